@@ -1,0 +1,222 @@
+"""Every option, one section a stage. The docs and ``config/default.yaml`` are made from here.
+
+A field whose value is "auto" (or null) is settled by the plan from what the scene shows.
+Importing this module costs pydantic and nothing heavier: the Snakefile imports it.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+Positive = Annotated[int, Field(gt=0)]
+Share = Annotated[float, Field(ge=0.0, le=1.0)]
+Rate = Annotated[float, Field(ge=0.0)]
+
+
+class Section(BaseModel):
+    model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False)
+
+
+class Inspect(Section):
+    """Looking at the folder once."""
+
+    image_folder: str = Field(
+        "auto",
+        description="Folder of photographs inside the scene folder; auto takes images/, else the "
+        "scene folder itself, and of images_2|4|8/ the one nearest above views.max_long_side_px.",
+    )
+    min_images: Positive = Field(2, description="Fewer readable photographs than this is an error.")
+
+
+class Views(Section):
+    """What every view-reading stage shares: resolution, split, masks."""
+
+    max_long_side_px: Positive = Field(
+        960, description="Views with a longer side are resized (by area) down to this, in pixels."
+    )
+    holdout_every: Annotated[int, Field(ge=0)] = Field(
+        8,
+        description="Every n-th view, sorted by name, is held out of training and used only to "
+        "evaluate; 0 trains on all and evaluates on the training views (said in the protocol).",
+    )
+    masks: Literal["auto", "ignore"] = Field(
+        "auto", description="auto uses masks/ where it exists: zero pixels count for nothing."
+    )
+
+
+class Decode(Section):
+    """RAW to pictures, all views of a scene developed alike."""
+
+    demosaic: Literal["linear", "ahd", "aahd"] = Field("ahd", description="LibRaw's demosaicker.")
+    half_size: bool = Field(False, description="Half the width and height, four times as fast.")
+    linear: bool = Field(
+        False, description="16-bit linear light instead of display-ready 8-bit sRGB."
+    )
+    white_balance: Literal["camera", "daylight"] = Field(
+        "camera",
+        description="camera: the median of the photographs' as-shot balance, for all of them; "
+        "daylight: the sensor's daylight balance.",
+    )
+
+
+class Features(Section):
+    """SIFT keypoints."""
+
+    backend: Literal["opencv", "colmap"] = Field(
+        "opencv", description="opencv (faster, RootSIFT) or COLMAP's own extractor."
+    )
+    max_features: Positive = Field(4096, description="Strongest features kept for an image.")
+    max_long_side_px: Positive = Field(
+        1600, description="Larger photographs are reduced to this for feature extraction, pixels."
+    )
+
+
+class Matches(Section):
+    """Which pairs are matched, and how they are verified."""
+
+    pairs: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = Field(
+        "auto", description="auto chooses from count, order and GPS."
+    )
+    neighbours: Positive = Field(
+        12, description="Pairs an image (sequential overlap, spatial or retrieval neighbours)."
+    )
+    max_ratio: Share = Field(0.8, description="Lowe's ratio test.")
+    min_inliers: Positive = Field(15, description="Fewer verified matches drop a pair.")
+
+
+class Sfm(Section):
+    """Camera poses and sparse points."""
+
+    mapper: Literal["auto", "incremental", "global"] = Field(
+        "auto", description="auto: incremental up to 150 photographs, global above."
+    )
+    camera_model: Literal[
+        "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+    ] = Field("auto", description="auto: SIMPLE_RADIAL.")
+    share_cameras: Literal["auto", "single", "group", "image"] = Field(
+        "auto",
+        description="auto and group: one camera for photographs of one body, lens, focal and "
+        "size; single: one for all; image: one each.",
+    )
+    refine_principal_point: Literal["auto", "yes", "no"] = Field(
+        "auto",
+        description="auto: in a last bundle adjustment, kept where the geometry carries it.",
+    )
+    min_registered_share: Share = Field(
+        0.5, description="A model with fewer of the photographs registered is a failure."
+    )
+
+
+class Undistort(Section):
+    """Pictures and masks as pinhole cameras would have seen them."""
+
+    blank_pixels: Share = Field(
+        0.0, description="Share of blank border allowed: 0 crops to valid pixels, 1 keeps all."
+    )
+    jpeg_quality: Annotated[int, Field(ge=0, le=100)] = Field(
+        0, description="0 writes lossless PNG; otherwise JPEG of this quality."
+    )
+
+
+class Init(Section):
+    """The first Gaussians."""
+
+    method: Literal["auto", "points", "random"] = Field(
+        "auto", description="auto: sparse points, triangulated if the poses came without any."
+    )
+    num_random: Positive = Field(50_000, description="Gaussians of a random start.")
+    opacity: Share = Field(0.1, description="Opacity of a new Gaussian.")
+    max_points: Positive = Field(200_000, description="More sparse points are thinned to this.")
+
+
+class Density(Section):
+    """Adaptive density control after Kerbl et al. 2023, section 5.2."""
+
+    start_step: int = Field(500, description="First densification.")
+    stop_share: Share = Field(0.5, description="Densify until this share of the steps.")
+    interval: Positive = Field(100, description="Steps between densifications.")
+    grad_threshold: Rate = Field(
+        2e-4, description="Mean view-space positional gradient (in NDC) that densifies."
+    )
+    split_scale: Rate = Field(
+        0.01, description="Gaussians larger than this share of the scene's extent split."
+    )
+    prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
+    prune_scale: Rate = Field(0.1, description="Larger ones (share of the extent) are removed.")
+    opacity_reset_interval: Positive = Field(3000, description="Steps between opacity resets.")
+    max_gaussians: Positive = Field(300_000, description="Budget: never more Gaussians than this.")
+
+
+class Train(Section):
+    """The optimisation of the Gaussians."""
+
+    steps: Positive = Field(7000, description="Optimiser steps, one view each.")
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
+    sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
+    ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
+    coarse_until: Share = Field(
+        0.4, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
+    )
+    background: Literal["auto", "black", "white", "random"] = Field(
+        "auto", description="auto: random where images have alpha, else black."
+    )
+    antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
+    lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")
+    lr_means_final: Rate = Field(1.6e-6, description="The same at the end (log-linear decay).")
+    lr_scales: Rate = 5e-3
+    lr_quats: Rate = 1e-3
+    lr_opacities: Rate = 5e-2
+    lr_sh0: Rate = 2.5e-3
+    lr_shN: Rate = Field(1.25e-4, description="Higher SH bands.")
+    density: Density = Field(default_factory=Density)
+
+
+class Evaluate(Section):
+    """Held-out views against renders."""
+
+    lpips_net: Literal["vgg", "alex", "none"] = Field(
+        "vgg", description="LPIPS backbone; its weights are looked for, never downloaded."
+    )
+
+
+class Export(Section):
+    """Files for other programs."""
+
+    formats: tuple[Literal["ply", "colmap", "points"], ...] = Field(
+        ("ply", "colmap", "points"),
+        description="ply: Gaussians in INRIA's layout; colmap: the model; points: coloured cloud.",
+    )
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Truncate SH to this.")
+    min_opacity: Share = Field(0.0, description="Leave fainter Gaussians out.")
+
+
+class Report(Section):
+    """The page."""
+
+    views: Positive = Field(3, description="Views shown beside photographs, worst to best.")
+
+
+class Config(Section):
+    """All options of a scene."""
+
+    preset: Literal["fast", "balanced", "high"] = Field(
+        "balanced", description="Starting values; single options override it."
+    )
+    poses: Literal["auto", "ignore"] = Field(
+        "auto", description="ignore: reconstruct poses though the scene brings some."
+    )
+    seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    inspect: Inspect = Field(default_factory=Inspect)
+    views: Views = Field(default_factory=Views)
+    decode: Decode = Field(default_factory=Decode)
+    features: Features = Field(default_factory=Features)
+    matches: Matches = Field(default_factory=Matches)
+    sfm: Sfm = Field(default_factory=Sfm)
+    undistort: Undistort = Field(default_factory=Undistort)
+    init: Init = Field(default_factory=Init)
+    train: Train = Field(default_factory=Train)
+    evaluate: Evaluate = Field(default_factory=Evaluate)
+    export: Export = Field(default_factory=Export)
+    report: Report = Field(default_factory=Report)

@@ -1,0 +1,61 @@
+"""The list of a scene's photographs that stages hand to one another (``images.json``)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.runtime.atomic import write_text
+
+
+class Photo(BaseModel):
+    """One photograph, all facts known without decoding its pixels.
+
+    Sizes and coordinates refer to the stored pixel grid: EXIF orientation is never applied to
+    pixels (COLMAP's habit; cv2 must be told), only carried along for pages that show pictures.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    name: str
+    """Relative to the image folder, "/" between folders; unique."""
+    path: str
+    """File to read, as seen from the working directory."""
+    width: int
+    height: int
+    digest: str
+    """Hex digest of the file's bytes."""
+    raw: bool = False
+    alpha: bool = False
+    bits: int = 8
+    orientation: int = 1
+    """EXIF orientation, 1 to 8."""
+    mask: str | None = None
+    """Mask file; non-zero pixels count, zero ones are ignored."""
+    depth: str | None = None
+    focal_px: float | None = None
+    """Focal length prior from EXIF in pixels of this size."""
+    camera_group: str = ""
+    """Photographs with the same group were taken with the same body, lens, focal and size."""
+    gps: tuple[float, float, float] | None = None
+    """Latitude and longitude in degrees, altitude in metres."""
+    taken: str | None = None
+    """EXIF time, ISO 8601."""
+
+
+class Manifest(BaseModel):
+    """A scene's photographs, sorted by name."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: str
+    photos: tuple[Photo, ...]
+    warnings: tuple[str, ...] = ()
+
+    def write(self, path: Path) -> None:
+        write_text(path, self.model_dump_json(indent=1) + "\n")
+
+    @staticmethod
+    def read(path: Path) -> Manifest:
+        return Manifest.model_validate_json(path.read_text())

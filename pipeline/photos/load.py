@@ -1,0 +1,214 @@
+"""Pictures from files, on the stored pixel grid: EXIF orientation is never applied.
+
+cv2's decoders fill what is missing from a cut-off file with grey and say nothing; the files'
+own framing is checked here instead.
+"""
+
+from __future__ import annotations
+
+import struct
+import zlib
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.errors import UserError
+
+Picture = NDArray[Any]
+FIX = "Replace the file by a whole one, or remove it from the folder."
+# Sizes reached by rounding (images_4/ and the like) still have nearly the same shape.
+ASPECT_TOLERANCE = 0.02
+
+
+@dataclass(frozen=True)
+class ViewPixels:
+    """One view at its working resolution.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, straight (not multiplied by alpha); 0 where alpha is 0.
+        alpha: (H, W) uint8, or None where the file has none.
+        mask: (H, W) bool, True where pixels count, or None without a mask.
+    """
+
+    rgb: NDArray[np.uint8]
+    alpha: NDArray[np.uint8] | None
+    mask: NDArray[np.bool_] | None
+
+
+def load_rgb(path: str | Path) -> Picture:
+    """Read a picture as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.
+
+    Raises:
+        UserError: the file is missing, cut off, or no picture that can be read.
+    """
+    return _split(_read(Path(path)))[0]
+
+
+def load_rgba(path: str | Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Read a picture as (H, W, 3) uint8 RGB and (H, W) uint8 alpha, None where it has none.
+
+    Raises:
+        UserError: as ``load_rgb``.
+    """
+    rgb, alpha = _split(_read(Path(path)))
+    return to_8bit(rgb), None if alpha is None else to_8bit(alpha)
+
+
+def load_mask(path: str | Path) -> NDArray[np.bool_]:
+    """Read a mask as (H, W) bool: True where any colour channel is not zero.
+
+    Raises:
+        UserError: as ``load_rgb``.
+    """
+    return np.asarray(load_rgb(path).any(axis=2))
+
+
+def load_view(
+    path: str | Path, mask_path: str | Path | None, width: int, height: int
+) -> ViewPixels:
+    """Read a view and its mask, resized by area to exactly ``width`` x ``height`` pixels.
+
+    Colours are averaged weighted by alpha, so that hidden colours never bleed in. A mask's pixel
+    counts if at least half of the pixels under it do.
+
+    Raises:
+        UserError: as ``load_rgb``; or picture or mask is not of the asked shape.
+    """
+    rgb, alpha = load_rgba(path)
+    _check_shape(rgb, width, height, Path(path))
+    mask = None
+    if mask_path is not None:
+        mask = load_mask(mask_path)
+        _check_shape(mask, width, height, Path(mask_path))
+        mask = resize_mask(mask, width, height)
+    return ViewPixels(*resize_rgba(rgb, alpha, width, height), mask)
+
+
+def resize_rgba(
+    rgb: NDArray[np.uint8], alpha: NDArray[np.uint8] | None, width: int, height: int
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+    """Resize (H, W, 3) uint8 colours and (H, W) uint8 alpha by area, colours weighted by alpha."""
+    if alpha is None:
+        return resize_area(rgb, width, height), None
+    if rgb.shape[:2] == (height, width):
+        return np.where(alpha[..., None] > 0, rgb, np.uint8(0)), alpha
+    weight = alpha.astype(np.float32)
+    small_weight = resize_area(weight, width, height)
+    light = resize_area(rgb * weight[..., None], width, height)
+    small_alpha = np.rint(small_weight).astype(np.uint8)
+    colour = np.rint(light / np.maximum(small_weight, 1e-6)[..., None]).clip(0, 255)
+    return np.where(small_alpha[..., None] > 0, colour, 0).astype(np.uint8), small_alpha
+
+
+def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
+    """Resize an (H, W) mask; a pixel counts if at least half of the pixels under it do."""
+    return np.asarray(resize_area(mask.astype(np.float32), width, height) >= 0.5)
+
+
+def resize_area(picture: Picture, width: int, height: int) -> Picture:
+    """Resize (H, W[, C]) by area averaging; the dtype is kept."""
+    if picture.shape[:2] == (height, width):
+        return picture
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
+
+
+def to_8bit(values: Picture) -> NDArray[np.uint8]:
+    """uint8 as it is; uint16 rounded, 65535 to 255."""
+    if values.dtype == np.uint8:
+        return values
+    return ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
+
+
+def _read(path: Path) -> Picture:
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(f"cannot be read: {error.strerror}", file=path, fix=FIX) from None
+    if _is_cut_off(data):
+        raise UserError("the picture is cut off or damaged", file=path, fix=FIX)
+    picture = None
+    if data:
+        try:
+            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+        except cv2.error:
+            picture = None
+    if picture is None:
+        raise UserError(
+            "not a picture that can be read (expected JPEG, PNG, TIFF or WebP)", file=path, fix=FIX
+        )
+    if picture.dtype not in (np.uint8, np.uint16):
+        raise UserError(
+            f"pixels of type {picture.dtype} (expected 8 or 16 bits)",
+            file=path,
+            fix="Convert the picture to 8-bit or 16-bit PNG.",
+        )
+    return picture
+
+
+def _split(picture: Picture) -> tuple[Picture, Picture | None]:
+    """OpenCV's grey, grey + alpha, BGR or BGRA as RGB and alpha."""
+    if picture.ndim == 2:
+        picture = picture[..., None]
+    channels = picture.shape[2]
+    alpha = np.ascontiguousarray(picture[..., -1]) if channels in (2, 4) else None
+    if channels <= 2:
+        return np.repeat(picture[..., :1], 3, axis=2), alpha
+    return np.ascontiguousarray(picture[..., 2::-1]), alpha
+
+
+def _check_shape(picture: Picture, width: int, height: int, path: Path) -> None:
+    found_height, found_width = picture.shape[:2]
+    if abs(found_width * height / (found_height * width) - 1) > ASPECT_TOLERANCE:
+        raise UserError(
+            f"is {found_width}x{found_height} pixels (expected the shape of {width}x{height})",
+            file=path,
+            fix="Use the picture its camera was made for, neither turned nor cropped.",
+        )
+
+
+def _is_cut_off(data: bytes) -> bool:
+    """True where a JPEG, PNG or WebP file ends before its format says it does."""
+    if data[:2] == b"\xff\xd8":
+        return not _jpeg_ends(data)
+    if data[:8] == b"\x89PNG\r\n\x1a\n":
+        return not _png_is_whole(data)
+    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
+        return len(data) < 8 + int(struct.unpack("<I", data[4:8])[0])
+    return False
+
+
+def _jpeg_ends(data: bytes) -> bool:
+    """True if an end-of-image marker follows the first scan (ITU T.81, annex B).
+
+    Searched from the scan on: the preview inside EXIF has an end of its own.
+    """
+    at = 2
+    while at + 4 <= len(data) and data[at] == 0xFF:
+        marker = data[at + 1]
+        if marker == 0xFF:  # fill byte
+            at += 1
+            continue
+        if marker == 0xDA:
+            return data.find(b"\xff\xd9", at) >= 0
+        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
+    return False
+
+
+def _png_is_whole(data: bytes) -> bool:
+    """True if every chunk up to IEND is there with its checksum (PNG specification, section 5)."""
+    at = 8
+    while at + 12 <= len(data):
+        length = int.from_bytes(data[at : at + 4], "big")
+        end = at + 8 + length
+        if end + 4 > len(data):
+            return False
+        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
+            return False
+        if data[at + 4 : at + 8] == b"IEND":
+            return True
+        at = end + 4
+    return False

@@ -1,0 +1,130 @@
+"""How alike two pictures are: PSNR, and SSIM with the window of the 3DGS literature.
+
+SSIM is written from the formula of Wang, Bovik, Sheikh and Simoncelli, "Image quality
+assessment: from error visibility to structural similarity" (2004), equation 13, with their
+constants K1 = 0.01, K2 = 0.03 and their 11 x 11 Gaussian window of sigma 1.5. Implementations
+differ at the border and so in the second digit; ``SSIM_VARIANT`` names which one the headline is.
+
+Pictures are (H, W, 3) in [0, 1]; everything is computed in float64. A mask is (H, W); its
+non-zero pixels count.
+"""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.errors import UserError
+
+PSNR_CAP = 100.0
+"""dB, reported for identical pictures: JSON has no infinity."""
+
+SSIM_VARIANT = "3DGS: 11x11 Gaussian, sigma 1.5, zero padding, mean over channels"
+SSIM_VALID_VARIANT = "11x11 Gaussian, sigma 1.5, valid region only, mean over channels"
+
+_RADIUS = 5
+_SIGMA = 1.5
+_C1 = 0.01**2
+_C2 = 0.03**2
+
+
+def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None = None) -> float:
+    """Peak signal-to-noise ratio in dB, peak 1, over all channels of the unmasked pixels.
+
+    Args:
+        image, reference: (H, W, 3), [0, 1].
+        mask: (H, W) or None; zero pixels count for nothing.
+
+    Returns:
+        ``min(-10 log10(mean squared error), PSNR_CAP)``.
+
+    Raises:
+        UserError: no pixel is unmasked.
+    """
+    image, reference, keep = _checked(image, reference, mask)
+    squared = (image - reference) ** 2
+    error = float(np.mean(squared if keep is None else squared[keep]))
+    return min(-10.0 * np.log10(error), PSNR_CAP) if error > 0.0 else PSNR_CAP
+
+
+def ssim(
+    image: NDArray[Any],
+    reference: NDArray[Any],
+    mask: NDArray[Any] | None = None,
+    *,
+    padding: Literal["zero", "valid"] = "zero",
+) -> float:
+    """Mean structural similarity, averaged over pixels and channels.
+
+    Args:
+        image, reference: (H, W, 3), [0, 1].
+        mask: (H, W) or None. Masked pixels of the image are replaced by the reference's, so that
+            what was rendered there reaches no window, and the map is averaged over the others.
+        padding: "zero" continues both pictures with black, as the 3DGS literature does
+            (``SSIM_VARIANT``); "valid" averages only where the window lies inside the picture.
+
+    Raises:
+        UserError: no pixel is left to average, or a side is under 11 pixels with "valid".
+    """
+    image, reference, keep = _checked(image, reference, mask)
+    if keep is not None:
+        image = np.where(keep[..., None], image, reference)
+    values = _ssim_map(image, reference)
+    if padding == "valid":
+        height, width = values.shape[:2]
+        if min(height, width) <= 2 * _RADIUS:
+            raise UserError(
+                f"SSIM without padding needs pictures of at least 11 x 11 pixels, "
+                f"found {width} x {height}",
+                fix="use larger pictures, or zero padding",
+            )
+        inner = np.s_[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
+        values = values[inner]
+        keep = None if keep is None else _not_empty(keep[inner])
+    return float(np.mean(values if keep is None else values[keep]))
+
+
+def _ssim_map(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
+    """SSIM(x, y) of every pixel and channel, both pictures continued with zeros."""
+    mean_x, mean_y = _blur(x), _blur(y)
+    variance_x = _blur(x * x) - mean_x**2
+    variance_y = _blur(y * y) - mean_y**2
+    covariance = _blur(x * y) - mean_x * mean_y
+    luminance = (2.0 * mean_x * mean_y + _C1) / (mean_x**2 + mean_y**2 + _C1)
+    structure = (2.0 * covariance + _C2) / (variance_x + variance_y + _C2)
+    return luminance * structure
+
+
+def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Each channel weighted by the (separable) Gaussian window around every pixel."""
+    from scipy.ndimage import correlate1d
+
+    offsets = np.arange(-_RADIUS, _RADIUS + 1)
+    window = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
+    window /= window.sum()
+    rows = correlate1d(values, window, axis=0, mode="constant", cval=0.0)
+    return correlate1d(rows, window, axis=1, mode="constant", cval=0.0)
+
+
+def _checked(
+    image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_] | None]:
+    if image.shape != reference.shape or image.ndim != 3:
+        raise ValueError(f"pictures of shapes {image.shape} and {reference.shape}")
+    keep = None
+    if mask is not None:
+        if mask.shape != image.shape[:2]:
+            raise ValueError(f"mask of shape {mask.shape} for pictures of shape {image.shape}")
+        keep = _not_empty(mask != 0)
+    return image.astype(np.float64), reference.astype(np.float64), keep
+
+
+def _not_empty(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
+    if not keep.any():
+        raise UserError(
+            "the mask leaves no pixel to measure",
+            fix="leave this view out of the evaluation, or mend its mask (non-zero counts)",
+        )
+    return keep

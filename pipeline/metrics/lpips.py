@@ -1,0 +1,250 @@
+"""LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual
+Metric", 2018), where its trained weights are found on this machine. Nothing is downloaded, and
+nothing ever stands in for missing weights: the metric is then not available, with the reason.
+
+Two files are needed, both in ``$TORCH_HOME/hub/checkpoints`` (``~/.cache/torch`` by default):
+
+- the backbone, torchvision's ImageNet weights: ``vgg16-397923af.pth`` or
+  ``alexnet-owt-7be5be79.pth``;
+- the linear heads of the LPIPS authors' release v0.1: ``lpips_vgg.pth`` or ``lpips_alex.pth``
+  (also found as ``vgg.pth`` or ``alex.pth``, as other programs leave them there).
+
+The published 3DGS numbers feed [0, 1] where the network was trained on [-1, 1]; so does this.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    import torch
+
+Net = Literal["vgg", "alex", "none"]
+Lpips = Callable[[NDArray[Any], NDArray[Any], NDArray[Any] | None], float]
+
+LPIPS_VARIANTS: dict[str, str] = {
+    "vgg": "LPIPS v0.1, VGG16, inputs [0,1] as INRIA",
+    "alex": "LPIPS v0.1, AlexNet, inputs [0,1] as INRIA",
+}
+
+MIN_SIDE = 32
+"""Pixels; a smaller picture shrinks to nothing inside the networks."""
+
+# The authors' input normalisation: ImageNet's mean and deviation seen from [-1, 1].
+_SHIFT = (-0.030, -0.088, -0.188)
+_SCALE = (0.458, 0.448, 0.450)
+# Keeps an all-zero feature vector from dividing by zero, as in the authors' release.
+_EPSILON = 1e-10
+
+
+@dataclass(frozen=True)
+class _Conv:
+    """A convolution with ReLU: its index in torchvision's ``features``, output channels, kernel,
+    stride, padding; the max-pooling (kernel, stride) before it; whether LPIPS reads its output."""
+
+    index: int
+    channels: int
+    kernel: int = 3
+    stride: int = 1
+    padding: int = 1
+    pool: tuple[int, int] | None = None
+    tap: bool = False
+
+
+@dataclass(frozen=True)
+class _Network:
+    backbone: str
+    heads: tuple[str, ...]
+    convs: tuple[_Conv, ...]
+
+
+_NETWORKS = {
+    "vgg": _Network(
+        "vgg16-397923af.pth",
+        ("lpips_vgg.pth", "vgg.pth"),
+        (
+            _Conv(0, 64),
+            _Conv(2, 64, tap=True),
+            _Conv(5, 128, pool=(2, 2)),
+            _Conv(7, 128, tap=True),
+            _Conv(10, 256, pool=(2, 2)),
+            _Conv(12, 256),
+            _Conv(14, 256, tap=True),
+            _Conv(17, 512, pool=(2, 2)),
+            _Conv(19, 512),
+            _Conv(21, 512, tap=True),
+            _Conv(24, 512, pool=(2, 2)),
+            _Conv(26, 512),
+            _Conv(28, 512, tap=True),
+        ),
+    ),
+    "alex": _Network(
+        "alexnet-owt-7be5be79.pth",
+        ("lpips_alex.pth", "alex.pth"),
+        (
+            _Conv(0, 64, kernel=11, stride=4, padding=2, tap=True),
+            _Conv(3, 192, kernel=5, padding=2, pool=(3, 2), tap=True),
+            _Conv(6, 384, pool=(3, 2), tap=True),
+            _Conv(8, 256, tap=True),
+            _Conv(10, 256, tap=True),
+        ),
+    ),
+}
+
+
+def lpips_available(net: Net) -> tuple[Lpips | None, str]:
+    """The metric, or None and why there is none.
+
+    Returns:
+        ``(measure, "")``, or ``(None, reason)`` where a file is missing or not what it should
+        be; the reason names the file and where to put it. ``measure(image, reference, mask)``
+        takes (H, W, 3) in [0, 1] and a mask (H, W) or None, and returns the distance (0 for
+        identical pictures). Masked (zero) pixels of the image are replaced by the reference's
+        and each layer is averaged by how much of it is unmasked. It raises UserError for
+        pictures under ``MIN_SIDE`` pixels.
+    """
+    if net == "none":
+        return None, "switched off"
+    import torch
+
+    network = _NETWORKS[net]
+    folder = Path(torch.hub.get_dir()) / "checkpoints"
+    backbone_file = folder / network.backbone
+    heads_file = next(
+        (folder / name for name in network.heads if (folder / name).is_file()),
+        folder / network.heads[0],
+    )
+    missing = [str(file) for file in (backbone_file, heads_file) if not file.is_file()]
+    if missing:
+        return None, (
+            f"weights not found: put {' and '.join(missing)} there (torchvision's ImageNet "
+            f"backbone {network.backbone}; the linear heads of LPIPS v0.1 as {network.heads[0]})"
+        )
+    try:
+        weights = _backbone(_load(backbone_file), network)
+    except Exception as error:
+        return None, f"{backbone_file} is not torchvision's {network.backbone}: {error}"
+    try:
+        heads = _heads(_load(heads_file), network)
+    except Exception as error:
+        return None, f"{heads_file} does not hold the linear heads of LPIPS v0.1: {error}"
+
+    def measure(
+        image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None = None
+    ) -> float:
+        return _distance(network, weights, heads, image, reference, mask)
+
+    return measure, ""
+
+
+def _load(file: Path) -> dict[str, torch.Tensor]:
+    import torch
+
+    return torch.load(file, map_location="cpu", weights_only=True)
+
+
+def _expect(tensor: torch.Tensor, name: str, shape: tuple[int, ...]) -> torch.Tensor:
+    if tuple(tensor.shape) != shape:
+        raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
+    return tensor.float()
+
+
+def _backbone(
+    state: dict[str, torch.Tensor], network: _Network
+) -> list[tuple[torch.Tensor, torch.Tensor]]:
+    weights, channels = [], 3
+    for conv in network.convs:
+        name = f"features.{conv.index}"
+        shape = (conv.channels, channels, conv.kernel, conv.kernel)
+        weight = _expect(state[f"{name}.weight"], f"{name}.weight", shape)
+        bias = _expect(state[f"{name}.bias"], f"{name}.bias", (conv.channels,))
+        weights.append((weight, bias))
+        channels = conv.channels
+    return weights
+
+
+def _heads(state: dict[str, torch.Tensor], network: _Network) -> list[torch.Tensor]:
+    taps = [conv for conv in network.convs if conv.tap]
+    names = [f"lin{layer}.model.1.weight" for layer in range(len(taps))]
+    return [
+        _expect(state[name], name, (1, conv.channels, 1, 1))
+        for name, conv in zip(names, taps, strict=True)
+    ]
+
+
+def _distance(
+    network: _Network,
+    weights: list[tuple[torch.Tensor, torch.Tensor]],
+    heads: list[torch.Tensor],
+    image: NDArray[Any],
+    reference: NDArray[Any],
+    mask: NDArray[Any] | None,
+) -> float:
+    import torch
+    import torch.nn.functional as F
+
+    height, width = image.shape[:2]
+    if min(height, width) < MIN_SIDE:
+        raise UserError(
+            f"LPIPS needs pictures of at least {MIN_SIDE} x {MIN_SIDE} pixels, "
+            f"found {width} x {height}",
+            fix="use larger pictures, or evaluate without it (lpips_net: none)",
+        )
+    keep = np.ones((height, width), bool) if mask is None else mask != 0
+    if not keep.any():
+        raise UserError("the mask leaves no pixel to measure", fix="leave this view out")
+    image = np.where(keep[..., None], image, reference)
+
+    def as_batch(values: NDArray[Any]) -> torch.Tensor:
+        pixels = torch.from_numpy(values.astype(np.float32)).permute(2, 0, 1)[None]
+        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
+        return (pixels - shift) / scale
+
+    unmasked = torch.from_numpy(keep.astype(np.float32))[None, None]
+    total, layer = 0.0, 0
+    with torch.no_grad(), _one_thread():
+        x, y = as_batch(image), as_batch(reference)
+        for conv, (weight, bias) in zip(network.convs, weights, strict=True):
+            if conv.pool is not None:
+                x, y = F.max_pool2d(x, *conv.pool), F.max_pool2d(y, *conv.pool)
+            x, y = (
+                F.relu(F.conv2d(v, weight, bias, stride=conv.stride, padding=conv.padding))
+                for v in (x, y)
+            )
+            if conv.tap:
+                difference = (_unit(x) - _unit(y)) ** 2
+                distance = F.conv2d(difference, heads[layer])[0, 0]
+                share = F.adaptive_avg_pool2d(unmasked, (distance.shape[0], distance.shape[1]))[
+                    0, 0
+                ]
+                d, s = (t.numpy().astype(np.float64) for t in (distance, share))
+                total += float(np.sum(d * s) / np.sum(s))
+                layer += 1
+    return total
+
+
+@contextmanager
+def _one_thread() -> Iterator[None]:
+    """Torch's convolutions round differently with the number of threads; a metric must not."""
+    import torch
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        yield
+    finally:
+        torch.set_num_threads(before)
+
+
+def _unit(features: torch.Tensor) -> torch.Tensor:
+    """Feature vectors of every pixel at length one."""
+    return features / (features.square().sum(dim=1, keepdim=True).sqrt() + _EPSILON)

@@ -1,0 +1,261 @@
+"""PLY files: Gaussians in INRIA's layout, and coloured point clouds for mesh programs.
+
+INRIA's layout is one ``vertex`` element of little-endian float32 properties: ``x y z nx ny nz
+f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``. Scales are natural logarithms, opacity is a
+logit, rotation is wxyz; ``f_rest`` goes channel by channel (all red coefficients of the higher
+bands, then green, then blue). Normals are zero. Other programs drop or reorder properties, so
+they are read by name.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.errors import UserError
+
+_POSITION = ("x", "y", "z")
+_NORMAL = ("nx", "ny", "nz")
+_SCALE = tuple(f"scale_{i}" for i in range(3))
+_ROTATION = tuple(f"rot_{i}" for i in range(4))
+_DC = tuple(f"f_dc_{i}" for i in range(3))
+_REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
+
+_TYPES = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+# A header has under a hundred lines; a longer one is another kind of file.
+_MAX_HEADER = 1 << 16
+_FIX = "write the file again, or get a whole copy of it"
+
+
+@dataclass(frozen=True)
+class SplatArrays:
+    """Gaussians as float32 numpy arrays: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz as
+    stored (not normalised), opacity_logits (N,), sh (N, K, 3) with K = (degree + 1)^2."""
+
+    means: NDArray[np.float32]
+    log_scales: NDArray[np.float32]
+    quats: NDArray[np.float32]
+    opacity_logits: NDArray[np.float32]
+    sh: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        return round(self.sh.shape[1] ** 0.5) - 1
+
+
+def write_splat_ply(
+    path: Path,
+    means: NDArray[Any],
+    log_scales: NDArray[Any],
+    quats: NDArray[Any],
+    opacity_logits: NDArray[Any],
+    sh: NDArray[Any],
+) -> None:
+    """Write Gaussians in INRIA's layout: 62 floats each at SH degree 3, fewer at lower ones.
+
+    Args:
+        path: appears whole or not at all.
+        means, log_scales: (N, 3). quats: (N, 4) wxyz. opacity_logits: (N,).
+        sh: (N, K, 3), K = 1, 4, 9 or 16.
+    """
+    count, bands = sh.shape[:2]
+    shapes = (means.shape, log_scales.shape, quats.shape, opacity_logits.shape, sh.shape)
+    if shapes != ((count, 3), (count, 3), (count, 4), (count,), (count, bands, 3)):
+        raise ValueError(f"arrays that do not belong together: {shapes}")
+    if bands not in (1, 4, 9, 16):
+        raise ValueError(f"{bands} SH coefficients; 1, 4, 9 or 16 make whole bands")
+    rest = [f"f_rest_{i}" for i in range(3 * (bands - 1))]
+    names = [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
+    columns = (
+        means,
+        np.zeros((count, 3)),
+        sh[:, 0],
+        sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),
+        opacity_logits[:, None],
+        log_scales,
+        quats,
+    )
+    table = np.concatenate([np.asarray(c, "<f4") for c in columns], axis=1, dtype="<f4")
+    _write(path, count, [("float", name) for name in names], table.tobytes())
+
+
+def write_points_ply(
+    path: Path,
+    xyz: NDArray[Any],
+    rgb: NDArray[np.uint8],
+    normals: NDArray[Any] | None = None,
+) -> None:
+    """Write a coloured point cloud that mesh programs open: float32 positions (and normals),
+    uchar red, green, blue.
+
+    Args:
+        path: appears whole or not at all.
+        xyz, rgb: (P, 3). normals: (P, 3) or None.
+    """
+    columns = [("float", "f4", _POSITION, xyz)]
+    if normals is not None:
+        columns.append(("float", "f4", _NORMAL, normals))
+    columns.append(("uchar", "u1", ("red", "green", "blue"), rgb))
+    if any(np.shape(values) != (len(xyz), 3) for *_, values in columns):
+        raise ValueError(f"arrays that do not belong together: {[np.shape(c[3]) for c in columns]}")
+    fields = [(n, f"<{code}") for _, code, names, _ in columns for n in names]
+    table = np.zeros(len(xyz), np.dtype(fields))
+    for _, _, names, values in columns:
+        for i, name in enumerate(names):
+            table[name] = values[:, i]
+    properties = [(kind, name) for kind, _, names, _ in columns for name in names]
+    _write(path, len(xyz), properties, table.tobytes())
+
+
+def _write(path: Path, count: int, properties: list[tuple[str, str]], body: bytes) -> None:
+    lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
+    lines += [f"property {kind} {name}" for kind, name in properties]
+    write_bytes(path, "\n".join([*lines, "end_header", ""]).encode() + body)
+
+
+def read_splat_ply(path: Path) -> SplatArrays:
+    """Read Gaussians by property name: any order, normals optional, SH degree 0 to 3, any
+    number type; binary of either byte order, or ASCII.
+
+    Raises:
+        UserError: the file is missing, is no PLY of Gaussians, is cut short, or holds more than
+            its header says.
+    """
+    try:
+        with open(path, "rb") as file:
+            header = _read_header(file, path)
+            rest = sorted(n for n in header.fields if n.startswith("f_rest_"))
+            missing = [name for name in _REQUIRED if name not in header.fields]
+            bands = len(rest) // 3 + 1
+            if not missing:
+                missing = [
+                    n for n in (f"f_rest_{i}" for i in range(len(rest))) if n not in header.fields
+                ]
+            if missing:
+                raise _wrong(path, f"expected the properties of Gaussians, found no {missing[0]}")
+            if len(rest) not in (0, 9, 24, 45):
+                raise _wrong(path, f"expected 0, 9, 24 or 45 f_rest properties, found {len(rest)}")
+            table = _read_body(file, header, path)
+    except OSError as error:
+        raise UserError(
+            f"expected a PLY file, could not read it: {error.strerror}",
+            file=path,
+            fix="check the path and its permissions",
+        ) from error
+
+    def columns(names: tuple[str, ...]) -> NDArray[np.float32]:
+        return np.stack([table[name].astype(np.float32) for name in names], axis=1)
+
+    sh = np.empty((header.count, bands, 3), np.float32)
+    sh[:, 0] = columns(_DC)
+    for channel in range(3):
+        for band in range(bands - 1):
+            sh[:, band + 1, channel] = table[f"f_rest_{channel * (bands - 1) + band}"]
+    return SplatArrays(
+        columns(_POSITION),
+        columns(_SCALE),
+        columns(_ROTATION),
+        table["opacity"].astype(np.float32),
+        sh,
+    )
+
+
+@dataclass(frozen=True)
+class _Header:
+    """Its ``vertex`` element, which comes first: rows, type of each property, byte order
+    ("" for ASCII); and whether other elements follow."""
+
+    count: int
+    fields: dict[str, str]
+    order: str
+    more: bool
+
+
+def _wrong(path: Path, what: str) -> UserError:
+    return UserError(what, file=path, fix=_FIX)
+
+
+def _read_header(file: BinaryIO, path: Path) -> _Header:
+    lines: list[list[str]] = []
+    size = 0
+    while not lines or lines[-1] != ["end_header"]:
+        line = file.readline(_MAX_HEADER)
+        size += len(line)
+        if not lines and line.rstrip() != b"ply":
+            raise _wrong(path, f"expected a PLY file, found one that begins with {line[:16]!r}")
+        if not line.endswith(b"\n") or size > _MAX_HEADER:
+            raise _wrong(path, "expected a PLY header, found no end of it (end_header)")
+        lines.append(line.decode("ascii", "replace").split())
+    order = None
+    elements: list[tuple[str, str]] = []
+    fields: dict[str, str] = {}
+    for words in lines[1:-1]:
+        match words:
+            case [] | ["comment" | "obj_info", *_]:
+                pass
+            case ["format", kind, "1.0"] if kind in _ORDERS:
+                order = _ORDERS[kind]
+            case ["element", name, count]:
+                elements.append((name, count))
+            case ["property", kind, name] if kind in _TYPES and elements:
+                if len(elements) == 1:
+                    if name in fields:
+                        raise _wrong(path, f"expected each property once, found {name} twice")
+                    fields[name] = _TYPES[kind]
+            case ["property", "list", _, _, _] if len(elements) > 1:
+                pass
+            case _:
+                raise _wrong(path, f"expected a PLY header line, found {' '.join(words)[:80]!r}")
+    if order is None:
+        raise _wrong(path, "expected a format line in the PLY header, found none")
+    if not elements or elements[0][0] != "vertex" or not elements[0][1].isdecimal():
+        raise _wrong(path, "expected 'element vertex COUNT' as the first element, found none")
+    return _Header(int(elements[0][1]), fields, order, len(elements) > 1)
+
+
+def _read_body(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray[Any]]:
+    """(count,) values of each property."""
+    if not header.order:
+        return _read_ascii(file, header, path)
+    dtype = np.dtype([(name, header.order + code) for name, code in header.fields.items()])
+    start = file.tell()
+    found, expected = file.seek(0, 2) - start, header.count * dtype.itemsize
+    if found < expected or (found > expected and not header.more):
+        raise _wrong(
+            path,
+            f"expected {expected} bytes of {header.count} Gaussians after the header, "
+            f"found {found}",
+        )
+    file.seek(start)
+    table = np.frombuffer(file.read(expected), dtype)
+    return {name: table[name] for name in header.fields}
+
+
+def _read_ascii(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray[Any]]:
+    rows = file.read().splitlines()
+    if len(rows) < header.count or (len(rows) > header.count and not header.more):
+        raise _wrong(path, f"expected {header.count} lines of Gaussians, found {len(rows)}")
+    try:
+        values = np.array([row.split() for row in rows[: header.count]], np.float64)
+        values = values.reshape(header.count, len(header.fields))
+    except ValueError:
+        raise _wrong(path, f"expected {len(header.fields)} numbers in each line") from None
+    return dict(zip(header.fields, values.T, strict=True))

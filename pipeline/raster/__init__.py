@@ -1,0 +1,43 @@
+"""The differentiable rasterizer for 3D Gaussians: C++ kernels, their Python face, a torch twin.
+
+``forward``, ``backward``, ``l1_ssim`` and ``adam_step`` are what a trainer calls; ``render`` wraps
+the first two in autograd. The kernels are compiled at first use, or beforehand by
+``python -m pipeline.raster.build``. ``pipeline.raster.twin`` holds the method in readable torch.
+Importing this package imports no torch.
+"""
+
+from __future__ import annotations
+
+import importlib
+from typing import TYPE_CHECKING, Any
+
+from pipeline.raster.types import (
+    Gradients,
+    LossResult,
+    RasterCamera,
+    RasterOptions,
+    RenderOutput,
+)
+
+if TYPE_CHECKING:
+    from pipeline.raster.ops import Forward, adam_step, backward, forward, l1_ssim, render
+
+__all__ = [
+    "Forward",
+    "Gradients",
+    "LossResult",
+    "RasterCamera",
+    "RasterOptions",
+    "RenderOutput",
+    "adam_step",
+    "backward",
+    "forward",
+    "l1_ssim",
+    "render",
+]
+
+
+def __getattr__(name: str) -> Any:
+    if name in __all__:
+        return getattr(importlib.import_module("pipeline.raster.ops"), name)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,105 @@
+"""Values that pass in and out of the rasterizer. Importable without torch."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    import torch
+
+
+@dataclass(frozen=True)
+class RasterCamera:
+    """One pinhole view, COLMAP's convention: x right, y down, z forward.
+
+    Pixel centres lie at half integers: pixel (column i, row j) samples (i + 0.5, j + 0.5).
+
+    Attributes:
+        width, height: image size in pixels.
+        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        world_to_camera: (4, 4) float32 or float64, rigid.
+    """
+
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: torch.Tensor
+
+
+@dataclass(frozen=True)
+class RasterOptions:
+    """How a view is drawn.
+
+    Attributes:
+        sh_degree: active spherical harmonics degree, 0 to 3; coefficients above are ignored.
+        background: RGB behind everything; None adds none (the same image as black).
+        antialias: scale opacities by Mip-Splatting's compensation, so that the 0.3 px
+            dilation changes a Gaussian's size but not its energy.
+        near: Gaussians whose centre has camera z <= near are not drawn. In scene units, and
+            scenes from photographs have an arbitrary scale: choose it well under the distance
+            of the nearest thing worth drawing.
+        threads: OpenMP threads, 0 for all. The result does not depend on it.
+    """
+
+    sh_degree: int = 3
+    background: tuple[float, float, float] | None = None
+    antialias: bool = False
+    near: float = 0.01
+    threads: int = 0
+
+
+@dataclass(frozen=True)
+class Gradients:
+    """dL/d(parameter), float32, each shaped as its parameter; zero for what is not visible.
+
+    Attributes:
+        means2d: (N, 2) dL/d(pixel position of the centre).
+        means2d_abs: (N, 2) the sum over pixels of the absolute value of each pixel's share of
+            means2d (AbsGS, Ye et al. 2024); None when not asked for.
+    """
+
+    means: torch.Tensor
+    log_scales: torch.Tensor
+    quats: torch.Tensor
+    opacity_logits: torch.Tensor
+    sh: torch.Tensor
+    means2d: torch.Tensor
+    means2d_abs: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class RenderOutput:
+    """A drawn view; color, alpha and depth carry gradients.
+
+    Attributes:
+        color: (H, W, 3).
+        alpha: (H, W) 1 - transmittance.
+        depth: (H, W) sum of weight * camera z, not divided by alpha.
+        median_depth: (H, W) camera z of the Gaussian that takes the transmittance below 0.5;
+            0 where none does.
+        radii: (N,) pixels along the long axis out to where alpha falls to 1/255; 0: not visible.
+        num_visible: Gaussians that touch the image.
+        num_dropped: Gaussians left out because a value is not finite or degenerate.
+    """
+
+    color: torch.Tensor
+    alpha: torch.Tensor
+    depth: torch.Tensor
+    median_depth: torch.Tensor
+    radii: torch.Tensor
+    num_visible: int
+    num_dropped: int
+
+
+@dataclass(frozen=True)
+class LossResult:
+    """loss = (1 - w) l1 + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
+
+    loss: float
+    l1: float
+    ssim: float
+    grad: torch.Tensor

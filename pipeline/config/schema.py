@@ -140,6 +140,11 @@ class Density(Section):
     grad_threshold: Rate = Field(
         2e-4, description="Mean view-space positional gradient (in NDC) that densifies."
     )
+    absolute_gradient: bool = Field(
+        False,
+        description="Sum the absolute values of each pixel's gradient (AbsGS), so that pulls in "
+        "opposite directions don't cancel; wants a larger grad_threshold.",
+    )
     split_scale: Rate = Field(
         0.01, description="Gaussians larger than this share of the scene's extent split."
     )

@@ -1,0 +1,60 @@
+# Two commands: `make demo` reconstructs a scene the project makes itself, `make test` runs the
+# tests. Both set up what they need: a virtual environment in .venv and the compiled extension.
+
+PYTHON ?= python3
+CORES ?= all
+VENV := .venv
+BIN := $(VENV)/bin
+
+.PHONY: demo test lint format docs setup clean
+.DEFAULT_GOAL := help
+
+help:
+	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
+	@echo "make test   run the tests"
+	@echo "make setup  only set up .venv and the extension"
+	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
+	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
+	@echo "make clean  remove results/ and data/demo"
+
+$(VENV)/installed: pyproject.toml
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
+	@command -v $${CXX:-g++} >/dev/null || \
+	  { echo "error: no C++ compiler found ($${CXX:-g++}); install g++, or set CXX"; exit 2; }
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
+	  print("\n".join(p["dependencies"] + p["optional-dependencies"]["dev"]))' > $(VENV)/requirements.txt
+	@echo "installing dependencies into $(VENV) (once; a minute or two)"
+	@$(BIN)/pip install --quiet --disable-pip-version-check -r $(VENV)/requirements.txt
+	@touch $@
+
+setup: $(VENV)/installed
+	@$(BIN)/python -m pipeline.raster.build
+
+data/demo/demo.json: | setup
+	@$(BIN)/python -m pipeline.demo data/demo
+
+demo: setup data/demo/demo.json
+	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json
+	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
+
+test: setup
+	@$(BIN)/python -m pytest tests
+
+lint: $(VENV)/installed
+	@$(BIN)/ruff check .
+	@$(BIN)/ruff format --check .
+	@$(BIN)/mypy
+	@$(BIN)/snakefmt --check Snakefile
+	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/raster/csrc/*')
+
+format: $(VENV)/installed
+	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile
+	@$(BIN)/clang-format -i $$(git ls-files 'pipeline/raster/csrc/*')
+
+docs: $(VENV)/installed
+	@$(BIN)/python -m pipeline.config.docs
+
+clean:
+	rm -rf results data/demo

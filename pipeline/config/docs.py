@@ -1,0 +1,141 @@
+"""``python -m pipeline.config.docs [--check]``: the option page and the commented default YAML.
+
+Both are made from the schemas, so that they can't disagree with the program.
+"""
+
+from __future__ import annotations
+
+import sys
+from pathlib import Path
+from typing import Any, get_args, get_origin
+
+import yaml
+from pydantic import BaseModel
+from pydantic.fields import FieldInfo
+
+from pipeline.config.load import Project
+from pipeline.config.presets import PRESETS
+from pipeline.runtime.atomic import write_text
+
+ROOT = Path(__file__).resolve().parents[2]
+PAGE = ROOT / "docs" / "configuration.md"
+DEFAULTS = ROOT / "config" / "config.yaml"
+
+_INTRO = """# Configuration
+
+Made from the schemas by `make docs`; do not edit. Every option has a default that suits most
+scenes: give only what you want otherwise, in `config/config.yaml`, in a file of your own
+(`--configfile mine.yaml`) or, for simple values, as `--config preset=fast`. Options under
+`scenes.<name>` are for that scene alone. An unknown name or an impossible value is named before
+any job starts. `auto` is settled by the plan from what the scene shows: `results/<scene>/plan.json`
+says how and why.
+"""
+
+
+def page() -> str:
+    """The Markdown of docs/configuration.md."""
+    lines = [_INTRO, "## Top level", "", *_table(Project)]
+    for name, info in Project.model_fields.items():
+        section = _section(info)
+        if section is not None:
+            lines += _section_page(name, section)
+    lines += ["## Presets", "", "What each sets over the defaults above.", ""]
+    for preset, values in PRESETS.items():
+        lines += [f"`{preset}`:", "", "```yaml"]
+        lines += [yaml.safe_dump(values or {}, sort_keys=False).strip(), "```", ""]
+    return "\n".join(lines).rstrip() + "\n"
+
+
+def _section_page(path: str, section: type[BaseModel]) -> list[str]:
+    lines = [f"## {path}", "", (section.__doc__ or "").strip(), "", *_table(section)]
+    for name, info in section.model_fields.items():
+        inner = _section(info)
+        if inner is not None:
+            lines += _section_page(f"{path}.{name}", inner)
+    return lines
+
+
+def _table(model: type[BaseModel]) -> list[str]:
+    rows = ["| option | values | default | meaning |", "|---|---|---|---|"]
+    for name, info in model.model_fields.items():
+        if _section(info) is None:
+            default = yaml_value(_default(info))
+            rows.append(f"| `{name}` | {_values(info)} | `{default}` | {info.description or ''} |")
+    return [*rows, ""] if len(rows) > 2 else []
+
+
+def defaults() -> str:
+    """The YAML of config/config.yaml: what is set, and everything else as comments."""
+    lines = [
+        "# Every option with its default; made by `make docs`. Take away the # of what you change.",
+        "# docs/configuration.md says what each means.",
+        "data_root: data",
+        "preset: balanced",
+        "",
+    ]
+    for name, info in Project.model_fields.items():
+        if name in ("data_root", "preset"):
+            continue
+        lines += _commented(name, info, 0)
+    return "\n".join(lines) + "\n"
+
+
+def _commented(name: str, info: FieldInfo, depth: int) -> list[str]:
+    pad = "  " * depth
+    section = _section(info)
+    if section is None:
+        return [f"# {pad}{name}: {yaml_value(_default(info))}"]
+    lines = [f"# {pad}{name}:"]
+    for inner, inner_info in section.model_fields.items():
+        lines += _commented(inner, inner_info, depth + 1)
+    return lines
+
+
+def _section(info: FieldInfo) -> type[BaseModel] | None:
+    kind = info.annotation
+    return kind if isinstance(kind, type) and issubclass(kind, BaseModel) else None
+
+
+def _default(info: FieldInfo) -> Any:
+    return info.get_default(call_default_factory=True)
+
+
+def yaml_value(value: Any) -> str:
+    """A value as YAML on one line."""
+    plain = list(value) if isinstance(value, tuple) else value
+    return yaml.safe_dump(plain, default_flow_style=True, width=1000).removesuffix("...\n").strip()
+
+
+def _values(info: FieldInfo) -> str:
+    kind: Any = info.annotation
+    if get_origin(kind) is tuple:
+        kind = get_args(kind)[0]
+        return "list of " + ", ".join(f"`{v}`" for v in get_args(kind))
+    choices = get_args(kind)
+    if choices and not isinstance(choices[0], type):
+        return ", ".join(f"`{v}`" for v in choices)
+    words = {int: "whole number", float: "number", bool: "true, false", str: "text"}
+    bounds = [
+        f"{sign} {getattr(meta, name):g}"
+        for meta in info.metadata
+        for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
+        if getattr(meta, name, None) is not None
+    ]
+    return " ".join([words.get(kind, "mapping"), *bounds])
+
+
+def main() -> int:
+    """Write both files, or with ``--check`` only say whether they are current."""
+    stale = []
+    for path, text in ((PAGE, page()), (DEFAULTS, defaults())):
+        if not path.exists() or path.read_text() != text:
+            stale.append(path.relative_to(ROOT))
+            if "--check" not in sys.argv[1:]:
+                write_text(path, text)
+    for path in stale:
+        print(f"{path}: {'not current: run make docs' if '--check' in sys.argv else 'written'}")
+    return 1 if stale and "--check" in sys.argv[1:] else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,71 @@
+"""``metrics.json``: what a scene's stages recorded, put together."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+from pipeline.runtime.job import read_stage
+
+
+def collect_metrics(
+    scene: str,
+    plan: dict[str, Any],
+    folder: Path,
+    evaluation: dict[str, Any],
+    own_run: dict[str, Any],
+) -> dict[str, Any]:
+    """Gather a scene's metrics.
+
+    Args:
+        scene: its name.
+        plan: ``plan.json``.
+        folder: ``results/<scene>``, with the stages' folders.
+        evaluation: ``evaluate/evaluation.json``.
+        own_run: how the calling stage's run has gone so far (it has no ``run.json`` yet).
+
+    Returns:
+        The content of ``metrics.json``; times and memory are this machine's, the rest is the
+        same for the same input.
+    """
+    stages: dict[str, Any] = {}
+    warnings: list[str] = list(plan["warnings"])
+    counters: dict[str, dict[str, Any]] = {}
+    for name, step in plan["stages"].items():
+        if not step["run"]:
+            stages[name] = _timing(None) | {"skipped": True, "reason": step["reason"]}
+            continue
+        if name == "report":
+            run = own_run
+        else:
+            record = read_stage(folder / name)
+            counters[name] = record["counters"]
+            warnings += [f"{name}: {text}" for text in record["warnings"]]
+            run = json.loads((folder / name / "run.json").read_text())
+        stages[name] = _timing(run) | {"skipped": False, "reason": step["reason"]}
+    sfm = counters.get("sfm", {})
+    photos = counters["inspect"]["photos"]
+    return {
+        "scene": scene,
+        "psnr": evaluation["psnr"],
+        "ssim": evaluation["ssim"],
+        "lpips": evaluation["lpips"],
+        "lpips_reason": evaluation["lpips_reason"],
+        "per_view": evaluation["per_view"],
+        "protocol": evaluation["protocol"],
+        "num_gaussians": counters["train"]["num_gaussians"],
+        "registered_images": sfm.get("registered", counters["inspect"].get("given_poses")),
+        "total_images": photos + counters["inspect"]["left_out"],
+        "reprojection_error_px": sfm.get("reprojection_error_px"),
+        "pose_error": evaluation["pose_error"],
+        "stages": stages,
+        "versions": own_run["versions"],
+        "seed": own_run["seed"],
+        "warnings": list(dict.fromkeys(warnings)),
+    }
+
+
+def _timing(run: dict[str, Any] | None) -> dict[str, Any]:
+    names = ("wall_s", "cpu_s", "peak_rss_mb")
+    return {name: run[name] if run else 0.0 for name in names}

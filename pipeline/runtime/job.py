@@ -1,0 +1,392 @@
+"""What every stage needs around its work: identity, lock, atomic outputs, sidecars, errors.
+
+A stage owns one folder. Its work is written to a scratch folder and put in place by a rename
+when all is done, so that what exists is whole. Two sidecars stand beside the outputs:
+
+- ``stage.json``: the same for the same work. Key, digests of inputs and outputs, counters,
+  decisions, warnings.
+- ``run.json``: how this run went. Versions, commit, host, wall and CPU time, peak memory.
+
+A stage whose key and inputs are those of its finished folder is not worked again: Snakemake
+deletes a job's declared outputs before it runs it, so a hidden copy of ``stage.json`` lets the
+stage see that the work is there, check the digests, and put the declared file back.
+"""
+
+from __future__ import annotations
+
+import errno
+import fcntl
+import hashlib
+import json
+import platform
+import resource
+import shutil
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Any, TextIO, TypeVar
+
+from pydantic import BaseModel
+
+from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.progress import write_progress_to
+
+SIDE_CARS = ("stage.json", "run.json", ".stage.json")
+EXIT_USER_ERROR = 2
+
+S = TypeVar("S", bound=BaseModel)
+
+
+@dataclass
+class Job:
+    """One stage's work on one scene.
+
+    Attributes:
+        stage, scene: names.
+        key: the stage's key as a parsed JSON object (see ``stages.wiring.stage_key``).
+        inputs: folder of each input role ("photos", "model", ...).
+        out: write outputs here; it becomes the stage's folder when ``run`` returns.
+        scratch: survives a kill and is found again by a run with the same identity.
+        shared_cache: survives changed options; for content-addressed per-image results.
+        threads: native threads to use; never changes a result.
+        counters, decisions, warnings: recorded in ``stage.json``; fill them in.
+        published: extra declared outputs: file in ``out`` -> path where it is wanted as well.
+        timings: recorded in ``run.json``.
+    """
+
+    stage: str
+    scene: str
+    key: dict[str, Any]
+    inputs: dict[str, Path]
+    out: Path
+    scratch: Path
+    shared_cache: Path
+    threads: int
+    counters: dict[str, Any] = field(default_factory=dict)
+    decisions: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    published: dict[str, Path] = field(default_factory=dict)
+    timings: dict[str, Any] = field(default_factory=dict)
+
+    @property
+    def seed(self) -> int:
+        return int(self.key["seed"])
+
+    def section(self, model: type[S]) -> S:
+        """The validated config section of type ``model``; only sections in the key exist."""
+        return model.model_validate(self.key["config"][model.__name__.lower()])
+
+    def warn(self, text: str) -> None:
+        print(f"warning: {text}", file=sys.stderr, flush=True)
+        self.warnings.append(text)
+
+    def decide(self, text: str) -> None:
+        print(text, file=sys.stderr, flush=True)
+        self.decisions.append(text)
+
+
+@dataclass(frozen=True)
+class Request:
+    """What a stage's command line asks for."""
+
+    stage: str
+    key: dict[str, Any]
+    inputs: dict[str, Path]
+    out: Path
+    threads: int
+    log: Path | None
+    publish: dict[str, Path]
+
+
+def run_stage(request: Request, work: Callable[[Job], None]) -> int:
+    """Run ``work`` as a stage and return the process's exit code.
+
+    0: done, or there already. 2: the user must mend something (one clear message). Any other
+    exception is a bug of the program: exit code 1, with a traceback.
+    """
+    with _logging_to(request.log):
+        try:
+            return _run_locked(request, work)
+        except UserError as error:
+            _say_error(request, error)
+            return EXIT_USER_ERROR
+        except MemoryError:
+            _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))
+            return EXIT_USER_ERROR
+        except OSError as error:
+            known = _as_user_error(error)
+            if known is None:
+                traceback.print_exc(file=sys.stderr)
+                return 1
+            _say_error(request, known)
+            return EXIT_USER_ERROR
+        except Exception:
+            traceback.print_exc(file=sys.stderr)
+            return 1
+
+
+def _say_error(request: Request, error: UserError) -> None:
+    print(f"error in {request.stage}: {error}", file=sys.stderr, flush=True)
+
+
+def _as_user_error(error: OSError) -> UserError | None:
+    """Failures of disk and permissions are the surroundings' fault, not the program's."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"
+        return UserError("the disk is full", file=error.filename, fix=fix)
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        fix = "make it writable, or run in another folder (snakemake --directory)"
+        return UserError("permission denied", file=error.filename, fix=fix)
+    return None
+
+
+def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
+    scene_folder = request.out.parent
+    scratch_root = scene_folder / ".scratch"
+    scratch_root.mkdir(parents=True, exist_ok=True)
+    with _locked(scratch_root / f"{request.stage}.lock", request):
+        digests = {role: content_digest(folder) for role, folder in request.inputs.items()}
+        _recover(request.out)
+        if _is_done(request, digests):
+            write_bytes(request.out / "stage.json", (request.out / ".stage.json").read_bytes())
+            _publish(request)
+            print(f"{request.stage}: up to date, nothing to do", file=sys.stderr)
+            return 0
+        stage_scratch = scratch_root / request.stage
+        scratch = stage_scratch / _identity(request.key, digests)[:16]
+        out = scratch / "out"
+        if out.exists():
+            shutil.rmtree(out)
+        out.mkdir(parents=True)
+        job = Job(
+            stage=request.stage,
+            scene=scene_folder.name,
+            key=request.key,
+            inputs=request.inputs,
+            out=out,
+            scratch=scratch,
+            shared_cache=scratch_root / f"{request.stage}-cache",
+            threads=request.threads,
+        )
+        write_progress_to(scene_folder / ".scratch" / "progress.json")
+        start = time.perf_counter()
+        try:
+            work(job)
+        except BaseException:
+            shutil.rmtree(out, ignore_errors=True)
+            raise
+        finally:
+            write_progress_to(None)
+        _write_sidecars(job, digests, time.perf_counter() - start)
+        replace_folder(out, request.out)
+        _publish(request)
+        shutil.rmtree(stage_scratch, ignore_errors=True)
+    return 0
+
+
+# --- identity ---------------------------------------------------------------------------------
+
+
+def canonical(value: Any) -> str:
+    """Canonical JSON: sorted keys, no spaces, no NaN."""
+    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
+
+
+def content_digest(folder: Path) -> str:
+    """Digest of what a finished stage made: its outputs, not how or from what it made them."""
+    record = read_stage(folder)
+    content = {name: record[name] for name in ("outputs", "counters", "warnings")}
+    return hashlib.sha256(canonical(content).encode()).hexdigest()
+
+
+def read_stage(folder: Path) -> dict[str, Any]:
+    """The parsed ``stage.json`` of a finished stage's folder."""
+    path = folder / "stage.json"
+    try:
+        return json.loads(path.read_text())
+    except FileNotFoundError:
+        raise UserError(
+            "this stage's output is missing", file=path, fix="run snakemake again"
+        ) from None
+
+
+def _identity(key: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
+    return hashlib.sha256(canonical({"key": key, "inputs": inputs}).encode()).hexdigest()
+
+
+def _is_done(request: Request, inputs: dict[str, str]) -> bool:
+    hidden = request.out / ".stage.json"
+    if not hidden.is_file():
+        return False
+    try:
+        record = json.loads(hidden.read_text())
+        same = _identity(record["key"], record["inputs"]) == _identity(request.key, inputs)
+    except (ValueError, KeyError):
+        return False
+    return same and _digests(request.out) == record["outputs"]
+
+
+def _recover(out: Path) -> None:
+    """A kill between the two renames of ``replace_folder`` leaves the former folder aside."""
+    old = out.with_name(f".{out.name}.old")
+    if old.exists():
+        if (out / ".stage.json").exists():
+            shutil.rmtree(old)
+        else:
+            replace_folder(old, out)
+
+
+def _digests(folder: Path) -> dict[str, str]:
+    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in SIDE_CARS)
+    return {p.relative_to(folder).as_posix(): file_digest(p) for p in files}
+
+
+def file_digest(path: Path) -> str:
+    """SHA-256 of a file's bytes, hexadecimal."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
+
+
+# --- sidecars ---------------------------------------------------------------------------------
+
+
+def _write_sidecars(job: Job, inputs: dict[str, str], wall: float) -> None:
+    record = {
+        "stage": job.stage,
+        "scene": job.scene,
+        "key": job.key,
+        "inputs": inputs,
+        "outputs": _digests(job.out),
+        "counters": job.counters,
+        "decisions": job.decisions,
+        "warnings": job.warnings,
+    }
+    write_json(job.out / "run.json", run_facts(job, wall))
+    write_json(job.out / ".stage.json", record)
+    write_json(job.out / "stage.json", record)
+
+
+def run_facts(job: Job, wall: float) -> dict[str, Any]:
+    """How a run went: times in seconds, memory in MiB, versions, commit, host."""
+    own = resource.getrusage(resource.RUSAGE_SELF)
+    children = resource.getrusage(resource.RUSAGE_CHILDREN)
+    unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes on macOS, KiB on Linux
+    return {
+        "wall_s": round(wall, 3),
+        "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in (own, children)), 3),
+        "peak_rss_mb": round(max(own.ru_maxrss, children.ru_maxrss) / unit, 1),
+        "threads": job.threads,
+        "seed": job.seed,
+        "host": platform.node(),
+        "platform": platform.platform(),
+        "versions": versions(),
+        "commit": _commit(),
+        "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
+        **job.timings,
+    }
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python and of the packages whose results we depend on."""
+    found = {"python": platform.python_version()}
+    for name in (
+        "torch",
+        "pycolmap",
+        "opencv-contrib-python-headless",
+        "numpy",
+        "scipy",
+        "rawpy",
+        "snakemake",
+    ):
+        try:
+            found[name] = version(name)
+        except PackageNotFoundError:
+            found[name] = "missing"
+    return found
+
+
+def _commit() -> str | None:
+    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    try:
+        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
+    except (OSError, subprocess.TimeoutExpired):
+        return None
+    return done.stdout.strip() or None
+
+
+def _publish(request: Request) -> None:
+    for name, target in request.publish.items():
+        write_bytes(target, (request.out / name).read_bytes())
+
+
+# --- lock and log -----------------------------------------------------------------------------
+
+
+@contextmanager
+def _locked(path: Path, request: Request) -> Iterator[None]:
+    """Hold the stage's lock: a job orphaned by a killed Snakemake may still be writing."""
+    with open(path, "w") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except OSError:
+            print(
+                f"{request.stage}: another run is at work on {request.out}; waiting for it",
+                file=sys.stderr,
+                flush=True,
+            )
+            fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+class _Tee:
+    """stderr that is written to the log as well, and outlives a terminal that went away."""
+
+    def __init__(self, terminal: TextIO, log: TextIO):
+        self._terminal: TextIO | None = terminal
+        self._log = log
+
+    def write(self, text: str) -> int:
+        self._log.write(text)
+        if self._terminal is not None:
+            try:
+                self._terminal.write(text)
+            except OSError:
+                self._terminal = None
+        return len(text)
+
+    def flush(self) -> None:
+        self._log.flush()
+        if self._terminal is not None:
+            try:
+                self._terminal.flush()
+            except OSError:
+                self._terminal = None
+
+
+@contextmanager
+def _logging_to(path: Path | None) -> Iterator[None]:
+    if path is None:
+        yield
+        return
+    terminal = sys.stderr
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        log = open(path, "w")  # noqa: SIM115  (closed below)
+    except OSError:
+        # The work itself will meet the same trouble and say so in full.
+        yield
+        return
+    with log:
+        sys.stderr = _Tee(terminal, log)  # type: ignore[assignment]
+        try:
+            yield
+        finally:
+            sys.stderr.flush()
+            sys.stderr = terminal

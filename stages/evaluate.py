@@ -1,0 +1,48 @@
+"""Held-out views against their photographs, poses against the truth where it is known.
+
+Outputs: ``evaluation.json`` and ``renders/``.
+"""
+
+from dataclasses import asdict
+
+from pipeline.config.schema import Evaluate, Train, Views
+from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+from pipeline.metrics.pose import pose_error
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.job import Job
+from pipeline.scene.colmap import read_model
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.views import load_views
+from pipeline.splats.gaussians import Gaussians
+from stages.command import main
+
+
+def run(job: Job) -> None:
+    manifest = Manifest.read(job.inputs["views"] / "images.json")
+    views = load_views(
+        manifest, read_model(job.inputs["model"] / "sparse" / "0"), job.section(Views)
+    )
+    train = job.section(Train)
+    protocol = choose_protocol(views, train, any(photo.alpha for photo in manifest.photos))
+    evaluation = evaluate_views(
+        Gaussians.load(job.inputs["train"] / "gaussians.npz"),
+        protocol,
+        job.section(Evaluate),
+        train,
+        job.out / "renders",
+        threads=job.threads,
+    )
+    evaluation["pose_error"] = None
+    truth = job.inputs["inspect"] / "truth"
+    if truth.is_dir():
+        estimated = read_model(job.inputs["poses"] / "sparse" / "0")
+        evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
+    write_json(job.out / "evaluation.json", evaluation)
+    job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
+    job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
+    if not protocol.held_out:
+        job.warn("no view was held out: quality was measured on training views")
+
+
+if __name__ == "__main__":
+    main("evaluate", run, __doc__)

@@ -1,0 +1,60 @@
+"""The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
+
+from pipeline.config.schema import Features, Init, Views
+from pipeline.runtime.job import Job
+from pipeline.scene.colmap import read_model
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.views import load_views
+from pipeline.sfm.triangulation import triangulate
+from pipeline.splats.init import gaussians_from_points, gaussians_random
+from stages.command import main
+
+# Fewer sparse points than this say too little about the scene to start from.
+MIN_POINTS = 100
+
+
+def run(job: Job) -> None:
+    config = job.section(Init)
+    manifest = Manifest.read(job.inputs["views"] / "images.json")
+    sparse = job.inputs["model"] / "sparse" / "0"
+    model = read_model(sparse)
+    views = load_views(manifest, model, job.section(Views))
+    train = [view for view in views if not view.is_test]
+    points = model.points
+    if config.method != "random" and len(points) == 0:
+        job.decide("the given poses come without points: triangulating them")
+        triangulate(
+            manifest,
+            sparse,
+            job.scratch / "triangulation",
+            job.section(Features),
+            threads=job.threads,
+            seed=job.seed,
+        )
+        points = read_model(job.scratch / "triangulation" / "sparse" / "0").points
+        job.counters["triangulated_points"] = len(points)
+    method = config.method
+    if method != "random" and len(points) < MIN_POINTS:
+        job.warn(f"only {len(points)} sparse points: starting from random Gaussians instead")
+        method = "random"
+    if method == "random":
+        first = gaussians_random(train, config, 0, job.seed)
+    else:
+        import numpy as np
+
+        first = gaussians_from_points(points, np.array([v.centre for v in train]), config, 0)
+    # torch only now: the triangulation starts processes that import this module and pycolmap.
+    from pipeline.splats.gaussians import Gaussians
+
+    Gaussians.from_arrays(first).save(job.out / "gaussians.npz")
+    job.decide(f"{len(first)} Gaussians from {'random places' if method == 'random' else 'points'}")
+    job.counters |= {
+        "num_gaussians": len(first),
+        "points": len(points),
+        "dropped": first.num_dropped,
+        "thinned": first.num_thinned,
+    }
+
+
+if __name__ == "__main__":
+    main("init", run, __doc__)

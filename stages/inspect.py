@@ -1,0 +1,43 @@
+"""Look at the scene folder thoroughly once: which photographs are whole, which poses came along.
+
+Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses were given and
+``truth`` where the scene has ``sparse_gt``.
+"""
+
+from pathlib import Path
+
+from pipeline.config.schema import Config, Inspect, Views
+from pipeline.runtime.job import Job
+from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.given import load_given
+from pipeline.scene.scan import scan, verify_photos
+from stages.command import main
+
+
+def run(job: Job) -> None:
+    config = Config(poses=job.key["poses"], inspect=job.section(Inspect), views=job.section(Views))
+    found = scan(
+        Path(job.key["folder"]), job.scene, config, cache=job.scratch.parents[1] / "scan.json"
+    )
+    for text in found.warnings:
+        job.warn(text)
+    manifest, warnings = verify_photos(
+        found.manifest, threads=job.threads, min_images=config.inspect.min_images
+    )
+    for text in warnings:
+        job.warn(text)
+    manifest.write(job.out / "images.json")
+    job.counters = {
+        "photos": len(manifest.photos),
+        "left_out": len(found.manifest.photos) - len(manifest.photos),
+    }
+    if found.poses is not None and config.poses == "auto":
+        given = load_given(found, manifest)
+        write_model(job.out / "sparse" / "0", given)
+        job.counters |= {"given_poses": len(given.images), "given_points": len(given.points)}
+    if found.truth is not None:
+        write_model(job.out / "truth", read_model(found.truth))
+
+
+if __name__ == "__main__":
+    main("inspect", run, __doc__)

@@ -1,0 +1,127 @@
+"""What each stage reads, and the key that says when it must run again.
+
+The Snakefile binds stages to one another from these tables and nothing else.
+"""
+
+from __future__ import annotations
+
+from importlib.metadata import version
+from typing import Any
+
+from pipeline.config.schema import Config
+from pipeline.runtime.job import canonical
+from pipeline.runtime.source import stage_source_hash
+from pipeline.scene.plan import Plan
+
+STAGES = (
+    "inspect",
+    "decode",
+    "features",
+    "matches",
+    "sfm",
+    "undistort",
+    "init",
+    "train",
+    "evaluate",
+    "export",
+    "report",
+)
+
+_PHOTOS = ("decode", "inspect")
+_VIEWS = ("undistort", "decode", "inspect")
+_POSES = ("sfm", "inspect")
+_MODEL = ("undistort", "sfm", "inspect")
+
+# stage -> role -> stages that can fill it; the first one that the plan runs does.
+ROLES: dict[str, dict[str, tuple[str, ...]]] = {
+    "inspect": {},
+    "decode": {"photos": ("inspect",)},
+    "features": {"photos": _PHOTOS},
+    "matches": {"photos": _PHOTOS, "features": ("features",)},
+    "sfm": {"photos": _PHOTOS, "matches": ("matches",)},
+    "undistort": {"photos": _PHOTOS, "model": _POSES},
+    "init": {"views": _VIEWS, "model": _MODEL},
+    "train": {"views": _VIEWS, "model": _MODEL, "init": ("init",)},
+    "evaluate": {
+        "views": _VIEWS,
+        "model": _MODEL,
+        "train": ("train",),
+        "poses": _POSES,
+        "inspect": ("inspect",),
+    },
+    "export": {"views": _VIEWS, "model": _MODEL, "train": ("train",)},
+    "report": {
+        "views": _VIEWS,
+        "model": _MODEL,
+        "inspect": ("inspect",),
+        "poses": _POSES,
+        "train": ("train",),
+        "evaluate": ("evaluate",),
+        "export": ("export",),
+    },
+}
+
+# stage -> config sections it reads.
+SECTIONS: dict[str, tuple[str, ...]] = {
+    "inspect": ("inspect", "views"),
+    "decode": ("decode",),
+    "features": ("features",),
+    "matches": ("matches", "sfm"),
+    "sfm": ("sfm",),
+    "undistort": ("undistort", "views"),
+    "init": ("init", "views", "features"),
+    "train": ("train", "views"),
+    "evaluate": ("evaluate", "views", "train"),
+    "export": ("export",),
+    "report": ("report", "views", "train"),
+}
+
+# stage -> packages whose version decides its result.
+PACKAGES: dict[str, tuple[str, ...]] = {
+    "decode": ("rawpy",),
+    "features": ("opencv-contrib-python-headless", "pycolmap"),
+    "matches": ("pycolmap",),
+    "sfm": ("pycolmap",),
+    "undistort": ("opencv-contrib-python-headless",),
+    "init": ("pycolmap", "scipy"),
+    "train": ("torch", "numpy"),
+    "evaluate": ("torch", "scipy"),
+}
+
+
+def upstream(stage: str, plan: Plan) -> dict[str, str]:
+    """Role -> the stage that fills it, for a scene with this plan."""
+    return {
+        role: next(s for s in candidates if plan.stages[s].run)
+        for role, candidates in ROLES[stage].items()
+    }
+
+
+def stage_key(stage: str, plan: Plan, folder: str, fingerprint: str) -> str:
+    """The stage's key: one canonical JSON string.
+
+    Snakemake compares parameters as a set of ``repr(value)``, so only a single canonical string
+    notices every change. It holds the config sections the stage reads (settled by the plan), the
+    hash of its source, the versions of the packages that decide its result, the seed, for the
+    first stage the scene's folder and fingerprint, for the last the plan it shows. What changes
+    only the speed is not in it.
+    """
+    config: Config = plan.config
+    dumped = config.model_dump(mode="json")
+    key: dict[str, Any] = {
+        "stage": stage,
+        "seed": config.seed,
+        "source": stage_source_hash(f"stages.{stage}"),
+        "packages": {name: version(name) for name in PACKAGES.get(stage, ())},
+        "config": {name: dumped[name] for name in SECTIONS[stage]},
+    }
+    if stage == "inspect":
+        key |= {"folder": folder, "fingerprint": fingerprint, "poses": config.poses}
+    if stage == "report":
+        key["plan"] = public_plan(plan)
+    return canonical(key)
+
+
+def public_plan(plan: Plan) -> dict[str, Any]:
+    """What ``plan.json`` holds: every stage with run or skip, the reasons, facts, warnings."""
+    return plan.model_dump(mode="json", exclude={"config"})

@@ -60,7 +60,8 @@ def _table(model: type[BaseModel]) -> list[str]:
     for name, info in model.model_fields.items():
         if _section(info) is None:
             default = yaml_value(_default(info))
-            rows.append(f"| `{name}` | {_values(info)} | `{default}` | {info.description or ''} |")
+            meaning = (info.description or "").replace("|", "\\|")
+            rows.append(f"| `{name}` | {_values(info)} | `{default}` | {meaning} |")
     return [*rows, ""] if len(rows) > 2 else []
 
 

@@ -240,7 +240,8 @@ def _recover(out: Path) -> None:
         if (out / ".stage.json").exists():
             shutil.rmtree(old)
         else:
-            replace_folder(old, out)
+            shutil.rmtree(out, ignore_errors=True)
+            old.rename(out)
 
 
 def _digests(folder: Path) -> dict[str, str]:

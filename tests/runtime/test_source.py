@@ -1,0 +1,67 @@
+"""The hash of a stage's code: what changes it and what does not."""
+
+import pytest
+
+from pipeline.runtime import source
+
+
+@pytest.fixture
+def project(tmp_path, monkeypatch):
+    for folder in ("pipeline/raster/csrc", "pipeline/runtime", "stages"):
+        (tmp_path / folder).mkdir(parents=True)
+    for folder in ("pipeline", "pipeline/raster", "pipeline/runtime", "stages"):
+        (tmp_path / folder / "__init__.py").write_text("")
+    files = {
+        "pipeline/a.py": "X = 1\n",
+        "pipeline/b.py": "Y = 1\n",
+        "pipeline/runtime/log.py": "Z = 1\n",
+        "pipeline/raster/csrc/kernel.cpp": 'int f() { return 1; } // "one"\n',
+        "stages/work.py": "from pipeline.a import X\nimport pipeline.runtime.log\n",
+        "stages/draw.py": "import pipeline.raster\n",
+    }
+    for name, text in files.items():
+        (tmp_path / name).write_text(text)
+    monkeypatch.setattr(source, "ROOT", tmp_path)
+
+    def hash_of(stage):
+        for cached in (source._tree, source._imports, source._module_hash):
+            cached.cache_clear()
+        return source.stage_source_hash(f"stages.{stage}")
+
+    yield tmp_path, hash_of
+    for cached in (source._tree, source._imports, source._module_hash):
+        cached.cache_clear()
+
+
+@pytest.mark.parametrize(
+    ("file", "text"),
+    [
+        ("pipeline/a.py", "# a comment\nX   =   1\n"),
+        ("pipeline/a.py", '"""A docstring."""\nX = 1\n'),
+        ("pipeline/b.py", "Y = 2  # not imported by the stage\n"),
+        ("pipeline/runtime/log.py", "Z = 2\n"),
+    ],
+)
+def test_comments_and_foreign_code_leave_the_hash(project, file, text):
+    root, hash_of = project
+    before = hash_of("work")
+    (root / file).write_text(text)
+    assert hash_of("work") == before
+
+
+def test_code_that_the_stage_imports_changes_the_hash(project):
+    root, hash_of = project
+    before = hash_of("work")
+    (root / "pipeline/a.py").write_text("X = 2\n")
+    assert hash_of("work") != before
+
+
+def test_kernels_count_without_their_comments(project):
+    root, hash_of = project
+    before = hash_of("draw")
+    kernel = root / "pipeline/raster/csrc/kernel.cpp"
+    kernel.write_text("/* one\n */ int f() {\n  return 1; }\n")
+    assert hash_of("draw") == before
+    kernel.write_text("int f() { return 2; }\n")
+    assert hash_of("draw") != before
+    assert hash_of("work") == hash_of("work")

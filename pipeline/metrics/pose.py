@@ -1,0 +1,185 @@
+"""How far estimated camera poses are from the truth."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scene.model import Reconstruction
+
+Array = NDArray[np.float64]
+
+AUC_DEGREES = (1.0, 5.0, 10.0)
+
+
+@dataclass(frozen=True)
+class PoseError:
+    """Pose errors after the similarity that best lays the estimated centres on the true ones.
+
+    Attributes:
+        rotation_median_deg, rotation_mean_deg: degrees over the common images; None where there
+            is no common image.
+        centre_median, centre_mean: distances of the centres in the truth's unit; None below
+            three common images (a similarity of two centres leaves no residual).
+        centre_relative_median: ``centre_median`` over ``radius``.
+        radius: root mean square distance of the true common centres from their mean.
+        scale: truth units in one unit of the estimate.
+        auc: degrees -> area under the recall curve of relative pose errors of all pairs of the
+            truth's images, up to that many degrees, in 0..1; None below two true images.
+        num_common, num_truth: images in both, images in the truth.
+    """
+
+    rotation_median_deg: float | None
+    rotation_mean_deg: float | None
+    centre_median: float | None
+    centre_mean: float | None
+    centre_relative_median: float | None
+    radius: float | None
+    scale: float | None
+    auc: dict[float, float] | None
+    num_common: int
+    num_truth: int
+
+
+def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:
+    """The similarity with the least squared distances: ``target ~ scale * R @ source + t``.
+
+    Umeyama 1991, equations 38-43. Collinear or coincident points leave the rotation (and, where
+    all sources coincide, the scale) undetermined: then one of the minimisers is returned, and
+    scale 1 for coincident sources.
+
+    Args:
+        source, target: (N, 3), N >= 1.
+
+    Returns:
+        scale (>= 0), R (3, 3) a proper rotation, t (3,).
+    """
+    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
+    mean_source, mean_target = source.mean(0), target.mean(0)
+    centred_source, centred_target = source - mean_source, target - mean_target
+    u, d, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
+    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    rotation = u @ np.diag(signs) @ vt
+    variance = float((centred_source**2).sum() / len(source))
+    scale = max(float(d @ signs) / variance, 0.0) if variance > 0 else 1.0
+    return scale, rotation, mean_target - scale * rotation @ mean_source
+
+
+def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
+    """Compare poses of the images that both know by name.
+
+    Images of the truth that the estimate lacks count as failures in the AUC, and in
+    ``num_common`` against ``num_truth``; the other figures are over the common ones.
+
+    The rotation between the two worlds comes from the centres when they determine it, else (two
+    common images, or centres on a line) from the rotations themselves.
+    """
+    found, true = estimated.by_name(), truth.by_name()
+    names = sorted(true)
+    common = [name for name in names if name in found]
+    auc = _relative_pose_auc(found, true, names)
+    if not common:
+        return PoseError(None, None, None, None, None, None, None, auc, 0, len(names))
+
+    r_found = np.stack([found[n].rotation for n in common])
+    r_true = np.stack([true[n].rotation for n in common])
+    c_found = np.stack([found[n].centre for n in common])
+    c_true = np.stack([true[n].centre for n in common])
+    radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))
+    scale, world, shift = umeyama(c_found, c_true)
+    if len(common) < 3 or _spread_dimensions(c_true) < 2 or _spread_dimensions(c_found) < 2:
+        # R_true ~ R_found @ world.T for each image; their chordal mean.
+        u, _, vt = np.linalg.svd(np.einsum("nij,nik->jk", r_true, r_found))
+        world = u @ np.diag([1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+        shift = c_true.mean(0) - scale * world @ c_found.mean(0)
+    rotations = _angle(r_found @ world.T, r_true)
+    centres = np.linalg.norm(scale * c_found @ world.T + shift - c_true, axis=1)
+    enough = len(common) >= 3
+    median = float(np.median(centres))
+    return PoseError(
+        rotation_median_deg=float(np.median(rotations)),
+        rotation_mean_deg=float(rotations.mean()),
+        centre_median=median if enough else None,
+        centre_mean=float(centres.mean()) if enough else None,
+        centre_relative_median=median / radius if enough and radius > 0 else None,
+        radius=radius,
+        scale=scale,
+        auc=auc,
+        num_common=len(common),
+        num_truth=len(names),
+    )
+
+
+def auc_of_errors(errors: Array, limit: float) -> float:
+    """Area under the cumulative recall of ``errors`` from 0 to ``limit``, over ``limit``.
+
+    The trapezoid rule of SuperGlue's evaluation, as the Image Matching Challenge uses it;
+    failures have an infinite error.
+    """
+    errors = np.sort(np.asarray(errors, np.float64))
+    if len(errors) == 0:
+        return 0.0
+    recall = np.concatenate([[0.0], np.arange(1, len(errors) + 1) / len(errors)])
+    errors = np.concatenate([[0.0], errors])
+    last = int(np.searchsorted(errors, limit))
+    x = np.concatenate([errors[:last], [limit]])
+    y = np.concatenate([recall[:last], [recall[last - 1]]])
+    return float(np.trapezoid(y, x) / limit)
+
+
+def _relative_pose_auc(found: dict, true: dict, names: list[str]) -> dict[float, float] | None:
+    """AUC over all pairs of true images; a pair's error is the larger of the angles between
+    the relative rotations and between the directions of the relative translations."""
+    if len(names) < 2:
+        return None
+    errors = []
+    for i, first in enumerate(names):
+        rest = [n for n in names[i + 1 :] if first in found and n in found]
+        errors.extend([np.inf] * (len(names) - 1 - i - len(rest)))
+        if not rest:
+            continue
+        estimated, expected = (_relative(poses, first, rest) for poses in (found, true))
+        rotation = _angle(estimated[0], expected[0])
+        direction = _direction_angle(estimated[1], expected[1])
+        errors.extend(np.maximum(rotation, direction))
+    return {limit: auc_of_errors(np.array(errors), limit) for limit in AUC_DEGREES}
+
+
+def _relative(poses: dict, first: str, rest: list[str]) -> tuple[Array, Array]:
+    """Rotations (M, 3, 3) and translations (M, 3) from camera ``first`` to each of ``rest``."""
+    rotations = np.stack([poses[n].rotation @ poses[first].rotation.T for n in rest])
+    translations = np.stack([poses[n].translation for n in rest])
+    return rotations, translations - rotations @ poses[first].translation
+
+
+def _angle(first: Array, second: Array) -> Array:
+    """Degrees between two stacks of rotations. By atan2, exact for tiny angles too."""
+    delta = first @ np.swapaxes(second, -1, -2)
+    axis = np.stack(
+        [
+            delta[:, 2, 1] - delta[:, 1, 2],
+            delta[:, 0, 2] - delta[:, 2, 0],
+            delta[:, 1, 0] - delta[:, 0, 1],
+        ],
+        axis=-1,
+    )
+    sine, cosine = np.linalg.norm(axis, axis=-1), np.trace(delta, axis1=1, axis2=2) - 1
+    return np.degrees(np.arctan2(sine, cosine))
+
+
+def _direction_angle(first: Array, second: Array) -> Array:
+    """Degrees between directions. A true translation of zero length has none: no error then;
+    an estimated one against a true direction is a failure."""
+    lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
+    sine = np.linalg.norm(np.cross(first, second), axis=1)
+    angle = np.degrees(np.arctan2(sine, (first * second).sum(1)))
+    angle = np.where(lengths[0] == 0, 180.0, angle)
+    return np.where(lengths[1] == 0, 0.0, angle)
+
+
+def _spread_dimensions(centres: Array) -> int:
+    """Dimensions that points spread over: 0 a point, 1 a line, 2 a plane, 3."""
+    values = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
+    return int((values > 1e-6 * max(float(values[0]), 1e-300)).sum()) if values[0] > 0 else 0

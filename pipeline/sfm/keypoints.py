@@ -1,0 +1,64 @@
+"""Keypoints of one photograph and their file."""
+
+from __future__ import annotations
+
+import io
+from dataclasses import dataclass
+from pathlib import Path
+from urllib.parse import quote
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.atomic import write_bytes
+
+
+@dataclass(frozen=True)
+class Keypoints:
+    """Keypoints of one photograph, largest scale first.
+
+    Attributes:
+        xy: (F, 2) float32, stored pixels, pixel centres at .5.
+        scale: (F,) float32, sigma in stored pixels.
+        orientation: (F,) float32, radians.
+        descriptors: (F, 128) uint8, RootSIFT times 512.
+        rgb: (F, 3) uint8, the photograph's colour there.
+    """
+
+    xy: NDArray[np.float32]
+    scale: NDArray[np.float32]
+    orientation: NDArray[np.float32]
+    descriptors: NDArray[np.uint8]
+    rgb: NDArray[np.uint8]
+
+    def __len__(self) -> int:
+        return len(self.xy)
+
+    def write(self, path: Path) -> None:
+        """Write as ``.npz``, atomically; the same keypoints give the same bytes."""
+        buffer = io.BytesIO()
+        np.savez(
+            buffer,
+            xy=self.xy,
+            scale=self.scale,
+            orientation=self.orientation,
+            descriptors=self.descriptors,
+            rgb=self.rgb,
+        )
+        write_bytes(path, buffer.getvalue())
+
+    @staticmethod
+    def read(path: Path) -> Keypoints:
+        with np.load(path, allow_pickle=False) as data:
+            return Keypoints(**{name: data[name] for name in Keypoints.__dataclass_fields__})
+
+
+def keypoint_file(folder: Path, name: str) -> Path:
+    """The keypoint file of the photograph ``name``: no two names share one."""
+    return folder / f"{quote(name, safe='')}.npz"
+
+
+def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(F, 128) RootSIFT times 512 of (F, 128) SIFT descriptors of any scale."""
+    sums = np.maximum(np.abs(descriptors).sum(axis=1, keepdims=True), 1e-12)
+    return np.clip(np.rint(512 * np.sqrt(descriptors / sums)), 0, 255).astype(np.uint8)

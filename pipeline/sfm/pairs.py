@@ -1,0 +1,165 @@
+"""Which pairs of photographs to match. Pairs are (i, j) indices with i < j, sorted."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_matrix
+from scipy.sparse.csgraph import minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+from pipeline.runtime.progress import Progress
+
+Pair = tuple[int, int]
+
+# Retrieval by the largest-scale descriptors: with 300 of them, the eight best pairs of an image
+# hold 98% of the pairs that full matching finds best.
+RETRIEVAL_DESCRIPTORS = 300
+RETRIEVAL_RATIO = 0.85
+# Above 300 photographs fewer descriptors keep the quadratic cost where it was at 300.
+RETRIEVAL_BUDGET = 300 * RETRIEVAL_DESCRIPTORS
+RETRIEVAL_MIN_DESCRIPTORS = 64
+# Mutual matches by chance: unrelated photographs share a few.
+RETRIEVAL_MIN_SCORE = 4
+
+LOOP_CLOSURES = 3
+
+
+def exhaustive_pairs(count: int) -> list[Pair]:
+    """All pairs of ``count`` photographs."""
+    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+
+
+def sequential_pairs(count: int, overlap: int) -> list[Pair]:
+    """Each photograph with the next ``overlap``, and with those 2, 4, 8, ... 2^overlap after it
+    (which bridge a blurred or covered stretch), in the order given."""
+    steps = set(range(1, overlap + 1))
+    power = 1
+    while power < count and power <= 2**overlap:
+        steps.add(power)
+        power *= 2
+    return [(i, i + step) for i in range(count) for step in sorted(steps) if i + step < count]
+
+
+def spatial_pairs(gps: Sequence[tuple[float, float, float] | None], neighbours: int) -> list[Pair]:
+    """Each photograph with its nearest ``neighbours`` on the ground; altitudes, which GPS
+    measures badly, are left out. Photographs without a position are in no pair.
+
+    Args:
+        gps: latitude and longitude in degrees, altitude in metres.
+    """
+    known = [i for i, position in enumerate(gps) if position is not None]
+    if len(known) < 2:
+        return []
+    degrees = np.array([gps[i][:2] for i in known])  # type: ignore[index]
+    # Equirectangular around the mean latitude: nearness in a scene needs no geodesy.
+    east = degrees[:, 1] * np.cos(np.radians(degrees[:, 0].mean()))
+    metres = np.column_stack([east, degrees[:, 0]]) * 111_320.0
+    _, nearest = cKDTree(metres).query(metres, k=min(neighbours + 1, len(known)))
+    return _unique((known[a], known[b]) for a, row in enumerate(nearest) for b in row)
+
+
+def proximity_pairs(
+    centres: NDArray[np.float64], directions: NDArray[np.float64], neighbours: int
+) -> list[Pair]:
+    """Each camera with its ``neighbours`` nearest ones that look a similar way (within 75
+    degrees), of those as far apart as the median nearest distance first.
+
+    Args:
+        centres, directions: (N, 3), world; directions are unit vectors along the optical axes.
+    """
+    count = len(centres)
+    if count < 2:
+        return []
+    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    turn = np.arccos(np.clip(directions @ directions.T, -1, 1))
+    np.fill_diagonal(distance, np.inf)
+    # One radian of turn weighs as much as the typical distance of cameras from each other.
+    unit = float(np.median(distance[np.isfinite(distance)]))
+    cost = distance / max(unit, 1e-12) + turn
+    cost[turn > np.radians(75)] = np.inf
+    np.fill_diagonal(cost, np.inf)
+    k = min(neighbours, count - 1)
+    nearest = np.argsort(cost, axis=1, kind="stable")[:, :k]
+    return _unique(
+        (i, int(j)) for i, row in enumerate(nearest) for j in row if np.isfinite(cost[i, j])
+    )
+
+
+def retrieval_pairs(descriptors: Sequence[NDArray[np.uint8]], neighbours: int) -> list[Pair]:
+    """Each photograph with the ``neighbours`` it shares most features with, and the pairs of the
+    maximum spanning tree of shared features, which keep together what hangs together.
+
+    Args:
+        descriptors: for each photograph (F, 128) uint8, largest scale first.
+    """
+    score = retrieval_scores(descriptors)
+    return _unique([*_best(score, neighbours), *_spanning_tree(score)])
+
+
+def loop_closure_pairs(descriptors: Sequence[NDArray[np.uint8]], overlap: int) -> list[Pair]:
+    """For each photograph the best three by shared features that are more than ``overlap``
+    places away in the sequence."""
+    score = retrieval_scores(descriptors)
+    place = np.arange(len(score))
+    score[np.abs(place[:, None] - place[None]) <= overlap] = 0
+    return _unique(_best(score, LOOP_CLOSURES))
+
+
+def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
+    """(N, N) symmetric: mutual nearest neighbours that pass the ratio test both ways, among the
+    largest-scale descriptors of two photographs.
+
+    Products of bytes are summed exactly in float32 (below 2^24), so the scores do not depend on
+    the linear algebra library or its threads.
+    """
+    count = len(descriptors)
+    keep = RETRIEVAL_BUDGET // max(count, 1)
+    keep = max(RETRIEVAL_MIN_DESCRIPTORS, min(RETRIEVAL_DESCRIPTORS, keep))
+    tops = [d[:keep].astype(np.float32) for d in descriptors]
+    norms = [(d * d).sum(axis=1) for d in tops]
+    score = np.zeros((count, count), np.int64)
+    progress = Progress("looking for pairs", count, "photographs")
+    for i in range(count):
+        for j in range(i + 1, count):
+            if len(tops[i]) > 1 and len(tops[j]) > 1:
+                squared = norms[i][:, None] + norms[j][None] - 2 * (tops[i] @ tops[j].T)
+                score[i, j] = score[j, i] = _mutual(squared)
+        progress.advance()
+    return score
+
+
+def _mutual(squared: NDArray[np.float32]) -> int:
+    """Number of mutual nearest neighbours that pass the ratio test in both directions."""
+    rows = np.arange(len(squared))
+    forward = squared.argmin(axis=1)
+    mutual = squared.argmin(axis=0)[forward] == rows
+    best = squared[rows, forward]
+    second_row = np.partition(squared, 1, axis=1)[:, 1]
+    second_column = np.partition(squared, 1, axis=0)[1][forward]
+    limit = RETRIEVAL_RATIO**2 * np.minimum(second_row, second_column)
+    return int((mutual & (best < limit)).sum())
+
+
+def _best(score: NDArray[np.int64], neighbours: int) -> list[Pair]:
+    ranked = np.argsort(-score, axis=1, kind="stable")[:, :neighbours]
+    return [
+        (i, int(j))
+        for i, row in enumerate(ranked)
+        for j in row
+        if score[i, j] >= RETRIEVAL_MIN_SCORE
+    ]
+
+
+def _spanning_tree(score: NDArray[np.int64]) -> list[Pair]:
+    # Distances for the minimum tree: higher score, smaller distance; unconnected are absent.
+    weight = np.where(score >= RETRIEVAL_MIN_SCORE, 1.0 / np.maximum(score, 1), 0.0)
+    tree = minimum_spanning_tree(csr_matrix(np.triu(weight))).tocoo()
+    return [(int(i), int(j)) for i, j in zip(tree.row, tree.col, strict=True)]
+
+
+def _unique(pairs: object) -> list[Pair]:
+    ordered = {(min(int(a), int(b)), max(int(a), int(b))) for a, b in pairs}  # type: ignore
+    return sorted((a, b) for a, b in ordered if a != b)

@@ -1,0 +1,153 @@
+"""SIFT of one photograph by OpenCV. The only module of this package that imports cv2."""
+
+from __future__ import annotations
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Photo
+from pipeline.sfm.keypoints import Keypoints, root_sift
+
+# COLMAP's peak threshold (0.02 / 3); OpenCV divides this value by its layers. Half of OpenCV's
+# default: weakly textured scenes need the faint ones, and only the strongest are kept anyway.
+CONTRAST_THRESHOLD = 0.02
+
+
+class Picture:
+    """A photograph prepared for detection.
+
+    Attributes:
+        grey: (h, w) uint8.
+        rgb: (h, w, 3) uint8.
+        usable: (h, w) uint8, zero where no feature may lie; None where all may.
+        scale: (2,) stored pixels in one pixel of ``grey``, x and y.
+    """
+
+    def __init__(self, photo: Photo, max_long_side_px: int):
+        pixels = cv2.imread(photo.path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        if pixels is None:
+            raise UserError("cannot be read as a picture", file=photo.path, fix="remove it")
+        height, width = pixels.shape[:2]
+        if (width, height) != (photo.width, photo.height):
+            raise UserError(
+                f"is {width}x{height} pixels, but was {photo.width}x{photo.height} when the scene "
+                "was inspected",
+                file=photo.path,
+                fix="do not change photographs while the program runs; start it again",
+            )
+        reduction = min(1.0, max_long_side_px / max(width, height))
+        size = (max(1, round(width * reduction)), max(1, round(height * reduction)))
+        bgr, alpha = _split(pixels)
+        usable = None if alpha is None else (alpha > 0).astype(np.uint8)
+        if photo.mask is not None:
+            mask = _read_mask(photo, (width, height))
+            usable = mask if usable is None else usable & mask
+        if reduction < 1:
+            bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
+            if usable is not None:
+                usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST)
+        self.grey = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
+        self.rgb = np.ascontiguousarray(bgr[..., ::-1])
+        self.usable = usable
+        self.scale = np.array([width / size[0], height / size[1]])
+
+    def finish(
+        self,
+        xy: NDArray[np.float64],
+        scale: NDArray[np.float64],
+        orientation: NDArray[np.float64],
+        descriptors: NDArray[np.uint8],
+    ) -> Keypoints:
+        """Keypoints in stored pixels, largest scale first, from those found in ``grey``.
+
+        Args:
+            xy: (F, 2) in pixels of ``grey``, pixel centres at .5.
+        """
+        at = np.floor(xy).astype(np.int64)
+        rows = np.clip(at[:, 1], 0, self.grey.shape[0] - 1)
+        columns = np.clip(at[:, 0], 0, self.grey.shape[1] - 1)
+        order = np.lexsort((orientation, xy[:, 1], xy[:, 0], -scale))
+        return Keypoints(
+            xy=(xy * self.scale).astype(np.float32)[order],
+            scale=(scale * self.scale.mean()).astype(np.float32)[order],
+            orientation=orientation.astype(np.float32)[order],
+            descriptors=np.ascontiguousarray(descriptors[order]),
+            rgb=np.ascontiguousarray(self.rgb[rows, columns][order]),
+        )
+
+
+def detect(picture: Picture, max_features: int) -> Keypoints:
+    """SIFT keypoints of a picture: the ``max_features`` of strongest response where usable.
+
+    RootSIFT descriptors (Arandjelovic and Zisserman 2012), times 512, as COLMAP stores them.
+    """
+    sift = cv2.SIFT_create(  # type: ignore[attr-defined]
+        # OpenCV takes the strongest before it looks at the mask; with one, do it here instead.
+        nfeatures=max_features if picture.usable is None else 0,
+        contrastThreshold=CONTRAST_THRESHOLD,
+        # Without it keypoints are biased by a quarter of a pixel: 0.025 degrees of rotation.
+        enable_precise_upscale=True,
+    )
+    if picture.usable is None:
+        found, descriptors = sift.detectAndCompute(picture.grey, None)
+    else:
+        found = sift.detect(picture.grey, picture.usable)
+        found = sorted(found, key=lambda k: (-k.response, k.pt, k.size, k.angle))[:max_features]
+        found, descriptors = sift.compute(picture.grey, found)
+    # Ties in response let OpenCV keep a few more.
+    found = list(found)[:max_features]
+    table = np.array([(*k.pt, k.size, k.angle) for k in found], np.float64).reshape(-1, 4)
+    if descriptors is None or not found:
+        descriptors = np.zeros((0, 128), np.float32)
+    # OpenCV's pixel centres are integers, COLMAP's are at .5; its size is a diameter.
+    return picture.finish(
+        table[:, :2] + 0.5,
+        table[:, 2] / 2,
+        np.radians(table[:, 3]),
+        root_sift(descriptors[: len(found)]),
+    )
+
+
+def write_grey(picture: Picture, path: str) -> None:
+    """Write ``picture.grey`` as PNG."""
+    if not cv2.imwrite(path, picture.grey):
+        raise UserError("cannot be written", file=path, fix="look at free space and rights")
+
+
+def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
+    """8-bit BGR over black, and the alpha channel where there is one."""
+    if pixels.dtype == np.uint16:
+        alpha_scale, pixels8 = 65535.0, (pixels // 257).astype(np.uint8)
+    elif pixels.dtype == np.uint8:
+        alpha_scale, pixels8 = 255.0, pixels
+    else:
+        # Float and other pictures: stretched to what they hold.
+        low, high = float(np.nanmin(pixels)), float(np.nanmax(pixels))
+        values = (np.nan_to_num(pixels, nan=low) - low) / max(high - low, 1e-12)
+        alpha_scale, pixels8 = 1.0, (values * 255).astype(np.uint8)
+    if pixels8.ndim == 2:
+        return np.repeat(pixels8[..., None], 3, axis=2), None
+    if pixels8.shape[2] in (2, 4):
+        alpha = pixels[..., -1]
+        colour = pixels8[..., :-1] * (alpha[..., None] / alpha_scale)
+        colour = np.repeat(colour, 3, axis=2) if colour.shape[2] == 1 else colour
+        return np.rint(colour).astype(np.uint8), alpha
+    if pixels8.shape[2] == 1:
+        return np.repeat(pixels8, 3, axis=2), None
+    return np.ascontiguousarray(pixels8[..., :3]), None
+
+
+def _read_mask(photo: Photo, size: tuple[int, int]) -> NDArray[np.uint8]:
+    """(h, w) uint8: 1 where the photograph's mask is not zero."""
+    assert photo.mask is not None
+    mask = cv2.imread(photo.mask, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+    if mask is None:
+        raise UserError("cannot be read as a mask", file=photo.mask, fix="replace or remove it")
+    if mask.ndim == 3:
+        mask = mask[..., :3].max(axis=2)
+    usable = (mask > 0).astype(np.uint8)
+    if (mask.shape[1], mask.shape[0]) != size:
+        usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST)
+    return usable

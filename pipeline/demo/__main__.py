@@ -1,0 +1,56 @@
+"""``python -m pipeline.demo FOLDER``: write the demo scene."""
+
+from __future__ import annotations
+
+import argparse
+import re
+import sys
+from pathlib import Path
+from typing import get_args
+
+from pipeline.demo.cameras import LENSES
+from pipeline.demo.write import DemoSpec, Format, Poses, write_demo
+from pipeline.runtime.errors import UserError
+
+
+def _size(text: str) -> tuple[int, int]:
+    match = re.fullmatch(r"(\d+)x(\d+)", text)
+    if not match:
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, found {text!r}")
+    return int(match[1]), int(match[2])
+
+
+def main(arguments: list[str] | None = None) -> int:
+    default = DemoSpec()
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline.demo",
+        description="Write the demo scene: photographs of a ray-traced room with exact truth.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    add = parser.add_argument
+    add("folder", type=Path, help="scene folder to write, for example data/demo")
+    add("--views", type=int, default=default.views, help="number of photographs")
+    add("--size", type=_size, default=f"{default.width}x{default.height}", help="pixels")
+    add("--format", choices=get_args(Format), default=default.format)
+    add("--distortion", choices=[*LENSES], default=default.distortion, help="the lens")
+    add("--poses", choices=get_args(Poses), default=default.poses, help="poses given as input")
+    add("--no-points", action="store_true", help="sparse/0 without points")
+    add("--alpha", action="store_true", help="objects alone, transparent ground (png)")
+    add("--masks", action="store_true", help="a moving ball, and masks that leave it out")
+    add("--noise", type=float, default=default.noise, help="read noise of dng, 14-bit steps")
+    add("--seed", type=int, default=default.seed, help="another seed, other camera positions")
+    add("--threads", type=int, default=None, help="views rendered at once; None is all cores")
+    options = vars(parser.parse_args(arguments))
+    folder, threads = options.pop("folder"), options.pop("threads")
+    options["width"], options["height"] = options.pop("size")
+    options["points"] = not options.pop("no_points")
+    try:
+        write_demo(folder, DemoSpec(**options), threads)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,58 @@
+"""Where the demo's photographs are taken from, and through what lens."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scene.model import Camera, Posed
+
+Array = NDArray[np.float64]
+
+# The focal length a 35 mm camera would have, in mm on a sensor SENSOR_WIDTH_MM wide.
+FOCAL_35MM = 28
+SENSOR_WIDTH_MM = 36.0
+# Neighbours farther apart than this share too little for SIFT: fewer views make a shorter arc.
+MAX_STEP_DEGREES = 12.0
+
+LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
+    "none": ("PINHOLE", ()),
+    "simple_radial": ("SIMPLE_RADIAL", (-0.06,)),
+    "opencv": ("OPENCV", (-0.09, 0.015, 0.0012, -0.0008)),
+    "opencv_fisheye": ("OPENCV_FISHEYE", (0.03, -0.008, 0.0, 0.0)),
+}
+
+
+def lens(distortion: str, width: int, height: int) -> Camera:
+    """The demo's camera: ``distortion`` is a key of ``LENSES``; sizes in pixels."""
+    model, coefficients = LENSES[distortion]
+    focal = FOCAL_35MM / SENSOR_WIDTH_MM * width
+    focals = [focal] if model.startswith("SIMPLE") else [focal, focal]
+    return Camera(model, width, height, np.array([*focals, width / 2, height / 2, *coefficients]))
+
+
+def orbit(names: list[str], seed: int) -> list[Posed]:
+    """Cameras on a wavy ring around the objects, looking at them; neighbours in order."""
+    rng = np.random.default_rng([seed, 1])
+    step = np.radians(min(360.0 / len(names), MAX_STEP_DEGREES))
+    start, radius_phase, height_phase = rng.uniform(0, 2 * np.pi, 3)
+    posed = []
+    for i, name in enumerate(names):
+        angle = start + i * step
+        radius = 2.3 + 0.25 * np.sin(2 * angle + radius_phase) + rng.uniform(-0.05, 0.05)
+        height = 1.25 + 0.40 * np.sin(3 * angle + height_phase) + rng.uniform(-0.05, 0.05)
+        centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
+        target = np.array([0.0, 0.0, 0.45]) + rng.uniform(-0.1, 0.1, 3)
+        rotation = look_at(centre, target, roll=rng.uniform(-0.05, 0.05))
+        posed.append(Posed(name, 1, rotation, -rotation @ centre))
+    return posed
+
+
+def look_at(centre: Array, target: Array, roll: float = 0.0) -> Array:
+    """(3, 3) world-to-camera rotation of a camera that looks at ``target``; roll in radians."""
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, (0.0, 0.0, 1.0))
+    right /= np.linalg.norm(right)
+    down = np.cross(forward, right)
+    c, s = np.cos(roll), np.sin(roll)
+    return np.stack([c * right + s * down, c * down - s * right, forward])

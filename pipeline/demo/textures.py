@@ -1,0 +1,71 @@
+"""Solid textures made of plane waves: detail at every scale, and none finer than was asked for.
+
+A sum of waves of random direction and phase is a Gaussian random field with an exactly known
+band: full of blobs for SIFT, and free of the aliasing that noise on a lattice brings.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Floats = NDArray[np.float32]
+
+BANDS = 7
+WAVES_PER_BAND = 9
+# The share of its colour range a texture spends: steeper makes patches with softer insides.
+STEEPNESS = 1.3
+
+
+@dataclass(frozen=True)
+class Material:
+    """A surface's colours, linear light.
+
+    Attributes:
+        base, tint_a, tint_b: RGB; the colour is base + a tint_a + b tint_b with a and b in (-1, 1).
+        finest, coarsest: wavelengths of the texture, in the world's unit.
+        seed: another seed, another pattern.
+        gloss: share of mirror reflection seen head on; 0 is a matte surface.
+    """
+
+    base: tuple[float, float, float]
+    tint_a: tuple[float, float, float]
+    tint_b: tuple[float, float, float]
+    finest: float
+    coarsest: float
+    seed: int
+    gloss: float = 0.0
+
+    def albedo(self, point: Floats, blur: Floats) -> Floats:
+        """(3, N) linear RGB at (3, N) points, blurred by a Gaussian of (N,) sigma, world unit."""
+        a = self._field(point, blur, 0)
+        b = self._field(point, blur, 1)
+        base, tint_a, tint_b = (
+            np.array(v, np.float32)[:, None] for v in (self.base, self.tint_a, self.tint_b)
+        )
+        return np.clip(base + tint_a * a + tint_b * b, 0.01, 0.95)
+
+    def _field(self, point: Floats, blur: Floats, which: int) -> Floats:
+        rng = np.random.default_rng([self.seed, which])
+        total = np.zeros(point.shape[1], np.float32)
+        variance = 0.0
+        for wavelength in np.geomspace(self.finest, self.coarsest, BANDS):
+            # Amplitudes grow slowly with the wavelength, as in natural pictures.
+            amplitude = (wavelength / self.coarsest) ** 0.4
+            variance += amplitude**2 * WAVES_PER_BAND / 2
+            directions = rng.normal(size=(WAVES_PER_BAND, 3))
+            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+            phases = rng.uniform(0, 2 * np.pi, WAVES_PER_BAND)
+            band = np.zeros_like(total)
+            for k, phase in zip(
+                (directions * 2 * np.pi / wavelength).astype(np.float32), phases, strict=True
+            ):
+                band += np.cos(
+                    k[0] * point[0] + k[1] * point[1] + k[2] * point[2] + np.float32(phase)
+                )
+            # A Gaussian blur of sigma s leaves exp(-2 pi^2 s^2 / wavelength^2) of a wave.
+            fade = np.exp(np.float32(-2 * np.pi**2 / wavelength**2) * blur * blur)
+            total += np.float32(amplitude) * fade * band
+        return np.tanh(np.float32(STEEPNESS / np.sqrt(variance)) * total)

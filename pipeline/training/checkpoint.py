@@ -1,0 +1,109 @@
+"""Checkpoints that are whole or are not used.
+
+A file is a numpy archive followed by the 32 bytes of its SHA-256. It is written under a temporary
+name, synced and renamed; the last two are kept.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+import json
+import os
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+
+KEPT = 2
+PATTERN = "checkpoint_*.npz.sha256"
+
+
+@dataclass
+class Checkpoint:
+    """The whole state of a run.
+
+    Attributes:
+        step: steps done.
+        identity: names the run (its inputs and settings); another run's state is no use.
+        arrays: by name.
+        values: everything else, as JSON.
+    """
+
+    step: int
+    identity: str
+    arrays: dict[str, NDArray[Any]]
+    values: dict[str, Any]
+
+
+class _HashingWriter(io.RawIOBase):
+    """Passes bytes on and hashes them; not seekable, so that each byte passes once."""
+
+    def __init__(self, file: BinaryIO):
+        self.file, self.hash = file, hashlib.sha256()
+
+    def writable(self) -> bool:
+        return True
+
+    def write(self, data: Any) -> int:
+        self.hash.update(data)
+        return self.file.write(data)
+
+
+def save(folder: Path, checkpoint: Checkpoint) -> Path:
+    """Write a checkpoint into ``folder`` and delete all but the last ``KEPT``."""
+    folder.mkdir(parents=True, exist_ok=True)
+    path = folder / f"checkpoint_{checkpoint.step:08d}.npz.sha256"
+    temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
+    header = {
+        "step": checkpoint.step,
+        "identity": checkpoint.identity,
+        "values": checkpoint.values,
+    }
+    text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    try:
+        with open(temporary, "wb") as file:
+            writer = _HashingWriter(file)
+            np.savez(writer, **checkpoint.arrays, __header__=text)  # type: ignore[arg-type]
+            file.write(writer.hash.digest())
+            file.flush()
+            os.fsync(file.fileno())
+        os.replace(temporary, path)
+    finally:
+        temporary.unlink(missing_ok=True)
+    for old in sorted(folder.glob(PATTERN))[:-KEPT]:
+        old.unlink(missing_ok=True)
+    return path
+
+
+def load_latest(
+    folder: Path, identity: str, on_warning: Callable[[str], None]
+) -> Checkpoint | None:
+    """The newest whole checkpoint of this run, None if there is none. Damaged ones and those of
+    another run are left out with a warning."""
+    for path in sorted(folder.glob(PATTERN), reverse=True):
+        checkpoint = _load(path)
+        if checkpoint is None:
+            on_warning(f"{path}: the checkpoint is damaged; an older one or none is used")
+        elif checkpoint.identity != identity:
+            on_warning(f"{path}: the checkpoint is of a run with other inputs; it is not used")
+        else:
+            return checkpoint
+    return None
+
+
+def _load(path: Path) -> Checkpoint | None:
+    try:
+        data = path.read_bytes()
+    except OSError:
+        return None
+    payload, digest = memoryview(data)[:-32], data[-32:]
+    if len(data) < 32 or hashlib.sha256(payload).digest() != digest:
+        return None
+    with np.load(io.BytesIO(payload)) as archive:
+        arrays = {name: archive[name] for name in archive.files}
+    header = json.loads(arrays.pop("__header__").tobytes())
+    return Checkpoint(header["step"], header["identity"], arrays, header["values"])

@@ -1,0 +1,81 @@
+"""Adam over the five arrays of Gaussians, whose rows come and go."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from pipeline.raster.ops import adam_step
+from pipeline.raster.types import Gradients
+from pipeline.splats.gaussians import Gaussians, resize_bands
+
+BETA1, BETA2 = 0.9, 0.999
+# 3DGS's: gradients of a mean over all pixels are far below the usual 1e-8.
+EPSILON = 1e-15
+
+
+@dataclass(frozen=True)
+class Rates:
+    """Learning rates of one step; ``means`` is in the world's unit."""
+
+    means: float
+    log_scales: float
+    quats: float
+    opacity_logits: float
+    sh0: float
+    shN: float
+
+
+class Adam:
+    """First and second moments beside a ``Gaussians``, row by row.
+
+    Attributes:
+        first, second: by the name of the array, of its shape, float32.
+    """
+
+    def __init__(self, gaussians: Gaussians):
+        tensors = gaussians.tensors()
+        self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+
+    def step(
+        self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
+    ) -> None:
+        """Move ``gaussians`` in place; ``step`` counts from 1 (bias correction)."""
+        dc_before = gaussians.sh[:, 0].clone()
+        for name, parameter in gaussians.tensors().items():
+            adam_step(
+                parameter,
+                getattr(gradients, name),
+                self.first[name],
+                self.second[name],
+                rates.shN if name == "sh" else getattr(rates, name),
+                step,
+                BETA1,
+                BETA2,
+                EPSILON,
+                threads,
+            )
+        # The constant coefficient shares the array and the moments but has a rate of its own.
+        first = self.first["sh"][:, 0] / (1 - BETA1**step)
+        second = self.second["sh"][:, 0] / (1 - BETA2**step)
+        gaussians.sh[:, 0] = dc_before - rates.sh0 * first / (second.sqrt() + EPSILON)
+
+    def select(self, rows: Tensor, fresh: Tensor) -> None:
+        """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""
+        for moments in (self.first, self.second):
+            for name, tensor in moments.items():
+                moments[name] = tensor[rows].contiguous()
+                moments[name][fresh] = 0.0
+
+    def forget(self, name: str) -> None:
+        """Zero the moments of one array."""
+        self.first[name].zero_()
+        self.second[name].zero_()
+
+    def resize_bands(self, degree: int) -> None:
+        """Follow ``Gaussians.with_sh_degree``."""
+        for moments in (self.first, self.second):
+            moments["sh"] = resize_bands(moments["sh"], degree)

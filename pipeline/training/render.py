@@ -1,0 +1,80 @@
+"""Rendering Gaussians into views, for evaluation and for looking at."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.raster.ops import forward
+from pipeline.raster.types import RasterCamera, RasterOptions
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.targets import reduced_size
+
+
+@dataclass(frozen=True)
+class Render:
+    """One picture.
+
+    Attributes:
+        rgb: (H, W, 3) float32, over the background, clamped to [0, 1].
+        alpha: (H, W) float32 in [0, 1].
+        depth: (H, W) float32, camera z summed by weight, not divided by alpha; world unit.
+    """
+
+    rgb: NDArray[np.float32]
+    alpha: NDArray[np.float32]
+    depth: NDArray[np.float32]
+
+
+def near_plane(extent: float) -> float:
+    """The near plane's distance for a scene of size ``extent``, both in the world's unit: what is
+    nearer to a camera than this share of the cameras' spread is a floater."""
+    return 0.01 * extent
+
+
+def raster_camera(view: View, factor: int = 1) -> RasterCamera:
+    """The rasterizer's camera for a view at 1 / ``factor`` of its size."""
+    width, height = reduced_size(view, factor)
+    sx, sy = width / view.width, height / view.height
+    return RasterCamera(
+        width,
+        height,
+        view.fx * sx,
+        view.fy * sy,
+        view.cx * sx,
+        view.cy * sy,
+        torch.from_numpy(np.ascontiguousarray(view.world_to_camera, np.float64)),
+    )
+
+
+def render_view(
+    gaussians: Gaussians,
+    view: View,
+    *,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    sh_degree: int | None = None,
+    antialias: bool = False,
+    near: float = 0.01,
+    threads: int = 1,
+) -> Render:
+    """Render ``gaussians`` as ``view`` sees them, at the view's size.
+
+    Args:
+        sh_degree: higher bands are left out; None takes all there are.
+        antialias: as in training (``Train.antialias``).
+        near: in the world's unit, as in training (``near_plane``).
+    """
+    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
+    options = RasterOptions(
+        sh_degree=degree,
+        background=background,
+        antialias=antialias,
+        near=near,
+        threads=threads,
+    )
+    result = forward(*gaussians.parameters(), raster_camera(view), options)
+    return Render(result.color.clamp(0.0, 1.0).numpy(), result.alpha.numpy(), result.depth.numpy())

@@ -1,0 +1,95 @@
+"""What happens when: resolution, SH degree, learning rates and density control by step.
+
+Intervals in the config mean what they say for runs of ``NOMINAL_STEPS`` and more. Shorter runs
+have them all shrunk by ``steps / NOMINAL_STEPS``, so that 600 steps pass through the same phases
+as 7000. Steps count from 1: "after step t".
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from pipeline.config.schema import Train
+
+NOMINAL_STEPS = 7000
+# Fewer steps than this between two densifications say too little about a gradient's mean.
+MIN_REFINE_INTERVAL = 10
+COARSE_FACTORS = (4, 2)
+
+
+@dataclass(frozen=True)
+class Schedule:
+    """The phases of one run.
+
+    Attributes:
+        steps: optimiser steps in all.
+        sh_degree, sh_interval: final SH degree; steps between one degree and the next.
+        coarse_steps: steps at reduced resolution, first half of them at 1/4, the rest at 1/2.
+        refine_start, refine_stop, refine_interval: density control after steps of this range.
+        reset_interval: steps between opacity resets.
+        lr_means, lr_means_final: of the first and the last step, times the scene's extent.
+    """
+
+    steps: int
+    sh_degree: int
+    sh_interval: int
+    coarse_steps: int
+    refine_start: int
+    refine_stop: int
+    refine_interval: int
+    reset_interval: int
+    lr_means: float
+    lr_means_final: float
+
+    @staticmethod
+    def of(config: Train) -> Schedule:
+        """The schedule of ``config.steps`` steps."""
+        shrink = min(1.0, config.steps / NOMINAL_STEPS)
+        density = config.density
+        interval = min(density.interval, MIN_REFINE_INTERVAL)
+        return Schedule(
+            steps=config.steps,
+            sh_degree=config.sh_degree,
+            sh_interval=max(1, round(config.sh_interval * shrink)),
+            coarse_steps=round(config.coarse_until * config.steps),
+            refine_start=round(density.start_step * shrink),
+            refine_stop=round(density.stop_share * config.steps),
+            refine_interval=max(interval, round(density.interval * shrink)),
+            reset_interval=max(1, round(density.opacity_reset_interval * shrink)),
+            lr_means=config.lr_means,
+            lr_means_final=config.lr_means_final,
+        )
+
+    def resolution_factor(self, step: int) -> int:
+        """4, 2 or 1: images of step ``step`` are reduced by this."""
+        if step > self.coarse_steps:
+            return 1
+        return COARSE_FACTORS[(step - 1) * len(COARSE_FACTORS) // self.coarse_steps]
+
+    def sh_degree_at(self, step: int) -> int:
+        return min(self.sh_degree, step // self.sh_interval)
+
+    def lr_means_at(self, step: int) -> float:
+        """Log-linear between the first and the last step; to be multiplied by the extent."""
+        if not self.lr_means or not self.lr_means_final:
+            return self.lr_means
+        t = (step - 1) / max(1, self.steps - 1)
+        return self.lr_means ** (1 - t) * self.lr_means_final**t
+
+    def refines_after(self, step: int) -> bool:
+        """Densify and prune after this step."""
+        return self.refine_start <= step <= self.refine_stop and step % self.refine_interval == 0
+
+    def prunes_after(self, step: int) -> bool:
+        """Prune after this step (densification is over, but useless Gaussians still cost time);
+        not in the last tenth, where nothing would make up for what is lost."""
+        return self.refine_stop < step <= 0.9 * self.steps and step % self.refine_interval == 0
+
+    def resets_opacity_after(self, step: int) -> bool:
+        """Only where a whole interval of density control follows to recover in."""
+        return step % self.reset_interval == 0 and step + self.reset_interval <= self.refine_stop
+
+    def prunes_huge_after(self, step: int) -> bool:
+        """Late enough for first Gaussians that had to be large (a distant background) to have
+        been split (3DGS: after the first opacity reset)."""
+        return step > self.reset_interval

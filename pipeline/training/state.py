@@ -1,0 +1,117 @@
+"""Everything a run must remember to go on after a kill as if nothing had happened."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, field
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density import Changes, GradientDensity
+from pipeline.training.optimiser import Adam
+
+
+@dataclass
+class Counters:
+    """What happened, summed over the run.
+
+    Attributes:
+        changes: of density control.
+        opacity_resets: how often.
+        max_gaussians: the most there ever were.
+        num_dropped: Gaussians the rasterizer left out for numerical reasons, over all steps.
+        blind_steps: steps whose view saw no Gaussian.
+    """
+
+    changes: Changes = field(default_factory=Changes)
+    opacity_resets: int = 0
+    max_gaussians: int = 0
+    num_dropped: int = 0
+    blind_steps: int = 0
+
+
+@dataclass
+class Window:
+    """Sums since the last record of the curve."""
+
+    loss: float = 0.0
+    steps: int = 0
+    psnr: float = 0.0
+    samples: int = 0
+
+
+@dataclass
+class TrainState:
+    """The state after ``step`` steps.
+
+    Attributes:
+        order: (V,) int64, this epoch's order of views; ``position`` of them are done.
+        curve: records without times; ``curve_seconds`` has the time of each.
+        seconds: training time before this process.
+    """
+
+    gaussians: Gaussians
+    adam: Adam
+    density: GradientDensity
+    rng: np.random.Generator
+    order: NDArray[np.int64]
+    position: int = 0
+    step: int = 0
+    counters: Counters = field(default_factory=Counters)
+    window: Window = field(default_factory=Window)
+    curve: list[dict[str, float]] = field(default_factory=list)
+    curve_seconds: list[float] = field(default_factory=list)
+    seconds: float = 0.0
+
+    def next_view(self) -> int:
+        """The next view's index: shuffled epochs, each view once in each."""
+        if self.position == len(self.order):
+            self.order, self.position = self.rng.permutation(len(self.order)), 0
+        self.position += 1
+        return int(self.order[self.position - 1])
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """All arrays, sharing memory."""
+        result: dict[str, NDArray[Any]] = {"order": self.order}
+        for name, tensor in self.gaussians.tensors().items():
+            result[f"parameter.{name}"] = tensor.numpy()
+            result[f"first.{name}"] = self.adam.first[name].numpy()
+            result[f"second.{name}"] = self.adam.second[name].numpy()
+        result["gradient_sum"] = self.density.gradient_sum.numpy()
+        result["seen"] = self.density.seen.numpy()
+        return result
+
+    def values(self) -> dict[str, Any]:
+        """The rest, as JSON; floats survive exactly."""
+        return {
+            "rng": self.rng.bit_generator.state,
+            "position": self.position,
+            "counters": asdict(self.counters),
+            "window": asdict(self.window),
+            "curve": self.curve,
+            "curve_seconds": self.curve_seconds,
+            "seconds": self.seconds,
+        }
+
+    def restore(self, step: int, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
+        """Become what ``arrays()`` and ``values()`` described."""
+        self.step, self.order = step, arrays["order"]
+        self.gaussians = Gaussians.from_arrays(
+            {name: arrays[f"parameter.{name}"] for name in self.gaussians.tensors()}
+        )
+        self.adam = Adam(self.gaussians)
+        for name in self.gaussians.tensors():
+            self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
+            self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
+        self.density.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
+        self.density.seen = torch.from_numpy(arrays["seen"])
+        self.rng.bit_generator.state = values["rng"]
+        self.position = values["position"]
+        counters = dict(values["counters"])
+        self.counters = Counters(changes=Changes(**counters.pop("changes")), **counters)
+        self.window = Window(**values["window"])
+        self.curve, self.curve_seconds = values["curve"], values["curve_seconds"]
+        self.seconds = values["seconds"]

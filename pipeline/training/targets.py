@@ -1,0 +1,124 @@
+"""What the renders are compared with: the views' pixels, as 8 bits, at the resolution in use."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.photos.load import ViewPixels, load_view, resize_area
+from pipeline.runtime.progress import track
+from pipeline.scene.model import View
+
+# Below this (pixels on the shorter side) SSIM's window of 11 sees little but borders.
+MIN_SHORT_SIDE = 64
+
+
+@dataclass(frozen=True)
+class Target:
+    """One view's pixels.
+
+    Attributes:
+        rgb: (H, W, 3) uint8, multiplied by alpha; 0 where ignored.
+        alpha: (H, W) uint8, or None where the view is opaque; 255 where ignored.
+        ignored: (H, W) bool, True where pixels count for nothing, or None where all count.
+    """
+
+    rgb: Tensor
+    alpha: Tensor | None
+    ignored: Tensor | None
+
+    def over(self, background: tuple[float, float, float]) -> Tensor:
+        """The picture in front of ``background`` (linear in [0, 1]): (H, W, 3), uint8 where the
+        view is opaque, else float32 in [0, 1]."""
+        if self.alpha is None:
+            return self.rgb
+        behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
+        return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
+
+
+class Targets:
+    """All views' pixels in memory; those of a reduced resolution are made once, when first asked
+    for, and only one reduced resolution is kept."""
+
+    def __init__(self, views: Sequence[View], threads: int):
+        def load(view: View) -> Target:
+            return _target(load_view(view.image, view.mask, view.width, view.height))
+
+        with ThreadPoolExecutor(max(1, threads)) as pool:
+            self._full = list(
+                track(pool.map(load, views), "reading views", len(views), unit="views")
+            )
+        self._factor = 1
+        self._reduced: dict[int, Target] = {}
+
+    @property
+    def have_alpha(self) -> bool:
+        return any(target.alpha is not None for target in self._full)
+
+    def get(self, index: int, factor: int) -> Target:
+        """View ``index`` at 1 / ``factor`` of its size (see ``reduced_size``)."""
+        full = self._full[index]
+        if factor == 1:
+            self._reduced.clear()
+            return full
+        if factor != self._factor:
+            self._factor, self._reduced = factor, {}
+        if index not in self._reduced:
+            self._reduced[index] = _reduce(full, factor)
+        return self._reduced[index]
+
+
+def reduced_size(view: View, factor: int) -> tuple[int, int]:
+    """(width, height) of a view at 1 / ``factor``, rounded."""
+    return max(1, round(view.width / factor)), max(1, round(view.height / factor))
+
+
+def usable_factor(views: Sequence[View], factor: int) -> int:
+    """``factor``, halved until every view keeps ``MIN_SHORT_SIDE`` pixels (or 1 is reached)."""
+    shortest = min(min(view.width, view.height) for view in views)
+    while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
+        factor //= 2
+    return factor
+
+
+def _target(pixels: ViewPixels) -> Target:
+    rgb, alpha = pixels.rgb, pixels.alpha
+    ignored = None if pixels.mask is None or pixels.mask.all() else ~pixels.mask
+    if alpha is not None:
+        rgb = np.rint(rgb * (alpha[..., None].astype(np.float32) / 255.0)).astype(np.uint8)
+    if ignored is not None:
+        # SSIM's windows reach across a mask's edge: what lies behind must be the same everywhere.
+        rgb = np.where(ignored[..., None], np.uint8(0), rgb)
+        alpha = None if alpha is None else np.where(ignored, np.uint8(255), alpha)
+    if alpha is not None and alpha.min() == 255:
+        alpha = None
+    return Target(_tensor(rgb), _tensor_or_none(alpha), _tensor_or_none(ignored))
+
+
+def _reduce(target: Target, factor: int) -> Target:
+    """A reduced pixel is ignored if any pixel under it is."""
+    height, width = target.rgb.shape[:2]
+    size = max(1, round(width / factor)), max(1, round(height / factor))
+    rgb = resize_area(target.rgb.numpy(), *size)
+    alpha = None if target.alpha is None else resize_area(target.alpha.numpy(), *size)
+    ignored = None
+    if target.ignored is not None:
+        ignored = resize_area(target.ignored.numpy().astype(np.float32), *size) > 1e-6
+        rgb = np.where(ignored[..., None], np.uint8(0), rgb)
+        alpha = None if alpha is None else np.where(ignored, np.uint8(255), alpha)
+    return Target(_tensor(rgb), _tensor_or_none(alpha), _tensor_or_none(ignored))
+
+
+def _tensor(array: NDArray[Any]) -> Tensor:
+    return torch.from_numpy(np.ascontiguousarray(array))
+
+
+def _tensor_or_none(array: NDArray[Any] | None) -> Tensor | None:
+    return None if array is None else _tensor(array)

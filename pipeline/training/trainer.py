@@ -1,0 +1,359 @@
+"""The training loop: 3D Gaussian splatting (Kerbl et al. 2023) on the native rasterizer.
+
+Bits depend on the inputs, the settings and the seed alone: not on the number of threads, on when
+checkpoints were written, or on how often the run was killed.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import math
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.config.schema import Train
+from pipeline.raster.ops import backward, forward, l1_ssim
+from pipeline.raster.types import RasterCamera, RasterOptions
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.progress import Progress
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training import checkpoint
+from pipeline.training.checkpoint import Checkpoint
+from pipeline.training.density import GradientDensity
+from pipeline.training.optimiser import Adam, Rates
+from pipeline.training.render import near_plane, raster_camera
+from pipeline.training.schedule import Schedule
+from pipeline.training.state import TrainState, Window
+from pipeline.training.targets import Target, Targets, usable_factor
+
+# Part of a checkpoint's identity: raise it when the state or its meaning changes.
+STATE_VERSION = 1
+CHECKPOINT_SECONDS = 30.0
+CURVE_RECORDS = 100
+# PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
+PSNR_EVERY = 10
+
+Colour = tuple[float, float, float]
+BACKGROUNDS: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """A trained scene.
+
+    Attributes:
+        gaussians: with SH of the configured degree.
+        curve: {step, loss, psnr, num_gaussians} about every hundredth of the run: means since
+            the record before, over training views at the resolution in use. Deterministic.
+        curve_seconds: training time of each record; differs from run to run.
+        counters: what happened, as plain values (see ``state.Counters``).
+        near: the near plane it was trained with; render with the same.
+        background: of the training: black, white or random.
+        warnings: for a person; deterministic except those about checkpoints.
+        steps: optimiser steps done.
+        seconds: training time in all, over every process that worked on it.
+    """
+
+    gaussians: Gaussians
+    curve: list[dict[str, float]]
+    curve_seconds: list[float]
+    counters: dict[str, Any]
+    near: float
+    background: str
+    warnings: list[str]
+    steps: int
+    seconds: float
+
+
+def train(
+    views: Sequence[View],
+    initial: Gaussians,
+    config: Train,
+    *,
+    seed: int,
+    threads: int,
+    extent: float,
+    checkpoint_dir: Path,
+    on_log: Callable[[str], None] | None = None,
+) -> TrainResult:
+    """Optimise ``initial`` until its renders look like ``views``.
+
+    Goes on from the last checkpoint in ``checkpoint_dir`` if there is one of this very run; the
+    caller deletes the folder when the result is safe.
+
+    Args:
+        views: training views only.
+        threads: of the native operators; torch itself runs on one, so that sums are the same.
+        extent: the scene's size in the world's unit (``splats.init.scene_extent``).
+        on_log: called with one line for each warning.
+
+    Raises:
+        UserError: no views or no Gaussians, unreadable pictures, no view sees a Gaussian, the
+            loss is not a number, or every Gaussian died.
+    """
+    if not views or not len(initial):
+        raise UserError(
+            f"expected views and Gaussians to train; found {len(views)} views and "
+            f"{len(initial)} Gaussians",
+            fix="check the split and the initialisation",
+        )
+    torch_threads = torch.get_num_threads()
+    torch.set_num_threads(1)
+    try:
+        return _Run(views, initial, config, seed, threads, extent, checkpoint_dir, on_log).train()
+    finally:
+        torch.set_num_threads(torch_threads)
+
+
+class _Run:
+    """One call of ``train``: what does not change during it, and the state that does."""
+
+    def __init__(
+        self,
+        views: Sequence[View],
+        initial: Gaussians,
+        config: Train,
+        seed: int,
+        threads: int,
+        extent: float,
+        checkpoint_dir: Path,
+        on_log: Callable[[str], None] | None,
+    ):
+        self.views, self.config = list(views), config
+        self.threads, self.extent, self.near = threads, extent, near_plane(extent)
+        self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
+        self.warnings: list[str] = []
+        self.schedule = Schedule.of(config)
+        self.cameras: dict[tuple[int, int], RasterCamera] = {}
+        self.identity = _identity(views, initial, config, seed, extent)
+        self.targets = Targets(views, threads)
+        self.background = config.background
+        if self.background == "auto":
+            self.background = "random" if self.targets.have_alpha else "black"
+
+        gaussians = initial.with_sh_degree(0).clone()
+        rng = np.random.Generator(np.random.PCG64(seed))
+        budget = config.density.max_gaussians
+        if len(gaussians) > budget:
+            self.warn(
+                f"{len(gaussians)} Gaussians at the start are more than the budget: a random "
+                f"{budget} of them are kept (train.density.max_gaussians)"
+            )
+            chosen = np.sort(rng.permutation(len(gaussians))[:budget])
+            gaussians = gaussians.select(torch.from_numpy(chosen))
+        density = GradientDensity(config.density, extent)
+        density.start(len(gaussians))
+        self.state = TrainState(
+            gaussians, Adam(gaussians), density, rng, rng.permutation(len(views))
+        )
+
+    def warn(self, message: str) -> None:
+        self.warnings.append(message)
+        if self.on_log is not None:
+            self.on_log(message)
+
+    def train(self) -> TrainResult:
+        state, steps = self.state, self.config.steps
+        found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.warn)
+        if found is not None:
+            state.restore(found.step, found.arrays, found.values)
+        started = saved = time.monotonic()
+        seconds_before = state.seconds
+        progress = Progress("training", steps, unit="steps")
+        progress.start_at(state.step)
+        records = max(1, steps // CURVE_RECORDS)
+        while state.step < steps:
+            self.step()
+            now = time.monotonic()
+            state.seconds = seconds_before + now - started
+            if state.step % records == 0 or state.step == steps:
+                self.record()
+            if now - saved >= CHECKPOINT_SECONDS and state.step < steps:
+                self.save()
+                saved = time.monotonic()
+            progress.advance(note=self.note())
+        return self.result()
+
+    def step(self) -> None:
+        """One view: render, compare, differentiate, move; then density control when due."""
+        state, config = self.state, self.config
+        state.step += 1
+        step = state.step
+        self.raise_sh_degree()
+        index = state.next_view()
+        factor = usable_factor(self.views, self.schedule.resolution_factor(step))
+        target, camera = self.targets.get(index, factor), self.camera(index, factor)
+        background = self.draw_background()
+        options = RasterOptions(
+            sh_degree=state.gaussians.sh_degree,
+            background=background,
+            antialias=config.antialias,
+            near=self.near,
+            threads=self.threads,
+        )
+        rendered = forward(*state.gaussians.parameters(), camera, options)
+        wanted = target.over(background)
+        loss = l1_ssim(rendered.color, wanted, config.ssim_weight, target.ignored, self.threads)
+        self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
+        gradients = backward(rendered, loss.grad, means2d_abs=config.density.absolute_gradient)
+        state.density.observe(rendered, gradients, camera.width, camera.height)
+        state.adam.step(state.gaussians, gradients, self.rates(step), step, self.threads)
+
+        state.window.loss += float(loss.loss)
+        state.window.steps += 1
+        if (step - 1) % min(PSNR_EVERY, max(1, config.steps // CURVE_RECORDS)) == 0:
+            state.window.psnr += _psnr(rendered.color, wanted, target)
+            state.window.samples += 1
+        self.control_density(step)
+
+    def control_density(self, step: int) -> None:
+        state, schedule = self.state, self.schedule
+        densify = schedule.refines_after(step)
+        if densify or schedule.prunes_after(step):
+            state.gaussians, changes = state.density.refine(
+                state.gaussians,
+                state.adam,
+                state.rng,
+                densify=densify,
+                prune_huge=schedule.prunes_huge_after(step),
+            )
+            state.counters.changes.add(changes)
+            if not len(state.gaussians):
+                raise UserError(
+                    f"every Gaussian has died by step {step}: none was of any use to the pictures",
+                    fix="check the poses and the masks; a lower train.density.prune_opacity or "
+                    "init.method: points may help",
+                )
+        if schedule.resets_opacity_after(step):
+            state.density.reset_opacity(state.gaussians, state.adam)
+            state.counters.opacity_resets += 1
+        state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
+
+    def raise_sh_degree(self) -> None:
+        """Bands that are not in use yet are not there at all: they would only cost time."""
+        state = self.state
+        degree = self.schedule.sh_degree_at(state.step)
+        if degree > state.gaussians.sh_degree:
+            state.gaussians = state.gaussians.with_sh_degree(degree)
+            state.adam.resize_bands(degree)
+
+    def draw_background(self) -> Colour:
+        if self.background == "random":
+            red, green, blue = self.state.rng.random(3, np.float32).tolist()
+            return red, green, blue
+        return BACKGROUNDS[self.background]
+
+    def rates(self, step: int) -> Rates:
+        config = self.config
+        return Rates(
+            means=self.schedule.lr_means_at(step) * self.extent,
+            log_scales=config.lr_scales,
+            quats=config.lr_quats,
+            opacity_logits=config.lr_opacities,
+            sh0=config.lr_sh0,
+            shN=config.lr_shN,
+        )
+
+    def camera(self, index: int, factor: int) -> RasterCamera:
+        if (index, factor) not in self.cameras:
+            self.cameras[index, factor] = raster_camera(self.views[index], factor)
+        return self.cameras[index, factor]
+
+    def check(self, loss: float, num_visible: int, num_dropped: int, index: int) -> None:
+        """Stop where going on makes no sense; count what is odd."""
+        counters, step = self.state.counters, self.state.step
+        counters.num_dropped += num_dropped
+        counters.blind_steps += num_visible == 0
+        if not math.isfinite(loss):
+            raise UserError(
+                f"the loss is not a number at step {step}, view {self.views[index].name}",
+                fix="lower the learning rates (train.lr_*), or check the poses and points",
+            )
+        if step >= len(self.views) and counters.blind_steps == step:
+            raise UserError(
+                f"no camera sees any Gaussian ({len(self.views)} views tried)",
+                fix="check that the poses and the points are of one world and that the poses are "
+                "world to camera, x right, y down, z forward",
+            )
+
+    def record(self) -> None:
+        """Add to the curve and begin a new window."""
+        state = self.state
+        window = state.window
+        previous = state.curve[-1]["psnr"] if state.curve else 0.0
+        state.curve.append(
+            {
+                "step": state.step,
+                "loss": window.loss / max(1, window.steps),
+                "psnr": window.psnr / window.samples if window.samples else previous,
+                "num_gaussians": len(state.gaussians),
+            }
+        )
+        state.curve_seconds.append(state.seconds)
+        state.window = Window()
+
+    def note(self) -> str:
+        text = f"{len(self.state.gaussians)} Gaussians"
+        if self.state.curve:
+            last = self.state.curve[-1]
+            text = f"loss {last['loss']:.4f}, PSNR {last['psnr']:.2f} dB, {text}"
+        return text
+
+    def save(self) -> None:
+        state = self.state
+        checkpoint.save(
+            self.checkpoint_dir,
+            Checkpoint(state.step, self.identity, state.arrays(), state.values()),
+        )
+
+    def result(self) -> TrainResult:
+        state = self.state
+        if state.counters.blind_steps:
+            self.warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
+        return TrainResult(
+            gaussians=state.gaussians.with_sh_degree(self.config.sh_degree),
+            curve=state.curve,
+            curve_seconds=state.curve_seconds,
+            counters=asdict(state.counters),
+            near=self.near,
+            background=self.background,
+            warnings=self.warnings,
+            steps=state.step,
+            seconds=state.seconds,
+        )
+
+
+def _identity(
+    views: Sequence[View], initial: Gaussians, config: Train, seed: int, extent: float
+) -> str:
+    """A digest of all that determines the result, apart from the pixels (whose stage's key names
+    the folder of checkpoints)."""
+    digest = hashlib.sha256()
+    described = [
+        (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
+        for v in views
+    ]
+    text = json.dumps([STATE_VERSION, config.model_dump(), seed, extent, described])
+    digest.update(text.encode())
+    for array in initial.arrays().values():
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+def _psnr(rendered: Tensor, wanted: Tensor, target: Target) -> float:
+    """PSNR in dB over the pixels that count."""
+    scale = 1 / 255.0 if wanted.dtype == torch.uint8 else 1.0
+    difference = rendered - wanted.to(torch.float32) * scale
+    if target.ignored is not None:
+        difference = difference[~target.ignored]
+    error = float(difference.square().mean()) if difference.numel() else 0.0
+    return -10 * math.log10(max(error, 1e-10))

@@ -1,0 +1,150 @@
+"""The first Gaussians: finite whatever the points, where and as large as they should be."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.config.schema import Init
+from pipeline.runtime.errors import UserError
+from pipeline.scene.model import Points, View
+from pipeline.splats.init import (
+    MAX_ANGLE,
+    SH_C0,
+    InitGaussians,
+    gaussians_from_points,
+    gaussians_random,
+    scene_extent,
+)
+
+CENTRES = np.array([[0.0, 0.0, -5.0], [1.0, 0.0, -5.0], [0.0, 1.0, -5.0]])
+
+
+def points_at(xyz: np.ndarray) -> Points:
+    n = len(xyz)
+    return Points(
+        xyz=np.asarray(xyz, np.float64).reshape(n, 3),
+        rgb=np.full((n, 3), 200, np.uint8),
+        error=np.zeros(n),
+        track_start=np.zeros(n + 1, np.int64),
+        track_image_id=np.zeros(0, np.int64),
+        track_xy=np.zeros((0, 2)),
+    )
+
+
+def looking_at(centre: np.ndarray, target: np.ndarray) -> View:
+    forward = (target - centre) / np.linalg.norm(target - centre)
+    right = np.cross(forward, [0.1, 1.0, 0.05])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = rotation, -rotation @ centre
+    return View("v", "v.png", None, 80, 60, 70.0, 70.0, 40.0, 30.0, pose, False)
+
+
+def assert_whole(gaussians: InitGaussians) -> None:
+    n = len(gaussians)
+    for array in gaussians.arrays().values():
+        assert array.dtype == np.float32
+        assert array.flags.c_contiguous
+        assert len(array) == n
+        assert np.isfinite(array).all()
+    assert np.isfinite(np.exp(gaussians.log_scales)).all()
+    assert (np.exp(gaussians.log_scales) > 0).all()
+
+
+coordinate = st.one_of(
+    st.floats(-10, 10),
+    st.sampled_from([0.0, 1.0, -5.0, 1e-30, 1e12, -1e17]),
+    st.floats(allow_nan=True, allow_infinity=True),
+)
+
+
+@settings(max_examples=80, deadline=None, derandomize=True)
+@given(st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=40))
+def test_any_points_give_finite_gaussians_or_one_clear_error(rows: list) -> None:
+    try:
+        result = gaussians_from_points(points_at(np.array(rows)), CENTRES, Init(), 1)
+    except UserError:
+        return
+    assert_whole(result)
+    assert len(result) + result.num_dropped == len(rows)
+
+
+def test_duplicates_and_a_single_point_have_a_size() -> None:
+    for xyz in (np.zeros((1, 3)), np.zeros((20, 3))):
+        result = gaussians_from_points(points_at(xyz), CENTRES, Init(), 0)
+        assert_whole(result)
+        assert np.exp(result.log_scales).min() > 1e-5
+
+
+def test_scale_is_the_mean_distance_of_three_neighbours() -> None:
+    grid = np.stack(np.meshgrid(*[np.arange(4) * 0.1] * 3), -1).reshape(-1, 3)
+    result = gaussians_from_points(points_at(grid), CENTRES, Init(), 0)
+    assert np.allclose(np.exp(result.log_scales), 0.1, rtol=1e-5)
+    assert np.allclose(0.5 + SH_C0 * result.sh[:, 0], 200 / 255, atol=1e-6)
+    assert np.allclose(1 / (1 + np.exp(-result.opacity_logits)), 0.1, atol=1e-6)
+
+
+def test_points_next_to_a_camera_and_far_outliers_are_dropped() -> None:
+    good = np.random.default_rng(0).normal(size=(200, 3))
+    bad = np.array([[0.0, 0.0, -5.0], [0.0, 0.001, -5.0], [0.0, 0.0, 1e7]])
+    result = gaussians_from_points(points_at(np.concatenate([good, bad])), CENTRES, Init(), 0)
+    assert result.num_dropped == 3
+    assert np.allclose(result.means, good.astype(np.float32))
+
+
+def test_a_lone_point_does_not_fill_the_view() -> None:
+    cluster = np.random.default_rng(0).normal(size=(100, 3)) * 0.01
+    lone = np.array([[40.0, 0.0, 0.0]])
+    result = gaussians_from_points(points_at(np.concatenate([cluster, lone])), CENTRES, Init(), 0)
+    distance = np.linalg.norm(lone - CENTRES, axis=1).min()
+    assert np.exp(result.log_scales[-1, 0]) <= MAX_ANGLE * distance * 1.0001
+
+
+def test_thinning_keeps_the_number_asked_for_and_is_repeatable() -> None:
+    xyz = np.random.default_rng(0).normal(size=(500, 3))
+    first = gaussians_from_points(points_at(xyz), CENTRES, Init(max_points=50), 0)
+    again = gaussians_from_points(points_at(xyz), CENTRES, Init(max_points=50), 0)
+    assert len(first) == 50
+    assert first.num_thinned == 450
+    assert np.array_equal(first.means, again.means)
+
+
+def test_no_point_left_is_a_clear_error() -> None:
+    with pytest.raises(UserError, match="none is usable"):
+        gaussians_from_points(points_at(np.full((3, 3), np.nan)), CENTRES, Init(), 0)
+    with pytest.raises(UserError, match="none is usable"):
+        gaussians_from_points(Points.empty(), CENTRES, Init(), 0)
+
+
+def test_random_start_fills_what_inward_cameras_share() -> None:
+    target = np.array([3.0, -2.0, 7.0])
+    directions = np.random.default_rng(0).normal(size=(12, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    views = [looking_at(target + 4.0 * d, target) for d in directions]
+    result = gaussians_random(views, Init(num_random=500), 2, seed=1)
+    assert_whole(result)
+    assert result.sh.shape == (500, 9, 3)
+    assert np.allclose(result.means.mean(0), target, atol=0.3)
+    for view in views:
+        camera = result.means @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        pixel = camera[:, :2] / camera[:, 2:] * 70.0 + [40.0, 30.0]
+        assert (camera[:, 2] > 0).all()
+        assert ((pixel >= -0.5) & (pixel <= [80.5, 60.5])).all()
+    other = gaussians_random(views, Init(num_random=500), 2, seed=2)
+    assert not np.array_equal(result.means, other.means)
+
+
+def test_random_start_of_cameras_looking_ahead_lies_in_front_of_them() -> None:
+    views = [looking_at(np.array([0.1 * i, 0.0, 0.0]), np.array([0.1 * i, 0, 9])) for i in range(5)]
+    result = gaussians_random(views, Init(num_random=300), 0, seed=1)
+    assert_whole(result)
+    assert (result.means[:, 2] > 0).all()
+
+
+def test_extent_follows_the_cameras_and_is_never_zero() -> None:
+    assert scene_extent(np.array([[-1.0, 0, 0], [1.0, 0, 0]])) == pytest.approx(1.1)
+    assert scene_extent(np.zeros((3, 3))) == 1.0

@@ -1,0 +1,88 @@
+"""A tiny scene of known Gaussians, photographed by the rasterizer itself."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.config.schema import Density, Train
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.render import render_view
+
+WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
+NUM_VIEWS = 6
+
+
+@dataclass
+class TinyScene:
+    """``views`` have files without alpha, ``alpha_views`` the same with it."""
+
+    truth: Gaussians
+    initial: Gaussians
+    views: list[View]
+    alpha_views: list[View]
+    extent: float
+
+
+def tiny_config(steps: int = 40, **changes: object) -> Train:
+    """Training short enough for a test, with every phase in it."""
+    density = {"start_step": 700, "interval": 1750, "stop_share": 0.7, "max_gaussians": 130}
+    density |= changes.pop("density", {})  # type: ignore[arg-type]
+    values = {"steps": steps, "sh_degree": 1, "sh_interval": 2000, "coarse_until": 0.0}
+    return Train(**(values | changes), density=Density(**density))  # type: ignore[arg-type]
+
+
+def ball(count: int, seed: int) -> Gaussians:
+    rng = np.random.default_rng(seed)
+    sh = np.zeros((count, 4, 3), np.float32)
+    sh[:, 0] = rng.uniform(-1.5, 1.5, (count, 3))
+    return Gaussians.from_arrays(
+        {
+            "means": rng.normal(size=(count, 3)) * 0.5,
+            "log_scales": rng.uniform(-2.5, -1.7, (count, 3)),
+            "quats": rng.normal(size=(count, 4)),
+            "opacity_logits": rng.uniform(0.5, 3.0, count),
+            "sh": sh,
+        }
+    )
+
+
+def camera_at(angle: float) -> View:
+    centre = 3.0 * np.array([np.sin(angle), 0.2, -np.cos(angle)])
+    forward = -centre / np.linalg.norm(centre)
+    right = np.cross([0.0, 1.0, 0.0], forward)
+    right /= np.linalg.norm(right)
+    pose = np.eye(4)
+    pose[:3, :3] = np.stack([right, np.cross(forward, right), forward])
+    pose[:3, 3] = -pose[:3, :3] @ centre
+    half = WIDTH / 2, HEIGHT / 2
+    return View("", "", None, WIDTH, HEIGHT, FOCAL, FOCAL, *half, pose, False)
+
+
+@pytest.fixture(scope="session")
+def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
+    folder: Path = tmp_path_factory.mktemp("tiny")
+    truth = ball(60, 1)
+    views, alpha_views = [], []
+    for index in range(NUM_VIEWS):
+        view = camera_at(index * 2 * np.pi / NUM_VIEWS)
+        render = render_view(truth, view)
+        rgb = np.rint(render.rgb * 255).astype(np.uint8)
+        Image.fromarray(rgb).save(folder / f"{index}.png")
+        alpha = np.rint(render.alpha * 255).astype(np.uint8)
+        straight = np.where(alpha[..., None] > 0, render.rgb / (alpha[..., None] / 255 + 1e-9), 0)
+        rgba = np.dstack([np.rint(np.clip(straight, 0, 1) * 255).astype(np.uint8), alpha])
+        Image.fromarray(rgba).save(folder / f"{index}a.png")
+        views.append(replace(view, name=f"{index}.png", image=str(folder / f"{index}.png")))
+        alpha_views.append(replace(view, name=f"{index}a.png", image=str(folder / f"{index}a.png")))
+    initial = ball(60, 1)
+    rng = np.random.default_rng(5)
+    initial.means += initial.means.new_tensor(rng.normal(size=(60, 3)) * 0.05)
+    initial.sh.zero_()
+    initial.opacity_logits.fill_(-1.0)
+    return TinyScene(truth, initial, views, alpha_views, extent=3.3)

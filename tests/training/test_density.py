@@ -1,0 +1,137 @@
+"""Density control: rows, moments and budget stay in order; splits keep where things are."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.config.schema import Density
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density import SPLIT_SHRINK, GradientDensity, rotations
+from pipeline.training.optimiser import Adam
+from tests.training.conftest import ball
+
+
+def marked(count: int) -> tuple[Gaussians, Adam]:
+    """Gaussians whose moments name the row they belong to."""
+    gaussians = ball(count, 0)
+    adam = Adam(gaussians)
+    for moments in (adam.first, adam.second):
+        for tensor in moments.values():
+            tensor += torch.arange(1, count + 1).view(-1, *[1] * (tensor.ndim - 1))
+    return gaussians, adam
+
+
+def strategy(count: int, **options: object) -> GradientDensity:
+    density = GradientDensity(Density(**options), extent=1.0)  # type: ignore[arg-type]
+    density.start(count)
+    density.seen += 1
+    return density
+
+
+def refine(
+    density: GradientDensity, gaussians: Gaussians, adam: Adam, *, densify: bool = True
+) -> Gaussians:
+    rng = np.random.Generator(np.random.PCG64(0))
+    return density.refine(gaussians, adam, rng, densify=densify, prune_huge=False)[0]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 60), st.integers(1, 80), st.integers(0, 2**31), st.booleans())
+def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
+    gaussians, adam = marked(count)
+    rng = np.random.default_rng(seed)
+    density = strategy(count, max_gaussians=budget, split_scale=0.13)
+    density.gradient_sum = torch.from_numpy(rng.uniform(0, 4e-4, count).astype(np.float32))
+    gaussians.opacity_logits[torch.from_numpy(rng.random(count) < 0.2)] = -9.0
+    rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
+
+    rng2 = np.random.Generator(np.random.PCG64(seed))
+    result, changes = density.refine(gaussians, adam, rng2, densify=densify, prune_huge=False)
+
+    assert len(result) == count - changes.pruned + changes.cloned + changes.split
+    assert len(result) <= max(budget, count - changes.pruned)
+    assert len(density.gradient_sum) == len(density.seen) == len(result)
+    for name, tensor in result.tensors().items():
+        assert tensor.is_contiguous()
+        for moments in (adam.first, adam.second):
+            assert moments[name].shape == tensor.shape
+            per_row = moments[name].flatten(1) if tensor.ndim > 1 else moments[name][:, None]
+            assert (per_row == per_row[:, :1]).all()
+    # Whoever has moments has its own; the new have none.
+    for row, moment in zip(result.means, adam.first["opacity_logits"], strict=True):
+        if moment > 0:
+            assert rows[row.numpy().tobytes()] == moment
+    if len(result):
+        survivors = int((adam.first["opacity_logits"] > 0).sum())
+        assert survivors == count - changes.pruned - changes.split
+
+
+def test_the_budget_goes_to_the_largest_gradients() -> None:
+    gaussians, adam = marked(10)
+    density = strategy(10, max_gaussians=13, split_scale=100.0)
+    density.gradient_sum = torch.arange(10.0)
+    result = refine(density, gaussians, adam)
+    assert len(result) == 13
+    assert torch.equal(result.means[10:], gaussians.means[[7, 8, 9]])
+
+
+def test_invisible_steps_do_not_thin_the_mean_gradient() -> None:
+    gaussians, adam = marked(2)
+    density = strategy(2, split_scale=100.0, grad_threshold=1.0)
+    density.gradient_sum = torch.tensor([3.0, 3.0])
+    density.seen = torch.tensor([2.0, 4.0])
+    assert len(refine(density, gaussians, adam)) == 3
+
+
+def test_a_split_keeps_the_mean_and_shrinks() -> None:
+    one = ball(1, 4)
+    count = 20_000
+    gaussians = one.select(torch.zeros(count, dtype=torch.int64))
+    adam = Adam(gaussians)
+    density = strategy(count, split_scale=0.0)
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    assert len(result) == 2 * count
+    assert torch.allclose(result.log_scales, one.log_scales - math.log(SPLIT_SHRINK))
+    offset = (result.means - one.means).double()
+    sigma = one.log_scales.exp().max().item()
+    assert offset.mean(0).abs().max() < 5 * sigma / math.sqrt(2 * count)
+    # Drawn from the Gaussian itself: its covariance R S S R^T.
+    axes = rotations(one.quats)[0].double() * one.log_scales.exp().double()
+    wanted = axes @ axes.T
+    assert torch.allclose(offset.T @ offset / len(offset), wanted, atol=0.03 * sigma**2)
+
+
+def test_clones_are_copies() -> None:
+    gaussians, adam = marked(5)
+    density = strategy(5, split_scale=100.0)
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    for tensor in result.tensors().values():
+        assert torch.equal(tensor[:5], tensor[5:])
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
+def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
+    gaussians, adam = marked(6)
+    gaussians.tensors()[name].view(6, -1)[2, 0] = math.nan
+    result = refine(strategy(6), gaussians, adam, densify=False)
+    assert len(result) == 5
+    assert all(torch.isfinite(tensor).all() for tensor in result.tensors().values())
+
+
+def test_opacity_reset_caps_and_forgets() -> None:
+    gaussians, adam = marked(4)
+    gaussians.opacity_logits[0] = -7.0
+    strategy(4).reset_opacity(gaussians, adam)
+    opacity = torch.sigmoid(gaussians.opacity_logits)
+    assert opacity[0] < 0.001
+    assert torch.allclose(opacity[1:], torch.tensor(0.01))
+    assert not adam.first["opacity_logits"].any()
+    assert adam.first["means"].all()

@@ -1,0 +1,37 @@
+"""Every length of run passes through the same phases, in an order that makes sense."""
+
+from __future__ import annotations
+
+import pytest
+
+from pipeline.config.schema import Train
+from pipeline.training.schedule import Schedule
+
+
+@pytest.mark.parametrize("steps", [1, 10, 60, 600, 2000, 7000, 30_000])
+def test_phases_fit_into_the_run(steps: int) -> None:
+    schedule = Schedule.of(Train(steps=steps))
+    every = range(1, steps + 1)
+    factors = [schedule.resolution_factor(step) for step in every]
+    assert factors == sorted(factors, reverse=True)
+    assert factors[-1] == 1
+    degrees = [schedule.sh_degree_at(step) for step in every]
+    assert degrees == sorted(degrees)
+    refines = [step for step in every if schedule.refines_after(step)]
+    resets = [step for step in every if schedule.resets_opacity_after(step)]
+    assert all(step <= schedule.refine_stop for step in refines)
+    assert all(step + schedule.reset_interval <= schedule.refine_stop for step in resets)
+    assert not schedule.prunes_after(steps)
+    if steps >= 600:
+        assert degrees[-1] == 3
+        assert len(refines) >= 10
+        assert set(factors) == {1, 2, 4}
+    if steps == 30_000:
+        assert resets == [3000, 6000, 9000, 12_000]
+
+
+def test_rates_decay_log_linearly() -> None:
+    schedule = Schedule.of(Train(steps=101, lr_means=1e-2, lr_means_final=1e-4))
+    assert schedule.lr_means_at(1) == pytest.approx(1e-2)
+    assert schedule.lr_means_at(51) == pytest.approx(1e-3)
+    assert schedule.lr_means_at(101) == pytest.approx(1e-4)

@@ -1,0 +1,229 @@
+"""Training for real on a tiny scene: it learns, resumes to the bit, and stops with clear errors."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline.config.schema import Train
+from pipeline.runtime.errors import UserError
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training import trainer
+from pipeline.training.checkpoint import PATTERN
+from pipeline.training.render import render_view
+from pipeline.training.trainer import TrainResult, train
+from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
+
+
+def run(
+    scene: TinyScene,
+    folder: Path,
+    config: Train | None = None,
+    views: list[View] | None = None,
+    threads: int = 1,
+    seed: int = 3,
+) -> TrainResult:
+    return train(
+        scene.views if views is None else views,
+        scene.initial,
+        config or tiny_config(),
+        seed=seed,
+        threads=threads,
+        extent=scene.extent,
+        checkpoint_dir=folder,
+    )
+
+
+def assert_same(a: TrainResult, b: TrainResult) -> None:
+    for name, tensor in a.gaussians.tensors().items():
+        assert torch.equal(tensor, b.gaussians.tensors()[name]), name
+    assert a.curve == b.curve
+    assert a.counters == b.counters
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
+    """Kill the run in the middle of its ``call``-th step."""
+    calls = 0
+    original = trainer.backward
+
+    def dying(*args: object, **kwargs: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(trainer, "backward", dying)
+
+
+def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
+    result = run(scene, tmp_path, tiny_config(150))
+    assert result.steps == 150
+    assert result.curve[-1]["loss"] < 0.4 * result.curve[0]["loss"]
+    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 8
+    assert result.gaussians.sh_degree == 1
+    assert len(result.curve) == len(result.curve_seconds)
+    view = scene.views[0]
+    rendered = render_view(result.gaussians, view, near=result.near).rgb
+    error = np.mean((rendered - np.asarray(Image.open(view.image)) / 255.0) ** 2)
+    assert -10 * np.log10(error) > 25
+
+
+@pytest.mark.parametrize("call", [1, 2, 11, 23, 40])
+def test_killed_and_resumed_gives_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    config = tiny_config(40)
+    whole = run(scene, tmp_path / "whole", config, scene.alpha_views)
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, call)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path / "cut", config, scene.alpha_views)
+    assert len(list((tmp_path / "cut").glob(PATTERN))) == min(2, call - 1)
+    resumed = run(scene, tmp_path / "cut", config, scene.alpha_views)
+    assert_same(whole, resumed)
+    assert not resumed.warnings
+
+
+def test_resuming_from_an_older_step_gives_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(scene, tmp_path / "whole")
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 20)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path / "cut")
+    newest = max((tmp_path / "cut").glob(PATTERN))
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(bytes(data))
+    resumed = run(scene, tmp_path / "cut")
+    assert_same(whole, resumed)
+    assert len(resumed.warnings) == 1
+    assert "damaged" in resumed.warnings[0]
+
+
+def test_a_checkpoint_of_other_settings_is_not_used(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    run(scene, tmp_path, seed=1)
+    other = run(scene, tmp_path, seed=2)
+    assert_same(other, run(scene, tmp_path / "clean", seed=2))
+    assert any("other inputs" in warning for warning in other.warnings)
+
+
+def test_threads_do_not_change_the_bits(scene: TinyScene, tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    one = run(scene, tmp_path / "1", views=scene.alpha_views, threads=1)
+    two = run(scene, tmp_path / "2", views=scene.alpha_views, threads=2)
+    assert_same(one, two)
+    assert torch.get_num_threads() == before
+    one.gaussians.save(tmp_path / "1.npz")
+    two.gaussians.save(tmp_path / "2.npz")
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+
+
+def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) -> None:
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[8:20, 5:22] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    results = []
+    for seed in (1, 2):
+        views = []
+        for index, view in enumerate(scene.views):
+            picture = np.array(Image.open(view.image))
+            noise = np.random.default_rng(seed).integers(0, 256, picture.shape, np.uint8)
+            picture = np.where(mask[..., None] == 0, noise, picture)
+            path = tmp_path / f"{seed}_{index}.png"
+            Image.fromarray(picture).save(path)
+            views.append(replace(view, image=str(path), mask=str(tmp_path / "mask.png")))
+        results.append(run(scene, tmp_path / f"c{seed}", views=views))
+    assert_same(*results)
+
+
+def test_alpha_with_random_background_leaves_the_empty_empty(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    start = scene.initial.clone()
+    start.opacity_logits.fill_(1.0)
+    start.log_scales += 0.7
+    result = train(
+        scene.alpha_views,
+        start,
+        tiny_config(150),
+        seed=0,
+        threads=1,
+        extent=scene.extent,
+        checkpoint_dir=tmp_path,
+    )
+    assert result.background == "random"
+    for view in scene.alpha_views[:2]:
+        alpha = np.asarray(Image.open(view.image))[..., 3]
+        empty = alpha == 0
+        assert empty.sum() > 50
+        before = render_view(start, view).alpha[empty].mean()
+        after = render_view(result.gaussians, view).alpha[empty].mean()
+        assert after < 0.02 < before
+
+
+def test_a_loss_that_is_no_number_is_a_clear_error(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = trainer.l1_ssim
+    monkeypatch.setattr(
+        trainer, "l1_ssim", lambda *args: replace(original(*args), loss=float("nan"))
+    )
+    with pytest.raises(UserError, match=r"not a number at step 1, view \d\.png"):
+        run(scene, tmp_path)
+
+
+def test_all_gaussians_dead_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="every Gaussian has died"):
+        run(scene, tmp_path, tiny_config(40, density={"prune_opacity": 1.0}))
+
+
+def test_gaussians_that_no_camera_sees_are_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    far = scene.initial.clone()
+    far.means += 1000.0
+    with pytest.raises(UserError, match="no camera sees"):
+        train(
+            scene.views,
+            far,
+            tiny_config(),
+            seed=0,
+            threads=1,
+            extent=scene.extent,
+            checkpoint_dir=tmp_path,
+        )
+
+
+def test_nothing_to_train_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="0 views"):
+        run(scene, tmp_path, views=[])
+
+
+def test_more_gaussians_than_the_budget_are_thinned_with_a_warning(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    result = run(scene, tmp_path, tiny_config(10, density={"max_gaussians": 20}))
+    assert result.counters["max_gaussians"] <= 20
+    assert any("budget" in warning for warning in result.warnings)
+
+
+def test_saved_gaussians_come_back_the_same(scene: TinyScene, tmp_path: Path) -> None:
+    scene.truth.save(tmp_path / "a.npz")
+    back = Gaussians.load(tmp_path / "a.npz")
+    for name, tensor in scene.truth.tensors().items():
+        assert torch.equal(tensor, back.tensors()[name])
+    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-100])
+    with pytest.raises(UserError, match="could not read"):
+        Gaussians.load(tmp_path / "a.npz")

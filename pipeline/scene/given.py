@@ -1,0 +1,130 @@
+"""The poses a scene brings, whatever file they come in, for the photographs that are used."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+
+import numpy as np
+
+from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import read_model
+from pipeline.scene.llff import read_poses_bounds
+from pipeline.scene.manifest import Photo
+from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.names import NameIndex
+from pipeline.scene.scan import Scan
+from pipeline.scene.transforms import read_transforms
+
+# Shapes of a photograph and of its camera differ by rounding in reduced copies, not by more.
+_ASPECT_TOLERANCE = 0.02
+
+
+def load_given(scan: Scan) -> Reconstruction:
+    """Poses in COLMAP's convention, named by and sized for the photographs of the manifest.
+
+    Points keep the observations in those photographs; points seen in none of them are dropped.
+
+    Raises:
+        UserError: malformed pose files; a camera of another shape than its photograph.
+        ValueError: the scan found no poses.
+    """
+    if scan.poses is None:
+        raise ValueError("the scan found no poses")
+    path = scan.folder / scan.poses.path
+    photos = {photo.name: photo for photo in scan.photos}
+    sizes = {name: (photo.width, photo.height) for name, photo in photos.items()}
+    if scan.poses.kind == "transforms":
+        prefix = "" if scan.base_folder == "." else f"{scan.base_folder}/"
+        model = read_transforms(path, {prefix + name: size for name, size in sizes.items()})
+        model = Reconstruction(
+            model.cameras,
+            {
+                i: Posed(im.name[len(prefix) :], im.camera_id, im.rotation, im.translation)
+                for i, im in model.images.items()
+            },
+        )
+    elif scan.poses.kind == "llff":
+        # Rows go by order, so files that cannot be read still count; they are dropped below.
+        some_size = next(iter(sizes.values()))
+        listed = [sizes.get(name, some_size) for name in scan.listed]
+        model, _ = read_poses_bounds(path, scan.listed, listed)
+    else:
+        model = read_model(path)
+    return fit_to_photos(model, photos, str(path))
+
+
+def fit_to_photos(
+    model: Reconstruction, photos: Mapping[str, Photo], source: str
+) -> Reconstruction:
+    """``model`` for the photographs at hand: renamed to them, cameras resized, others dropped.
+
+    Names match exactly or without their suffix. Ids of images stay.
+
+    Raises:
+        UserError: a camera of another shape than its photograph; ``source`` names the poses.
+    """
+    index = NameIndex(photos)
+    images: dict[int, Posed] = {}
+    cameras: dict[int, Camera] = {}
+    ids: dict[tuple[int, int, int], int] = {}
+    scale: dict[int, tuple[float, float]] = {}
+    fresh = max(model.cameras, default=0)
+    taken: set[str] = set()
+    for number, image in sorted(model.images.items()):
+        name = index.find(image.name)
+        if name is None or name in taken:
+            continue
+        taken.add(name)
+        photo, camera = photos[name], model.cameras[image.camera_id]
+        _check_shape(photo, camera, source)
+        key = (image.camera_id, photo.width, photo.height)
+        if key not in ids:
+            if image.camera_id in cameras:
+                fresh += 1
+            ids[key] = fresh if image.camera_id in cameras else image.camera_id
+            cameras[ids[key]] = (
+                camera
+                if (camera.width, camera.height) == key[1:]
+                else camera.resized(photo.width, photo.height)
+            )
+        scale[number] = photo.width / camera.width, photo.height / camera.height
+        images[number] = Posed(name, ids[key], image.rotation, image.translation)
+    return Reconstruction(cameras, images, _points_in(model.points, scale))
+
+
+def _check_shape(photo: Photo, camera: Camera, source: str) -> None:
+    want, found = camera.width / camera.height, photo.width / photo.height
+    # One pixel of rounding in either side of a small copy.
+    slack = _ASPECT_TOLERANCE + 1 / min(photo.width, photo.height)
+    if abs(found / want - 1) > slack:
+        raise UserError(
+            f"{photo.name} is {photo.width}x{photo.height}, its given camera "
+            f"{camera.width}x{camera.height}: another shape, so the poses are not this picture's",
+            file=source,
+            fix="bring the photographs the poses were made from (stored orientation, not cropped), "
+            "or set poses: ignore",
+        )
+
+
+def _points_in(points: Points, scale: Mapping[int, tuple[float, float]]) -> Points:
+    """The points seen in images of ``scale``, pixels multiplied by its (x, y) factors."""
+    if not len(points):
+        return points
+    factors = np.full((int(points.track_image_id.max(initial=0)) + 1, 2), np.nan)
+    for number, factor in scale.items():
+        if number < len(factors):
+            factors[number] = factor
+    row_factor = factors[points.track_image_id]
+    kept = ~np.isnan(row_factor[:, 0])
+    owner = np.repeat(np.arange(len(points)), points.track_length)
+    length = np.bincount(owner[kept], minlength=len(points))
+    # Points that come without tracks are kept: nothing says that they are unseen.
+    seen = (length > 0) | (points.track_length == 0)
+    return Points(
+        points.xyz[seen],
+        points.rgb[seen],
+        points.error[seen],
+        np.concatenate([[0], np.cumsum(length[seen])]).astype(np.int64),
+        points.track_image_id[kept],
+        points.track_xy[kept] * row_factor[kept],
+    )

@@ -1,0 +1,163 @@
+"""Camera poses that come with the photographs: which files, and what they hold."""
+
+from __future__ import annotations
+
+import os
+from functools import partial
+from pathlib import Path, PurePosixPath
+from typing import Any, Literal
+
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.runtime.errors import UserError
+from pipeline.scene.cache import FactCache
+from pipeline.scene.colmap import has_model, read_model
+from pipeline.scene.folders import PhotoFolder
+from pipeline.scene.llff import read_rows
+from pipeline.scene.names import PHOTO_SUFFIXES, NameIndex, suffix_of
+from pipeline.scene.photofile import digest_of
+from pipeline.scene.transforms import find_transforms, frame_camera_model, read_frames
+
+_COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+_LLFF_FILE = "poses_bounds.npy"
+
+
+class GivenPoses(BaseModel):
+    """Poses found in a scene folder.
+
+    ``path`` is relative to the scene folder: the model's folder, the json or npy file, or "."
+    for several transforms files. ``names`` are the photographs as the pose files name them
+    (empty for LLFF, which goes by order). ``models`` are the camera models in use; ``pinhole``
+    says that none of the cameras distorts. ``num_points`` counts sparse points.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    kind: Literal["colmap", "transforms", "llff"]
+    path: str
+    names: tuple[str, ...]
+    num_images: int
+    models: tuple[str, ...]
+    pinhole: bool
+    num_points: int
+
+
+def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
+    """The poses a scene brings. A COLMAP model, which may hold points, goes before the others.
+
+    Raises:
+        UserError: the pose files are malformed.
+    """
+    for path in _COLMAP_FOLDERS:
+        if has_model(folder / path):
+            return _remembered(folder, "colmap", path, cache)
+    files = find_transforms(folder)
+    if files:
+        path = files[0].name if len(files) == 1 else "."
+        return _remembered(folder, "transforms", path, cache)
+    if (folder / _LLFF_FILE).is_file():
+        return _remembered(folder, "llff", _LLFF_FILE, cache)
+    return None
+
+
+def pose_files(path: Path) -> list[Path]:
+    """The files that poses at ``path`` (folder or file) are read from."""
+    if path.is_file():
+        return [path]
+    for suffix in (".bin", ".txt"):
+        files = [path / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
+        if files[0].is_file() and files[1].is_file():
+            return [file for file in files if file.is_file()]
+    return find_transforms(path)
+
+
+def truth_folder(folder: Path) -> Path | None:
+    """Ground truth poses to measure against, never an input."""
+    truth = folder / "sparse_gt"
+    return truth if has_model(truth) else None
+
+
+def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder | None:
+    """The photographs that transforms*.json lists and that exist; None where it lists none.
+
+    Without ``warnings`` the poses are not wanted, so a malformed file counts as none.
+    """
+    if not find_transforms(folder) or (warnings is None and has_any_model(folder)):
+        return None
+    try:
+        frames = {frame.path: frame for frame in read_frames(folder)}
+    except UserError:
+        if warnings is not None:
+            raise
+        return None
+    parents = sorted({str(PurePosixPath(name).parent) for name in frames})
+    existing = [
+        str(PurePosixPath(parent) / name)
+        for parent in parents
+        if (folder / parent).is_dir()
+        for name in os.listdir(folder / parent)
+        if suffix_of(name) in PHOTO_SUFFIXES and name[0] != "."
+    ]
+    index = NameIndex(existing)
+    found = {match: frame for name, frame in frames.items() if (match := index.find(name))}
+    if not found:
+        return None
+    base = os.path.commonpath([os.path.dirname(name) or "." for name in found]) or "."
+    masks = {os.path.relpath(name, base): frame.mask for name, frame in found.items()}
+    return PhotoFolder(
+        base,
+        base,
+        "the photographs that transforms*.json lists",
+        sorted(masks),
+        {name: mask for name, mask in masks.items() if mask is not None},
+    )
+
+
+def has_any_model(folder: Path) -> bool:
+    return any(has_model(folder / path) for path in _COLMAP_FOLDERS)
+
+
+def _remembered(folder: Path, kind: str, path: str, cache: FactCache) -> GivenPoses:
+    """Reading a large model takes seconds: remember what it held by its files' contents."""
+    digests = [
+        [file.name, cache.get(file, "digest", partial(digest_of, file))]
+        for file in pose_files(folder / path)
+    ]
+    read = {"colmap": _colmap, "transforms": _transforms, "llff": _llff}[kind]
+    key = f"poses:{folder / path}"
+    facts = cache.remember(key, digests, lambda: {"kind": kind, "path": path, **read(folder, path)})
+    return GivenPoses.model_validate(facts)
+
+
+def _colmap(folder: Path, path: str) -> dict[str, Any]:
+    model = read_model(folder / path)
+    used = [model.cameras[i] for i in sorted({im.camera_id for im in model.images.values()})]
+    return {
+        "names": sorted(image.name for image in model.images.values()),
+        "num_images": len(model.images),
+        "models": sorted({camera.model for camera in used}),
+        "pinhole": all(camera.is_pinhole for camera in used),
+        "num_points": len(model.points),
+    }
+
+
+def _transforms(folder: Path, path: str) -> dict[str, Any]:
+    frames = read_frames(folder / path)
+    models = sorted({frame_camera_model(frame) for frame in frames})
+    return {
+        "names": sorted(frame.path for frame in frames),
+        "num_images": len(frames),
+        "models": models,
+        "pinhole": models == ["PINHOLE"],
+        "num_points": 0,
+    }
+
+
+def _llff(folder: Path, path: str) -> dict[str, Any]:
+    return {
+        "names": [],
+        "num_images": len(read_rows(folder / path)),
+        "models": ["SIMPLE_PINHOLE"],
+        "pinhole": True,
+        "num_points": 0,
+    }

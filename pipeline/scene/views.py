@@ -1,0 +1,73 @@
+"""The pinhole views that training and evaluation look at."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from pipeline.config import schema
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction, View, is_held_out
+
+
+def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
+    """Width and height in pixels, reduced so that neither exceeds ``max_long_side``; the shape
+    stays, but for rounding."""
+    longest = max(width, height)
+    if longest <= max_long_side:
+        return width, height
+    return (
+        max(1, round(width * max_long_side / longest)),
+        max(1, round(height * max_long_side / longest)),
+    )
+
+
+def load_views(manifest: Manifest, model: Reconstruction, views: schema.Views) -> list[View]:
+    """The photographs that have a pose, sorted by name, at the size ``views`` asks for.
+
+    Intrinsics are scaled by the exact ratios of widths and of heights.
+
+    Raises:
+        ValueError: a camera distorts; such pictures must be undistorted first.
+    """
+    posed = model.by_name()
+    photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
+    result = []
+    for index, photo in enumerate(photos):
+        image = posed[photo.name]
+        camera = model.cameras[image.camera_id]
+        if not camera.is_pinhole:
+            raise ValueError(f"{photo.name}: its {camera.model} camera distorts")
+        width, height = view_size(photo.width, photo.height, views.max_long_side_px)
+        fx, fy, cx, cy = camera.resized(width, height).pinhole
+        result.append(
+            View(
+                name=photo.name,
+                image=photo.path,
+                mask=photo.mask if views.masks == "auto" else None,
+                width=width,
+                height=height,
+                fx=fx,
+                fy=fy,
+                cx=cx,
+                cy=cy,
+                world_to_camera=image.world_to_camera,
+                is_test=is_held_out(index, views.holdout_every),
+            )
+        )
+    return result
+
+
+def scene_extent(views: list[View]) -> float:
+    """1.1 times the largest distance of a training camera from their mean, in world units.
+
+    3DGS's measure of a scene's size (Kerbl et al. 2023, reference code), by which learning rates
+    and thresholds scale. Where the training cameras stand in one place all views count, and
+    where these do too the extent is 1.
+    """
+    for chosen in ([view for view in views if not view.is_test], views):
+        if chosen:
+            centres = np.stack([view.centre for view in chosen])
+            radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
+            if radius > 0:
+                return 1.1 * radius
+    return 1.0

@@ -23,7 +23,6 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.model import CAMERA_MODELS, Camera, Points, Posed, Reconstruction
 
 _MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
-_NO_POINT = 2**64 - 1
 _POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
 _POINT3D = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("length", "<u8")]
@@ -444,11 +443,16 @@ def _floats(text: str) -> list[float]:
     return [float(word) for word in text.split()]
 
 
-def _natural(text: str) -> int:
+def _natural(text: str, limit: int = 2**63) -> int:
     value = int(text)
-    if not 0 <= value < 2**63:
+    if not 0 <= value < limit:
         raise ValueError(text)
     return value
+
+
+def _id(text: str) -> int:
+    """An id of a camera or image, 32 bits in the binary format."""
+    return _natural(text, 2**32)
 
 
 def _cameras_from_text(file: Path) -> dict[int, Camera]:
@@ -457,7 +461,7 @@ def _cameras_from_text(file: Path) -> dict[int, Camera]:
         if not line.strip():
             continue
         number, name, width, height, params = _fields(
-            file, line_number, line, [_natural, str, _natural, _natural, _floats]
+            file, line_number, line, [_id, str, _natural, _natural, _floats]
         )
         if name not in CAMERA_MODELS:
             raise _unknown_model(file, number, name)
@@ -471,7 +475,7 @@ def _images_from_text(
     images: dict[int, Posed] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     lines = _lines(file)
-    types: list[Callable[[str], Any]] = [_natural, *[float] * 7, _natural, str.strip]
+    types: list[Callable[[str], Any]] = [_id, *[float] * 7, _id, str.strip]
     for line_number, line in lines:
         if not line.strip():
             continue
@@ -500,7 +504,7 @@ def _points_from_text(file: Path) -> _PointTable:
             continue
         try:
             row = [kind(word) for kind, word in zip(types, words[:8], strict=True)]
-            track = [_natural(word) for word in words[8:]]
+            track = [_id(word) for word in words[8:]]
             if len(track) % 2 or max(row[4:7]) > 255:
                 raise ValueError(line)
         except ValueError:

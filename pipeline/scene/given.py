@@ -110,11 +110,10 @@ def _points_in(points: Points, scale: Mapping[int, tuple[float, float]]) -> Poin
     """The points seen in images of ``scale``, pixels multiplied by its (x, y) factors."""
     if not len(points):
         return points
-    factors = np.full((int(points.track_image_id.max(initial=0)) + 1, 2), np.nan)
-    for number, factor in scale.items():
-        if number < len(factors):
-            factors[number] = factor
-    row_factor = factors[points.track_image_id]
+    numbers, inverse = np.unique(points.track_image_id, return_inverse=True)
+    unseen = (np.nan, np.nan)
+    factors = np.array([scale.get(int(n), unseen) for n in numbers], np.float64).reshape(-1, 2)
+    row_factor = factors[inverse]
     kept = ~np.isnan(row_factor[:, 0])
     owner = np.repeat(np.arange(len(points)), points.track_length)
     length = np.bincount(owner[kept], minlength=len(points))

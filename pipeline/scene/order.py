@@ -12,8 +12,9 @@ from pipeline.scene.names import stem_key
 
 # Slower than this between photographs, neighbours in time need not overlap.
 MAX_GAP_SECONDS = 10.0
-# Names that programs give to the frames of a video: frame_0001, video-12, 00042.
-_FRAME_PREFIX = re.compile(r"(^|/|frame|video|vid)[ _-]?$")
+# Names that programs give to the frames of a video: frame_0001, video-12. A bare number says
+# nothing: collections are numbered too.
+_FRAME_PREFIX = re.compile(r"(frame|video|vid)[ _-]?$")
 
 
 def why_ordered(photos: Sequence[Photo]) -> str | None:

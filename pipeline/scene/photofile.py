@@ -156,9 +156,7 @@ def _exif_facts(tags: Mapping[int, Any], width: int, height: int) -> dict[str, A
     focal_mm = _float(tags.get(_BASE.FocalLength))
     return {
         "orientation": orientation if orientation in range(1, 9) else 1,
-        "body": model
-        if model.casefold().startswith(make.casefold())
-        else f"{make} {model}".strip(),
+        "body": _body(make, model),
         "lens": _text(tags.get(_BASE.LensModel)),
         "focal_mm": focal_mm if _plausible(focal_mm) else None,
         "focal_px": focal_pixels(tags, width, height),

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Init
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import Points, View
+from pipeline.scene.views import scene_extent
 
 # The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient.
 SH_C0 = 0.28209479177387814
@@ -54,14 +55,6 @@ class InitGaussians:
     def arrays(self) -> dict[str, NDArray[np.float32]]:
         """The five arrays by name."""
         return {f.name: getattr(self, f.name) for f in fields(self)[:5]}
-
-
-def scene_extent(camera_centres: NDArray[np.float64]) -> float:
-    """The scene's size in the world's unit, as 3DGS defines it: 1.1 times the largest distance of
-    a camera's centre (C, 3) from their mean. One camera, or all in one place, give 1."""
-    offsets = camera_centres - camera_centres.mean(0)
-    extent = 1.1 * float(np.linalg.norm(offsets, axis=1).max())
-    return extent if extent > 0 else 1.0
 
 
 def gaussians_from_points(
@@ -128,7 +121,7 @@ def gaussians_random(
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
         xyz = centre + radius * np.cbrt(generator.random((count, 1))) * direction
     else:
-        xyz = _in_frustums(views, scene_extent(centres), count, generator)
+        xyz = _in_frustums(views, scene_extent(list(views)), count, generator)
     distance = _nearest_distance(xyz, centres)
     k = min(NEIGHBOURS, count - 1)
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else MAX_ANGLE * distance

@@ -67,8 +67,7 @@ class GradientDensity:
             assert gradients.means2d_abs is not None
             pull = gradients.means2d_abs
         # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
-        to_ndc = torch.tensor([0.5 * width, 0.5 * height])
-        self.gradient_sum += torch.linalg.vector_norm(pull * to_ndc, dim=1)
+        self.gradient_sum += torch.hypot(pull[:, 0] * (0.5 * width), pull[:, 1] * (0.5 * height))
         self.seen += forward.radii > 0
 
     def refine(

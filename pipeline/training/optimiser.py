@@ -59,9 +59,9 @@ class Adam:
                 threads,
             )
         # The constant coefficient shares the array and the moments but has a rate of its own.
-        first = self.first["sh"][:, 0] / (1 - BETA1**step)
-        second = self.second["sh"][:, 0] / (1 - BETA2**step)
-        gaussians.sh[:, 0] = dc_before - rates.sh0 * first / (second.sqrt() + EPSILON)
+        scale = self.second["sh"][:, 0].clone().div_(1 - BETA2**step).sqrt_().add_(EPSILON)
+        move = self.first["sh"][:, 0].clone().div_(scale)
+        gaussians.sh[:, 0] = dc_before.sub_(move, alpha=rates.sh0 / (1 - BETA1**step))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""

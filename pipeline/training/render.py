@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 import torch
@@ -15,8 +15,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.targets import reduced_size
 
 
-@dataclass(frozen=True)
-class Render:
+class Render(NamedTuple):
     """One picture.
 
     Attributes:

@@ -93,7 +93,7 @@ def train(
     Args:
         views: training views only.
         threads: of the native operators; torch itself runs on one, so that sums are the same.
-        extent: the scene's size in the world's unit (``splats.init.scene_extent``).
+        extent: the scene's size in the world's unit (``scene.views.scene_extent``).
         on_log: called with one line for each warning.
 
     Raises:

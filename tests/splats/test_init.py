@@ -16,7 +16,6 @@ from pipeline.splats.init import (
     InitGaussians,
     gaussians_from_points,
     gaussians_random,
-    scene_extent,
 )
 
 CENTRES = np.array([[0.0, 0.0, -5.0], [1.0, 0.0, -5.0], [0.0, 1.0, -5.0]])
@@ -143,8 +142,3 @@ def test_random_start_of_cameras_looking_ahead_lies_in_front_of_them() -> None:
     result = gaussians_random(views, Init(num_random=300), 0, seed=1)
     assert_whole(result)
     assert (result.means[:, 2] > 0).all()
-
-
-def test_extent_follows_the_cameras_and_is_never_zero() -> None:
-    assert scene_extent(np.array([[-1.0, 0, 0], [1.0, 0, 0]])) == pytest.approx(1.1)
-    assert scene_extent(np.zeros((3, 3))) == 1.0

@@ -13,8 +13,8 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float32]
 
-BANDS = 7
-WAVES_PER_BAND = 9
+BANDS = 6
+WAVES_PER_BAND = 8
 # The share of its colour range a texture spends: steeper makes patches with softer insides.
 STEEPNESS = 1.3
 
@@ -53,7 +53,7 @@ class Material:
         variance = 0.0
         for wavelength in np.geomspace(self.finest, self.coarsest, BANDS):
             # Amplitudes grow slowly with the wavelength, as in natural pictures.
-            amplitude = (wavelength / self.coarsest) ** 0.4
+            amplitude = (wavelength / self.coarsest) ** 0.3
             variance += amplitude**2 * WAVES_PER_BAND / 2
             directions = rng.normal(size=(WAVES_PER_BAND, 3))
             directions /= np.linalg.norm(directions, axis=1, keepdims=True)

@@ -1,0 +1,201 @@
+"""Line charts and histograms as SVG inside HTML: they take their colours from the page, so that
+they follow its light and dark dress, and the same data gives the same bytes."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.reporting.text import escape
+
+_WIDTH, _HEIGHT = 440, 250
+_LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 14, 40
+
+Label = Callable[[float], str]
+
+
+def short(value: float) -> str:
+    """A tick's label: 1500 -> 1.5k, 0.25 -> 0.25."""
+    for limit, unit in ((1e6, "M"), (1e3, "k")):
+        if abs(value) >= limit:
+            return f"{value / limit:.4g}{unit}"
+    return f"{value:.4g}"
+
+
+def clock(seconds: float) -> str:
+    """A tick's label for a time: 90 -> 1:30, 5400 -> 1:30:00."""
+    whole = round(seconds)
+    if whole >= 3600:
+        return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    return f"{whole // 60}:{whole % 60:02d}"
+
+
+def linear_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Round numbers within [low, high], at most ``most`` of them."""
+    span = high - low
+    step = 10.0 ** math.floor(math.log10(span / most))
+    while span / step > most - 1:
+        step *= 2.5 if _leading(step) == 2 else 2
+    first = math.ceil(low / step - 1e-9)
+    return [i * step for i in range(first, math.floor(high / step + 1e-9) + 1)]
+
+
+def time_ticks(low: float, high: float, most: int = 6) -> list[float]:
+    """Round times in seconds within [low, high]."""
+    for step in (1, 2, 5, 10, 15, 30, 60, 120, 300, 600, 900, 1800):
+        if (high - low) / step <= most - 1:
+            break
+    else:
+        step = 3600 * math.ceil((high - low) / 3600 / (most - 1))
+    return [float(t) for t in range(math.ceil(low / step) * step, math.floor(high) + 1, step)]
+
+
+def log_ticks(low: float, high: float) -> list[float]:
+    """1, 2 and 5 of every decade (only the decades over more than three of them)."""
+    first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
+    digits = (1, 2, 5) if last - first <= 3 else (1,)
+    ticks = [d * 10.0**e for e in range(first, last + 1) for d in digits]
+    return [t for t in ticks if low * (1 - 1e-9) <= t <= high * (1 + 1e-9)]
+
+
+def _leading(value: float) -> int:
+    return round(value / 10.0 ** math.floor(math.log10(value) + 1e-9))
+
+
+def line_chart(
+    xs: Sequence[float],
+    ys: Sequence[float],
+    *,
+    title: str,
+    x_title: str,
+    y_label: Label,
+    timed: bool = False,
+    log: bool = False,
+) -> str:
+    """A line through the points, each with its values as a tooltip.
+
+    Args:
+        xs, ys: finite, at least one point.
+        y_label: how a y value reads in a tooltip.
+        timed: x is seconds.
+        log: logarithmic y axis, where all values are positive.
+    """
+    log = log and min(ys) > 0
+    x_low, x_high = _range(min(xs), max(xs), pad=0.0)
+    y_low, y_high = (min(ys), max(ys)) if log else _range(min(ys), max(ys), pad=0.06)
+    if log and y_high < 1.05 * y_low:
+        y_low, y_high = y_low / 1.05, y_high * 1.05
+    across = _scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT)
+    up = _scale(y_low, y_high, _HEIGHT - _BOTTOM, _TOP, log=log)
+    x_label: Label = clock if timed else short
+    x_ticks = time_ticks(x_low, x_high) if timed else linear_ticks(x_low, x_high)
+    y_ticks = log_ticks(y_low, y_high) if log else linear_ticks(y_low, y_high, 5)
+    if len(y_ticks) < 2:
+        y_ticks = linear_ticks(y_low, y_high, 5)
+    spots = [(across(x), up(y)) for x, y in zip(xs, ys, strict=True)]
+    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in spots)
+    base = _HEIGHT - _BOTTOM
+    area = f"{spots[0][0]:.1f},{base} {path} {spots[-1][0]:.1f},{base}"
+    dots = "".join(
+        f'<circle class="dot" cx="{sx:.1f}" cy="{sy:.1f}" r="5"><title>'
+        f"{escape(x_title)} {escape(clock(x) if timed else f'{x:,.0f}')}: {escape(y_label(y))}"
+        "</title></circle>"
+        for (sx, sy), x, y in zip(spots, xs, ys, strict=True)
+    )
+    marks = f'<polygon class="area" points="{area}"/><polyline class="line" points="{path}"/>'
+    axes = _axes([(across(t), x_label(t)) for t in x_ticks], [(up(t), short(t)) for t in y_ticks])
+    return _svg(title, x_title, axes + marks + dots)
+
+
+def histogram(
+    values: NDArray[Any], *, title: str, x_title: str, whole: bool = False, bins: int = 40
+) -> str:
+    """Counts of the values; those above the 99th percentile stand in the last bar.
+
+    Args:
+        values: finite, at least one.
+        whole: one bar a whole number (or several, where there are more than ``bins``).
+    """
+    top = float(np.percentile(values, 99))
+    if whole:
+        low = math.floor(values.min())
+        width = max(math.ceil((math.ceil(top) - low + 1) / bins), 1)
+        edges = np.arange(low, math.ceil(top) + width + 1, width, dtype=np.float64)
+    else:
+        low, high = _range(float(values.min()), top, pad=0.0)
+        edges = np.linspace(low, high, bins + 1)
+    counts, _ = np.histogram(np.minimum(values, (edges[-2] + edges[-1]) / 2), edges)
+    over = bool(values.max() > edges[-1])
+    across = _scale(float(edges[0]), float(edges[-1]), _LEFT, _WIDTH - _RIGHT)
+    up = _scale(0.0, float(counts.max()) * 1.04, _HEIGHT - _BOTTOM, _TOP)
+    bars = []
+    for i, n in enumerate(counts):
+        x, right = across(edges[i]) + 0.5, across(edges[i + 1]) - 0.5
+        last = over and i == len(counts) - 1
+        if whole:
+            name = short(edges[i]) if edges[i + 1] - edges[i] == 1 else ""
+            name = name or f"{short(edges[i])} to {short(edges[i + 1] - 1)}"
+        else:
+            name = f"{short(edges[i])} to {short(edges[i + 1])}"
+        name = f"{short(edges[i])} or more" if last else name
+        bars.append(
+            f'<rect class="bar" x="{x:.1f}" y="{up(n):.1f}" width="{max(right - x, 0.5):.1f}" '
+            f'height="{_HEIGHT - _BOTTOM - up(n):.1f}"><title>{name}: {n:,}</title></rect>'
+        )
+    ticks = linear_ticks(float(edges[0]), float(edges[-1]))
+    half = 0.5 if whole and edges[1] - edges[0] == 1 else 0.0  # a number names its bar's middle
+    ticks = [t for t in ticks if t == round(t) and t < edges[-1]] if whole else ticks
+    median = float(np.median(values))
+    at = across(min(median + half, float(edges[-1])))
+    line = (
+        f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}"/>'
+    )
+    y_ticks = [t for t in linear_ticks(0.0, float(counts.max()) * 1.04, 5) if t == round(t)]
+    axes = _axes(
+        [(across(t + half), short(t)) for t in ticks], [(up(t), short(t)) for t in y_ticks]
+    )
+    return _svg(title, x_title, axes + "".join(bars) + line)
+
+
+def _range(low: float, high: float, pad: float) -> tuple[float, float]:
+    """With some room; never empty."""
+    span = high - low
+    if span <= 1e-9 * max(abs(low), abs(high), 1e-9):
+        span = max(abs(high), 1.0)
+        return low - span / 2, high + span / 2
+    return low - pad * span, high + pad * span
+
+
+def _scale(
+    low: float, high: float, start: float, stop: float, *, log: bool = False
+) -> Callable[[float], float]:
+    if log:
+        linear = _scale(math.log(low), math.log(high), start, stop)
+        return lambda value: linear(math.log(value))
+    return lambda value: start + (value - low) / (high - low) * (stop - start)
+
+
+def _axes(xs: list[tuple[float, str]], ys: list[tuple[float, str]]) -> str:
+    base, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
+    parts = []
+    for y, label in ys:
+        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
+        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
+    parts.append(f'<line class="axis" x1="{_LEFT}" x2="{right}" y1="{base}" y2="{base}"/>')
+    for x, label in xs:
+        parts.append(f'<text x="{x:.1f}" y="{base + 17}" text-anchor="middle">{label}</text>')
+    return "".join(parts)
+
+
+def _svg(title: str, x_title: str, inside: str) -> str:
+    middle = (_LEFT + _WIDTH - _RIGHT) / 2
+    return (
+        f'<figure class="chart"><figcaption>{escape(title)}</figcaption>'
+        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">{inside}'
+        f'<text class="name" x="{middle}" y="{_HEIGHT - 5}" text-anchor="middle">'
+        f"{escape(x_title)}</text></svg></figure>"
+    )

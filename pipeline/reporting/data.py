@@ -1,0 +1,98 @@
+"""What the report page shows."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """A held-out view beside its photograph, both on the stored pixel grid.
+
+    Attributes:
+        label: which of the views it is.
+        name: the photograph's name.
+        photograph, render: (H, W, 3) uint8.
+        mask: (H, W), zero pixels counted for nothing; or None.
+        psnr, ssim: of this view.
+        orientation: EXIF orientation, 1 to 8; turns the pictures for display only.
+    """
+
+    label: Literal["worst", "low", "median", "high", "best"]
+    name: str
+    photograph: NDArray[np.uint8]
+    render: NDArray[np.uint8]
+    mask: NDArray[Any] | None
+    psnr: float
+    ssim: float
+    orientation: int = 1
+
+
+def _empty(*shape: int) -> NDArray[np.float64]:
+    return np.zeros(shape)
+
+
+@dataclass(frozen=True)
+class ReportData:
+    """One scene. What is empty is left out of the page, which says so.
+
+    Attributes:
+        scene: its name.
+        metrics: the content of ``metrics.json``.
+        plan: the content of ``plan.json``; ``stages`` maps a name to ``run`` and ``reason``.
+        decisions: stage -> what it decided, as recorded in its ``stage.json``.
+        curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, where it
+            is known, ``seconds`` since the start of training; a missing or null value is a gap.
+        comparisons: pictures to show, worst first.
+        camera_centres: (C, 3) world. camera_rotations: (C, 3, 3) world to camera.
+        camera_names, camera_is_test: C each.
+        points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
+        reprojection_errors: pixels, one a sparse point. track_lengths: images, one a point.
+    """
+
+    scene: str
+    metrics: Mapping[str, Any]
+    plan: Mapping[str, Any] = field(default_factory=dict)
+    decisions: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    curve: Sequence[Mapping[str, float | None]] = ()
+    comparisons: Sequence[Comparison] = ()
+    camera_centres: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
+    camera_rotations: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3, 3))
+    camera_names: Sequence[str] = ()
+    camera_is_test: Sequence[bool] = ()
+    points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
+    points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
+    reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))
+    track_lengths: NDArray[Any] = field(default_factory=lambda: _empty(0))
+
+
+def ranked(
+    per_view: Sequence[Mapping[str, Any]], count: int
+) -> list[tuple[Literal["worst", "low", "median", "high", "best"], Mapping[str, Any]]]:
+    """``count`` of the views' measurements from the worst PSNR to the best, evenly over the ranks,
+    each with its label; fewer where there are fewer views."""
+    ordered = sorted(per_view, key=lambda view: (view["psnr"], view["name"]))
+    count = min(count, len(ordered))
+    if count == 1:
+        return [("median", ordered[len(ordered) // 2])]
+    chosen: list[tuple[Literal["worst", "low", "median", "high", "best"], Mapping[str, Any]]] = []
+    for i in range(count):
+        share = i / (count - 1)
+        label: Literal["worst", "low", "median", "high", "best"] = (
+            "worst"
+            if i == 0
+            else "best"
+            if i == count - 1
+            else "median"
+            if share == 0.5
+            else "low"
+            if share < 0.5
+            else "high"
+        )
+        chosen.append((label, ordered[round(share * (len(ordered) - 1))]))
+    return chosen

@@ -1,0 +1,285 @@
+"""The report: one HTML file a scene that opens anywhere, without a network.
+
+Everything is inside it: style, script, pictures. A content security policy forbids the browser
+to ask for anything else. The same data gives the same bytes.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.reporting.charts import histogram, line_chart
+from pipeline.reporting.cloud import cloud
+from pipeline.reporting.data import Comparison, ReportData
+from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
+from pipeline.reporting.script import JS
+from pipeline.reporting.style import CSS
+from pipeline.reporting.tables import definitions, per_view_table, stages_table
+from pipeline.reporting.text import count, duration, escape, fixed
+from pipeline.runtime.atomic import write_text
+
+_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+
+
+def write_report(data: ReportData, path: Path) -> None:
+    """Write the page to ``path``, whole or not at all."""
+    write_text(path, report_html(data))
+
+
+def report_html(data: ReportData) -> str:
+    """The page as a string."""
+    sections = [
+        ("pictures", "Photograph and render", _pictures(data.comparisons)),
+        ("training", "Training", _curves(data)),
+        ("geometry", "Cameras and points", _space(data)),
+        ("reconstruction", "Reconstruction", _reconstruction(data)),
+        ("views", "Every view", per_view_table(data.metrics.get("per_view") or [])),
+        ("stages", "Stages", stages_table(data.metrics.get("stages") or {})),
+        ("how", "Decisions and protocol", _how(data)),
+    ]
+    links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in sections)
+    body = "".join(
+        f'<section id="{key}"><h2>{title}</h2>{inside}</section>' for key, title, inside in sections
+    )
+    scene = escape(data.scene)
+    return (
+        '<!DOCTYPE html>\n<html lang="en"><head><meta charset="utf-8">'
+        f'<meta http-equiv="Content-Security-Policy" content="{_POLICY}">'
+        '<meta name="viewport" content="width=device-width, initial-scale=1">'
+        f'<link rel="icon" href="data:,"><title>{scene} \u00b7 splatmake</title>'
+        f"<style>{CSS}</style></head>\n<body>"
+        f'<div class="top"><h1>{scene}</h1><p class="lead">{_lead(data)}</p>'
+        f"<nav>{links}</nav>{_cards(data)}</div>\n<main>{_warnings(data)}{body}</main>"
+        '<div class="foot">Made by splatmake. This page needs no network.</div>'
+        f"<script>{JS}</script></body></html>\n"
+    )
+
+
+def _lead(data: ReportData) -> str:
+    protocol = data.metrics.get("protocol") or {}
+    resolution = protocol.get("resolution")
+    sizes = [resolution] if isinstance(resolution, str) else list(resolution or [])
+    views = len(data.metrics.get("per_view") or [])
+    parts = [f"Measured on {count(views)} {'view' if views == 1 else 'views'}"]
+    if sizes:
+        parts.append(str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}")
+    if protocol.get("split"):
+        parts.append(str(protocol["split"]))
+    return escape(" \u00b7 ".join(parts))
+
+
+def _cards(data: ReportData) -> str:
+    m = data.metrics
+    stages = (m.get("stages") or {}).values()
+    lpips = m.get("lpips")
+    protocol = m.get("protocol") or {}
+    registered, total = m.get("registered_images"), m.get("total_images")
+    whole = f'<span class="unit"> / {count(total)}</span>' if total is not None else ""
+    ran = [s for s in stages if not s.get("skipped")]
+    cpu, rss = sum(s["cpu_s"] for s in ran), max((s["peak_rss_mb"] for s in ran), default=0.0)
+    cards = [
+        (
+            "first",
+            "PSNR",
+            f'{fixed(m.get("psnr"), 2)}<span class="unit"> dB</span>',
+            "mean of the views",
+        ),
+        ("first", "SSIM", fixed(m.get("ssim"), 4), protocol.get("ssim", "")),
+        (
+            "first",
+            "LPIPS",
+            fixed(lpips, 4),
+            protocol.get("lpips", "") if lpips is not None else m.get("lpips_reason") or "",
+        ),
+        ("", "Gaussians", count(m.get("num_gaussians")), ""),
+        ("", "Images registered", f"{count(registered)}{whole}", ""),
+        (
+            "",
+            "Time",
+            duration(sum(s["wall_s"] for s in ran)),
+            f"CPU {duration(cpu)}, peak memory {count(rss)} MB",
+        ),
+    ]
+    if m.get("reprojection_error_px") is not None:
+        value = f'{fixed(m["reprojection_error_px"], 3)}<span class="unit"> px</span>'
+        cards.append(("", "Reprojection error", value, "mean of the sparse points"))
+    pose = m.get("pose_error")
+    if pose:
+        value = f'{fixed(pose.get("rotation_median_deg"), 4)}<span class="unit">\u00b0</span>'
+        centre = pose.get("centre_median")
+        note = "" if centre is None else f"median centre error {centre:.4g} (truth's unit)"
+        cards.append(("", "Rotation error, median", value, note))
+    rows = []
+    for row in ("first", ""):
+        inside = "".join(
+            f'<div class="card {kind}"><div class="name">{name}</div>'
+            f'<div class="value">{value}</div><div class="note">{escape(note)}</div></div>'
+            for kind, name, value, note in cards
+            if kind == row
+        )
+        rows.append(f'<div class="cards">{inside}</div>')
+    return "".join(rows)
+
+
+def _warnings(data: ReportData) -> str:
+    both = [*(data.metrics.get("warnings") or []), *(data.plan.get("warnings") or [])]
+    texts = list(dict.fromkeys(str(text) for text in both))
+    if not texts:
+        return '<div class="calm">No warnings</div>'
+    items = "".join(f"<li>{escape(text)}</li>" for text in texts)
+    title = "1 warning" if len(texts) == 1 else f"{len(texts)} warnings"
+    return f'<div class="warnings" role="note"><h2>{title}</h2><ul>{items}</ul></div>'
+
+
+def _nothing(what: str) -> str:
+    return f'<p class="hint">{what}</p>'
+
+
+def _choice(target: str, toggle: str, off: str, on: str) -> str:
+    """Two radio buttons that put the class ``toggle`` on the element ``target``, or take it."""
+    buttons = "".join(
+        f'<label><input type="radio" name="{toggle}" value="{value}" data-toggle="{toggle}" '
+        f'data-target="{target}"{" checked" if value == "off" else ""}>{text}</label>'
+        for value, text in (("off", off), ("on", on))
+    )
+    return f'<div class="choice" role="radiogroup">{buttons}</div>'
+
+
+def _pictures(views: Iterable[Comparison]) -> str:
+    views = list(views)
+    if not views:
+        return _nothing("No picture was kept for comparison.")
+    grey = "<b></b>masked" if any(v.mask is not None for v in views) else ""
+    parts = [
+        '<div class="bar-top">'
+        + _choice("pictures", "sliding", "Side by side", "Slider")
+        + f'<div class="scale">error 0<i style="background: {scale_gradient()}"></i>'
+        f"{ERROR_SCALE:g} of full range or more{grey}</div></div>"
+    ]
+    for view, row in zip(views, page_pictures(views), strict=True):
+        name = escape(view.name)
+        figures = "".join(
+            f'<figure class="{kind}"><img src="{uri}" width="{width}" height="{height}" '
+            f'alt="{kind} {name}"><figcaption>{kind}</figcaption></figure>'
+            for kind, (uri, width, height) in zip(
+                ("photograph", "render", "error"), row, strict=True
+            )
+        )
+        tall = " tall" if row[0][2] > row[0][1] else ""
+        parts.append(
+            f'<article class="view"><header><span class="badge {view.label}">{view.label}</span>'
+            f"<h3>{name}</h3><span>PSNR {fixed(view.psnr, 2)} dB \u00b7 SSIM "
+            f'{fixed(view.ssim, 4)}</span></header><div class="triple{tall}">{figures}'
+            '<input type="range" min="0" max="100" value="50" step="0.5" '
+            f'aria-label="photograph or render of {name}"><div class="divider"></div>'
+            "</div></article>"
+        )
+    return "".join(parts)
+
+
+def _curves(data: ReportData) -> str:
+    kinds: list[tuple[str, str, Callable[[float], str], bool]] = [
+        ("loss", "Loss", lambda v: f"{v:.4g}", True),
+        ("psnr", "PSNR on training views, dB", lambda v: f"{v:.2f} dB", False),
+        ("num_gaussians", "Gaussians", lambda v: f"{v:,.0f}", False),
+    ]
+
+    def charts(x_key: str, x_title: str) -> str:
+        parts = []
+        for key, title, label, log in kinds:
+            pairs = [(r.get(x_key), r.get(key)) for r in data.curve]
+            spots = [
+                (float(x), float(y))
+                for x, y in pairs
+                if x is not None and y is not None and np.isfinite(x) and np.isfinite(y)
+            ]
+            if spots:
+                xs, ys = zip(*spots, strict=True)
+                timed = x_key == "seconds"
+                parts.append(
+                    line_chart(
+                        xs, ys, title=title, x_title=x_title, y_label=label, timed=timed, log=log
+                    )
+                )
+        return "".join(parts)
+
+    by_step, by_time = charts("step", "step"), charts("seconds", "time")
+    if not by_step:
+        return _nothing("No curve was recorded.")
+    if not by_time:
+        return f'<div class="charts">{by_step}</div>'
+    return (
+        f'<div class="bar-top">{_choice("training", "timed", "By step", "By time")}</div>'
+        f'<div class="charts by-step">{by_step}</div><div class="charts by-time">{by_time}</div>'
+    )
+
+
+def _space(data: ReportData) -> str:
+    if not len(data.camera_centres) and not len(data.points_xyz):
+        return _nothing("There are no cameras and no points.")
+    test = sum(bool(t) for t in data.camera_is_test)
+    train = len(data.camera_centres) - test
+    return (
+        '<p class="hint">Drag to turn, shift and drag to move, double click to reset; click it '
+        "first to zoom with the wheel. Point at a camera for its name.</p>"
+        '<div id="space"><canvas tabindex="0" aria-label="cameras and sparse points"></canvas>'
+        "<output></output></div>"
+        f'<div class="keys"><span><i style="background: var(--train)"></i>{count(train)} training '
+        f'cameras</span><span><i style="background: var(--test)"></i>{count(test)} held-out '
+        f"cameras</span><span>{count(len(data.points_xyz))} sparse points</span></div>"
+        f'<script type="application/json" id="cloud">{_json(cloud(data))}</script>'
+    )
+
+
+def _reconstruction(data: ReportData) -> str:
+    parts = []
+    errors = np.asarray(data.reprojection_errors, np.float64)
+    errors = errors[np.isfinite(errors) & (errors >= 0)]  # -1 where unknown
+    lengths = np.asarray(data.track_lengths, np.float64)
+    if len(errors):
+        title = f"Reprojection error of points (median {np.median(errors):.3f} px)"
+        parts.append(histogram(errors, title=title, x_title="pixels"))
+    if len(lengths):
+        title = f"Track length (mean {lengths.mean():.2f} images)"
+        parts.append(histogram(lengths, title=title, x_title="images that see a point", whole=True))
+    out = f'<div class="charts">{"".join(parts)}</div>' if parts else ""
+    pose = data.metrics.get("pose_error")
+    if pose:
+        out += "<h3>Poses against the truth</h3>" + definitions(pose)
+    return out or _nothing("Nothing is known of points and tracks, and there is no true pose.")
+
+
+def _how(data: ReportData) -> str:
+    m = data.metrics
+    decided = {s: texts for s, texts in data.decisions.items() if texts}
+    if decided:
+        rows = "".join(
+            f"<dt>{escape(stage)}</dt><dd>{'<br>'.join(escape(t) for t in texts)}</dd>"
+            for stage, texts in decided.items()
+        )
+        decisions = f"<dl>{rows}</dl>"
+    else:
+        decisions = _nothing("No decision was recorded.")
+    return (
+        f'<div class="columns"><div><h3>Decisions</h3>{decisions}</div>'
+        f"<div><h3>Protocol</h3>{definitions(m.get('protocol') or {})}"
+        f"<h3>Versions</h3>"
+        f"{definitions({**(m.get('versions') or {}), 'seed': m.get('seed')})}</div></div>"
+        + _raw("metrics.json", m)
+        + _raw("plan.json", data.plan)
+    )
+
+
+def _raw(name: str, value: Mapping[str, Any]) -> str:
+    text = json.dumps(value, indent=2, ensure_ascii=False)
+    return f"<details><summary>{name}</summary><pre>{escape(text)}</pre></details>"
+
+
+def _json(value: Any) -> str:
+    """JSON that cannot end the script element it stands in."""
+    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,0 +1,162 @@
+"""Pictures for pages: error maps, display orientation, JPEG inside HTML, a montage."""
+
+from __future__ import annotations
+
+import base64
+import io
+from collections.abc import Sequence
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.reporting.data import Comparison
+from pipeline.runtime.atomic import write_bytes
+
+Picture = NDArray[np.uint8]
+
+ERROR_SCALE = 0.2
+"""Absolute error, of a range of 1, shown in the brightest colour; larger ones look the same.
+The scale is fixed, so that maps of different views and scenes can be compared."""
+
+MASKED_GREY = 128
+
+_COLOURMAP = "inferno"
+_PAGE_SIDE = 900
+_JPEG_QUALITY = 86
+# Bytes of JPEG in one page; base64 makes a third more of them.
+_PAGE_BUDGET = 3_300_000
+
+
+def error_map(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None) -> Picture:
+    """Absolute error, averaged over channels, in a perceptually uniform colour map.
+
+    Args:
+        image, reference: (H, W, 3), both uint8 or both floats in [0, 1].
+        mask: (H, W), zero pixels are painted grey; or None.
+
+    Returns:
+        (H, W, 3) uint8; black is no error, the brightest yellow ``ERROR_SCALE`` or more.
+    """
+    top = 255.0 if image.dtype == np.uint8 else 1.0
+    error = np.abs(image.astype(np.float64) - reference).mean(axis=2) / top
+    colours = _colours()
+    index = np.rint(np.clip(error / ERROR_SCALE, 0, 1) * (len(colours) - 1)).astype(np.intp)
+    picture = colours[index]
+    if mask is not None:
+        picture[mask == 0] = MASKED_GREY
+    return picture
+
+
+@cache
+def _colours() -> Picture:
+    from matplotlib import colormaps
+
+    return np.rint(colormaps[_COLOURMAP](np.arange(256))[:, :3] * 255).astype(np.uint8)
+
+
+def scale_gradient() -> str:
+    """The error map's colours as a CSS gradient, left to right."""
+    stops = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _colours()[:: 255 // 15]]
+    return f"linear-gradient(to right, {', '.join(stops)})"
+
+
+def upright(picture: Picture, orientation: int) -> Picture:
+    """The picture as EXIF says it is to be looked at; unknown values leave it as it is."""
+    if orientation >= 5:
+        picture = picture.swapaxes(0, 1)  # 5: transposed; 6, 7, 8: that, and then flipped
+    flip_vertically, flip_horizontally = {
+        2: (False, True),
+        3: (True, True),
+        4: (True, False),
+        6: (False, True),
+        7: (True, True),
+        8: (True, False),
+    }.get(orientation, (False, False))
+    rows = slice(None, None, -1 if flip_vertically else 1)
+    columns = slice(None, None, -1 if flip_horizontally else 1)
+    return np.ascontiguousarray(picture[rows, columns])
+
+
+def triple(view: Comparison) -> tuple[Picture, Picture, Picture]:
+    """Photograph, render and error map, turned for display."""
+    error = error_map(view.render, view.photograph, view.mask)
+    photograph, render, error = (
+        upright(p, view.orientation) for p in (view.photograph, view.render, error)
+    )
+    return photograph, render, error
+
+
+def shrunk(picture: Picture, max_side: int) -> Picture:
+    """Reduced, by area, so that no side is longer than ``max_side`` pixels."""
+    height, width = picture.shape[:2]
+    scale = max_side / max(height, width)
+    if scale >= 1:
+        return picture
+    size = (max(round(width * scale), 1), max(round(height * scale), 1))
+    return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
+
+
+def page_pictures(views: Sequence[Comparison]) -> list[list[tuple[str, int, int]]]:
+    """The triples of all views for one page, within a budget of bytes.
+
+    Returns:
+        For each view its photograph, render and error map as (data URI, width, height).
+    """
+    triples = [triple(view) for view in views]
+    side = _PAGE_SIDE
+    while True:
+        small = [[shrunk(picture, side) for picture in pictures] for pictures in triples]
+        encoded = [[_jpeg(picture) for picture in pictures] for pictures in small]
+        if sum(len(data) for row in encoded for data in row) <= _PAGE_BUDGET or side <= 100:
+            break
+        side = side * 4 // 5
+    return [
+        [
+            (_data_uri(data), picture.shape[1], picture.shape[0])
+            for data, picture in zip(row, pictures, strict=True)
+        ]
+        for row, pictures in zip(encoded, small, strict=True)
+    ]
+
+
+def _jpeg(picture: Picture) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
+    return buffer.getvalue()
+
+
+def _data_uri(jpeg: bytes) -> str:
+    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+
+
+def montage(views: Sequence[Comparison], *, max_side: int = 480, gap: int = 8) -> Picture:
+    """Photograph | render | error map, a row a view, on white.
+
+    Args:
+        max_side: longest side of a single picture, in pixels.
+        gap: white pixels between pictures.
+    """
+    rows = [[shrunk(picture, max_side) for picture in triple(view)] for view in views]
+    widths = [3 * row[0].shape[1] + 2 * gap for row in rows]
+    height = sum(row[0].shape[0] for row in rows) + gap * (len(rows) - 1)
+    canvas = np.full((height, max(widths), 3), 255, np.uint8)
+    y = 0
+    for row, width in zip(rows, widths, strict=True):
+        x = (canvas.shape[1] - width) // 2
+        for picture in row:
+            h, w = picture.shape[:2]
+            canvas[y : y + h, x : x + w] = picture
+            x += w + gap
+        y += row[0].shape[0] + gap
+    return canvas
+
+
+def write_montage(views: Sequence[Comparison], path: Path, *, max_side: int = 480) -> None:
+    """Write ``montage`` as PNG, whole or not at all."""
+    buffer = io.BytesIO()
+    Image.fromarray(montage(views, max_side=max_side)).save(buffer, "PNG", optimize=True)
+    write_bytes(path, buffer.getvalue())

@@ -1,0 +1,102 @@
+"""Tables and lists of the report page."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+from pipeline.reporting.text import MISSING, count, duration, escape, fixed, plain
+
+# Measures of a view: name -> (heading, decimals).
+_MEASURES = {"psnr": ("PSNR, dB", 2), "ssim": ("SSIM", 4), "lpips": ("LPIPS", 4)}
+
+_NAMES = {
+    "rotation_median_deg": "rotation error, median, degrees",
+    "rotation_mean_deg": "rotation error, mean, degrees",
+    "centre_median": "centre error, median, truth's unit",
+    "centre_mean": "centre error, mean, truth's unit",
+    "centre_relative_median": "centre error, median, share of the radius",
+    "radius": "radius of the cameras, truth's unit",
+    "scale": "truth's units in one unit of the model",
+    "auc": "AUC of relative poses (degrees: share)",
+    "num_common": "cameras compared",
+    "num_truth": "true cameras",
+}
+
+
+def definitions(values: Mapping[str, Any]) -> str:
+    """Names and values; known names are spelled out."""
+    if not values:
+        return f'<p class="hint">{MISSING}</p>'
+    rows = "".join(
+        f"<dt>{escape(_NAMES.get(name, name.replace('_', ' ')))}</dt><dd>{escape(plain(v))}</dd>"
+        for name, v in values.items()
+    )
+    return f"<dl>{rows}</dl>"
+
+
+def per_view_table(per_view: Sequence[Mapping[str, Any]]) -> str:
+    """Sortable; a measure that no view has is left out."""
+    if not per_view:
+        return '<p class="hint">No view was measured.</p>'
+    known = [key for key in _MEASURES if any(view.get(key) is not None for view in per_view)]
+    heads = "".join(
+        f'<th class="number" scope="col"><button>{_MEASURES[key][0]}</button></th>' for key in known
+    )
+    spans = {key: _span([view.get(key) for view in per_view]) for key in known}
+    rows = []
+    for view in per_view:
+        name = escape(view["name"])
+        cells = [f'<td class="name" data-value="{name}">{name}</td>']
+        for key in known:
+            value = view.get(key)
+            sort = "" if value is None else repr(float(value))
+            bar = "" if value is None else _bar(value, *spans[key])
+            cells.append(
+                f'<td class="number" data-value="{sort}">{fixed(value, _MEASURES[key][1])}'
+                f"{bar}</td>"
+            )
+        rows.append(f"<tr>{''.join(cells)}</tr>")
+    return (
+        '<div class="table"><table><thead><tr><th scope="col"><button>View</button></th>'
+        f"{heads}</tr></thead><tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
+    """Time and memory of what ran, the reason of what did not."""
+    if not stages:
+        return '<p class="hint">No stage was recorded.</p>'
+    longest = max((s["wall_s"] for s in stages.values()), default=0.0)
+    rows = []
+    for name, stage in stages.items():
+        reason = escape(stage.get("reason") or "")
+        if stage.get("skipped"):
+            cells = '<td><span class="pill">skipped</span></td>' + 3 * '<td class="number">-</td>'
+            rows.append(f'<tr class="skipped"><td>{escape(name)}</td>{cells}<td>{reason}</td></tr>')
+            continue
+        rows.append(
+            f'<tr><td>{escape(name)}</td><td><span class="pill run">run</span></td>'
+            f'<td class="number">{duration(stage["wall_s"])}{_bar(stage["wall_s"], 0.0, longest)}'
+            f'</td><td class="number">{duration(stage["cpu_s"])}</td>'
+            f'<td class="number">{count(stage["peak_rss_mb"])} MB</td><td>{reason}</td></tr>'
+        )
+    heads = '<th scope="col">Stage</th><th scope="col"></th>' + "".join(
+        f'<th class="number" scope="col">{name}</th>' for name in ("Wall time", "CPU", "Memory")
+    )
+    return (
+        f'<div class="table"><table><thead><tr>{heads}<th scope="col">Why</th></tr></thead>'
+        f"<tbody>{''.join(rows)}</tbody></table></div>"
+    )
+
+
+def _span(values: Sequence[float | None]) -> tuple[float, float]:
+    found = [v for v in values if v is not None and math.isfinite(v)]
+    low, high = min(found, default=0.0), max(found, default=1.0)
+    return low - 0.12 * (high - low), high  # the smallest keeps a visible bar
+
+
+def _bar(value: float, low: float, high: float) -> str:
+    share = (value - low) / (high - low) if high > low else 1.0
+    return f'<meter-bar><i style="width: {100 * min(max(share, 0.0), 1.0):.0f}%"></i></meter-bar>'

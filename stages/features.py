@@ -12,9 +12,7 @@ def run(job: Job) -> None:
     report = extract_features(
         manifest, job.section(Features), job.out, cache=job.shared_cache, threads=job.threads
     )
-    for text in report.warnings:
-        job.warn(text)
-    job.counters = {"features": report.counts}
+    job.record(report)
 
 
 if __name__ == "__main__":

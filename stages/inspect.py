@@ -10,29 +10,29 @@ from pipeline.config.schema import Config, Inspect, Views
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.given import load_given
-from pipeline.scene.scan import scan, verify_photos
+from pipeline.scene.scan import scan
+from pipeline.scene.verify import verify_photos
 from stages.command import main
 
 
 def run(job: Job) -> None:
     config = Config(poses=job.key["poses"], inspect=job.section(Inspect), views=job.section(Views))
-    found = scan(
-        Path(job.key["folder"]), job.scene, config, cache=job.scratch.parents[1] / "scan.json"
-    )
+    cache = job.out.parents[2] / "scan.json"
+    found = scan(Path(job.key["folder"]), job.scene, config, cache=cache)
     for text in found.warnings:
         job.warn(text)
     manifest, warnings = verify_photos(
-        found.manifest, threads=job.threads, min_images=config.inspect.min_images
+        found.manifest, threads=job.threads, min_photos=config.inspect.min_images
     )
     for text in warnings:
         job.warn(text)
     manifest.write(job.out / "images.json")
     job.counters = {
         "photos": len(manifest.photos),
-        "left_out": len(found.manifest.photos) - len(manifest.photos),
+        "left_out": len(found.listed) - len(manifest.photos),
     }
-    if found.poses is not None and config.poses == "auto":
-        given = load_given(found, manifest)
+    if found.poses is not None:
+        given = load_given(found.model_copy(update={"manifest": manifest}))
         write_model(job.out / "sparse" / "0", given)
         job.counters |= {"given_poses": len(given.images), "given_points": len(given.points)}
     if found.truth is not None:

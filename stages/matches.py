@@ -18,9 +18,7 @@ def run(job: Job) -> None:
         threads=job.threads,
         seed=job.seed,
     )
-    for text in report.warnings:
-        job.warn(text)
-    job.counters = report.counters
+    job.record(report)
 
 
 if __name__ == "__main__":

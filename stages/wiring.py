@@ -13,20 +13,6 @@ from pipeline.runtime.job import canonical
 from pipeline.runtime.source import stage_source_hash
 from pipeline.scene.plan import Plan
 
-STAGES = (
-    "inspect",
-    "decode",
-    "features",
-    "matches",
-    "sfm",
-    "undistort",
-    "init",
-    "train",
-    "evaluate",
-    "export",
-    "report",
-)
-
 _PHOTOS = ("decode", "inspect")
 _VIEWS = ("undistort", "decode", "inspect")
 _POSES = ("sfm", "inspect")
@@ -92,7 +78,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 def upstream(stage: str, plan: Plan) -> dict[str, str]:
     """Role -> the stage that fills it, for a scene with this plan."""
     return {
-        role: next(s for s in candidates if plan.stages[s].run)
+        role: next(name for name in candidates if plan.runs(name))
         for role, candidates in ROLES[stage].items()
     }
 

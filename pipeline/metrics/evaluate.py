@@ -17,19 +17,28 @@ from pipeline.metrics.lpips import lpips_available
 from pipeline.photos.load import ViewPixels, load_view
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View
+from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import render_view
+from pipeline.training.render import near_plane, render_view
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
 class Protocol:
-    """How quality was measured; the same for every view of a scene."""
+    """How quality was measured; the same for every view of a scene.
+
+    Attributes:
+        views: those measured on.
+        held_out: training never saw them.
+        background: RGB in [0, 1] behind renders and transparent photographs.
+        near: near plane of the renders, as in training; world unit.
+    """
 
     views: list[View]
     held_out: bool
     background: tuple[float, float, float]
+    near: float
 
 
 def choose_protocol(views: Sequence[View], train: Train, has_alpha: bool) -> Protocol:
@@ -40,7 +49,12 @@ def choose_protocol(views: Sequence[View], train: Train, has_alpha: bool) -> Pro
     """
     held_out = [view for view in views if view.is_test]
     white = train.background == "white" or (train.background in ("auto", "random") and has_alpha)
-    return Protocol(held_out or list(views), bool(held_out), WHITE if white else BLACK)
+    return Protocol(
+        held_out or list(views),
+        bool(held_out),
+        WHITE if white else BLACK,
+        near_plane(scene_extent(list(views))),
+    )
 
 
 def evaluate_views(
@@ -66,15 +80,16 @@ def evaluate_views(
     per_view: list[dict[str, Any]] = []
     progress = Progress("evaluating", len(protocol.views), "views")
     for index, view in enumerate(protocol.views):
-        rendered, _, _ = render_view(
+        rendered = render_view(
             gaussians,
             view,
             background=protocol.background,
             sh_degree=train.sh_degree,
             antialias=train.antialias,
+            near=protocol.near,
             threads=threads,
         )
-        picture = to_bytes(rendered)
+        picture = to_bytes(rendered.rgb)
         Image.fromarray(picture).save(out / f"{index:04d}.png")
         pixels = load_view(view.image, view.mask, view.width, view.height)
         a, b = picture / 255.0, reference(pixels, protocol.background) / 255.0

@@ -57,7 +57,7 @@ def collect_metrics(
         "num_gaussians": counters["train"]["num_gaussians"],
         "registered_images": sfm.get("registered", counters["inspect"].get("given_poses")),
         "total_images": photos + counters["inspect"]["left_out"],
-        "reprojection_error_px": sfm.get("reprojection_error_px"),
+        "reprojection_error_px": sfm.get("mean_reprojection_error_px"),
         "pose_error": evaluation["pose_error"],
         "stages": stages,
         "versions": own_run["versions"],

@@ -13,7 +13,7 @@ def headline(metrics: dict[str, Any]) -> str:
     lpips = "n/a" if metrics["lpips"] is None else f"{metrics['lpips']:.3f}"
     wall = sum(stage["wall_s"] for stage in metrics["stages"].values())
     pose = metrics["pose_error"]
-    error = f", rotation error {pose['median_rotation_deg']:.3f} degrees" if pose else ""
+    error = f", rotation error {pose['rotation_median_deg']:.3f} degrees" if pose else ""
     return (
         f"{metrics['scene']}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}, "
         f"LPIPS {lpips}, {metrics['num_gaussians']} Gaussians, "

@@ -27,7 +27,7 @@ import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import dataclass, field
+from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TextIO, TypeVar
@@ -82,6 +82,16 @@ class Job:
     def section(self, model: type[S]) -> S:
         """The validated config section of type ``model``; only sections in the key exist."""
         return model.model_validate(self.key["config"][model.__name__.lower()])
+
+    def record(self, report: Any) -> None:
+        """Take over a report (a dataclass): its ``decisions`` and ``warnings`` are told and kept,
+        its other fields become counters."""
+        facts = asdict(report)
+        for text in facts.pop("decisions", []):
+            self.decide(text)
+        for text in facts.pop("warnings", []):
+            self.warn(text)
+        self.counters |= facts
 
     def warn(self, text: str) -> None:
         print(f"warning: {text}", file=sys.stderr, flush=True)

@@ -1,0 +1,115 @@
+"""``metrics.json`` and one page with everything: ``report.html``, which opens without a network."""
+
+import json
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.config.schema import Report, Train, Views
+from pipeline.metrics.evaluate import choose_protocol, reference
+from pipeline.photos.load import load_view
+from pipeline.reporting.collect import collect_metrics
+from pipeline.reporting.data import Comparison, ReportData, ranked
+from pipeline.reporting.headline import headline
+from pipeline.reporting.page import write_report
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.job import Job, read_stage, run_facts
+from pipeline.scene.colmap import read_model
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.views import load_views
+from stages.command import main
+
+
+def run(job: Job) -> None:
+    start = time.perf_counter()
+    plan = job.key["plan"]
+    manifest = Manifest.read(job.inputs["views"] / "images.json")
+    model = read_model(job.inputs["model"] / "sparse" / "0")
+    views = load_views(manifest, model, job.section(Views))
+    evaluation = read_json(job.inputs["evaluate"] / "evaluation.json")
+    comparisons = compare(job, manifest, views, evaluation)
+    own = run_facts(job, time.perf_counter() - start)
+    results = job.inputs["inspect"].parent
+    metrics = collect_metrics(job.scene, plan, results, evaluation, own)
+    write_json(job.out / "metrics.json", metrics)
+    data = ReportData(
+        scene=job.scene,
+        metrics=metrics,
+        plan=plan,
+        decisions=stage_decisions(plan, results),
+        curve=curve_of(job.inputs["train"]),
+        comparisons=comparisons,
+        camera_centres=np.array([view.centre for view in views]),
+        camera_rotations=np.array([view.world_to_camera[:3, :3] for view in views]),
+        camera_names=[view.name for view in views],
+        camera_is_test=[view.is_test for view in views],
+        **points_of(model),
+    )
+    write_report(data, job.out / "report.html")
+    job.decide(headline(metrics))
+
+
+def compare(
+    job: Job, manifest: Manifest, views: list[View], evaluation: dict[str, Any]
+) -> list[Comparison]:
+    """The views to show, worst to best, each beside its photograph."""
+    photos = {photo.name: photo for photo in manifest.photos}
+    by_name = {view.name: view for view in views}
+    has_alpha = any(photo.alpha for photo in manifest.photos)
+    background = choose_protocol(views, job.section(Train), has_alpha).background
+    shown = []
+    for label, measured in ranked(evaluation["per_view"], job.section(Report).views):
+        view = by_name[measured["name"]]
+        pixels = load_view(view.image, view.mask, view.width, view.height)
+        with Image.open(job.inputs["evaluate"] / "renders" / measured["render"]) as render:
+            shown.append(
+                Comparison(
+                    label=label,
+                    name=view.name,
+                    photograph=reference(pixels, background),
+                    render=np.asarray(render),
+                    mask=pixels.mask,
+                    psnr=measured["psnr"],
+                    ssim=measured["ssim"],
+                    orientation=photos[view.name].orientation,
+                )
+            )
+    return shown
+
+
+def curve_of(train: Path) -> list[dict[str, Any]]:
+    """The training curve with the seconds of the run that made it."""
+    seconds = read_json(train / "run.json")["curve_seconds"]
+    records = read_json(train / "curve.json")
+    return [r | {"seconds": s} for r, s in zip(records, seconds, strict=True)]
+
+
+def points_of(model: Reconstruction) -> dict[str, Any]:
+    return {
+        "points_xyz": model.points.xyz,
+        "points_rgb": model.points.rgb,
+        "reprojection_errors": model.points.error[model.points.error >= 0],
+        "track_lengths": model.points.track_length,
+    }
+
+
+def stage_decisions(plan: dict[str, Any], results: Path) -> dict[str, list[str]]:
+    """What each stage that has run decided, beside what the plan decided for it."""
+    return {
+        name: step["decisions"]
+        + (read_stage(results / name)["decisions"] if name != "report" else [])
+        for name, step in plan["stages"].items()
+        if step["run"]
+    }
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+if __name__ == "__main__":
+    main("report", run, __doc__)

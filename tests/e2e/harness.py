@@ -1,0 +1,130 @@
+"""Runs Snakemake for real on a copy of the project."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+
+# Small enough for a full run in well under a minute, large enough to go through densification.
+TINY = {
+    "views": {"max_long_side_px": 160},
+    "train": {"steps": 300, "density": {"max_gaussians": 20_000}},
+}
+
+
+def copy_project(target: Path) -> Path:
+    """Copy the project's sources, without results, data and builds."""
+    names = ("Snakefile", "pipeline", "stages", "profiles", "config", "pyproject.toml")
+    target.mkdir(parents=True)
+    for name in names:
+        source = ROOT / name
+        if source.is_dir():
+            shutil.copytree(source, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+        else:
+            shutil.copy(source, target / name)
+    return target
+
+
+def copy_run(source: Path, target: Path) -> Path:
+    """Copy a project together with its results, keeping times, as if it had always been there."""
+    subprocess.run(["cp", "-a", str(source), str(target)], check=True)
+    return target
+
+
+def environment(project: Path) -> dict[str, str]:
+    return os.environ | {
+        "PYTHONPATH": str(project),
+        # The compiled extension of the project under test: same sources, same key.
+        "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "raster")),
+        "NO_COLOR": "1",
+    }
+
+
+def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]:
+    line = [sys.executable, "-m", "snakemake", "--cores", str(cores), *args]
+    if config is not None:
+        line += ["--config", *(f"{name}={json.dumps(value)}" for name, value in config.items())]
+    return line
+
+
+def snakemake(
+    project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
+) -> subprocess.CompletedProcess[str]:
+    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
+    done = subprocess.run(
+        command(*args, config=config, cores=cores),
+        cwd=project,
+        env=environment(project),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=900,
+    )
+    if check and done.returncode != 0:
+        raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
+    return done
+
+
+def rules_run(done: subprocess.CompletedProcess[str]) -> set[str]:
+    """Names of the rules of which jobs were started."""
+    return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+
+
+def start_and_kill(
+    project: Path, target: str, ready: str, *, config: dict, only_snakemake: bool = False
+) -> None:
+    """Start Snakemake and SIGKILL it, with its jobs or alone, once a file matching ``ready``
+    (a glob below the project) exists."""
+    process = subprocess.Popen(
+        command(target, config=config),
+        cwd=project,
+        env=environment(project),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    )
+    deadline = time.monotonic() + 300
+    while not any(project.glob(ready)):
+        assert process.poll() is None, f"snakemake ended before {ready} appeared"
+        assert time.monotonic() < deadline, f"{ready} never appeared"
+        time.sleep(0.01)
+    if only_snakemake:
+        process.kill()
+    else:
+        os.killpg(process.pid, signal.SIGKILL)
+    process.wait()
+
+
+def metrics(project: Path, scene: str) -> dict:
+    """``metrics.json`` without what may differ between two runs: times and memory."""
+    found = json.loads((project / "results" / scene / "metrics.json").read_text())
+    for stage in found["stages"].values():
+        for name in ("wall_s", "cpu_s", "peak_rss_mb"):
+            stage.pop(name)
+    return found
+
+
+def model_digests(project: Path, scene: str) -> dict[str, str]:
+    """Digest of every file that makes up the result."""
+    folder = project / "results" / scene
+    files = [
+        *(folder / "export").rglob("*"),
+        *(folder / "evaluate").rglob("*"),
+        folder / "train" / "gaussians.npz",
+        folder / "train" / "curve.json",
+    ]
+    return {
+        str(file.relative_to(folder)): hashlib.sha256(file.read_bytes()).hexdigest()
+        for file in sorted(files)
+        if file.is_file() and "run.json" not in file.name
+    }

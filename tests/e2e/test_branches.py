@@ -1,0 +1,50 @@
+"""Every branch of the plan through Snakemake: what a scene does not need is no job."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from tests.e2e.conftest import make_scene
+from tests.e2e.harness import TINY, copy_project, rules_run, snakemake
+
+pytestmark = pytest.mark.slow
+
+ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "export", "report"}
+SFM = {"features", "matches", "sfm"}
+
+
+@pytest.fixture(scope="module")
+def project(tmp_path_factory):
+    return copy_project(tmp_path_factory.mktemp("branches") / "project")
+
+
+@pytest.mark.parametrize(
+    ("scene", "options", "expected"),
+    [
+        ("raw", ("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
+        ("distorted", ("--distortion",), ALWAYS | SFM | {"undistort"}),
+        ("posed", ("--poses", "colmap"), ALWAYS),
+        ("bare", ("--poses", "transforms", "--no-points"), ALWAYS),
+        ("lens", ("--poses", "colmap", "--distortion"), ALWAYS | {"undistort"}),
+        ("masked", ("--poses", "colmap", "--masks"), ALWAYS),
+        ("alpha", ("--poses", "transforms", "--format", "png", "--alpha"), ALWAYS),
+    ],
+)
+def test_the_plan_runs_what_the_scene_needs(project, scene, options, expected):
+    make_scene(project, scene, *options)
+    done = snakemake(project, f"results/{scene}/metrics.json", config=TINY)
+    assert rules_run(done) == expected
+    found = json.loads((project / f"results/{scene}/metrics.json").read_text())
+    assert {name for name, s in found["stages"].items() if not s["skipped"]} == expected - {"plan"}
+    assert all(s["reason"] for s in found["stages"].values() if s["skipped"])
+    assert found["registered_images"] == found["total_images"]
+    assert found["psnr"] > 18
+    assert found["pose_error"]["rotation_median_deg"] < 0.3
+
+
+def test_given_poses_can_be_ignored(project):
+    make_scene(project, "ignored", "--poses", "colmap")
+    done = snakemake(project, "-n", "results/ignored/metrics.json", config={"poses": "ignore"})
+    assert rules_run(done) >= SFM

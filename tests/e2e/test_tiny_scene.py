@@ -1,0 +1,188 @@
+"""The tiny synthetic scene through Snakemake itself: result, caching, kills, determinism."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import subprocess
+import time
+
+import pytest
+
+from tests.e2e.harness import (
+    TINY,
+    command,
+    copy_run,
+    environment,
+    metrics,
+    model_digests,
+    rules_run,
+    snakemake,
+    start_and_kill,
+)
+
+pytestmark = pytest.mark.slow
+
+TARGET = "results/tiny/metrics.json"
+
+
+@pytest.fixture
+def project(finished, tmp_path):
+    return copy_run(finished, tmp_path / "project")
+
+
+def test_photographs_become_a_scene(finished):
+    found = json.loads((finished / TARGET).read_text())
+    assert found["registered_images"] == found["total_images"]
+    assert found["pose_error"]["rotation_median_deg"] < 0.3
+    assert found["psnr"] > 20
+    assert 0.5 < found["ssim"] <= 1
+    assert found["lpips"] is None
+    assert "checkpoints" in found["lpips_reason"]
+    assert found["stages"]["decode"]["skipped"]
+    assert found["stages"]["train"]["wall_s"] > 0
+    assert found["protocol"]["num_views"] == len(found["per_view"])
+    folder = finished / "results/tiny"
+    for name in (
+        "plan.json",
+        "report.html",
+        "export/point_cloud.ply",
+        "export/sparse/0/images.bin",
+    ):
+        assert (folder / name).stat().st_size > 0
+    assert not list((folder / ".scratch").glob("*/*/out")), "half output was left"
+    logs = [p.read_bytes() for p in (folder / "logs").glob("*.log")]
+    assert logs
+    assert not any(b"\r" in log for log in logs)
+
+
+def test_a_second_run_does_nothing_and_a_dry_run_shows_the_plan(project):
+    done = snakemake(project, TARGET, config=TINY)
+    assert "Nothing to be done" in done.stdout
+    dry = snakemake(project, "-n", TARGET, config=TINY)
+    assert rules_run(dry) == set()
+    for text in ("decode", "skip", "no RAW"):
+        assert text in dry.stdout
+
+
+def test_an_export_option_never_retrains(project):
+    done = snakemake(project, TARGET, config=TINY | {"export": {"min_opacity": 0.1}})
+    assert rules_run(done) == {"export", "report"}
+
+
+def test_a_training_option_keeps_the_poses(project):
+    config = TINY | {"train": TINY["train"] | {"lr_scales": 0.004}}
+    done = snakemake(project, "-n", TARGET, config=config)
+    assert rules_run(done) == {"train", "evaluate", "export", "report"}
+
+
+def test_a_touched_photograph_and_a_comment_rerun_nothing(project):
+    for photo in (project / "data/tiny/images").iterdir():
+        photo.touch()
+    for name in ("training/trainer.py", "sfm/mapping.py", "scene/colmap.py"):
+        file = project / "pipeline" / name
+        file.write_text("# A comment.\n" + file.read_text() + "\n# Another.\n")
+    kernel = next((project / "pipeline/raster/csrc").glob("*.h"))
+    kernel.write_text("// A comment.\n" + kernel.read_text())
+    done = snakemake(project, TARGET, config=TINY)
+    assert rules_run(done) == set()
+
+
+def test_changed_code_reruns_its_stage_and_unchanged_results_stop_there(project):
+    """The export's code changes, its files don't: the page is not made again."""
+    file = project / "stages/export.py"
+    file.write_text(file.read_text() + "\nUNUSED = 1\n")
+    page = project / "results/tiny/report/report.html"
+    before = page.stat().st_mtime_ns
+    done = snakemake(project, TARGET, config=TINY)
+    assert "export" in rules_run(done)
+    assert "train" not in rules_run(done)
+    assert page.stat().st_mtime_ns == before
+
+
+@pytest.mark.parametrize(
+    ("stage", "ready"),
+    [
+        ("sfm", "results/tiny/.scratch/sfm/*/out"),
+        ("train", "results/tiny/.scratch/train/*/out"),
+        ("evaluate", "results/tiny/.scratch/evaluate/*/out/renders/*.png"),
+    ],
+)
+def test_kill_9_and_again_gives_the_same_result(project, finished, stage, ready):
+    folder = project / "results/tiny"
+    order = ["sfm", "undistort", "init", "train", "evaluate", "export", "report"]
+    for name in order[order.index(stage) :]:
+        shutil.rmtree(folder / name, ignore_errors=True)
+    (folder / "metrics.json").unlink()
+    start_and_kill(project, TARGET, ready, config=TINY)
+    assert not (folder / stage / "stage.json").exists()
+    snakemake(project, "--unlock", config=TINY)
+    snakemake(project, TARGET, config=TINY)
+    assert metrics(project, "tiny") == metrics(finished, "tiny")
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
+
+
+def test_training_goes_on_from_its_last_checkpoint(project, finished, monkeypatch):
+    monkeypatch.setenv("SPLATMAKE_CHECKPOINT_SECONDS", "0")
+    folder = project / "results/tiny"
+    shutil.rmtree(folder / "train")
+    (folder / "metrics.json").unlink()
+    start_and_kill(
+        project, TARGET, "results/tiny/.scratch/train/*/checkpoints/*1[0-9][0-9]*", config=TINY
+    )
+    snakemake(project, "--unlock", config=TINY)
+    done = snakemake(project, TARGET, config=TINY)
+    assert "resum" in done.stdout
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
+
+
+def test_an_orphaned_job_and_a_new_run_do_not_meet(project, finished):
+    """SIGKILL on Snakemake alone leaves its job running; the next run waits for it."""
+    folder = project / "results/tiny"
+    shutil.rmtree(folder / "train")
+    (folder / "metrics.json").unlink()
+    ready = "results/tiny/.scratch/train/*/out"
+    start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=True)
+    snakemake(project, "--unlock", config=TINY)
+    snakemake(project, TARGET, config=TINY)
+    log = (folder / "logs/train.log").read_text()
+    assert "another run is at work" in log or "up to date" in log
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
+
+
+def test_two_runs_at_once_on_one_scene(project, finished):
+    """Snakemake's own lock turns the second away; the first one's result is whole."""
+    shutil.rmtree(project / "results/tiny/train")
+    (project / TARGET).unlink()
+    first, second = (
+        subprocess.Popen(
+            command(TARGET, config=TINY),
+            cwd=project,
+            env=environment(project),
+            stdout=subprocess.DEVNULL,
+            stderr=subprocess.DEVNULL,
+        )
+        for _ in range(2)
+    )
+    codes = sorted([first.wait(), second.wait()])
+    assert codes[0] == 0
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
+
+
+def test_one_thread_gives_the_same_bytes_as_two(project, finished):
+    shutil.rmtree(project / "results")
+    shutil.rmtree(project / ".snakemake")
+    snakemake(project, TARGET, config=TINY, cores=1)
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
+    assert metrics(project, "tiny") == metrics(finished, "tiny")
+
+
+def test_progress_is_written_for_people_and_programs(project):
+    shutil.rmtree(project / "results/tiny/train")
+    (project / TARGET).unlink()
+    start = time.time()
+    done = snakemake(project, TARGET, config=TINY)
+    assert "left" in done.stdout
+    state = json.loads((project / "results/tiny/.scratch/progress.json").read_text())
+    assert {"label", "done", "total", "rate", "seconds_left"} <= state.keys()
+    assert (project / "results/tiny/.scratch/progress.json").stat().st_mtime >= start

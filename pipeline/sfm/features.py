@@ -60,8 +60,13 @@ def extract_features(
     if missing:
         progress = Progress("extracting features", len(missing), "photographs")
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv
-        extract(missing, config, {p.name: cache / f"{keys[p.name]}.npz" for p in missing},
-                threads, progress)
+        extract(
+            missing,
+            config,
+            {p.name: cache / f"{keys[p.name]}.npz" for p in missing},
+            threads,
+            progress,
+        )
     counts = {}
     for photo in manifest.photos:
         source = cache / f"{keys[photo.name]}.npz"
@@ -79,7 +84,8 @@ def extract_features(
             f"{len(counts)} photographs"
         ],
         warnings=[
-            f"{name}: only {count} features" for name, count in counts.items()
+            f"{name}: only {count} features"
+            for name, count in counts.items()
             if count < FEW_FEATURES
         ],
     )
@@ -181,9 +187,7 @@ def _colmap_sift(
     path = folder / "features.db"
     options = pycolmap.FeatureExtractionOptions(num_threads=threads)
     options.sift.max_num_features = max_features
-    pycolmap.extract_features(
-        path, folder, extraction_options=options, device=pycolmap.Device.cpu
-    )
+    pycolmap.extract_features(path, folder, extraction_options=options, device=pycolmap.Device.cpu)
     with pycolmap.Database.open(path) as database:
         found = {}
         for image in database.read_all_images():

@@ -76,9 +76,7 @@ def _child(
     try:
         results.send(("value", function(*args, **kwargs)))
     except UserError as error:
-        results.send(
-            ("user error", {"what": error.what, "file": error.file, "fix": error.fix})
-        )
+        results.send(("user error", {"what": error.what, "file": error.file, "fix": error.fix}))
     except Exception:
         results.send(("error", traceback.format_exc()))
     # Destructors of extension libraries have nothing left to do that is worth a crash here.

@@ -158,9 +158,7 @@ def shown(names: list[str]) -> str:
     return f"{text} and {rest} more" if rest > 0 else text
 
 
-def _components(
-    names: list[str], verified: list[tuple[str, str]]
-) -> tuple[list[int], list[str]]:
+def _components(names: list[str], verified: list[tuple[str, str]]) -> tuple[list[int], list[str]]:
     """Sizes of the connected sets, largest first, and the names outside the first of them."""
     place = {name: i for i, name in enumerate(names)}
     rows, columns = [place[a] for a, _ in verified], [place[b] for _, b in verified]

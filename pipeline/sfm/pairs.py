@@ -23,6 +23,11 @@ RETRIEVAL_BUDGET = 300 * RETRIEVAL_DESCRIPTORS
 RETRIEVAL_MIN_DESCRIPTORS = 64
 # Mutual matches by chance: unrelated photographs share a few.
 RETRIEVAL_MIN_SCORE = 4
+# Photographs compared with one at a time: 300 x 300 distances each, 20 MB together.
+RETRIEVAL_BATCH = 64
+DESCRIPTOR_SIZE = 128
+# Squared distance beyond any two descriptors (2 * 512^2); a whole number in float32.
+FAR = 2.0**22
 
 LOOP_CLOSURES = 3
 
@@ -109,7 +114,7 @@ def loop_closure_pairs(descriptors: Sequence[NDArray[np.uint8]], overlap: int) -
 
 
 def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
-    """(N, N) symmetric: mutual nearest neighbours that pass the ratio test both ways, among the
+    """(N, N) symmetric: mutual nearest neighbours that pass the ratio test, among the
     largest-scale descriptors of two photographs.
 
     Products of bytes are summed exactly in float32 (below 2^24), so the scores do not depend on
@@ -118,29 +123,39 @@ def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int
     count = len(descriptors)
     keep = RETRIEVAL_BUDGET // max(count, 1)
     keep = max(RETRIEVAL_MIN_DESCRIPTORS, min(RETRIEVAL_DESCRIPTORS, keep))
-    tops = [d[:keep].astype(np.float32) for d in descriptors]
-    norms = [(d * d).sum(axis=1) for d in tops]
+    # Photographs with fewer descriptors are filled up with ones too far away to be anyone's best.
+    table = np.zeros((count, keep, DESCRIPTOR_SIZE), np.float32)
+    norms = np.full((count, keep), FAR, np.float32)
+    for i, found in enumerate(descriptors):
+        table[i, : len(found[:keep])] = found[:keep]
+        norms[i, : len(found[:keep])] = (table[i, : len(found[:keep])] ** 2).sum(axis=1)
     score = np.zeros((count, count), np.int64)
     progress = Progress("looking for pairs", count, "photographs")
     for i in range(count):
-        for j in range(i + 1, count):
-            if len(tops[i]) > 1 and len(tops[j]) > 1:
-                squared = norms[i][:, None] + norms[j][None] - 2 * (tops[i] @ tops[j].T)
-                score[i, j] = score[j, i] = _mutual(squared)
+        own = min(len(descriptors[i]), keep)
+        for start in range(i + 1, count, RETRIEVAL_BATCH):
+            stop = min(start + RETRIEVAL_BATCH, count)
+            others = table[start:stop].reshape(-1, DESCRIPTOR_SIZE)
+            squared = -2 * (table[i, :own] @ others.T)
+            squared += norms[i, :own, None] + norms[start:stop].reshape(-1)
+            score[i, start:stop] = _mutual(squared.reshape(own, stop - start, keep))
+        score[i:, i] = score[i, i:]
         progress.advance()
     return score
 
 
-def _mutual(squared: NDArray[np.float32]) -> int:
-    """Number of mutual nearest neighbours that pass the ratio test in both directions."""
-    rows = np.arange(len(squared))
-    forward = squared.argmin(axis=1)
-    mutual = squared.argmin(axis=0)[forward] == rows
-    best = squared[rows, forward]
-    second_row = np.partition(squared, 1, axis=1)[:, 1]
-    second_column = np.partition(squared, 1, axis=0)[1][forward]
-    limit = RETRIEVAL_RATIO**2 * np.minimum(second_row, second_column)
-    return int((mutual & (best < limit)).sum())
+def _mutual(squared: NDArray[np.float32]) -> NDArray[np.int64]:
+    """(M,) mutual nearest neighbours that pass the ratio test, from the squared distances
+    (F, M, G) of F descriptors to the G descriptors of each of M photographs; overwritten."""
+    if squared.shape[0] == 0:
+        return np.zeros(squared.shape[1], np.int64)
+    nearest = squared.argmin(axis=2)
+    back = np.take_along_axis(squared.argmin(axis=0), nearest.T, axis=1).T
+    mutual = back == np.arange(len(squared))[:, None]
+    best = np.take_along_axis(squared, nearest[..., None], axis=2)[..., 0]
+    np.put_along_axis(squared, nearest[..., None], np.float32(2 * FAR), axis=2)
+    accepted = best < RETRIEVAL_RATIO**2 * squared.min(axis=2)
+    return (mutual & accepted & (best < FAR / 2)).sum(axis=0)
 
 
 def _best(score: NDArray[np.int64], neighbours: int) -> list[Pair]:

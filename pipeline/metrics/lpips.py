@@ -15,6 +15,7 @@ The published 3DGS numbers feed [0, 1] where the network was trained on [-1, 1];
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -204,37 +205,45 @@ def _distance(
         raise UserError("the mask leaves no pixel to measure", fix="leave this view out")
     image = np.where(keep[..., None], image, reference)
 
-    def as_batch(values: NDArray[Any]) -> torch.Tensor:
-        pixels = torch.from_numpy(values.astype(np.float32)).permute(2, 0, 1)[None]
-        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
-        return (pixels - shift) / scale
-
     unmasked = torch.from_numpy(keep.astype(np.float32))[None, None]
-    total, layer = 0.0, 0
-    with torch.no_grad(), _one_thread():
-        x, y = as_batch(image), as_batch(reference)
+    # Torch's convolutions round differently with the number of threads; a metric must not. So
+    # each picture has one thread of its own.
+    each = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
+    with _one_thread(), each as pool:
+        x, y = pool.map(lambda v: _taps(network, weights, v), (image, reference))
+        total = 0.0
+        for a, b, head in zip(x, y, heads, strict=True):
+            distance = F.conv2d((a - b) ** 2, head)[0, 0]
+            share = F.adaptive_avg_pool2d(unmasked, (distance.shape[0], distance.shape[1]))[0, 0]
+            d, s = (t.numpy().astype(np.float64) for t in (distance, share))
+            total += float(np.sum(d * s) / np.sum(s))
+    return total
+
+
+def _taps(
+    network: _Network, weights: list[tuple[torch.Tensor, torch.Tensor]], picture: NDArray[Any]
+) -> list[torch.Tensor]:
+    """The layers that LPIPS reads, (1, C, h, w) each, feature vectors at length one."""
+    import torch
+    import torch.nn.functional as F
+
+    found = []
+    with torch.no_grad():
+        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
+        x = torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None]
+        x = (x - shift) / scale
         for conv, (weight, bias) in zip(network.convs, weights, strict=True):
             if conv.pool is not None:
-                x, y = F.max_pool2d(x, *conv.pool), F.max_pool2d(y, *conv.pool)
-            x, y = (
-                F.relu(F.conv2d(v, weight, bias, stride=conv.stride, padding=conv.padding))
-                for v in (x, y)
-            )
+                x = F.max_pool2d(x, *conv.pool)
+            x = F.conv2d(x, weight, bias, stride=conv.stride, padding=conv.padding).relu_()
             if conv.tap:
-                difference = (_unit(x) - _unit(y)) ** 2
-                distance = F.conv2d(difference, heads[layer])[0, 0]
-                share = F.adaptive_avg_pool2d(unmasked, (distance.shape[0], distance.shape[1]))[
-                    0, 0
-                ]
-                d, s = (t.numpy().astype(np.float64) for t in (distance, share))
-                total += float(np.sum(d * s) / np.sum(s))
-                layer += 1
-    return total
+                length = x.square().sum(dim=1, keepdim=True).sqrt()
+                found.append(x / (length + _EPSILON))
+    return found
 
 
 @contextmanager
 def _one_thread() -> Iterator[None]:
-    """Torch's convolutions round differently with the number of threads; a metric must not."""
     import torch
 
     before = torch.get_num_threads()
@@ -243,8 +252,3 @@ def _one_thread() -> Iterator[None]:
         yield
     finally:
         torch.set_num_threads(before)
-
-
-def _unit(features: torch.Tensor) -> torch.Tensor:
-    """Feature vectors of every pixel at length one."""
-    return features / (features.square().sum(dim=1, keepdim=True).sqrt() + _EPSILON)

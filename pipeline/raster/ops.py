@@ -1,29 +1,123 @@
-"""The rasterizer's operators. (For now on the torch twin: slow, small sizes only.)"""
+"""The rasterizer's operators on the C++ kernels. float32, contiguous, CPU."""
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
 
 import torch
 
-from pipeline.raster import twin
+from pipeline.raster import build
 from pipeline.raster.types import Gradients, LossResult, RasterCamera, RasterOptions, RenderOutput
+from pipeline.runtime.errors import UserError
+
+MAX_IMAGE_SIDE = 1 << 16
 
 
 @dataclass(frozen=True)
 class Forward:
-    """A drawn view and what ``backward`` needs of it; see RenderOutput for the fields."""
+    """A drawn view and what ``backward`` needs of it. Do not write to its tensors.
+
+    Attributes:
+        color: (H, W, 3) float32, the background included.
+        alpha: (H, W) float32, 1 - transmittance.
+        depth: (H, W) float32, sum of weight * camera z, not divided by alpha. Drawn when first
+            asked for, as median_depth is: a training step that looks at neither pays for neither.
+        median_depth: (H, W) float32, camera z of the Gaussian that takes the transmittance below
+            0.5; 0 where none does.
+        radii: (N,) float32 pixels along the long axis out to where alpha falls to 1/255;
+            0: not visible.
+        num_visible: Gaussians that touch the image.
+        num_dropped: Gaussians left out because a value is not finite or degenerate.
+        num_intersections: (Gaussian, tile) pairs, what memory and time go with.
+    """
 
     color: torch.Tensor
     alpha: torch.Tensor
-    depth: torch.Tensor
-    median_depth: torch.Tensor
     radii: torch.Tensor
     num_visible: int
     num_dropped: int
-    inputs: tuple[torch.Tensor, ...]
-    camera: RasterCamera
+    state: _State
+
+    @property
+    def num_intersections(self) -> int:
+        return self.state.entries.shape[0]
+
+    @cached_property
+    def _depths(self) -> tuple[torch.Tensor, torch.Tensor]:
+        s = self.state
+        return _ops().blend_depth(
+            s.records, s.entries, s.tile_begin, s.view, *s.size, _threads(s.options.threads)
+        )
+
+    @property
+    def depth(self) -> torch.Tensor:
+        return self._depths[0]
+
+    @property
+    def median_depth(self) -> torch.Tensor:
+        return self._depths[1]
+
+
+@dataclass(frozen=True)
+class _State:
+    """The kernels' values between forward and backward; layouts in csrc/types.h."""
+
+    inputs: tuple[torch.Tensor, ...]  # means, log_scales, quats, opacity_logits, sh
+    view: torch.Tensor  # (17,) float64
+    size: tuple[int, int]  # width, height
+    background: torch.Tensor  # (3,)
     options: RasterOptions
+    records: torch.Tensor  # (N, 16)
+    entries: torch.Tensor  # (M, 3) int32
+    tile_begin: torch.Tensor  # (tiles + 1,) int64
+    tile_end: torch.Tensor  # (tiles,) int64
+    slots: torch.Tensor  # (N, 2) int32
+
+
+def _ops() -> Any:
+    build.load()
+    return torch.ops.splatmake
+
+
+def _threads(threads: int) -> int:
+    return threads if threads > 0 else torch.get_num_threads()
+
+
+def _plain(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> torch.Tensor:
+    """The tensor detached, after a look at its type and shape (None: any size)."""
+    fits = value.dim() == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if value.dtype != torch.float32 or value.device.type != "cpu" or not fits:
+        raise ValueError(
+            f"{name}: expected float32 {tuple('any' if s is None else s for s in shape)} on the "
+            f"CPU, found {value.dtype} {tuple(value.shape)} on {value.device}"
+        )
+    return value.detach().contiguous()
+
+
+def _pack_view(camera: RasterCamera, near: float) -> torch.Tensor:
+    """(17,) float64: fx fy cx cy, rotation by rows, translation, near."""
+    pose = camera.world_to_camera.detach().double()
+    if pose.shape != (4, 4):
+        raise ValueError(f"world_to_camera: expected (4, 4), found {tuple(pose.shape)}")
+    head = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
+    tail = torch.tensor([near], dtype=torch.float64)
+    view = torch.cat([head, pose[:3, :3].reshape(-1), pose[:3, 3], tail])
+    if not bool(view.isfinite().all()):
+        raise ValueError("camera: every value must be finite")
+    if not (camera.fx > 0 and camera.fy > 0):
+        raise ValueError(f"camera: focal lengths must be positive, found {camera.fx}, {camera.fy}")
+    if not (1 <= camera.width <= MAX_IMAGE_SIDE and 1 <= camera.height <= MAX_IMAGE_SIDE):
+        raise ValueError(
+            f"camera: sides must be 1 to {MAX_IMAGE_SIDE} px, found {camera.width} x {camera.height}"
+        )
+    if not near > 0:
+        raise ValueError(f"near must be positive, found {near}")
+    return view
 
 
 def forward(
@@ -35,14 +129,48 @@ def forward(
     camera: RasterCamera,
     options: RasterOptions,
 ) -> Forward:
-    """Draw a view, without autograd."""
-    inputs = tuple(t.detach() for t in (means, log_scales, quats, opacity_logits, sh))
-    with torch.no_grad():
-        out = twin.render(*inputs, camera, options)  # type: ignore
-    return Forward(
-        out.color, out.alpha, out.depth, out.median_depth, out.radii, out.num_visible,
-        out.num_dropped, inputs, camera, options,
-    )  # fmt: skip
+    """Draw a view, without autograd.
+
+    Args:
+        means: (N, 3) float32, world.
+        log_scales: (N, 3) float32.
+        quats: (N, 4) float32 wxyz, of any length.
+        opacity_logits: (N,) float32.
+        sh: (N, K, 3) float32, K >= (options.sh_degree + 1)^2.
+
+    Raises:
+        ValueError: shapes or types that do not fit, a camera that is none.
+        UserError: more (Gaussian, tile) pairs than memory is meant for; no compiler.
+    """
+    n, degree = means.shape[0], options.sh_degree
+    if not 0 <= degree <= 3 or sh.dim() != 3 or sh.shape[1] < (degree + 1) ** 2:
+        raise ValueError(f"sh_degree {degree} does not fit sh of shape {tuple(sh.shape)}")
+    inputs = (
+        _plain("means", means, (n, 3)),
+        _plain("log_scales", log_scales, (n, 3)),
+        _plain("quats", quats, (n, 4)),
+        _plain("opacity_logits", opacity_logits, (n,)),
+        _plain("sh", sh, (n, None, 3)),
+    )
+    view, size = _pack_view(camera, options.near), (camera.width, camera.height)
+    background = torch.tensor(options.background or (0.0, 0.0, 0.0), dtype=torch.float32)
+    ops, threads = _ops(), _threads(options.threads)
+    records, radii, visible, dropped = ops.project(
+        *inputs, view, *size, degree, options.antialias, threads
+    )
+    entries, tile_begin, slots, fits = ops.bin(records, radii, view, *size, threads)
+    if not fits:
+        raise UserError(
+            f"{visible} Gaussians cover more than 2^27 image tiles of 16 x 16 pixels in one view",
+            fix="draw smaller images, or look for Gaussians grown far too large",
+        )
+    color, alpha, tile_end = ops.blend(
+        records, entries, tile_begin, view, *size, background, threads
+    )
+    state = _State(
+        inputs, view, size, background, options, records, entries, tile_begin, tile_end, slots
+    )
+    return Forward(color, alpha, radii, visible, dropped, state)
 
 
 def backward(
@@ -53,17 +181,50 @@ def backward(
     *,
     means2d_abs: bool = True,
 ) -> Gradients:
-    """The gradients of a scalar given its gradients on the images."""
-    inputs = [t.requires_grad_() for t in (t.clone() for t in fwd.inputs)]
-    out = twin.render(*inputs, fwd.camera, fwd.options)  # type: ignore
-    total = (out.color * d_color).sum()
+    """The gradients of a scalar, given its gradients on the images.
+
+    Args:
+        d_color: (H, W, 3) float32; d_alpha, d_depth: (H, W) float32 or None.
+        means2d_abs: sum absolute values too; about a fifth of the time.
+    """
+    s = fwd.state
+    width, height = s.size
+    d_color = _plain("d_color", d_color, (height, width, 3))
     if d_alpha is not None:
-        total = total + (out.alpha * d_alpha).sum()
+        d_alpha = _plain("d_alpha", d_alpha, (height, width))
     if d_depth is not None:
-        total = total + (out.depth * d_depth).sum()
-    grads = torch.autograd.grad(total, inputs, materialize_grads=True)
-    flat = torch.zeros(len(inputs[0]), 2)
-    return Gradients(*grads, flat, flat.clone() if means2d_abs else None)  # type: ignore
+        d_depth = _plain("d_depth", d_depth, (height, width))
+    ops, threads = _ops(), _threads(s.options.threads)
+    slot_gradients = ops.blend_backward(
+        s.records, s.entries, s.tile_begin, s.tile_end, s.view, width, height, s.background,
+        fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
+        means2d_abs, threads,
+    )  # fmt: skip
+    *parameters, means2d, absolute = ops.project_backward(
+        *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias, s.records,
+        fwd.radii, s.slots, slot_gradients, means2d_abs, threads,
+    )  # fmt: skip
+    return Gradients(*parameters, means2d, absolute if means2d_abs else None)
+
+
+class _Render(torch.autograd.Function):
+    @staticmethod
+    def forward(ctx: Any, camera: RasterCamera, options: RasterOptions, *inputs: Any) -> Any:
+        fwd = forward(*inputs, camera, options)
+        ctx.fwd = fwd
+        ctx.set_materialize_grads(False)
+        ctx.mark_non_differentiable(fwd.median_depth, fwd.radii)
+        # Copies: what the caller writes to, backward must not read.
+        color, alpha, depth = fwd.color.clone(), fwd.alpha.clone(), fwd.depth.clone()
+        return color, alpha, depth, fwd.median_depth, fwd.radii, fwd.num_visible, fwd.num_dropped
+
+    @staticmethod
+    def backward(ctx: Any, *grads: Any) -> Any:
+        d_color, d_alpha, d_depth = grads[:3]
+        if d_color is None:
+            d_color = torch.zeros_like(ctx.fwd.color)
+        g = backward(ctx.fwd, d_color, d_alpha, d_depth, means2d_abs=False)
+        return None, None, g.means, g.log_scales, g.quats, g.opacity_logits, g.sh
 
 
 def render(
@@ -75,8 +236,9 @@ def render(
     camera: RasterCamera,
     options: RasterOptions,
 ) -> RenderOutput:
-    """Draw a view; color, alpha and depth carry gradients."""
-    return twin.render(means, log_scales, quats, opacity_logits, sh, camera, options)
+    """Draw a view; color, alpha and depth carry gradients to the five tensors. See ``forward``."""
+    outputs = _Render.apply(camera, options, means, log_scales, quats, opacity_logits, sh)
+    return RenderOutput(*outputs)
 
 
 def l1_ssim(
@@ -86,11 +248,28 @@ def l1_ssim(
     mask: torch.Tensor | None = None,
     threads: int = 0,
 ) -> LossResult:
-    """3DGS's loss and its gradient."""
-    leaf = rendered.detach().clone().requires_grad_()
-    loss, l1, ssim = twin.l1_ssim(leaf, target, ssim_weight, mask)
-    (grad,) = torch.autograd.grad(loss, leaf)
-    return LossResult(loss.item(), l1.item(), ssim.item(), grad)
+    """3DGS's loss (1 - w) L1 + w (1 - SSIM), and its gradient on the render.
+
+    Args:
+        rendered: (H, W, 3) float32 in [0, 1] or thereabouts.
+        target: (H, W, 3) float32, or uint8 of which 255 is 1.
+        ssim_weight: w in [0, 1].
+        mask: (H, W) bool or uint8, not zero where a pixel is left out: the render is replaced
+            by the target there, and both means are over the other pixels.
+    """
+    rendered = _plain("rendered", rendered, (None, None, 3))
+    size = tuple(rendered.shape)
+    if target.dtype == torch.uint8 and tuple(target.shape) == size:
+        target = target.contiguous()
+    else:
+        target = _plain("target", target, size)
+    if mask is not None:
+        if mask.dtype not in (torch.bool, torch.uint8) or tuple(mask.shape) != size[:2]:
+            raise ValueError(
+                f"mask: expected bool or uint8 {size[:2]}, found {mask.dtype} {tuple(mask.shape)}"
+            )
+        mask = mask.contiguous().view(torch.uint8)
+    return LossResult(*_ops().l1_ssim(rendered, target, mask, ssim_weight, _threads(threads)))
 
 
 def adam_step(
@@ -105,5 +284,18 @@ def adam_step(
     eps: float = 1e-15,
     threads: int = 0,
 ) -> None:
-    """One step of Adam, in place."""
-    twin.adam_step(param, grad, exp_avg, exp_avg_sq, lr, step, beta1, beta2, eps)
+    """One step of Adam in place, as torch.optim.Adam takes it; ``step`` counts from 1.
+
+    All four tensors: float32, contiguous, of one shape.
+    """
+    for tensor in (param, grad, exp_avg, exp_avg_sq):
+        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise ValueError("adam_step: tensors must be float32 and contiguous")
+        if tensor.shape != param.shape:
+            raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
+    if step < 1 or not math.isfinite(lr):
+        raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
+    _ops().adam_step(
+        param.detach(), grad.detach(), exp_avg, exp_avg_sq, lr, step, beta1, beta2, eps,
+        _threads(threads),
+    )  # fmt: skip

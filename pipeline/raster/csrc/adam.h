@@ -1,0 +1,16 @@
+// Adam (Kingma & Ba 2015), dense and in place.
+#pragma once
+
+#include <cstdint>
+
+namespace splat {
+
+struct AdamSettings {
+    double lr, beta1, beta2, eps;
+    int64_t step;  // from 1
+};
+
+void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t count,
+               const AdamSettings& settings, int threads);
+
+}  // namespace splat

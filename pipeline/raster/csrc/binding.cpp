@@ -1,0 +1,223 @@
+// The kernels as torch.ops.splatmake.*, on torch's stable ABI. Shapes are checked in ops.py; types
+// here, by the pointers taken.
+
+#include <torch/csrc/stable/library.h>
+#include <torch/csrc/stable/ops.h>
+#include <torch/csrc/stable/tensor.h>
+
+#include <optional>
+#include <tuple>
+
+#include "adam.h"
+#include "bin.h"
+#include "blend.h"
+#include "loss.h"
+#include "project.h"
+
+namespace {
+
+using torch::headeronly::ScalarType;
+using torch::stable::Tensor;
+using OptionalTensor = std::optional<Tensor>;
+
+const float* floats(const Tensor& t) { return t.const_data_ptr<float>(); }
+const float* floats(const OptionalTensor& t) { return t ? floats(*t) : nullptr; }
+float* mutable_floats(const Tensor& t) { return t.mutable_data_ptr<float>(); }
+
+Tensor new_floats(std::initializer_list<int64_t> shape) {
+    return torch::stable::empty(shape, ScalarType::Float);
+}
+
+// view: 17 float64, fx fy cx cy, rotation, translation, near.
+splat::View view_from(const Tensor& packed, int64_t width, int64_t height, int64_t sh_degree,
+                      bool antialias) {
+    const double* v = packed.const_data_ptr<double>();
+    splat::View view = {width, height, v[0],  v[1],      v[2],          v[3],
+                        {},    {},     v[16], antialias, int(sh_degree)};
+    for (int i = 0; i < 9; i++) view.rotation[i] = v[4 + i];
+    for (int i = 0; i < 3; i++) view.translation[i] = v[13 + i];
+    return view;
+}
+
+splat::Gaussians gaussians_from(const Tensor& means, const Tensor& log_scales, const Tensor& quats,
+                                const Tensor& opacity_logits, const Tensor& sh) {
+    return {means.size(0),          sh.size(1), floats(means), floats(log_scales), floats(quats),
+            floats(opacity_logits), floats(sh)};
+}
+
+const splat::Record* records_from(const Tensor& t) {
+    return reinterpret_cast<const splat::Record*>(floats(t));
+}
+
+splat::Pairs pairs_from(const Tensor& entries, const Tensor& tile_begin) {
+    return {reinterpret_cast<const splat::Entry*>(entries.const_data_ptr<int32_t>()),
+            tile_begin.const_data_ptr<int64_t>()};
+}
+
+// (N, 16) records, (N) radii, visible, dropped
+std::tuple<Tensor, Tensor, int64_t, int64_t> project(const Tensor& means, const Tensor& log_scales,
+                                                     const Tensor& quats,
+                                                     const Tensor& opacity_logits, const Tensor& sh,
+                                                     const Tensor& view, int64_t width,
+                                                     int64_t height, int64_t sh_degree,
+                                                     bool antialias, int64_t threads) {
+    const int64_t n = means.size(0);
+    Tensor records = new_floats({n, int64_t(sizeof(splat::Record) / sizeof(float))});
+    Tensor radii = new_floats({n});
+    const splat::ProjectCounts counts = splat::project_view(
+        gaussians_from(means, log_scales, quats, opacity_logits, sh),
+        view_from(view, width, height, sh_degree, antialias), int(threads),
+        reinterpret_cast<splat::Record*>(mutable_floats(records)), mutable_floats(radii));
+    return {records, radii, counts.visible, counts.dropped};
+}
+
+// (M, 3) entries, (tiles + 1) tile_begin, (N, 2) slots, and whether the pairs fit
+std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor& radii,
+                                             const Tensor& view, int64_t width, int64_t height,
+                                             int64_t threads) {
+    const splat::View v = view_from(view, width, height, 0, false);
+    splat::Binner binner;
+    const bool fits =
+        binner.find(records_from(records), floats(radii), records.size(0), v, int(threads));
+    const int64_t pairs = fits ? binner.intersections() : 0;
+    Tensor entries = torch::stable::empty({pairs, 3}, ScalarType::Int);
+    Tensor tile_begin = torch::stable::empty({v.tiles() + 1}, ScalarType::Long);
+    Tensor slots = torch::stable::empty({records.size(0), 2}, ScalarType::Int);
+    if (fits)
+        binner.write(reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
+                     tile_begin.mutable_data_ptr<int64_t>(),
+                     reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
+    return {entries, tile_begin, slots, fits};
+}
+
+// (H, W, 3) color, (H, W) alpha, (tiles) tile_end
+std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& entries,
+                                         const Tensor& tile_begin, const Tensor& view,
+                                         int64_t width, int64_t height, const Tensor& background,
+                                         int64_t threads) {
+    const splat::View v = view_from(view, width, height, 0, false);
+    Tensor color = new_floats({height, width, 3});
+    Tensor alpha = new_floats({height, width});
+    Tensor tile_end = torch::stable::empty({v.tiles()}, ScalarType::Long);
+    splat::blend(records_from(records), pairs_from(entries, tile_begin), v, floats(background),
+                 int(threads), mutable_floats(color), mutable_floats(alpha),
+                 tile_end.mutable_data_ptr<int64_t>());
+    return {color, alpha, tile_end};
+}
+
+// (H, W) depth, (H, W) median depth
+std::tuple<Tensor, Tensor> blend_depth(const Tensor& records, const Tensor& entries,
+                                       const Tensor& tile_begin, const Tensor& view, int64_t width,
+                                       int64_t height, int64_t threads) {
+    Tensor depth = new_floats({height, width});
+    Tensor median = new_floats({height, width});
+    splat::blend_depth(records_from(records), pairs_from(entries, tile_begin),
+                       view_from(view, width, height, 0, false), int(threads),
+                       mutable_floats(depth), mutable_floats(median));
+    return {depth, median};
+}
+
+// (M, 16) gradient slots
+Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor& tile_begin,
+                      const Tensor& tile_end, const Tensor& view, int64_t width, int64_t height,
+                      const Tensor& background, const Tensor& color, const Tensor& alpha,
+                      OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
+                      OptionalTensor d_depth, bool absolute, int64_t threads) {
+    Tensor slots = new_floats({entries.size(0), splat::kSlotFloats});
+    splat::blend_backward(records_from(records), pairs_from(entries, tile_begin),
+                          view_from(view, width, height, 0, false),
+                          {floats(color), floats(alpha), floats(depth), floats(d_color),
+                           floats(d_alpha), floats(d_depth), floats(background), absolute},
+                          tile_end.const_data_ptr<int64_t>(), int(threads), mutable_floats(slots));
+    return slots;
+}
+
+// Gradients of means, log_scales, quats, opacity_logits, sh, means2d, and means2d_abs (0 rows
+// when not asked for)
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
+    const Tensor& means, const Tensor& log_scales, const Tensor& quats,
+    const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
+    int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
+    const Tensor& slots, const Tensor& slot_gradients, bool absolute, int64_t threads) {
+    const int64_t n = means.size(0);
+    Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
+           d_quats = new_floats({n, 4});
+    Tensor d_opacity = new_floats({n}), d_sh = new_floats({n, sh.size(1), 3});
+    Tensor d_means2d = new_floats({n, 2}), d_abs = new_floats({absolute ? n : 0, 2});
+    splat::project_view_backward(
+        gaussians_from(means, log_scales, quats, opacity_logits, sh),
+        view_from(view, width, height, sh_degree, antialias), int(threads), records_from(records),
+        floats(radii), reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
+        floats(slot_gradients),
+        {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
+         mutable_floats(d_opacity), mutable_floats(d_sh), mutable_floats(d_means2d),
+         absolute ? mutable_floats(d_abs) : nullptr});
+    return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs};
+}
+
+// loss, l1, ssim, (H, W, 3) gradient
+std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
+                                                   OptionalTensor mask, double ssim_weight,
+                                                   int64_t threads) {
+    const bool bytes = target.scalar_type() == ScalarType::Byte;
+    Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
+    const splat::LossValues values = splat::l1_ssim(
+        {rendered.size(1), rendered.size(0), floats(rendered), bytes ? nullptr : floats(target),
+         bytes ? target.const_data_ptr<uint8_t>() : nullptr,
+         mask ? mask->const_data_ptr<uint8_t>() : nullptr},
+        ssim_weight, int(threads), mutable_floats(grad));
+    return {values.loss, values.l1, values.ssim, grad};
+}
+
+void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
+               const Tensor& exp_avg_sq, double lr, int64_t step, double beta1, double beta2,
+               double eps, int64_t threads) {
+    splat::adam_step(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
+                     mutable_floats(exp_avg_sq), param.numel(), {lr, beta1, beta2, eps, step},
+                     int(threads));
+}
+
+}  // namespace
+
+STABLE_TORCH_LIBRARY(splatmake, m) {
+    m.def(
+        "project(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, Tensor sh, "
+        "Tensor view, int width, int height, int sh_degree, bool antialias, int threads) -> "
+        "(Tensor, Tensor, int, int)");
+    m.def(
+        "bin(Tensor records, Tensor radii, Tensor view, int width, int height, int threads) -> "
+        "(Tensor, Tensor, Tensor, bool)");
+    m.def(
+        "blend(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int width, "
+        "int height, Tensor background, int threads) -> (Tensor, Tensor, Tensor)");
+    m.def(
+        "blend_depth(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int width, "
+        "int height, int threads) -> (Tensor, Tensor)");
+    m.def(
+        "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor tile_end, "
+        "Tensor view, int width, int height, Tensor background, Tensor color, Tensor alpha, "
+        "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, bool absolute, "
+        "int threads) -> Tensor");
+    m.def(
+        "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
+        "Tensor sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
+        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool absolute, "
+        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+    m.def(
+        "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, int threads) -> "
+        "(float, float, float, Tensor)");
+    m.def(
+        "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
+        "float lr, int step, float beta1, float beta2, float eps, int threads) -> ()");
+}
+
+STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
+    m.impl("project", TORCH_BOX(&project));
+    m.impl("bin", TORCH_BOX(&bin));
+    m.impl("blend", TORCH_BOX(&blend));
+    m.impl("blend_depth", TORCH_BOX(&blend_depth));
+    m.impl("blend_backward", TORCH_BOX(&blend_backward));
+    m.impl("project_backward", TORCH_BOX(&project_backward));
+    m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
+    m.impl("adam_step", TORCH_BOX(&adam_step));
+}

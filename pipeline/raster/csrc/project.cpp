@@ -1,0 +1,284 @@
+#include "project.h"
+
+#include <cmath>
+#include <limits>
+
+#include "project_math.h"
+#include "sh.h"
+
+namespace splat {
+namespace {
+
+constexpr double kHalfLog2e = 0.72134752044448170368;  // log2(e) / 2
+
+struct Center {
+    double xyz[3];
+};
+
+// The camera's centre in the world, -R^T t.
+Center camera_center(const View& view) {
+    Center c;
+    for (int i = 0; i < 3; i++)
+        c.xyz[i] =
+            -(view.rotation[i] * view.translation[0] + view.rotation[3 + i] * view.translation[1] +
+              view.rotation[6 + i] * view.translation[2]);
+    return c;
+}
+
+// Eight Gaussians from `first` on; the last one fills the lanes beyond the end.
+Inputs load_inputs(const Gaussians& g, int64_t first) {
+    double field[11][kProjectLanes];
+    for (int lane = 0; lane < kProjectLanes; lane++) {
+        const int64_t i = first + lane < g.count ? first + lane : g.count - 1;
+        for (int k = 0; k < 3; k++) field[k][lane] = g.means[3 * i + k];
+        for (int k = 0; k < 3; k++) field[3 + k][lane] = g.log_scales[3 * i + k];
+        for (int k = 0; k < 4; k++) field[6 + k][lane] = g.quats[4 * i + k];
+        field[10][lane] = g.opacity_logits[i];
+    }
+    const auto get = [&](int k) { return load<Lanes>(field[k]); };
+    return {{get(0), get(1), get(2)},
+            {get(3), get(4), get(5)},
+            {get(6), get(7), get(8), get(9)},
+            get(10)};
+}
+
+// -1 in the lanes whose every input is finite and whose quaternion has a direction.
+i64x8 usable(const Inputs& in, const Projected& p) {
+    const Lanes sum = (in.mean.x + in.mean.y + in.mean.z) +
+                      (in.log_scale.x + in.log_scale.y + in.log_scale.z) +
+                      (p.norm2 + in.opacity_logit);
+    // float32 values cannot overflow a float64 sum: it is finite when they are.
+    return i64x8(sum - sum == 0.0) & i64x8(p.norm2 >= kQuatNorm2Min);
+}
+
+struct Block {
+    double x[8], y[8], depth[8], uu[8], uw[8], ww[8], log2_opacity[8], extent_x[8], extent_y[8],
+        radius[8];
+    int64_t usable[8], in_front[8], sound[8], reaches[8];
+};
+
+void project_block(const Gaussians& g, const View& view, int64_t first, Block& out) {
+    const Inputs in = load_inputs(g, first);
+    const Projected p = project(in, view);
+    const Lanes log2_opacity = log2(p.opacity);
+    const Lanes reach = log2_opacity - double(kLog2AlphaMin);
+    const Lanes reach2 = clamp(reach, 0.0, 16.0) / kHalfLog2e;  // d^T inverse(cov) d at alpha_min
+    const Lanes uu = sqrt(kHalfLog2e * p.yy / p.det);
+    const Lanes half_difference = 0.5 * (p.xx - p.yy);
+    const Lanes longest =
+        0.5 * (p.xx + p.yy) + sqrt(half_difference * half_difference + p.xy * p.xy);
+    store(out.x, p.x);
+    store(out.y, p.y);
+    store(out.depth, p.cam.z);
+    store(out.uu, uu);
+    store(out.uw, -uu * p.xy / p.yy);
+    store(out.ww, sqrt(kHalfLog2e / p.yy));
+    store(out.log2_opacity, log2_opacity);
+    store(out.extent_x, sqrt(reach2 * p.xx));
+    store(out.extent_y, sqrt(reach2 * p.yy));
+    store(out.radius, sqrt(reach2 * longest));
+    store(out.usable, usable(in, p));
+    // Depth is kept in float32: beyond its range it would be infinite.
+    store(out.in_front, i64x8(p.cam.z > view.near));
+    store(out.sound, i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
+                         i64x8(p.yy < kCovarianceMax) & i64x8(p.x - p.x == 0.0) &
+                         i64x8(p.y - p.y == 0.0) & i64x8(p.cam.z < 1e38));
+    store(out.reaches, i64x8(reach > 0.0));
+}
+
+// Whether [center - extent, center + extent] holds the centre of a pixel among `size`.
+bool holds_pixel(double center, double extent, int64_t size) {
+    const double first = std::ceil(center - extent - 0.5);
+    const double last = std::floor(center + extent - 0.5);
+    return (first > 0 ? first : 0) <= (last < size - 1 ? last : size - 1);
+}
+
+float finite_float(double v, bool& finite) {
+    finite &= std::fabs(v) <= std::numeric_limits<float>::max();
+    return float(v);
+}
+
+}  // namespace
+
+ProjectCounts project_view(const Gaussians& in, const View& view, int threads, Record* records,
+                           float* radii) {
+    const Center center = camera_center(view);
+    const int64_t blocks = (in.count + kProjectLanes - 1) / kProjectLanes;
+    int64_t visible = 0, dropped = 0;
+#pragma omp parallel for num_threads(threads) schedule(static) reduction(+ : visible, dropped)
+    for (int64_t block = 0; block < blocks; block++) {
+        Block b;
+        const int64_t first = block * kProjectLanes;
+        project_block(in, view, first, b);
+        for (int lane = 0; lane < kProjectLanes && first + lane < in.count; lane++) {
+            const int64_t i = first + lane;
+            radii[i] = 0;
+            if (!b.usable[lane] || (b.in_front[lane] && !b.sound[lane])) {
+                dropped++;
+                continue;
+            }
+            if (!b.in_front[lane] || !b.reaches[lane] ||
+                !holds_pixel(b.x[lane], b.extent_x[lane], view.width) ||
+                !holds_pixel(b.y[lane], b.extent_y[lane], view.height))
+                continue;
+            Record r = {};
+            if (!sh_color(direction(in.means + 3 * i, center.xyz), view.sh_degree,
+                          in.sh + 3 * in.sh_coefficients * i, kShMax, r.rgb)) {
+                dropped++;
+                continue;
+            }
+            r.x = b.x[lane];
+            r.y = b.y[lane];
+            r.uu = float(b.uu[lane]);
+            r.uw = float(b.uw[lane]);
+            r.ww = float(b.ww[lane]);
+            r.log2_opacity = float(b.log2_opacity[lane]);
+            r.depth = float(b.depth[lane]);
+            r.extent_x = float(b.extent_x[lane]);
+            r.extent_y = float(b.extent_y[lane]);
+            records[i] = r;
+            radii[i] = float(b.radius[lane]);
+            visible++;
+        }
+    }
+    return {visible, dropped};
+}
+
+namespace {
+
+// The sums of one Gaussian's slots, by Moment.
+struct Sums {
+    double moment[kSlotFloats];
+};
+
+Sums sum_slots(const Slots& slots, const float* slot_gradients) {
+    Lanes low = {}, high = {};
+    for (uint32_t s = 0; s < slots.count; s++) {
+        const float* from = slot_gradients + int64_t(slots.first + s) * kSlotFloats;
+        typedef float f32x8 __attribute__((vector_size(32)));
+        low += __builtin_convertvector(load<f32x8>(from), Lanes);
+        high += __builtin_convertvector(load<f32x8>(from + 8), Lanes);
+    }
+    double lanes[kSlotFloats];
+    store(lanes, low);
+    store(lanes + 8, high);
+    Sums sums;
+    for (int m = 0; m < 12; m++) sums.moment[m] = lanes[sum_lane(m)];
+    return sums;
+}
+
+// From the moments of (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2), and
+// with L = [uu 0; uw ww], y = (u, w): d ln alpha / d centre = 2 ln 2 L y, and the covariance's
+// gradient is 2 (ln 2)^2 ... L (sum v y y^T) L^T with the factor worked out below.
+ImageGradients image_gradients(const double (*m)[kProjectLanes], const Record* const* records) {
+    double uu[8], uw[8], ww[8];
+    for (int lane = 0; lane < kProjectLanes; lane++) {
+        const Record* r = records[lane];
+        uu[lane] = r ? r->uu : 0;
+        uw[lane] = r ? r->uw : 0;
+        ww[lane] = r ? r->ww : 0;
+    }
+    const Lanes l00 = load<Lanes>(uu), l10 = load<Lanes>(uw), l11 = load<Lanes>(ww);
+    const auto get = [&](Moment k) { return load<Lanes>(m[k]); };
+    const double ln2 = 0.69314718055994530942;
+    ImageGradients g;
+    g.x = 2.0 * ln2 * l00 * get(kVU);
+    g.y = 2.0 * ln2 * (l10 * get(kVU) + l11 * get(kVW));
+    // inverse(cov) = 2 ln2 L L^T, d = L^-T y: 1/2 inverse(cov) (sum v d d^T) inverse(cov)
+    //   = 2 ln2^2 L (sum v y y^T) L^T
+    const double k = 2.0 * ln2 * ln2;
+    const Lanes a = get(kVUU), b = get(kVUW), c = get(kVWW);
+    g.xx = k * l00 * l00 * a;
+    g.xy = 2.0 * k * l00 * (l10 * a + l11 * b);
+    g.yy = k * (l10 * l10 * a + 2.0 * l10 * l11 * b + l11 * l11 * c);
+    g.depth = get(kDepth);
+    g.ln_opacity = get(kV);
+    return g;
+}
+
+// Row i of every gradient, zeroed.
+void zero_gradients(const Gaussians& in, int64_t i, const GaussianGradients& out) {
+    for (int k = 0; k < 3; k++) out.means[3 * i + k] = out.log_scales[3 * i + k] = 0;
+    for (int k = 0; k < 4; k++) out.quats[4 * i + k] = 0;
+    out.opacity_logits[i] = 0;
+    for (int k = 0; k < 2; k++) {
+        out.means2d[2 * i + k] = 0;
+        if (out.means2d_abs) out.means2d_abs[2 * i + k] = 0;
+    }
+    const int64_t width = 3 * in.sh_coefficients;
+    for (int64_t k = 0; k < width; k++) out.sh[width * i + k] = 0;
+}
+
+}  // namespace
+
+void project_view_backward(const Gaussians& in, const View& view, int threads,
+                           const Record* records, const float* radii, const Slots* slots,
+                           const float* slot_gradients, const GaussianGradients& out) {
+    const Center center = camera_center(view);
+    const int active = 3 * sh_count(view.sh_degree);
+    const int64_t sh_width = 3 * in.sh_coefficients;
+    const int64_t blocks = (in.count + kProjectLanes - 1) / kProjectLanes;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 64)
+    for (int64_t block = 0; block < blocks; block++) {
+        const int64_t first = block * kProjectLanes;
+        const int lanes = int(in.count - first < kProjectLanes ? in.count - first : kProjectLanes);
+        double moments[12][kProjectLanes] = {};
+        const Record* record[kProjectLanes] = {};
+        bool any_drawn = false;
+        for (int lane = 0; lane < lanes; lane++) {
+            const int64_t i = first + lane;
+            if (!(radii[i] > 0) || slots[i].count == 0) continue;
+            any_drawn = true;
+            record[lane] = records + i;
+            const Sums sums = sum_slots(slots[i], slot_gradients);
+            for (int m = 0; m < 12; m++) moments[m][lane] = sums.moment[m];
+        }
+        double field[11][kProjectLanes], xy[2][kProjectLanes];
+        if (any_drawn) {
+            const Projected p = project(load_inputs(in, first), view);
+            const ImageGradients image = image_gradients(moments, record);
+            const InputGradients g = project_backward(p, image, view);
+            const Lanes all[11] = {g.mean.x,      g.mean.y,      g.mean.z,       g.log_scale.x,
+                                   g.log_scale.y, g.log_scale.z, g.quat[0],      g.quat[1],
+                                   g.quat[2],     g.quat[3],     g.opacity_logit};
+            for (int k = 0; k < 11; k++) store(field[k], all[k]);
+            store(xy[0], image.x);
+            store(xy[1], image.y);
+        }
+        for (int lane = 0; lane < lanes; lane++) {
+            const int64_t i = first + lane;
+            const Record* r = record[lane];
+            if (!r) {
+                zero_gradients(in, i, out);
+                continue;
+            }
+            bool finite = true;
+            float d_rgb[3];
+            for (int c = 0; c < 3; c++)
+                d_rgb[c] = r->rgb[c] > 0 ? finite_float(moments[kRed + c][lane], finite) : 0;
+            double d_mean[3] = {field[0][lane], field[1][lane], field[2][lane]};
+            float* d_sh = out.sh + sh_width * i;
+            sh_backward(direction(in.means + 3 * i, center.xyz), view.sh_degree,
+                        in.sh + sh_width * i, d_rgb, d_sh, d_mean);
+            for (int64_t k = 0; k < active; k++) finite &= std::isfinite(d_sh[k]);
+            for (int64_t k = active; k < sh_width; k++) d_sh[k] = 0;
+            for (int k = 0; k < 3; k++) {
+                out.means[3 * i + k] = finite_float(d_mean[k], finite);
+                out.log_scales[3 * i + k] = finite_float(field[3 + k][lane], finite);
+            }
+            for (int k = 0; k < 4; k++)
+                out.quats[4 * i + k] = finite_float(field[6 + k][lane], finite);
+            out.opacity_logits[i] = finite_float(field[10][lane], finite);
+            const double ln2 = 0.69314718055994530942;
+            for (int k = 0; k < 2; k++) {
+                out.means2d[2 * i + k] = finite_float(xy[k][lane], finite);
+                if (out.means2d_abs)
+                    out.means2d_abs[2 * i + k] =
+                        finite_float(2.0 * ln2 * moments[kAbsX + k][lane], finite);
+            }
+            if (!finite) zero_gradients(in, i, out);
+        }
+    }
+}
+
+}  // namespace splat

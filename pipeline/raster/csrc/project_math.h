@@ -1,0 +1,176 @@
+// The projection of 8 Gaussians at a time, in float64, and its derivative. Sources: Kerbl et al.
+// 2023 (covariance), Zwicker et al. 2002 (EWA), Yu et al. 2024 (compensation); twin.py's project
+// says the same in fewer words.
+#pragma once
+
+#include "simd.h"
+#include "types.h"
+
+namespace splat {
+
+using Lanes = f64x8;
+constexpr int kProjectLanes = 8;
+
+struct Vec3 {
+    Lanes x, y, z;
+};
+SPLAT_INLINE Lanes dot(const Vec3& a, const Vec3& b) { return a.x * b.x + a.y * b.y + a.z * b.z; }
+SPLAT_INLINE Vec3 operator*(Lanes s, const Vec3& v) { return {s * v.x, s * v.y, s * v.z}; }
+SPLAT_INLINE Vec3 operator+(const Vec3& a, const Vec3& b) {
+    return {a.x + b.x, a.y + b.y, a.z + b.z};
+}
+SPLAT_INLINE Vec3 operator-(const Vec3& a, const Vec3& b) {
+    return {a.x - b.x, a.y - b.y, a.z - b.z};
+}
+SPLAT_INLINE Vec3 row(const double* matrix, int i) {
+    return {splat8(matrix[3 * i]), splat8(matrix[3 * i + 1]), splat8(matrix[3 * i + 2])};
+}
+
+struct Inputs {
+    Vec3 mean, log_scale;
+    Lanes quat[4], opacity_logit;
+};
+
+struct Projected {
+    // Intermediate values that backward needs again
+    Lanes norm2, inv_norm, q[4];  // the quaternion's squared length, and it normalised
+    Vec3 r[3], m[3];              // rows of R and of M = R S
+    Lanes scale[3];
+    Vec3 cam;                // centre in the camera's frame
+    Lanes inv_z, u, v;       // 1/z; x/z and y/z, clamped
+    Vec3 t[2];               // rows of T = J W
+    Vec3 h[2];               // rows of H = T M; Sigma' = H H^T
+    Lanes plain_det, ratio;  // det of Sigma' undilated; to the dilated one
+    Lanes sigmoid;
+    // Results
+    Lanes x, y;        // pixels
+    Lanes xx, xy, yy;  // dilated covariance, px^2
+    Lanes det, opacity;
+};
+
+SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
+    Projected p;
+    p.norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] + in.quat[2] * in.quat[2] +
+              in.quat[3] * in.quat[3];
+    p.inv_norm = 1.0 / sqrt(p.norm2);
+    for (int i = 0; i < 4; i++) p.q[i] = in.quat[i] * p.inv_norm;
+    const Lanes w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+    p.r[0] = {1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)};
+    p.r[1] = {2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)};
+    p.r[2] = {2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)};
+    p.scale[0] = exp(in.log_scale.x);
+    p.scale[1] = exp(in.log_scale.y);
+    p.scale[2] = exp(in.log_scale.z);
+    for (int i = 0; i < 3; i++)
+        p.m[i] = {p.r[i].x * p.scale[0], p.r[i].y * p.scale[1], p.r[i].z * p.scale[2]};
+
+    const double* t = view.translation;
+    p.cam = {dot(row(view.rotation, 0), in.mean) + t[0], dot(row(view.rotation, 1), in.mean) + t[1],
+             dot(row(view.rotation, 2), in.mean) + t[2]};
+    p.inv_z = 1.0 / p.cam.z;
+    const Lanes u = p.cam.x * p.inv_z, v = p.cam.y * p.inv_z;
+    p.x = view.fx * u + view.cx;
+    p.y = view.fy * v + view.cy;
+
+    const double margin_x = kFrustumMargin * 0.5 * view.width / view.fx;
+    const double margin_y = kFrustumMargin * 0.5 * view.height / view.fy;
+    p.u = clamp(u, -view.cx / view.fx - margin_x, (view.width - view.cx) / view.fx + margin_x);
+    p.v = clamp(v, -view.cy / view.fy - margin_y, (view.height - view.cy) / view.fy + margin_y);
+    const Vec3 forward = row(view.rotation, 2);
+    p.t[0] = (view.fx * p.inv_z) * (row(view.rotation, 0) - p.u * forward);
+    p.t[1] = (view.fy * p.inv_z) * (row(view.rotation, 1) - p.v * forward);
+    for (int i = 0; i < 2; i++) p.h[i] = p.t[i].x * p.m[0] + p.t[i].y * p.m[1] + p.t[i].z * p.m[2];
+    const Lanes xx = dot(p.h[0], p.h[0]), yy = dot(p.h[1], p.h[1]);
+    p.xy = dot(p.h[0], p.h[1]);
+    p.xx = xx + kDilation;
+    p.yy = yy + kDilation;
+    // Lagrange's identity |a|^2 |b|^2 - (a.b)^2 = |a x b|^2: nothing cancels for a needle.
+    const Vec3 a = p.h[0], b = p.h[1];
+    const Vec3 cross = {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
+    p.plain_det = dot(cross, cross);
+    p.det = p.plain_det + kDilation * (xx + yy + kDilation);
+
+    p.sigmoid = 1.0 / (1.0 + exp(-in.opacity_logit));
+    p.opacity = p.sigmoid;
+    p.ratio = p.plain_det / p.det;
+    if (view.antialias)
+        p.opacity *= sqrt(select(p.ratio > kCompensationMin, p.ratio, splat8(kCompensationMin)));
+    return p;
+}
+
+// dL/d(what the image sees of a Gaussian)
+struct ImageGradients {
+    Lanes x, y;        // centre, pixels
+    Lanes xx, xy, yy;  // dilated covariance; xy counts both off-diagonal entries
+    Lanes depth;
+    Lanes ln_opacity;  // of the compensated opacity
+};
+
+struct InputGradients {
+    Vec3 mean, log_scale;
+    Lanes quat[4], opacity_logit;
+};
+
+SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGradients& g,
+                                             const View& view) {
+    InputGradients out;
+    Lanes d_xx = g.xx, d_xy = g.xy, d_yy = g.yy;
+    out.opacity_logit = g.ln_opacity * (1.0 - p.sigmoid);
+    if (view.antialias) {
+        // ln opacity = ln sigmoid + (ln plain_det - ln det) / 2 above the floor
+        const Lanes half = select(p.ratio > kCompensationMin, 0.5 * g.ln_opacity, splat8(0.0));
+        const Lanes plain = half / select(p.plain_det > 0.0, p.plain_det, splat8(1.0));
+        const Lanes dilated = half / p.det;
+        d_xx += plain * (p.yy - kDilation) - dilated * p.yy;
+        d_yy += plain * (p.xx - kDilation) - dilated * p.xx;
+        d_xy -= 2.0 * p.xy * (plain - dilated);
+    }
+    // Sigma' = H H^T, H = T M
+    const Vec3 d_h[2] = {2.0 * d_xx * p.h[0] + d_xy * p.h[1], 2.0 * d_yy * p.h[1] + d_xy * p.h[0]};
+    Vec3 d_t[2], d_m[3];
+    for (int i = 0; i < 2; i++)
+        d_t[i] = {dot(p.m[0], d_h[i]), dot(p.m[1], d_h[i]), dot(p.m[2], d_h[i])};
+    d_m[0] = p.t[0].x * d_h[0] + p.t[1].x * d_h[1];
+    d_m[1] = p.t[0].y * d_h[0] + p.t[1].y * d_h[1];
+    d_m[2] = p.t[0].z * d_h[0] + p.t[1].z * d_h[1];
+
+    // M = R S
+    out.log_scale = {
+        p.m[0].x * d_m[0].x + p.m[1].x * d_m[1].x + p.m[2].x * d_m[2].x,
+        p.m[0].y * d_m[0].y + p.m[1].y * d_m[1].y + p.m[2].y * d_m[2].y,
+        p.m[0].z * d_m[0].z + p.m[1].z * d_m[1].z + p.m[2].z * d_m[2].z,
+    };
+    Vec3 d_r[3];
+    for (int i = 0; i < 3; i++)
+        d_r[i] = {d_m[i].x * p.scale[0], d_m[i].y * p.scale[1], d_m[i].z * p.scale[2]};
+    const Lanes w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
+    const Lanes d_q[4] = {
+        2.0 * (x * (d_r[2].y - d_r[1].z) + y * (d_r[0].z - d_r[2].x) + z * (d_r[1].x - d_r[0].y)),
+        2.0 * (w * (d_r[2].y - d_r[1].z) + y * (d_r[0].y + d_r[1].x) + z * (d_r[0].z + d_r[2].x) -
+               2.0 * x * (d_r[1].y + d_r[2].z)),
+        2.0 * (w * (d_r[0].z - d_r[2].x) + x * (d_r[0].y + d_r[1].x) + z * (d_r[1].z + d_r[2].y) -
+               2.0 * y * (d_r[0].x + d_r[2].z)),
+        2.0 * (w * (d_r[1].x - d_r[0].y) + x * (d_r[0].z + d_r[2].x) + y * (d_r[1].z + d_r[2].y) -
+               2.0 * z * (d_r[0].x + d_r[1].y)),
+    };
+    const Lanes along = w * d_q[0] + x * d_q[1] + y * d_q[2] + z * d_q[3];
+    for (int i = 0; i < 4; i++) out.quat[i] = (d_q[i] - along * p.q[i]) * p.inv_norm;
+
+    // T's rows: f / z (W_i - u W_2), with u clamped; the centre: f x / z + c
+    const Vec3 forward = row(view.rotation, 2);
+    const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z;
+    const Lanes zero = splat8(0.0);
+    const Lanes d_u =
+        select(free_u == p.u, -view.fx * p.inv_z * dot(d_t[0], forward), zero) + view.fx * g.x;
+    const Lanes d_v =
+        select(free_v == p.v, -view.fy * p.inv_z * dot(d_t[1], forward), zero) + view.fy * g.y;
+    const Vec3 d_cam = {
+        d_u * p.inv_z, d_v * p.inv_z,
+        g.depth -
+            (dot(d_t[0], p.t[0]) + dot(d_t[1], p.t[1]) + d_u * free_u + d_v * free_v) * p.inv_z};
+    out.mean =
+        d_cam.x * row(view.rotation, 0) + d_cam.y * row(view.rotation, 1) + d_cam.z * forward;
+    return out;
+}
+
+}  // namespace splat

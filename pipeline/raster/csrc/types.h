@@ -1,0 +1,65 @@
+// What passes between the stages.
+#pragma once
+
+#include <cstdint>
+
+#include "constants.h"
+
+namespace splat {
+
+// A pinhole view. Pixel centres at half integers; camera x right, y down, z forward.
+struct View {
+    int64_t width, height;
+    double fx, fy, cx, cy;
+    double rotation[9], translation[3];  // world to camera, row major
+    double near;
+    bool antialias;
+    int sh_degree;
+
+    int64_t tiles_x() const { return (width + kTile - 1) / kTile; }
+    int64_t tiles_y() const { return (height + kTile - 1) / kTile; }
+    int64_t tiles() const { return tiles_x() * tiles_y(); }
+};
+
+// N Gaussians: means (N,3), log_scales (N,3), quats (N,4) wxyz, opacity_logits (N), sh (N,K,3).
+struct Gaussians {
+    int64_t count, sh_coefficients;
+    const float *means, *log_scales, *quats, *opacity_logits, *sh;
+};
+
+// A Gaussian on the image, one cache line. With d the vector from its centre in pixels,
+//
+//     log2(alpha) = log2_opacity - u^2 - w^2,  u = uu d_x + uw d_y,  w = ww d_y.
+//
+// [uu 0; uw ww] is the Cholesky factor of log2(e)/2 times the inverse covariance. u and w are at
+// most 2.83 where alpha counts, so that a needle a thousand pixels long loses no digits as it
+// would in a dx^2 + 2 b dx dy + c dy^2. The centre is in float64: its float32 rounding alone
+// would cost 1e-5 of colour.
+struct alignas(64) Record {
+    double x, y;
+    float uu, uw, ww, log2_opacity;
+    float rgb[3], depth;
+    float extent_x, extent_y;  // half the bounding box of {alpha >= 1/255}, pixels
+    float unused[2];
+};
+static_assert(sizeof(Record) == 64);
+
+// One Gaussian in one tile. Slots count the pairs Gaussian by Gaussian, in order of depth: the
+// pairs of a Gaussian are neighbours there, whatever thread made them.
+struct Entry {
+    uint32_t gaussian, slot;
+    uint32_t rows;  // first row | last row << 8, within the tile
+};
+static_assert(sizeof(Entry) == 12);
+
+// The slots of a Gaussian: first, count.
+struct Slots {
+    uint32_t first, count;
+};
+
+// One slot of gradients: sums over the pixels of a tile, in the lanes of simd.h's sum_lanes.
+// v is dL/d(ln alpha) of a pixel.
+enum Moment { kV, kVU, kVW, kVUU, kVUW, kVWW, kRed, kGreen, kBlue, kDepth, kAbsX, kAbsY };
+constexpr int kSlotFloats = 16;
+
+}  // namespace splat

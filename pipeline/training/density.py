@@ -14,8 +14,7 @@ import torch
 from torch import Tensor
 
 from pipeline.config.schema import Density
-from pipeline.raster.ops import Forward
-from pipeline.raster.types import Gradients
+from pipeline.raster import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.optimiser import Adam
 

@@ -7,8 +7,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipeline.raster.ops import adam_step
-from pipeline.raster.types import Gradients
+from pipeline.raster import Gradients, adam_step
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA1, BETA2 = 0.9, 0.999

@@ -8,8 +8,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.raster.ops import forward
-from pipeline.raster.types import RasterCamera, RasterOptions
+from pipeline.raster import RasterCamera, RasterOptions, forward
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.targets import reduced_size

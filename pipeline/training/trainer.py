@@ -20,8 +20,7 @@ import torch
 from torch import Tensor
 
 from pipeline.config.schema import Train
-from pipeline.raster.ops import backward, forward, l1_ssim
-from pipeline.raster.types import RasterCamera, RasterOptions
+from pipeline.raster import RasterCamera, RasterOptions, backward, forward, l1_ssim
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
@@ -54,8 +55,33 @@ class Manifest(BaseModel):
     warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
-        write_text(path, self.model_dump_json(indent=1) + "\n")
+        """Files inside the manifest's own folder are written as "./..." from there: the folder
+        may be moved as a whole."""
+        folder = path.parent
+
+        def inside(file: str) -> str:
+            return (
+                f"./{Path(file).relative_to(folder)}" if Path(file).is_relative_to(folder) else file
+            )
+
+        write_text(path, self._with_files(inside).model_dump_json(indent=1) + "\n")
 
     @staticmethod
     def read(path: Path) -> Manifest:
-        return Manifest.model_validate_json(path.read_text())
+        def resolved(file: str) -> str:
+            return str(path.parent / file) if file.startswith("./") else file
+
+        return Manifest.model_validate_json(path.read_text())._with_files(resolved)
+
+    def _with_files(self, change: Callable[[str], str]) -> Manifest:
+        photos = [
+            photo.model_copy(
+                update={
+                    "path": change(photo.path),
+                    "mask": photo.mask and change(photo.mask),
+                    "depth": photo.depth and change(photo.depth),
+                }
+            )
+            for photo in self.photos
+        ]
+        return self.model_copy(update={"photos": tuple(photos)})

@@ -7,7 +7,7 @@ import datetime
 import hashlib
 import math
 import warnings
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -73,9 +73,9 @@ def read_facts(path: Path) -> FileFacts:
         digest = digest_of(path)
         if suffix_of(path.name) in RAW_SUFFIXES:
             return _raw_facts(path, digest)
-        with Image.open(path) as image:
+        with _quiet(), Image.open(path) as image:
             width, height = image.size
-            exif = _exif_of(image.getexif)
+            exif = _exif_of(lambda: _header_exif(image))
             return FileFacts(
                 digest=digest,
                 width=width,
@@ -104,7 +104,8 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
             focal_mm, stamp = float(raw.other.focal_length), raw.other.timestamp
             lens = str(raw.lens.model).strip()
     except rawpy.LibRawError as error:
-        raise ValueError(f"LibRaw says {error}") from None
+        words = [a.decode() if isinstance(a, bytes) else str(a) for a in error.args]
+        raise ValueError(f"LibRaw says {' '.join(words)}") from None
 
     def load() -> Image.Exif:
         exif = Image.Exif()
@@ -136,13 +137,29 @@ def _bits(image: Image.Image) -> int:
 # --- EXIF ---------------------------------------------------------------------------------
 
 
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """PIL warns of damaged EXIF; what is damaged is simply missing here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _header_exif(image: Image.Image) -> Image.Exif:
+    """EXIF before the pixels: PIL would decode a whole PNG to look for it behind them."""
+    if image.format != "PNG":
+        return image.getexif()
+    exif = Image.Exif()
+    exif.load(image.info.get("exif", b""))
+    return exif
+
+
 def _exif_of(load: Any) -> Mapping[int, Any]:
     """All tags, the EXIF and GPS folders' among them; what is damaged is missing."""
     tags: dict[int, Any] = {}
     # A damaged EXIF block is no reason to lose the photograph, and PIL's readers raise nearly
     # anything on one.
-    with contextlib.suppress(Exception), warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+    with contextlib.suppress(Exception), _quiet():
         exif = load()
         tags.update(exif)
         tags.update(exif.get_ifd(_IFD.Exif))

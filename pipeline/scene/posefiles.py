@@ -19,6 +19,7 @@ from pipeline.scene.photofile import digest_of
 from pipeline.scene.transforms import find_transforms, frame_camera_model, read_frames
 
 _COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
+_MODEL_FILES = [(stem, end) for stem in ("cameras", "images") for end in ("bin", "txt")]
 _LLFF_FILE = "poses_bounds.npy"
 
 
@@ -58,6 +59,16 @@ def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
     if (folder / _LLFF_FILE).is_file():
         return _remembered(folder, "llff", _LLFF_FILE, cache)
     return None
+
+
+def half_models(folder: Path) -> list[str]:
+    """A warning for each COLMAP folder that holds cameras or images but not both."""
+    return [
+        f"{folder / path}: not used as poses: a COLMAP model needs both cameras and images"
+        for path in _COLMAP_FOLDERS
+        if not has_model(folder / path)
+        and any((folder / path / f"{stem}.{end}").is_file() for stem, end in _MODEL_FILES)
+    ]
 
 
 def pose_files(path: Path) -> list[Path]:

@@ -31,6 +31,7 @@ from pipeline.scene.photofile import FileFacts, digest_of, read_facts
 from pipeline.scene.posefiles import (
     GivenPoses,
     find_poses,
+    half_models,
     pose_files,
     transforms_photos,
     truth_folder,
@@ -122,12 +123,14 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     _check_folder(folder)
     facts_cache = FactCache(cache)
     warnings: list[str] = []
-    use_poses = config.poses == "auto"
-    poses = find_poses(folder, facts_cache) if use_poses else None
+    poses = None
+    if config.poses == "auto":
+        poses = find_poses(folder, facts_cache)
+        warnings += half_models(folder)
 
     chosen = _choose_folder(folder, config, poses, facts_cache, warnings)
-    names = _without_twins(chosen.names, poses, warnings)
-    facts = _read_all(folder, chosen.path, names, facts_cache, warnings)
+    facts = _read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
+    facts = {name: facts[name] for name in _without_twins(sorted(facts), poses, warnings)}
     if not facts:
         raise UserError("no photograph found", file=folder, fix=_ADD_PHOTOS)
     if len(facts) < config.inspect.min_images:

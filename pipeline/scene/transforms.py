@@ -184,7 +184,7 @@ def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
     """A finite 4x4 (or 3x4, completed) matrix."""
     try:
         matrix = np.array(value, np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise UserError(f"{where}: expected 4x4 numbers", file=file, fix=_FIX)
@@ -201,7 +201,7 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     if "applied_transform" in content:
         moved = _matrix(file, "applied_transform", content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
-    if not isinstance(scale, int | float) or not math.isfinite(scale) or scale <= 0:
+    if not _is_number(scale) or scale <= 0:
         raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
     moved[:3] *= scale
     if not np.linalg.det(moved[:3, :3]) > 1e-12:
@@ -209,11 +209,18 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     return moved
 
 
+def _is_number(value: Any) -> bool:
+    """A finite number; JSON's integers may be larger than any float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300  # False for NaN.
+
+
 def _number(frame: Frame, name: str, default: float) -> float:
     value = frame.fields.get(name, default)
-    if isinstance(value, bool) or not isinstance(value, int | float) or not math.isfinite(value):
+    if not _is_number(value):
         raise UserError(
-            f"{frame.source}: {name} is {value!r}, expected a finite number",
+            f"{frame.source}: {name} is {str(value)[:40]!r}, expected a finite number",
             file=frame.file,
             fix=_FIX,
         )

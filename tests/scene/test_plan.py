@@ -1,0 +1,202 @@
+"""The plan: what runs, what is skipped, what is settled; for each kind of scene."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Config
+from pipeline.scene.plan import STAGES, Plan, describe, make_plan
+from pipeline.scene.scan import Scan, scan
+from tests.scene.pictures import photos, picture
+from tests.scene.test_llff import llff_row
+from tests.scene.test_scan import write_dng, write_sparse
+from tests.scene.test_transforms import frame, write
+
+
+def look(folder: Path, **sections) -> Scan:
+    return scan(folder, folder.name, Config.model_validate(sections), cache=None)
+
+
+def plan_of(folder: Path, **sections) -> Plan:
+    return make_plan(look(folder, **sections), Config.model_validate(sections))
+
+
+def skipped(plan: Plan) -> list[str]:
+    return [name for name, stage in plan.stages.items() if not stage.run]
+
+
+def many(folder: Path, count: int, **changes) -> Scan:
+    """A scan of ``count`` photographs without as many files: ``changes`` map a field of Photo
+    to a function of the index."""
+    photos(folder / "images", 2)
+    few = look(folder)
+    pictures = tuple(
+        few.photos[0].model_copy(
+            update={
+                "name": f"p{i:04d}.jpg",
+                **{field: value(i) for field, value in changes.items()},
+            }
+        )
+        for i in range(count)
+    )
+    return few.model_copy(update={"manifest": few.manifest.model_copy(update={"photos": pictures})})
+
+
+def test_photographs_alone_need_everything_but_raw(tmp_path):
+    photos(tmp_path / "images", 3)
+    plan = plan_of(tmp_path)
+    assert tuple(plan.stages) == STAGES
+    assert skipped(plan) == ["decode"]
+    assert all(stage.reason for stage in plan.stages.values())
+
+
+def test_raw_needs_decode(tmp_path):
+    for i in range(2):
+        write_dng(tmp_path / f"{i}.dng")
+    assert skipped(plan_of(tmp_path)) == []
+
+
+@pytest.mark.parametrize("model, undistort", [("PINHOLE", []), ("SIMPLE_RADIAL", ["undistort"])])
+def test_given_colmap_poses(tmp_path, model, undistort):
+    files = photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", [path.name for path in files], (64, 48), model)
+    plan = plan_of(tmp_path)
+    runs = {"features", "matches", "sfm", "decode", "undistort"} - set(skipped(plan))
+    assert sorted(runs) == undistort
+    assert "3 cameras" in plan.stages["sfm"].reason and model in plan.stages["undistort"].reason
+    assert "1 sparse points" in plan.stages["init"].reason
+    ignoring = plan_of(tmp_path, poses="ignore")
+    assert skipped(ignoring) == ["decode"] and "ignore" in ignoring.stages["sfm"].reason
+
+
+def test_given_poses_without_points_are_triangulated(tmp_path):
+    picture(tmp_path / "train" / "a.png", mode="RGBA")
+    picture(tmp_path / "train" / "b.png", mode="RGBA")
+    frames = [frame(path=f"./train/{name}") for name in "ab"]
+    write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, "transforms_train.json")
+    plan = plan_of(tmp_path)
+    assert skipped(plan) == ["decode", "features", "matches", "sfm", "undistort"]
+    assert "triangulated" in plan.stages["init"].reason
+    assert plan.config.train.background == "random"
+    assert "random" in plan_of(tmp_path, init={"method": "random"}).stages["init"].reason
+
+
+def test_llff(tmp_path):
+    photos(tmp_path / "images", 2)
+    np.save(tmp_path / "poses_bounds.npy", [llff_row(np.eye(3), np.zeros(3), 48, 64, 50.0)] * 2)
+    assert skipped(plan_of(tmp_path)) == ["decode", "features", "matches", "sfm", "undistort"]
+
+
+@pytest.mark.parametrize("model, runs", [("PINHOLE", False), ("auto", True), ("OPENCV", True)])
+def test_undistort_follows_the_camera_model_of_sfm(tmp_path, model, runs):
+    photos(tmp_path / "images", 2)
+    plan = plan_of(tmp_path, sfm={"camera_model": model})
+    assert plan.runs("undistort") == runs and "cameras" in plan.stages["undistort"].reason
+
+
+def test_nothing_that_can_be_settled_stays_auto(tmp_path):
+    photos(tmp_path / "images", 3)
+    config = plan_of(tmp_path).config
+    assert config.inspect.image_folder == "images"
+    assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
+    assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
+    assert (config.init.method, config.train.background) == ("points", "black")
+    # Planning again from the settled config changes nothing.
+    again = make_plan(scan(tmp_path, tmp_path.name, config, cache=None), config)
+    assert again.config == config
+    assert again.stages.keys() == plan_of(tmp_path).stages.keys()
+
+
+def test_what_the_user_sets_stays(tmp_path):
+    chosen = {
+        "matches": {"pairs": "sequential"},
+        "sfm": {"mapper": "global", "camera_model": "OPENCV", "share_cameras": "single"},
+        "train": {"background": "white"},
+        "init": {"method": "random"},
+    }
+    photos(tmp_path / "images", 2)
+    config = plan_of(tmp_path, **chosen).config.model_dump()
+    for section, values in chosen.items():
+        assert {key: config[section][key] for key in values} == values
+
+
+@pytest.mark.parametrize(
+    "count, changes, pairs, mapper",
+    [
+        (80, {}, "exhaustive", "incremental"),
+        (81, {}, "retrieval", "incremental"),
+        (151, {}, "retrieval", "global"),
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0)}, "spatial", "incremental"),
+        # GPS noise around one place sorts nothing.
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-6 * i, 0.0)}, "retrieval", "incremental"),
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0) if i % 2 else None}, "retrieval", None),
+    ],
+)
+def test_pairs_and_mapper(tmp_path, count, changes, pairs, mapper):
+    plan = make_plan(many(tmp_path, count, **changes), Config())
+    assert plan.config.matches.pairs == pairs
+    assert any(pairs in line for line in plan.stages["matches"].decisions)
+    assert mapper is None or plan.config.sfm.mapper == mapper
+
+
+def test_ordered_photographs_are_matched_in_sequence(tmp_path):
+    seen = many(tmp_path, 90).model_copy(update={"ordered": "numbered like a video"})
+    assert make_plan(seen, Config()).config.matches.pairs == "sequential"
+
+
+@pytest.mark.parametrize(
+    "group, share, model",
+    [
+        (lambda i: "NIKON D60 | ? | 29 mm | 64x48", "group", "SIMPLE_RADIAL"),
+        (lambda i: f"Body {i % 4} | ? | 29 mm | 64x48", "image", "SIMPLE_RADIAL"),
+        (lambda i: f"{64 + i}x48", "image", "SIMPLE_RADIAL"),
+        (lambda i: f"{64 + i % 2}x48", "group", "SIMPLE_RADIAL"),
+        (lambda i: "X | 8mm Fisheye | 8 mm | 64x48", "group", "OPENCV_FISHEYE"),
+    ],
+)
+def test_cameras(tmp_path, group, share, model):
+    sfm = make_plan(many(tmp_path, 12, camera_group=group), Config()).config.sfm
+    assert (sfm.share_cameras, sfm.camera_model) == (share, model)
+
+
+def test_decisions_say_the_resolution_and_the_split(tmp_path):
+    photos(tmp_path / "images", 2, (72, 128))
+    plan = plan_of(tmp_path, views={"max_long_side_px": 96, "holdout_every": 5})
+    assert plan.facts["view_size"] == [54, 96]
+    assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
+    assert "one view in 5" in plan.stages["evaluate"].reason
+    assert "no view" in plan_of(tmp_path, views={"holdout_every": 0}).stages["evaluate"].reason
+
+
+def test_facts_and_warnings_go_with_the_plan(tmp_path):
+    files = photos(tmp_path / "images", 2)
+    (tmp_path / "images" / "x.jpg").write_text("no picture")
+    write_sparse(tmp_path / "sparse_gt", [path.name for path in files], (64, 48))
+    plan = plan_of(tmp_path)
+    assert plan.facts["photographs"] == 2 and plan.facts["truth"] == "sparse_gt"
+    assert any("x.jpg" in line for line in plan.warnings)
+    assert any("sparse_gt" in line for line in plan.stages["evaluate"].decisions)
+    assert Plan.model_validate_json(plan.model_dump_json()) == plan
+
+
+def test_description_names_every_stage_once(tmp_path):
+    photos(tmp_path / "images", 2)
+    plan = plan_of(tmp_path)
+    lines = describe(plan).splitlines()
+    for name, stage in plan.stages.items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert line.split()[1] == ("run" if stage.run else "skip") and stage.reason in line
+
+
+def test_the_snakefile_can_afford_it():
+    """Planning imports nothing heavy: it happens at every start, before any job."""
+    program = (
+        "import sys, pipeline.scene.plan, pipeline.scene.given, pipeline.scene.views;"
+        "print([m for m in ('torch', 'cv2', 'scipy', 'skimage', 'pycolmap', 'rawpy', 'tifffile')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr

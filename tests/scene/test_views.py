@@ -1,0 +1,65 @@
+"""Views: sizes, scaled intrinsics, the split and the scene's extent."""
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Views
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.views import load_views, scene_extent, view_size
+
+
+def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruction]:
+    camera = camera or Camera("PINHOLE", 301, 200, np.array([250.0, 260.0, 150.0, 99.0]))
+    names = [f"p{i:02d}.jpg" for i in range(count)]
+    photos = [
+        Photo(name=n, path=f"/x/{n}", width=301, height=200, digest=n, mask=f"/m/{n}")
+        for n in names
+    ]
+    images = {
+        i + 1: Posed(n, 1, np.eye(3), np.array([-float(i), 0, 0])) for i, n in enumerate(names)
+    }
+    return Manifest(scene="s", photos=tuple(photos)), Reconstruction({1: camera}, images)
+
+
+def test_sizes():
+    assert view_size(301, 200, 960) == (301, 200)
+    assert view_size(720, 1280, 960) == (540, 960)
+    assert view_size(10_000, 1, 100) == (100, 1)
+
+
+def test_intrinsics_scale_by_the_exact_ratio_of_each_side():
+    manifest, model = make(1)
+    (view,) = load_views(manifest, model, Views(max_long_side_px=100))
+    assert (view.width, view.height) == (100, 66)
+    ratio_x, ratio_y = 100 / 301, 66 / 200
+    expected = (250 * ratio_x, 260 * ratio_y, 150 * ratio_x, 99 * ratio_y)
+    np.testing.assert_allclose((view.fx, view.fy, view.cx, view.cy), expected)
+
+
+def test_every_eighth_of_the_posed_photographs_by_name_is_held_out():
+    manifest, model = make(20)
+    del model.images[1]  # p00 has no pose: p01 is the first of the split.
+    views = load_views(manifest, model, Views())
+    assert [view.name for view in views if view.is_test] == ["p01.jpg", "p09.jpg", "p17.jpg"]
+    assert not any(view.is_test for view in load_views(manifest, model, Views(holdout_every=0)))
+
+
+def test_masks_can_be_ignored():
+    manifest, model = make(1)
+    assert load_views(manifest, model, Views())[0].mask == "/m/p00.jpg"
+    assert load_views(manifest, model, Views(masks="ignore"))[0].mask is None
+
+
+def test_distorting_cameras_are_refused():
+    manifest, model = make(1, Camera("SIMPLE_RADIAL", 301, 200, np.array([250.0, 150, 100, 0.1])))
+    with pytest.raises(ValueError, match="SIMPLE_RADIAL"):
+        load_views(manifest, model, Views())
+
+
+def test_extent():
+    manifest, model = make(9)
+    views = load_views(manifest, model, Views(holdout_every=8))
+    # Training cameras stand at x = 1 ... 7: 3 from their mean.
+    assert scene_extent(views) == pytest.approx(3.3)
+    assert scene_extent(views[:1]) == 1.0

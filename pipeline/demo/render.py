@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 
 SAMPLES = 2  # rays a pixel and axis
 # The lens's blur, in pixels: what keeps a real photograph free of aliasing, and a mosaic legible.
-LENS_SIGMA = 0.55
+LENS_SIGMA = 0.65
 MARGIN = 3  # pixels rendered around the picture for that blur
 # The texture filter's sigma in pixels; the lens's blur does the rest.
 TEXTURE_SIGMA = 0.35

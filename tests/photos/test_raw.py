@@ -1,0 +1,140 @@
+"""RAW files: true colours, all views alike, damaged ones left out by name."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Decode
+from pipeline.demo.cameras import orbit
+from pipeline.demo.render import rays, render
+from pipeline.demo.scene import OBJECTS
+from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng
+from pipeline.photos.load import load_rgb
+from pipeline.photos.raw import develop
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.model import Camera
+
+DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "raw"
+TAKEN = "2026:01:01 12:00:00"
+
+
+def manifest(paths: list[Path], width: int, height: int) -> Manifest:
+    photos = [
+        Photo(
+            name=path.name,
+            path=str(path),
+            width=width,
+            height=height,
+            digest="",
+            raw=True,
+            bits=16,
+            focal_px=100.0,
+            camera_group="one",
+            orientation=6,
+        )
+        for path in sorted(paths)
+    ]
+    return Manifest(scene="raw", photos=tuple(photos))
+
+
+def psnr(a: np.ndarray, b: np.ndarray, peak: float) -> float:
+    error = np.mean((a.astype(np.float64) - b.astype(np.float64)) ** 2)
+    return float(10 * np.log10(peak**2 / error))
+
+
+@pytest.fixture(scope="module")
+def light() -> np.ndarray:
+    """A view of the demo scene, linear light, through a lens long enough to see it smooth."""
+    camera = Camera("PINHOLE", 200, 150, np.array([480.0, 480.0, 100.0, 75.0]))
+    return render(orbit(["a"] * 8, 0)[0], camera, rays(camera), OBJECTS).light
+
+
+def test_dng_comes_back_as_the_picture_it_was_made_of(tmp_path: Path, light: np.ndarray) -> None:
+    write_dng(tmp_path / "a.dng", expose(light, 0.0, (0, 0)), TAKEN)
+    source = manifest([tmp_path / "a.dng"], 200, 150)
+    report = develop(source, Decode(), tmp_path / "display", threads=1)
+    inner = np.s_[4:-4, 4:-4]
+    shown = load_rgb(report.manifest.photos[0].path)
+    assert psnr(shown[inner], to_bytes(srgb(light))[inner], 255) >= 40
+    linear = develop(source, Decode(linear=True), tmp_path / "linear", threads=1)
+    deep = load_rgb(linear.manifest.photos[0].path)
+    assert deep.dtype == np.uint16 and linear.manifest.photos[0].bits == 16
+    assert psnr(deep[inner], np.clip(light, 0, 1)[inner] * 65535, 65535) >= 40
+
+
+def test_identical_light_is_developed_alike_whatever_else_is_in_the_picture(
+    tmp_path: Path,
+) -> None:
+    dark = np.full((64, 96, 3), 0.05)
+    bright = dark.copy()
+    bright[:, 48:] = 0.9  # LibRaw's own exposure would darken this picture
+    for name, light in (("dark", dark), ("bright", bright)):
+        write_dng(tmp_path / f"{name}.dng", expose(light, 0.0, (0, 0)), TAKEN)
+    both = manifest([tmp_path / "bright.dng", tmp_path / "dark.dng"], 96, 64)
+    report = develop(both, Decode(), tmp_path / "out", threads=2)
+    first, second = (load_rgb(photo.path) for photo in report.manifest.photos)
+    assert np.array_equal(first[:, :40], second[:, :40])
+    assert np.all(np.abs(second.astype(int) - to_bytes(srgb(dark))) <= 1)
+
+
+def test_manifest_of_developed_files(tmp_path: Path, light: np.ndarray) -> None:
+    for name in ("a.dng", "b.dng"):
+        write_dng(tmp_path / name, expose(light[:64, :96], 0.0, (0, 0)), TAKEN)
+    source = manifest([tmp_path / "a.dng", tmp_path / "b.dng"], 96, 64)
+    report = develop(source, Decode(half_size=True), tmp_path / "out", threads=2)
+    assert Manifest.read(tmp_path / "out" / "images.json") == report.manifest
+    for photo, name in zip(report.manifest.photos, ("a.png", "b.png"), strict=True):
+        assert (photo.name, photo.width, photo.height) == (name, 48, 32)
+        assert load_rgb(photo.path).shape == (32, 48, 3)
+        assert photo.focal_px == 50.0 and not photo.raw and photo.camera_group == "one"
+        assert photo.orientation == 6  # carried along, not applied
+    (tmp_path / "out").rename(tmp_path / "moved")
+    moved = Manifest.read(tmp_path / "moved" / "images.json")
+    assert load_rgb(moved.photos[0].path).shape == (32, 48, 3)
+
+
+def test_damaged_raw_is_left_out_by_name_and_all_damaged_is_an_error(
+    tmp_path: Path, light: np.ndarray
+) -> None:
+    for name in ("a.dng", "b.dng", "c.dng"):
+        write_dng(tmp_path / name, expose(light[:64, :96], 0.0, (0, 0)), TAKEN)
+    (tmp_path / "b.dng").write_bytes((tmp_path / "b.dng").read_bytes()[:5000])
+    (tmp_path / "c.dng").write_text("no RAW file")
+    source = manifest([tmp_path / f"{n}.dng" for n in "abc"], 96, 64)
+    report = develop(source, Decode(), tmp_path / "out", threads=2)
+    assert [photo.name for photo in report.manifest.photos] == ["a.png"]
+    assert len(report.warnings) == 2 and report.manifest.warnings == report.warnings
+    for name in ("b.dng", "c.dng"):
+        assert sum(f"{name}: RAW file left out" in text for text in report.warnings) == 1
+    broken = manifest([tmp_path / "b.dng", tmp_path / "c.dng"], 96, 64)
+    with pytest.raises(UserError, match="none of the 2 RAW files"):
+        develop(broken, Decode(), tmp_path / "out2", threads=2)
+
+
+def test_same_stems_keep_apart(tmp_path: Path, light: np.ndarray) -> None:
+    for name in ("a.dng", "a.nef"):
+        write_dng(tmp_path / name, expose(light[:64, :96], 0.0, (0, 0)), TAKEN)
+    source = manifest([tmp_path / "a.dng", tmp_path / "a.nef"], 96, 64)
+    report = develop(source, Decode(), tmp_path / "out", threads=1)
+    assert [photo.name for photo in report.manifest.photos] == ["a.dng.png", "a.nef.png"]
+
+
+@pytest.mark.skipif(not DATA.is_dir(), reason="real RAW files are not on this machine")
+def test_real_raw_files_of_three_bodies(tmp_path: Path) -> None:
+    sizes = {
+        "canon_eos_6d_linear_lossy.dng": (1224, 816),
+        "canon_eos_kissx4_magiclantern_colorchart.dng": (1734, 1156),
+        "kodak_dc50.KDC": (768, 512),
+    }
+    photos = [manifest([DATA / name], *size).photos[0] for name, size in sizes.items()]
+    source = Manifest(scene="raw", photos=tuple(photos))
+    report = develop(source, Decode(demosaic="linear"), tmp_path, threads=2)
+    assert not report.warnings
+    for photo, size in zip(report.manifest.photos, sizes.values(), strict=True):
+        rgb = load_rgb(photo.path)
+        assert rgb.shape[1::-1] == size == (photo.width, photo.height)
+        assert 10 < rgb.mean() < 200

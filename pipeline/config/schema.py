@@ -25,7 +25,9 @@ class Inspect(Section):
     image_folder: str = Field(
         "auto",
         description="Folder of photographs inside the scene folder; auto takes images/, else the "
-        "scene folder itself, and of images_2|4|8/ the one nearest above views.max_long_side_px.",
+        "scene folder itself or its only subfolder with photographs. Of images/ and "
+        "images_2|4|8/ auto takes the smallest not below views.max_long_side_px (where poses "
+        "are to be found, nor below features.max_long_side_px).",
     )
     min_images: Positive = Field(2, description="Fewer readable photographs than this is an error.")
 
@@ -77,7 +79,9 @@ class Matches(Section):
     """Which pairs are matched, and how they are verified."""
 
     pairs: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = Field(
-        "auto", description="auto chooses from count, order and GPS."
+        "auto",
+        description="auto: exhaustive up to 80 photographs; above, spatial where GPS tells them "
+        "apart, sequential where times or names say they are one walk, else retrieval.",
     )
     neighbours: Positive = Field(
         12, description="Pairs an image (sequential overlap, spatial or retrieval neighbours)."
@@ -94,11 +98,19 @@ class Sfm(Section):
     )
     camera_model: Literal[
         "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
-    ] = Field("auto", description="auto: SIMPLE_RADIAL.")
+    ] = Field(
+        "auto", description="auto: SIMPLE_RADIAL; OPENCV_FISHEYE where EXIF names a fisheye lens."
+    )
     share_cameras: Literal["auto", "single", "group", "image"] = Field(
         "auto",
-        description="auto and group: one camera for photographs of one body, lens, focal and "
-        "size; single: one for all; image: one each.",
+        description="group: one camera for photographs of one body, lens, focal and size; "
+        "single: one for all; image: one each; auto: group, but image for a collection by many "
+        "cameras.",
+    )
+    refine_radial: Literal["auto", "no"] = Field(
+        "auto",
+        description="auto: a last bundle adjustment turns SIMPLE_RADIAL cameras into RADIAL ones "
+        "where that lowers the error.",
     )
     refine_principal_point: Literal["auto", "yes", "no"] = Field(
         "auto",

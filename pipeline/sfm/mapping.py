@@ -20,6 +20,7 @@ from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.judge import Evidence, Verdict, gather, judge
 from pipeline.sfm.matching import shown
+from pipeline.sfm.models import Colors, color_points, write_model
 from pipeline.sfm.quiet import quiet_colmap
 from pipeline.sfm.refine import refine
 
@@ -120,18 +121,20 @@ def reconstruct(
             raise UserError("no reconstruction: " + "; ".join(attempt.verdict.reasons), fix=REMEDY)
         model, refined = refine(
             attempt.models[0],
-            radial=config.camera_model == "auto",
+            radial=config.refine_radial == "auto",
             principal_point=config.refine_principal_point,
         )
         decisions += refined
         # What the reader is told is of the model that is written.
         evidence = gather(model, work, total)
-    _color_points(model, database.with_name("keypoint_colors.npz"))
     others = attempt.models[1:]
-    _write_model(model, out / "sparse" / "0")
-    for index, other in enumerate(others, start=1):
-        _color_points(other, database.with_name("keypoint_colors.npz"))
-        _write_model(other, out / "other_models" / str(index))
+    folders = [out / "sparse" / "0"]
+    folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]
+    colors = _read_colors(database.with_name("keypoint_colors.npz"))
+    for each, folder_of in zip([model, *others], folders, strict=True):
+        if colors is not None:
+            color_points(each, colors)
+        write_model(each, folder_of)
 
     registered = {model.image(i).name for i in model.reg_image_ids()}
     missing = [photo.name for photo in manifest.photos if photo.name not in registered]
@@ -272,20 +275,11 @@ def _check_complete(manifest: Manifest, database: Path) -> list[str]:
     return [f"no features in {shown(sorted(empty))}"] if empty else []
 
 
-def _color_points(model: pycolmap.Reconstruction, colors: Path) -> None:
-    """Give each point the mean colour of its keypoints; grey where they are not known."""
-    if not colors.exists():
-        return
-    with np.load(colors) as data:
-        color_of = {int(key): data[key] for key in data.files}
-    for point in model.points3D.values():
-        seen = [color_of[e.image_id][e.point2D_idx] for e in point.track.elements]
-        point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
-
-
-def _write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    folder.mkdir(parents=True, exist_ok=True)
-    model.write_binary(folder)
+def _read_colors(path: Path) -> Colors | None:
+    if not path.exists():
+        return None
+    with np.load(path) as data:
+        return {int(key): data[key] for key in data.files}
 
 
 def _camera_summaries(model: pycolmap.Reconstruction, evidence: Evidence) -> list[CameraSummary]:

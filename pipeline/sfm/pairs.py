@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import minimum_spanning_tree
 from scipy.spatial import cKDTree
+from scipy.spatial.distance import cdist
 
 from pipeline.runtime.progress import Progress
 
@@ -70,7 +71,7 @@ def proximity_pairs(
     centres: NDArray[np.float64], directions: NDArray[np.float64], neighbours: int
 ) -> list[Pair]:
     """Each camera with its ``neighbours`` nearest ones that look a similar way (within 75
-    degrees), of those as far apart as the median nearest distance first.
+    degrees), by distance and turn together.
 
     Args:
         centres, directions: (N, 3), world; directions are unit vectors along the optical axes.
@@ -78,11 +79,10 @@ def proximity_pairs(
     count = len(centres)
     if count < 2:
         return []
-    distance = np.linalg.norm(centres[:, None] - centres[None], axis=-1)
+    distance = cdist(centres, centres)
     turn = np.arccos(np.clip(directions @ directions.T, -1, 1))
-    np.fill_diagonal(distance, np.inf)
     # One radian of turn weighs as much as the typical distance of cameras from each other.
-    unit = float(np.median(distance[np.isfinite(distance)]))
+    unit = float(np.median(distance[np.triu_indices(count, 1)]))
     cost = distance / max(unit, 1e-12) + turn
     cost[turn > np.radians(75)] = np.inf
     np.fill_diagonal(cost, np.inf)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import cast
+
 import numpy as np
 import pycolmap
 
@@ -89,7 +91,8 @@ def _adjust(model: pycolmap.Reconstruction, free_principal_point: set[int]) -> f
         for camera_id in sorted(set(model.cameras) - free_principal_point):
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
-    summary = pycolmap.create_default_ceres_bundle_adjuster(options, config, model).solve()
+    adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
+    summary = cast(pycolmap.CeresBundleAdjustmentSummary, adjuster.solve())
     model.update_point_3d_errors()
     return float(summary.ceres_summary.final_cost)
 

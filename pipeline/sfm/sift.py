@@ -45,9 +45,9 @@ class Picture:
             mask = _read_mask(photo, (width, height))
             usable = mask if usable is None else usable & mask
         if reduction < 1:
-            bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA)
-            if usable is not None:
-                usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST)
+            bgr = cv2.resize(bgr, size, interpolation=cv2.INTER_AREA).astype(np.uint8)
+        if reduction < 1 and usable is not None:
+            usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
         self.grey = cv2.cvtColor(bgr, cv2.COLOR_BGR2GRAY)
         self.rgb = np.ascontiguousarray(bgr[..., ::-1])
         self.usable = usable

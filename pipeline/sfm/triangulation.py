@@ -1,0 +1,172 @@
+"""Sparse points for cameras whose poses are given."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.config import schema
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.sfm.isolate import run_isolated
+from pipeline.sfm.keypoints import keypoint_file
+
+DEFAULT_MATCHES = schema.Matches()
+
+
+@dataclass(frozen=True)
+class TriangulationReport:
+    """Attributes:
+    num_points, mean_reprojection_error_px, mean_track_length: of the points; 0 without any.
+    num_pairs, num_verified: pairs matched and verified.
+    num_images: photographs with a pose.
+    decisions, warnings: for people.
+    """
+
+    num_points: int
+    mean_reprojection_error_px: float
+    mean_track_length: float
+    num_pairs: int
+    num_verified: int
+    num_images: int
+    decisions: list[str]
+    warnings: list[str]
+
+
+def triangulate(
+    manifest: Manifest,
+    sparse: Path,
+    out: Path,
+    features: schema.Features,
+    matches: schema.Matches = DEFAULT_MATCHES,
+    *,
+    threads: int,
+    seed: int,
+    cache: Path | None = None,
+) -> TriangulationReport:
+    """Write the model of ``sparse`` with points triangulated from the photographs to
+    ``out/sparse/0``; poses as they were, the points it brought replaced.
+
+    Everything heavy happens in processes of its own, so torch may be loaded here. The bytes do
+    not depend on ``threads``. Few points or none are no error: the report has their number.
+
+    Args:
+        sparse: folder of a COLMAP model; its images are found in the manifest by name, and those
+            that are not are left out. A camera of another size than its photographs (reduced
+            copies) is written in theirs.
+        matches: its ratio, inliers and neighbours; pairs are chosen by the cameras' nearness.
+        cache: of the features, where they shall outlive the call.
+
+    Raises:
+        UserError: no image of the model is among the photographs.
+    """
+    with tempfile.TemporaryDirectory(prefix="splatmake-triangulation-") as folder:
+        found = Path(folder) / "features"
+        cache = cache or Path(folder) / "cache"
+        feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
+        facts: dict[str, Any] = run_isolated(
+            _triangulate, manifest, sparse, out, found, matches, threads, seed
+        )
+    return TriangulationReport(
+        **facts,
+        decisions=[
+            f"{facts['num_points']} points triangulated from {facts['num_verified']} verified of "
+            f"{facts['num_pairs']} pairs of neighbouring cameras"
+        ],
+        warnings=feature_warnings,
+    )
+
+
+def _extract(
+    manifest: Manifest, config: schema.Features, out: Path, cache: Path, threads: int
+) -> list[str]:
+    from pipeline.sfm.features import extract_features
+
+    return extract_features(manifest, config, out, cache=cache, threads=threads).warnings
+
+
+def _triangulate(
+    manifest: Manifest,
+    sparse: Path,
+    out: Path,
+    features: Path,
+    config: schema.Matches,
+    threads: int,
+    seed: int,
+) -> dict[str, Any]:
+    import pycolmap
+
+    from pipeline.sfm.database import MatchingSettings, build_database, verified_inliers
+    from pipeline.sfm.models import color_points, posed_model, read_colors, write_model
+    from pipeline.sfm.pairs import proximity_pairs
+    from pipeline.sfm.quiet import quiet_colmap
+
+    quiet_colmap()
+    model = pycolmap.Reconstruction(sparse)
+    photos = {photo.name: photo for photo in manifest.photos}
+    ids = sorted(i for i in model.reg_image_ids() if model.image(i).name in photos)
+    if not ids:
+        raise UserError(
+            "no image of the given model is among the photographs",
+            file=sparse,
+            fix="give the images the names they have in the model",
+        )
+    cameras = {}
+    for image_id in ids:
+        image = model.image(image_id)
+        cameras[image.camera_id] = _camera_of(photos[image.name], model.camera(image.camera_id))
+    images = [(i, model.image(i).name, model.image(i).camera_id) for i in ids]
+    poses = [model.image(i).cam_from_world() for i in ids]
+    pairs = proximity_pairs(
+        np.array([model.image(i).projection_center() for i in ids]),
+        np.array([pose.rotation.matrix()[2] for pose in poses]),
+        config.neighbours,
+    )
+    with tempfile.TemporaryDirectory(prefix="splatmake-triangulation-") as folder:
+        database = Path(folder) / "database.db"
+        build_database(
+            database,
+            [cameras[i] for i in sorted(cameras)],
+            images,
+            features,
+            pairs,
+            MatchingSettings(config.max_ratio, config.min_inliers, threads, seed),
+        )
+        verified = verified_inliers(database)
+        points = posed_model(list(cameras.values()), images, poses)
+        options = pycolmap.IncrementalPipelineOptions(num_threads=1, random_seed=seed)
+        options.extract_colors = False
+        options.triangulation.ignore_two_view_tracks = False
+        if verified:
+            points = pycolmap.triangulate_points(
+                points, database, folder, folder, clear_points=True, options=options
+            )
+    names = {image_id: name for image_id, name, _ in images}
+    color_points(points, read_colors({i: keypoint_file(features, names[i]) for i in ids}))
+    num_points = int(points.num_points3D())
+    write_model(points, out / "sparse" / "0")
+    return {
+        "num_points": num_points,
+        "mean_reprojection_error_px": (
+            float(points.compute_mean_reprojection_error()) if num_points else 0.0
+        ),
+        "mean_track_length": float(points.compute_mean_track_length()) if num_points else 0.0,
+        "num_pairs": len(pairs),
+        "num_verified": len(verified),
+        "num_images": len(ids),
+    }
+
+
+def _camera_of(photo: Photo, camera: Any) -> Any:
+    """The camera at the size of the photograph: keypoints are in stored pixels."""
+    import pycolmap
+
+    sized = pycolmap.Camera(camera.todict())
+    if (sized.width, sized.height) != (photo.width, photo.height):
+        sized.rescale(photo.width, photo.height)
+    sized.has_prior_focal_length = True
+    return sized

@@ -98,8 +98,10 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             decisions=[scan.image_folder_reason],
         ),
         "decode": _decode(scan, settled),
-        "features": _pose_stage(poses, "keypoints to find the poses by", []),
-        "matches": _pose_stage(poses, "pairs to find the poses by", [pairs_reason]),
+        "features": _pose_stage(
+            poses, "keypoints to find the poses by", [_keypoints(scan, config)]
+        ),
+        "matches": _pose_stage(poses, "pairs to find poses by", [pairs_reason]),
         "sfm": _pose_stage(poses, _why_sfm(config), [mapper_reason, model_reason, sharing_reason]),
         "undistort": _undistort(scan, settled),
         "init": _init(scan, settled, pairs_reason),
@@ -166,6 +168,14 @@ def _gps_extent(scan: Scan) -> float:
         for place in places
     ]
     return math.hypot(max(north) - min(north), max(east) - min(east))
+
+
+def _keypoints(scan: Scan, config: Config) -> str:
+    features = config.features
+    longest = min(max(max(size) for size in scan.sizes), features.max_long_side_px)
+    return (
+        f"up to {features.max_features} SIFT keypoints each ({features.backend}), at {longest} px"
+    )
 
 
 def _mapper(scan: Scan, config: Config) -> Choice:

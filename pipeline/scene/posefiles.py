@@ -105,7 +105,7 @@ def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder |
     existing = [
         str(PurePosixPath(parent) / name)
         for parent in parents
-        if (folder / parent).is_dir()
+        if not parent.startswith(("/", "..")) and (folder / parent).is_dir()
         for name in os.listdir(folder / parent)
         if suffix_of(name) in PHOTO_SUFFIXES and name[0] != "."
     ]

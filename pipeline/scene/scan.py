@@ -7,11 +7,12 @@ builds its jobs, so facts about files are remembered between calls.
 from __future__ import annotations
 
 import hashlib
+import posixpath
 import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 
 from pydantic import BaseModel, ConfigDict
 
@@ -200,10 +201,11 @@ def _choose_folder(
 ) -> PhotoFolder:
     wanted = config.inspect.image_folder
     if wanted != "auto":
-        wanted = wanted.strip("/") or "."
-        if not (folder / wanted).is_dir():
+        wanted = PurePosixPath(wanted).as_posix()
+        inside = not wanted.startswith("/") and ".." not in wanted.split("/")
+        if not inside or not (folder / wanted).is_dir():
             raise UserError(
-                "inspect.image_folder names a folder that does not exist",
+                "inspect.image_folder does not name a folder inside the scene folder",
                 file=folder / wanted,
                 fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
             )
@@ -226,7 +228,11 @@ def _choose_folder(
             )
         return PhotoFolder(".", ".", "no images/; photographs lie in the scene folder", top)
     names = pictures_in(folder, warnings, skip_companions=True)
-    return PhotoFolder(".", ".", "no images/; photographs lie in subfolders", names)
+    parents = [posixpath.dirname(name) for name in names]
+    base = posixpath.commonpath(parents) if parents else ""
+    names = [posixpath.relpath(name, base or ".") for name in names]
+    where = f"{base}/" if base else "subfolders"
+    return PhotoFolder(base or ".", base or ".", f"no images/; photographs lie in {where}", names)
 
 
 def _choose_size(

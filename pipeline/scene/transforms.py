@@ -10,9 +10,10 @@ from __future__ import annotations
 
 import json
 import math
+import posixpath
 from collections.abc import Mapping
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -170,14 +171,24 @@ def _frame(
     rotation = _FLIP_YZ @ turn.T
     mask = entry.get("mask_path")
     return Frame(
-        path=str(PurePosixPath(path.replace("\\", "/"))),
-        mask=str(PurePosixPath(mask)) if isinstance(mask, str) and mask else None,
+        path=_relative(file, path),
+        mask=_relative(file, mask) if isinstance(mask, str) and mask else None,
         rotation=rotation,
         translation=-rotation @ to_world[:3, 3],
         fields={**shared, **entry},
         file=file,
         source=source,
     )
+
+
+def _relative(file: Path, path: str) -> str:
+    """``path`` relative to the folder of ``file``, "./" and "x/.." taken out; absolute, or
+    beginning with "..", only where it leads outside."""
+    plain = posixpath.normpath(path.replace("\\", "/"))
+    if not posixpath.isabs(plain):
+        return plain
+    folder = str(file.parent.resolve())
+    return posixpath.relpath(plain, folder) if plain.startswith(folder + "/") else plain
 
 
 def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:

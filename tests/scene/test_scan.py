@@ -92,6 +92,13 @@ def test_photographs_in_subfolders(tmp_path):
     assert names(look(tmp_path)) == ["left/p00.jpg", "right/p00.jpg"]
 
 
+def test_one_folder_of_another_name_counts_as_images(tmp_path):
+    photos(tmp_path / "input", 2)
+    write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
+    result = look(tmp_path)
+    assert (result.image_folder, names(result)) == ("input", ["p00.jpg", "p01.jpg"])
+
+
 @pytest.mark.parametrize(
     "long_side, chosen", [(960, "images"), (32, "images_2"), (16, "images_4"), (1, "images_4")]
 )
@@ -146,9 +153,10 @@ def test_configured_folder(tmp_path):
     photos(tmp_path / "images_2", 2, (32, 24))
     result = look(tmp_path, config(inspect={"image_folder": "images_2"}))
     assert (result.image_folder, result.sizes) == ("images_2", [(32, 24)])
-    with pytest.raises(UserError, match="image_folder") as error:
-        look(tmp_path, config(inspect={"image_folder": "imgs"}))
-    assert "images_2" in error.value.fix
+    for wrong in ("imgs", "..", str(tmp_path)):
+        with pytest.raises(UserError, match="image_folder") as error:
+            look(tmp_path, config(inspect={"image_folder": wrong}))
+        assert "images_2" in error.value.fix
 
 
 def test_given_colmap_model_and_truth(tmp_path):
@@ -203,6 +211,19 @@ def test_nerfstudio_with_masks(tmp_path):
     assert (result.num_masks, result.poses.models) == (2, ("OPENCV",))
     (camera,) = load_given(result).cameras.values()
     assert (camera.width, camera.pinhole[0]) == (64, 25)
+
+
+def test_transforms_with_absolute_paths_and_photographs_elsewhere(tmp_path):
+    folder = tmp_path / "scene"
+    photos(folder / "images", 2)
+    photos(tmp_path / "other", 2)
+    inside = [str(folder / "images" / "p00.jpg"), "images/../images/p01.jpg"]
+    outside = [str(tmp_path / "other" / "p00.jpg"), "../other/p01.jpg"]
+    frames = [frame(path=path) for path in inside + outside]
+    write(folder, {"fl_x": 50, "frames": frames})
+    result = look(folder)
+    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).by_name())
+    assert any("2 of 4 cameras have no photograph" in line for line in result.warnings)
 
 
 def test_llff_goes_by_order_even_past_a_broken_photograph(tmp_path):

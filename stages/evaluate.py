@@ -19,11 +19,10 @@ from stages.command import main
 
 def run(job: Job) -> None:
     manifest = Manifest.read(job.inputs["views"] / "images.json")
-    views = load_views(
-        manifest, read_model(job.inputs["model"] / "sparse" / "0"), job.section(Views)
-    )
+    split = job.section(Views)
+    views = load_views(manifest, read_model(job.inputs["model"] / "sparse" / "0"), split)
     train = job.section(Train)
-    protocol = choose_protocol(views, train, any(photo.alpha for photo in manifest.photos))
+    protocol = choose_protocol(views, split, train, any(photo.alpha for photo in manifest.photos))
     evaluation = evaluate_views(
         Gaussians.load(job.inputs["train"] / "gaussians.npz"),
         protocol,
@@ -32,6 +31,8 @@ def run(job: Job) -> None:
         job.out / "renders",
         threads=job.threads,
     )
+    for text in evaluation.pop("warnings"):
+        job.warn(text)
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
@@ -40,7 +41,7 @@ def run(job: Job) -> None:
     write_json(job.out / "evaluation.json", evaluation)
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
-    if not protocol.held_out:
+    if not protocol.every:
         job.warn("no view was held out: quality was measured on training views")
 
 

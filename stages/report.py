@@ -60,7 +60,7 @@ def compare(
     photos = {photo.name: photo for photo in manifest.photos}
     by_name = {view.name: view for view in views}
     has_alpha = any(photo.alpha for photo in manifest.photos)
-    background = choose_protocol(views, job.section(Train), has_alpha).background
+    protocol = choose_protocol(views, job.section(Views), job.section(Train), has_alpha)
     shown = []
     for label, measured in ranked(evaluation["per_view"], job.section(Report).views):
         view = by_name[measured["name"]]
@@ -70,7 +70,7 @@ def compare(
                 Comparison(
                     label=label,
                     name=view.name,
-                    photograph=reference(pixels, background),
+                    photograph=reference(pixels, protocol.background),
                     render=np.asarray(render),
                     mask=pixels.mask,
                     psnr=measured["psnr"],

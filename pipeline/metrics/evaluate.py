@@ -11,10 +11,11 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config.schema import Evaluate, Train
+from pipeline.config.schema import Evaluate, Train, Views
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
-from pipeline.metrics.lpips import lpips_available
+from pipeline.metrics.lpips import LPIPS_VARIANTS, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
+from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View
 from pipeline.scene.views import scene_extent
@@ -30,18 +31,18 @@ class Protocol:
 
     Attributes:
         views: those measured on.
-        held_out: training never saw them.
+        every: each this-many-th view was held out of training; 0: none was, these were seen.
         background: RGB in [0, 1] behind renders and transparent photographs.
         near: near plane of the renders, as in training; world unit.
     """
 
     views: list[View]
-    held_out: bool
+    every: int
     background: tuple[float, float, float]
     near: float
 
 
-def choose_protocol(views: Sequence[View], train: Train, has_alpha: bool) -> Protocol:
+def choose_protocol(views: Sequence[View], split: Views, train: Train, has_alpha: bool) -> Protocol:
     """The views to evaluate on (the held-out ones, else all) and the background.
 
     The background is the one trained on; where that was random (images with alpha), white, as
@@ -51,7 +52,7 @@ def choose_protocol(views: Sequence[View], train: Train, has_alpha: bool) -> Pro
     white = train.background == "white" or (train.background in ("auto", "random") and has_alpha)
     return Protocol(
         held_out or list(views),
-        bool(held_out),
+        split.holdout_every if held_out else 0,
         WHITE if white else BLACK,
         near_plane(scene_extent(list(views))),
     )
@@ -73,13 +74,19 @@ def evaluate_views(
 
     Returns:
         ``psnr``, ``ssim``, ``lpips`` (means of the views' values; lpips null where its weights are
-        missing, with ``lpips_reason``), ``per_view`` and ``protocol``.
+        missing, with ``lpips_reason``), ``per_view``, ``warnings`` and ``protocol``.
     """
     lpips, reason = lpips_available(config.lpips_net)
     out.mkdir(parents=True, exist_ok=True)
     per_view: list[dict[str, Any]] = []
     progress = Progress("evaluating", len(protocol.views), "views")
+    warnings: list[str] = []
     for index, view in enumerate(protocol.views):
+        pixels = load_view(view.image, view.mask, view.width, view.height)
+        if pixels.mask is not None and not pixels.mask.any():
+            warnings.append(f"{view.name}: its mask leaves no pixel to measure")
+            progress.advance()
+            continue
         rendered = render_view(
             gaussians,
             view,
@@ -91,24 +98,26 @@ def evaluate_views(
         )
         picture = to_bytes(rendered.rgb)
         Image.fromarray(picture).save(out / f"{index:04d}.png")
-        pixels = load_view(view.image, view.mask, view.width, view.height)
         a, b = picture / 255.0, reference(pixels, protocol.background) / 255.0
         per_view.append(
             {
                 "name": view.name,
                 "psnr": psnr(a, b, pixels.mask),
                 "ssim": ssim(a, b, pixels.mask),
-                "lpips": lpips(a, b) if lpips is not None else None,
+                "lpips": lpips(a, b, pixels.mask) if lpips is not None else None,
                 "render": f"{index:04d}.png",
             }
         )
         progress.advance(note=f"PSNR {per_view[-1]['psnr']:.2f} dB")
+    if not per_view:
+        raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
     return {
         "psnr": float(np.mean([v["psnr"] for v in per_view])),
         "ssim": float(np.mean([v["ssim"] for v in per_view])),
         "lpips": None if lpips is None else float(np.mean([v["lpips"] for v in per_view])),
         "lpips_reason": reason,
         "per_view": per_view,
+        "warnings": warnings,
         "protocol": _describe(protocol, config, reason if lpips is None else None),
     }
 
@@ -131,14 +140,14 @@ def _describe(protocol: Protocol, config: Evaluate, no_lpips: str | None) -> dic
     return {
         "resolution": [f"{w}x{h}" for w, h in sizes],
         "split": (
-            "held-out views: every n-th, sorted by name, from the first"
-            if protocol.held_out
+            f"held out: one view in {protocol.every}, sorted by name, from the first"
+            if protocol.every
             else "no view was held out: measured on the TRAINING views"
         ),
         "num_views": len(protocol.views),
         "psnr": "mean of the views' PSNR in dB, 8-bit renders, peak 1",
         "ssim": SSIM_VARIANT,
-        "lpips": no_lpips or f"{config.lpips_net}, inputs in [0, 1] (INRIA's protocol)",
+        "lpips": no_lpips or LPIPS_VARIANTS[config.lpips_net],
         "masks": "masked pixels count for nothing" if any(v.mask for v in protocol.views) else None,
         "background": list(protocol.background),
     }

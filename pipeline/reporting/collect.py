@@ -41,7 +41,8 @@ def collect_metrics(
         else:
             record = read_stage(folder / name)
             counters[name] = record["counters"]
-            warnings += [f"{name}: {text}" for text in record["warnings"]]
+            known = plan["warnings"]
+            warnings += [f"{name}: {text}" for text in record["warnings"] if text not in known]
             run = json.loads((folder / name / "run.json").read_text())
         stages[name] = _timing(run) | {"skipped": False, "reason": step["reason"]}
     sfm = counters.get("sfm", {})
@@ -62,7 +63,7 @@ def collect_metrics(
         "stages": stages,
         "versions": own_run["versions"],
         "seed": own_run["seed"],
-        "warnings": list(dict.fromkeys(warnings)),
+        "warnings": warnings,
     }
 
 

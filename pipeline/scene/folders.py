@@ -33,13 +33,11 @@ class PhotoFolder:
     masks: dict[str, str] = field(default_factory=dict)
 
 
-def pictures_in(
-    folder: Path, warnings: list[str], *, recursive: bool = True, skip_companions: bool = False
-) -> list[str]:
+def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) -> list[str]:
     """Names of the files with a photograph's suffix, relative to ``folder``, sorted.
 
-    Hidden files and folders are passed over. Pictures of a kind this program does not read add
-    one warning for the folder.
+    Hidden files and folders, and subfolders of masks, depth maps and models, are passed over.
+    Pictures of a kind this program does not read add one warning for the folder.
     """
     names: list[str] = []
     unread: list[str] = []
@@ -49,10 +47,7 @@ def pictures_in(
         subfolders[:] = [
             name
             for name in sorted(subfolders)
-            if recursive
-            and real not in seen
-            and name[0] != "."
-            and not (skip_companions and _is_companion(name))
+            if recursive and real not in seen and name[0] != "." and not _is_companion(name)
         ]
         if real in seen:  # A link back to a folder above.
             continue

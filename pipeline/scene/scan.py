@@ -38,6 +38,7 @@ from pipeline.scene.posefiles import (
     truth_folder,
 )
 
+_STEPS = ("", "_2", "_4", "_8")
 _ADD_PHOTOS = "put the photographs into images/ inside the scene folder"
 
 
@@ -209,15 +210,22 @@ def _choose_folder(
                 file=folder / wanted,
                 fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
             )
-        names = pictures_in(folder / wanted, warnings)
-        base = re.sub(r"_\d+$", "", wanted)
-        return PhotoFolder(wanted, base, "as configured", names)
     if poses is None or poses.kind == "transforms":
         listed = transforms_photos(folder, warnings if poses is not None else None)
-        if listed is not None:
+        if listed is not None and wanted in ("auto", listed.path):
             return listed
-    if (folder / "images").is_dir() or any((folder / f"images_{n}").is_dir() for n in (2, 4, 8)):
-        return _choose_size(folder, config, poses, cache, warnings)
+    if wanted not in ("auto", "."):
+        names = pictures_in(folder / wanted, warnings)
+        base = "images" if re.fullmatch(r"images_[248]", wanted) else wanted
+        return PhotoFolder(wanted, base, "as configured", names)
+    sized = [f"images{step}" for step in _STEPS if (folder / f"images{step}").is_dir()]
+    if wanted == "auto" and sized:
+        return _choose_size(folder, sized, config, poses, cache, warnings)
+    return _plain_folder(folder, warnings)
+
+
+def _plain_folder(folder: Path, warnings: list[str]) -> PhotoFolder:
+    """Photographs that lie in the scene folder itself, or in subfolders of any name."""
     top = pictures_in(folder, warnings, recursive=False)
     if top:
         below = [name for name in relative_folders(folder) if pictures_in(folder / name, [])]
@@ -227,7 +235,7 @@ def _choose_folder(
                 f"{', '.join(below)} are not used"
             )
         return PhotoFolder(".", ".", "no images/; photographs lie in the scene folder", top)
-    names = pictures_in(folder, warnings, skip_companions=True)
+    names = pictures_in(folder, warnings)
     parents = [posixpath.dirname(name) for name in names]
     base = posixpath.commonpath(parents) if parents else ""
     names = [posixpath.relpath(name, base or ".") for name in names]
@@ -237,6 +245,7 @@ def _choose_folder(
 
 def _choose_size(
     folder: Path,
+    sized: Sequence[str],
     config: Config,
     poses: GivenPoses | None,
     cache: FactCache,
@@ -247,8 +256,8 @@ def _choose_size(
     if poses is None:
         need = max(need, config.features.max_long_side_px)
     found: list[tuple[int, PhotoFolder]] = []
-    for path in ("images", "images_2", "images_4", "images_8"):
-        names = pictures_in(folder / path, warnings) if (folder / path).is_dir() else []
+    for path in sized:
+        names = pictures_in(folder / path, warnings)
         if names:
             facts = _read_all(folder, path, names[:1], cache, [])
             longest = max((max(f.width, f.height) for f in facts.values()), default=0)

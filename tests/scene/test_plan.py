@@ -104,10 +104,62 @@ def test_nothing_that_can_be_settled_stays_auto(tmp_path):
     assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
     assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
     assert (config.init.method, config.train.background) == ("points", "black")
-    # Planning again from the settled config changes nothing.
-    again = make_plan(scan(tmp_path, tmp_path.name, config, cache=None), config)
-    assert again.config == config
-    assert again.stages.keys() == plan_of(tmp_path).stages.keys()
+
+
+def images(folder: Path) -> None:
+    photos(folder / "images", 2)
+
+
+def smaller_copy(folder: Path) -> None:
+    photos(folder / "images", 2, (1280, 960))
+    photos(folder / "images_2", 2, (960, 720))
+    write_sparse(folder / "sparse" / "0", ["p00.jpg", "p01.jpg"], (1280, 960))
+
+
+def plain(folder: Path) -> None:
+    photos(folder, 2)
+    photos(folder / "masks", 2, mode="L")
+    photos(folder / "thumbs", 2)
+
+
+def subfolders(folder: Path) -> None:
+    photos(folder / "left", 1)
+    photos(folder / "right", 1)
+    photos(folder / "masks" / "left", 1, mode="L")
+
+
+def lone_subfolder(folder: Path) -> None:
+    photos(folder / "input", 2)
+    photos(folder / "input" / "masks", 2, mode="L")
+
+
+def nerf_synthetic(folder: Path) -> None:
+    for split in ("train", "test"):
+        picture(folder / split / "r_0.png")
+        picture(folder / split / "r_0_depth.png")
+        content = {"camera_angle_x": 0.7, "frames": [frame(path=f"./{split}/r_0")]}
+        write(folder, content, f"transforms_{split}.json")
+
+
+def nerfstudio(folder: Path) -> None:
+    photos(folder / "scan_2024", 3)
+    frames = [frame(path=f"scan_2024/p0{i}.jpg") for i in range(2)]
+    write(folder, {"fl_x": 50, "frames": frames})
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [images, smaller_copy, plain, subfolders, lone_subfolder, nerf_synthetic, nerfstudio],
+)
+@pytest.mark.parametrize("poses", ["auto", "ignore"])
+def test_a_settled_config_finds_the_same_scene(tmp_path, layout, poses):
+    """Stages look at the folder with the settled config and must see what the plan saw."""
+    layout(tmp_path)
+    first = look(tmp_path, poses=poses)
+    settled = make_plan(first, Config(poses=poses)).config
+    again = scan(tmp_path, tmp_path.name, settled, cache=None)
+    assert again.model_copy(update={"image_folder_reason": first.image_folder_reason}) == first
+    assert make_plan(again, settled).config == settled
 
 
 def test_what_the_user_sets_stays(tmp_path):

@@ -45,9 +45,7 @@ def load_given(scan: Scan) -> Reconstruction:
         )
     elif scan.poses.kind == "llff":
         # Rows go by order, so files that cannot be read still count; they are dropped below.
-        some_size = next(iter(sizes.values()))
-        listed = [sizes.get(name, some_size) for name in scan.listed]
-        model, _ = read_poses_bounds(path, scan.listed, listed)
+        model, _ = read_poses_bounds(path, scan.listed)
     else:
         model = read_model(path)
     return fit_to_photos(model, photos, str(path))

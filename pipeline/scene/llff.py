@@ -20,18 +20,17 @@ _FIX = "export the poses again with as many rows as photographs, or set poses: i
 
 
 def read_poses_bounds(
-    path: Path, names: Sequence[str], sizes: Sequence[tuple[int, int]]
+    path: Path, names: Sequence[str]
 ) -> tuple[Reconstruction, NDArray[np.float64]]:
     """Read LLFF poses.
 
     Args:
         path: the ``.npy`` file.
         names: the photographs, sorted as LLFF sorts them: row i is photograph i.
-        sizes: their widths and heights; the cameras are resized to them.
 
     Returns:
-        The reconstruction (SIMPLE_PINHOLE or, where the resize is not uniform, PINHOLE cameras;
-        no points) and (N, 2) near and far depths in world units.
+        The reconstruction (SIMPLE_PINHOLE cameras of the file's size, no points) and (N, 2) near
+        and far depths in world units.
 
     Raises:
         UserError: not such a file, another number of rows, values that are not finite, no
@@ -47,24 +46,22 @@ def read_poses_bounds(
     cameras: dict[int, Camera] = {}
     numbers: dict[tuple, int] = {}
     images: dict[int, Posed] = {}
-    for i, (name, (width, height)) in enumerate(zip(names, sizes, strict=True)):
+    for i, name in enumerate(names):
         matrix = rows[i, :15].reshape(3, 5)
-        down, right, backward, centre, (full_height, full_width, focal) = matrix.T
+        down, right, backward, centre, (height, width, focal) = matrix.T
         rotation = np.stack([right, down, -backward])
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
             raise UserError(f"row {i} ({name}): not a rotation", file=path, fix=_FIX)
-        if min(full_height, full_width, focal) <= 0:
+        if min(height, width) < 1 or focal <= 0:
             raise UserError(
                 f"row {i} ({name}): expected positive height, width and focal length, found "
-                f"{full_height:g}, {full_width:g}, {focal:g}",
+                f"{height:g}, {width:g}, {focal:g}",
                 file=path,
                 fix=_FIX,
             )
-        key = (full_width, full_height, focal, width, height)
-        camera_id = numbers.setdefault(key, len(numbers) + 1)
-        full = np.array([focal, full_width / 2, full_height / 2])
-        camera = Camera("SIMPLE_PINHOLE", round(full_width), round(full_height), full)
-        cameras[camera_id] = camera.resized(width, height)
+        camera_id = numbers.setdefault((width, height, focal), len(numbers) + 1)
+        params = np.array([focal, width / 2, height / 2])
+        cameras[camera_id] = Camera("SIMPLE_PINHOLE", round(width), round(height), params)
         images[i + 1] = Posed(name, camera_id, rotation, -rotation @ centre)
     return Reconstruction(cameras, images), rows[:, 15:]
 

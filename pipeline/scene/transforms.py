@@ -84,10 +84,11 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
         path: a scene folder or one file.
         sizes: width and height of each photograph by its path relative to the folder of the
             json. Frames of other photographs are left out; a suffix missing in the file, or
-            another than the photograph's, does not matter.
+            another than the photograph's, does not matter. Where the file does not say what
+            size its intrinsics are for, they are for the photograph's.
 
     Returns:
-        Images named by the keys of ``sizes``, cameras at those sizes, no points.
+        Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
 
     Raises:
         UserError: as ``read_frames``, and for intrinsics that are missing or impossible.
@@ -239,7 +240,7 @@ def _number(frame: Frame, name: str, default: float) -> float:
 
 
 def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
-    """The frame's camera at its photograph's size."""
+    """The frame's camera, of the photograph's size where it does not give its own."""
     width = round(_number(frame, "w", photo_width))
     height = round(_number(frame, "h", photo_height))
     if width <= 0 or height <= 0:
@@ -263,8 +264,7 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
         "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     }[model]
     params += [_number(frame, name, 0.0) for name in rest]
-    camera = Camera(model, width, height, np.array(params, np.float64))
-    return camera.resized(photo_width, photo_height)
+    return Camera(model, width, height, np.array(params, np.float64))
 
 
 def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:

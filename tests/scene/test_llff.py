@@ -19,16 +19,16 @@ def test_a_known_point_lands_on_its_pixel(tmp_path):
     rng = np.random.default_rng(0)
     rotation, centre = quat_to_rotation(rng.normal(size=4)), rng.normal(size=3)
     np.save(tmp_path / "p.npy", [llff_row(rotation, centre, 300, 400, 350.0, 2.0, 7.0)])
-    model, bounds = read_poses_bounds(tmp_path / "p.npy", ["a.jpg"], [(200, 150)])
+    model, bounds = read_poses_bounds(tmp_path / "p.npy", ["a.jpg"])
     image, camera = model.images[1], model.cameras[1]
     # A point 4 ahead, 0.5 to the right and 0.25 down.
     point = centre + rotation.T @ [0.5, 0.25, 4.0]
     local = image.rotation @ point + image.translation
     fx, fy, cx, cy = camera.pinhole
     found = [fx * local[0] / local[2] + cx, fy * local[1] / local[2] + cy]
-    np.testing.assert_allclose(found, [100 + 175 * 0.5 / 4, 75 + 175 * 0.25 / 4])
+    np.testing.assert_allclose(found, [200 + 350 * 0.5 / 4, 150 + 350 * 0.25 / 4])
     np.testing.assert_array_equal(bounds, [[2.0, 7.0]])
-    assert (camera.width, camera.height, image.name) == (200, 150, "a.jpg")
+    assert (camera.width, camera.height, image.name) == (400, 300, "a.jpg")
 
 
 @pytest.mark.parametrize(
@@ -45,7 +45,7 @@ def test_a_known_point_lands_on_its_pixel(tmp_path):
 def test_malformed(tmp_path, rows, message):
     np.save(tmp_path / "p.npy", rows)
     with pytest.raises(UserError, match=message) as error:
-        read_poses_bounds(tmp_path / "p.npy", ["a.jpg"], [(200, 150)])
+        read_poses_bounds(tmp_path / "p.npy", ["a.jpg"])
     assert error.value.file == tmp_path / "p.npy"
 
 
@@ -53,4 +53,4 @@ def test_malformed(tmp_path, rows, message):
 def test_not_an_array(tmp_path, data):
     (tmp_path / "p.npy").write_bytes(data)
     with pytest.raises(UserError):
-        read_poses_bounds(tmp_path / "p.npy", ["a.jpg"], [(200, 150)])
+        read_poses_bounds(tmp_path / "p.npy", ["a.jpg"])

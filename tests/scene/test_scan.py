@@ -509,6 +509,19 @@ def test_poses_of_other_photographs(tmp_path):
         load_given(look(tmp_path))
 
 
+def test_turned_photographs_do_not_fit_their_cameras(tmp_path):
+    """Poses made from pictures turned by EXIF are not those of the stored pixel grid."""
+    photos(tmp_path / "a" / "images", 2)
+    frames = [frame(path=f"images/p0{i}.jpg") for i in range(2)]
+    write(tmp_path / "a", {"fl_x": 50, "w": 48, "h": 64, "frames": frames})
+    photos(tmp_path / "b" / "images", 2)
+    rows = [llff_row(np.eye(3), np.zeros(3), 64, 48, 50.0)] * 2
+    np.save(tmp_path / "b" / "poses_bounds.npy", rows)
+    for name in "ab":
+        with pytest.raises(UserError, match="64x48, its given camera 48x64"):
+            load_given(look(tmp_path / name))
+
+
 def test_malformed_poses_stop_unless_ignored(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "transforms.json").write_text("{")

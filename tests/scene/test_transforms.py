@@ -85,7 +85,7 @@ def test_applied_transform_and_scale_are_undone(tmp_path):
     np.testing.assert_allclose(image.rotation.T, matrix[:3, :3] @ np.diag([1, -1, -1]), atol=1e-12)
 
 
-def test_intrinsics_are_each_frames_own_and_scaled_to_the_photograph(tmp_path):
+def test_intrinsics_are_each_frames_own(tmp_path):
     frames = [
         frame(path="images/a.png"),
         frame(path="images/b.png", fl_x=150, w=200, h=100, cx=90, cy=40, k1=0.1),
@@ -94,7 +94,7 @@ def test_intrinsics_are_each_frames_own_and_scaled_to_the_photograph(tmp_path):
     sizes = {"images/a.png": (200, 100), "images/b.png": (200, 100)}
     model = read_transforms(tmp_path, sizes)
     a, b = (model.cameras[model.by_name()[name].camera_id] for name in sorted(sizes))
-    assert (a.model, a.pinhole) == ("PINHOLE", (200, 200, 100, 50))
+    assert (a.model, a.pinhole) == ("PINHOLE", (400, 400, 200, 100))
     assert (b.model, b.params.tolist()) == ("OPENCV", [150, 150, 90, 40, 0.1, 0, 0, 0])
 
 

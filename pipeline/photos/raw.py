@@ -6,10 +6,9 @@ fine for one picture, poison for a scene. Here nothing is chosen per picture.
 
 from __future__ import annotations
 
-from collections import Counter
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 import cv2
 import numpy as np
@@ -17,6 +16,7 @@ import rawpy
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Decode
+from pipeline.photos.naming import rename
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
@@ -60,7 +60,7 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
         UserError: not one RAW file could be read.
     """
     raws = [photo for photo in manifest.photos if photo.raw]
-    names = _new_names(manifest)
+    names = rename({photo.name: ".png" if photo.raw else "" for photo in manifest.photos})
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         balances = dict(zip(raws, pool.map(_balance, raws), strict=True))
         warnings = [balance for balance in balances.values() if isinstance(balance, str)]
@@ -94,17 +94,6 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
     )
     developed.write(out / "images.json")
     return DecodeReport(developed, tuple(warnings))
-
-
-def _new_names(manifest: Manifest) -> dict[str, str]:
-    """PNG name of each RAW file; the full name is kept where two would become the same."""
-    short = {p.name: str(PurePosixPath(p.name).with_suffix(".png")) for p in manifest.photos}
-    count = Counter(short[p.name] if p.raw else p.name for p in manifest.photos)
-    return {
-        p.name: short[p.name] if count[short[p.name]] == 1 else f"{p.name}.png"
-        for p in manifest.photos
-        if p.raw
-    }
 
 
 def _balance(photo: Photo) -> _Balance | str:

@@ -1,0 +1,358 @@
+"""Pictures, masks and depth maps as pinhole cameras would have seen them."""
+
+from __future__ import annotations
+
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config import schema
+from pipeline.photos.distortion import fold_radius, normalised, pixels
+from pipeline.photos.load import (
+    Picture,
+    load_mask,
+    load_rgb,
+    load_rgba,
+    resize_area,
+    resize_mask,
+    resize_rgba,
+    to_8bit,
+)
+from pipeline.photos.naming import rename
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.progress import Progress
+from pipeline.scene.colmap import write_model
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.photofile import digest_of
+from pipeline.scene.views import view_size
+
+ROWS_AT_ONCE = 256
+# Sizes reached by rounding still have nearly the same shape.
+SHAPE_TOLERANCE = 0.02
+# A wide lens's border may lie at infinity: never see less than a fifth nor more than twice of
+# what a lens of the same focal length without distortion would. COLMAP's limits.
+MIN_SCALE, MAX_SCALE = 0.2, 2.0
+
+
+@dataclass(frozen=True)
+class UndistortReport:
+    """The new manifest, and what the user should know."""
+
+    manifest: Manifest
+    warnings: tuple[str, ...]
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """How pictures of one camera become pinhole pictures.
+
+    Attributes:
+        target: the pinhole camera at the size that is written.
+        x, y: (height, width) float32 positions in the photograph, cv2's pixel coordinates;
+            None where nothing is to be moved.
+        valid: (height, width) bool, False where the photograph shows nothing; None if all do.
+    """
+
+    target: Camera
+    x: NDArray[np.float32] | None
+    y: NDArray[np.float32] | None
+    valid: NDArray[np.bool_] | None
+
+    def move(self, picture: Picture, interpolation: int, border: int) -> Picture:
+        if self.x is None or self.y is None:
+            return picture
+        return np.asarray(cv2.remap(picture, self.x, self.y, interpolation, borderMode=border))
+
+
+def undistort(
+    manifest: Manifest,
+    model: Reconstruction,
+    config: schema.Undistort,
+    views: schema.Views,
+    out: Path,
+    *,
+    threads: int,
+) -> UndistortReport:
+    """Undistort every registered photograph at full resolution, then reduce it by area.
+
+    Writes ``out/images/<stem>.png`` (or .jpg, without alpha and where ``jpeg_quality`` asks for
+    it), ``out/masks/`` where there are masks or blank pixels, ``out/depths/``, ``out/sparse/0``
+    (poses and points unchanged, observations moved; those outside the picture become NaN) and
+    ``out/images.json``.
+
+    Raises:
+        UserError: a photograph cannot be read, or is not of its camera's shape.
+    """
+    registered = model.by_name()
+    photos = [photo for photo in manifest.photos if photo.name in registered]
+    jpeg = config.jpeg_quality > 0
+    names = rename({p.name: ".jpg" if jpeg and not p.alpha else ".png" for p in photos})
+    groups: dict[tuple[int, int, int], list[Photo]] = {}
+    for photo in photos:
+        key = (registered[photo.name].camera_id, photo.width, photo.height)
+        groups.setdefault(key, []).append(photo)
+
+    progress = Progress("undistorting", len(photos), "photographs")
+    cameras: dict[int, Camera] = {}
+    camera_of: dict[str, int] = {}
+    done: list[Photo] = []
+    warnings: list[str] = []
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        # One camera after the other: its maps are as large as a picture.
+        for number, (key, group) in enumerate(sorted(groups.items()), start=1):
+            source = _camera_of_size(model.cameras[key[0]], group[0])
+            lens = _lens(source, config.blank_pixels, views.max_long_side_px)
+            cameras[number] = lens.target
+            if lens.valid is not None:
+                share = 100 * (1 - float(lens.valid.mean()))
+                warnings.append(
+                    f"camera {key[0]} ({source.model}): {share:.1f}% of the undistorted pictures "
+                    f"is blank and masked out"
+                )
+
+            def work(photo: Photo, lens: _Lens = lens) -> Photo:
+                return _write(photo, names[photo.name], lens, config, views, out)
+
+            for photo, new in zip(group, pool.map(work, group), strict=True):
+                camera_of[photo.name] = number
+                done.append(new)
+                progress.advance()
+
+    write_model(out / "sparse" / "0", _moved(model, cameras, camera_of, names))
+    undistorted = Manifest(
+        scene=manifest.scene,
+        photos=tuple(sorted(done, key=lambda photo: photo.name)),
+        warnings=manifest.warnings,
+    )
+    undistorted.write(out / "images.json")
+    return UndistortReport(undistorted, tuple(warnings))
+
+
+def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
+    """The PINHOLE camera that sees what ``camera`` sees, with its focal lengths.
+
+    With ``blank_pixels`` 0 it is cropped to the rectangle inside the undistorted border, with 1
+    it holds the whole border; between them, between the two. As COLMAP's undistorter does, but
+    the principal point stays where it is, so that both sides of an off-centre lens are cropped
+    by what they need.
+    """
+    fx, fy, cx, cy = camera.pinhole
+    width, height = float(camera.width), float(camera.height)
+    x, y = np.arange(width + 1), np.arange(height + 1)
+    sides = (
+        (np.stack([np.zeros_like(y), y], -1), 0, -fx, cx),
+        (np.stack([np.full_like(y, width), y], -1), 0, fx, width - cx),
+        (np.stack([x, np.zeros_like(x)], -1), 1, -fy, cy),
+        (np.stack([x, np.full_like(x, height)], -1), 1, fy, height - cy),
+    )
+    reaches = []  # pixels from the principal point to the left, right, top and bottom
+    for border, axis, focal, room in sides:
+        reach = normalised(camera, border)[:, axis] * focal
+        finite = reach[np.isfinite(reach)]
+        inner = finite.min(initial=np.inf)
+        outer = finite.max(initial=-np.inf) if len(finite) == len(reach) else np.inf
+        inner, outer = np.clip((inner, outer), MIN_SCALE * room, MAX_SCALE * room)
+        reaches.append(outer * blank_pixels + inner * (1 - blank_pixels))
+    left, right, top, bottom = reaches
+    x0, x1 = int(np.ceil(cx - left - 1e-6)), int(np.floor(cx + right + 1e-6))
+    y0, y1 = int(np.ceil(cy - top - 1e-6)), int(np.floor(cy + bottom + 1e-6))
+    params = np.array([fx, fy, cx - x0, cy - y0])
+    return Camera("PINHOLE", max(x1 - x0, 1), max(y1 - y0, 1), params)
+
+
+def _camera_of_size(camera: Camera, photo: Photo) -> Camera:
+    """The camera at the photograph's size; given poses may refer to larger pictures."""
+    ratio = photo.width * camera.height / (photo.height * camera.width)
+    if abs(ratio - 1) > SHAPE_TOLERANCE:
+        raise UserError(
+            f"is {photo.width}x{photo.height} pixels, its camera {camera.width}x{camera.height}",
+            file=photo.path,
+            fix="Use the photographs the poses were made for, neither turned nor cropped.",
+        )
+    if (photo.width, photo.height) == (camera.width, camera.height):
+        return camera
+    return camera.resized(photo.width, photo.height)
+
+
+def _lens(source: Camera, blank_pixels: float, max_long_side: int) -> _Lens:
+    if source.is_pinhole:
+        size = (source.width, source.height)
+        fx, fy, cx, cy = source.pinhole
+        plain = Camera("PINHOLE", *size, np.array([fx, fy, cx, cy]))
+        return _Lens(plain.resized(*view_size(*size, max_long_side)), None, None, None)
+    pinhole = pinhole_camera(source, blank_pixels)
+    size = (pinhole.width, pinhole.height)
+    fx, fy, cx, cy = pinhole.pinhole
+    map_x, map_y = np.empty((2, size[1], size[0]), np.float32)
+    valid = np.empty((size[1], size[0]), bool)
+    fold = fold_radius(source)
+    columns = (np.arange(size[0]) + 0.5 - cx) / fx
+    for start in range(0, size[1], ROWS_AT_ONCE):
+        part = slice(start, min(start + ROWS_AT_ONCE, size[1]))
+        rows = (np.arange(part.start, part.stop) + 0.5 - cy) / fy
+        points = np.stack(np.meshgrid(columns, rows), axis=-1)
+        xy = pixels(source, points)
+        inside = (xy >= 0) & (xy <= (source.width, source.height))
+        valid[part] = inside.all(axis=-1) & (np.hypot(*np.moveaxis(points, -1, 0)) < fold)
+        map_x[part], map_y[part] = xy[..., 0] - 0.5, xy[..., 1] - 0.5
+    target = pinhole.resized(*view_size(*size, max_long_side))
+    return _Lens(target, map_x, map_y, None if valid.all() else valid)
+
+
+def _write(
+    photo: Photo,
+    name: str,
+    lens: _Lens,
+    config: schema.Undistort,
+    views: schema.Views,
+    out: Path,
+) -> Photo:
+    """Write one photograph and what belongs to it; its new entry in the manifest."""
+    width, height = lens.target.width, lens.target.height
+    picture, alpha = _picture(photo, lens)
+    path = out / "images" / name
+    if path.suffix == ".jpg":
+        _encode(path, to_8bit(picture)[..., ::-1], [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+    elif alpha is None:
+        _encode(path, picture[..., ::-1])
+    else:
+        _encode(path, np.dstack([picture[..., ::-1], alpha]))
+
+    mask = _mask(photo, lens, views)
+    mask_path = out / "masks" / f"{name}.png" if mask is not None else None
+    if mask is not None and mask_path is not None:
+        _encode(mask_path, mask.astype(np.uint8) * 255)
+    depth_path = None
+    if photo.depth is not None:
+        depth_path = out / "depths" / f"{name}{Path(photo.depth).suffix}"
+        _write_depth(photo, lens, depth_path)
+    return photo.model_copy(
+        update={
+            "name": name,
+            "path": str(path),
+            "width": width,
+            "height": height,
+            "digest": digest_of(path),
+            "alpha": alpha is not None,
+            "bits": 8 if path.suffix == ".jpg" or picture.dtype == np.uint8 else 16,
+            "mask": None if mask_path is None else str(mask_path),
+            "depth": None if depth_path is None else str(depth_path),
+            "focal_px": float(lens.target.params[0]),
+        }
+    )
+
+
+def _picture(photo: Photo, lens: _Lens) -> tuple[Picture, NDArray[np.uint8] | None]:
+    """Undistorted and reduced: (H, W, 3) colours (16 bits stay) and (H, W) alpha."""
+    size = (lens.target.width, lens.target.height)
+    alpha: NDArray[np.uint8] | None = None
+    if photo.alpha:
+        picture, alpha = load_rgba(photo.path)
+    else:
+        picture = load_rgb(photo.path)
+    _check_size(picture, photo, photo.path)
+    if lens.x is None or alpha is None:
+        moved = lens.move(picture, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
+        moved_alpha = alpha
+    else:
+        # Weighted by alpha, so that hidden colours never bleed in.
+        weight = alpha.astype(np.float32)
+        moved_weight = lens.move(weight, cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
+        light = lens.move(picture * weight[..., None], cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
+        colour = light / np.maximum(moved_weight, 1e-6)[..., None]
+        moved = np.rint(colour.clip(0, 255)).astype(np.uint8)
+        moved_alpha = np.rint(moved_weight).astype(np.uint8)
+    if lens.valid is not None:
+        moved = moved * lens.valid[..., None]
+        moved_alpha = None if moved_alpha is None else moved_alpha * lens.valid
+    if moved_alpha is None:
+        return resize_area(moved, *size), None
+    return resize_rgba(moved, moved_alpha, *size)
+
+
+def _mask(photo: Photo, lens: _Lens, views: schema.Views) -> NDArray[np.bool_] | None:
+    """What counts in the undistorted picture; None where everything does."""
+    size = (lens.target.width, lens.target.height)
+    mask = None
+    if photo.mask is not None and views.masks == "auto":
+        full = load_mask(photo.mask).astype(np.uint8)
+        full = _nearest(full, photo.width, photo.height)
+        moved = lens.move(full, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+        mask = resize_mask(moved > 0, *size)
+    if lens.valid is not None:
+        # A pixel that is blank in part shows a colour that is not the scene's.
+        seen = resize_area(lens.valid.astype(np.float32), *size) > 0.999
+        mask = seen if mask is None else mask & seen
+    return None if mask is None else np.asarray(mask)
+
+
+def _write_depth(photo: Photo, lens: _Lens, path: Path) -> None:
+    """Depth along z is the pinhole camera's too; values are moved, never mixed."""
+    assert photo.depth is not None
+    is_array = path.suffix == ".npy"
+    depth = np.load(photo.depth) if is_array else cv2.imread(photo.depth, cv2.IMREAD_UNCHANGED)
+    if depth is None:
+        raise UserError("the depth map cannot be read", file=photo.depth, fix="Replace the file.")
+    depth = _nearest(depth, photo.width, photo.height)
+    depth = lens.move(depth, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+    depth = _nearest(depth, lens.target.width, lens.target.height)
+    if not is_array:
+        return _encode(path, depth)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.save(path, depth)
+
+
+def _nearest(picture: Picture, width: int, height: int) -> Picture:
+    if picture.shape[:2] == (height, width):
+        return picture
+    return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_NEAREST_EXACT))
+
+
+def _encode(path: Path, picture: Picture, options: list[int] | None = None) -> None:
+    """Encoded and written apart: cv2.imwrite is silent about a full disk."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    _, data = cv2.imencode(path.suffix, picture, options or [])
+    path.write_bytes(data.tobytes())
+
+
+def _check_size(picture: Picture, photo: Photo, path: str) -> None:
+    if picture.shape[1::-1] != (photo.width, photo.height):
+        raise UserError(
+            f"is {picture.shape[1]}x{picture.shape[0]} pixels, "
+            f"was {photo.width}x{photo.height} when the scene was looked at",
+            file=path,
+            fix="Let the photographs alone while the program runs, and start it again.",
+        )
+
+
+def _moved(
+    model: Reconstruction,
+    cameras: dict[int, Camera],
+    camera_of: dict[str, int],
+    names: dict[str, str],
+) -> Reconstruction:
+    """The model with pinhole cameras, new names, and observations where they are now."""
+    images = {
+        number: Posed(names[i.name], camera_of[i.name], i.rotation, i.translation)
+        for number, i in model.images.items()
+        if i.name in names
+    }
+    points = model.points
+    kept = np.isin(points.track_image_id, list(images))
+    owner = np.repeat(np.arange(len(points)), points.track_length)[kept]
+    ids, xy = points.track_image_id[kept], points.track_xy[kept].copy()
+    for number, image in images.items():
+        here = np.flatnonzero(ids == number)
+        target = cameras[image.camera_id]
+        new = pixels(target, normalised(model.cameras[model.images[number].camera_id], xy[here]))
+        outside = np.any(~((new >= 0) & (new <= (target.width, target.height))), axis=1)
+        new[outside] = np.nan
+        xy[here] = new
+    starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=len(points)))])
+    moved = Points(points.xyz, points.rgb, points.error, starts.astype(np.int64), ids, xy)
+    return Reconstruction(cameras, images, moved)

@@ -5,7 +5,7 @@ Outputs: ``evaluation.json`` and ``renders/``.
 
 from dataclasses import asdict
 
-from pipeline.config.schema import Evaluate, Train, Views
+from pipeline.config.schema import Evaluate, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.atomic import write_json
@@ -19,8 +19,9 @@ from stages.command import main
 
 def run(job: Job) -> None:
     manifest = Manifest.read(job.inputs["views"] / "images.json")
-    split = job.section(Views)
-    views = load_views(manifest, read_model(job.inputs["model"] / "sparse" / "0"), split)
+    split = job.section(Split)
+    model = read_model(job.inputs["model"] / "sparse" / "0")
+    views = load_views(manifest, model, job.section(Views), split)
     train = job.section(Train)
     protocol = choose_protocol(views, split, train, any(photo.alpha for photo in manifest.photos))
     evaluation = evaluate_views(

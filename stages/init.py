@@ -1,6 +1,6 @@
 """The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
 
-from pipeline.config.schema import Features, Init, Views
+from pipeline.config.schema import Features, Init, Split, Views
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
@@ -18,7 +18,7 @@ def run(job: Job) -> None:
     manifest = Manifest.read(job.inputs["views"] / "images.json")
     sparse = job.inputs["model"] / "sparse" / "0"
     model = read_model(sparse)
-    views = load_views(manifest, model, job.section(Views))
+    views = load_views(manifest, model, job.section(Views), job.section(Split))
     train = [view for view in views if not view.is_test]
     points = model.points
     if config.method != "random" and len(points) == 0:

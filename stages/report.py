@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.config.schema import Report, Train, Views
+from pipeline.config.schema import Report, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol, reference
 from pipeline.photos.load import load_view
 from pipeline.reporting.collect import collect_metrics
@@ -29,7 +29,7 @@ def run(job: Job) -> None:
     plan = job.key["plan"]
     manifest = Manifest.read(job.inputs["views"] / "images.json")
     model = read_model(job.inputs["model"] / "sparse" / "0")
-    views = load_views(manifest, model, job.section(Views))
+    views = load_views(manifest, model, job.section(Views), job.section(Split))
     evaluation = read_json(job.inputs["evaluate"] / "evaluation.json")
     comparisons = compare(job, manifest, views, evaluation)
     own = run_facts(job, time.perf_counter() - start)
@@ -60,7 +60,7 @@ def compare(
     photos = {photo.name: photo for photo in manifest.photos}
     by_name = {view.name: view for view in views}
     has_alpha = any(photo.alpha for photo in manifest.photos)
-    protocol = choose_protocol(views, job.section(Views), job.section(Train), has_alpha)
+    protocol = choose_protocol(views, job.section(Split), job.section(Train), has_alpha)
     shown = []
     for label, measured in ranked(evaluation["per_view"], job.section(Report).views):
         view = by_name[measured["name"]]

@@ -1,6 +1,6 @@
 """Optimise the Gaussians. Outputs: ``gaussians.npz`` and ``curve.json``."""
 
-from pipeline.config.schema import Train, Views
+from pipeline.config.schema import Split, Train, Views
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
@@ -16,6 +16,7 @@ def run(job: Job) -> None:
         Manifest.read(job.inputs["views"] / "images.json"),
         read_model(job.inputs["model"] / "sparse" / "0"),
         job.section(Views),
+        job.section(Split),
     )
     result = train(
         [view for view in views if not view.is_test],

@@ -55,11 +55,11 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "matches": ("matches", "sfm"),
     "sfm": ("sfm",),
     "undistort": ("undistort", "views"),
-    "init": ("init", "views", "features"),
-    "train": ("train", "views"),
-    "evaluate": ("evaluate", "views", "train"),
+    "init": ("init", "views", "split", "features"),
+    "train": ("train", "views", "split"),
+    "evaluate": ("evaluate", "views", "split", "train"),
     "export": ("export",),
-    "report": ("report", "views", "train"),
+    "report": ("report", "views", "split", "train"),
 }
 
 # stage -> packages whose version decides its result.

@@ -33,18 +33,23 @@ class Inspect(Section):
 
 
 class Views(Section):
-    """What every view-reading stage shares: resolution, split, masks."""
+    """The pictures that training and evaluation see: resolution and masks."""
 
     max_long_side_px: Positive = Field(
         960, description="Views with a longer side are resized (by area) down to this, in pixels."
     )
+    masks: Literal["auto", "ignore"] = Field(
+        "auto", description="auto uses masks/ where it exists: zero pixels count for nothing."
+    )
+
+
+class Split(Section):
+    """Which views training never sees."""
+
     holdout_every: Annotated[int, Field(ge=0)] = Field(
         8,
         description="Every n-th view, sorted by name, is held out of training and used only to "
         "evaluate; 0 trains on all and evaluates on the training views (said in the protocol).",
-    )
-    masks: Literal["auto", "ignore"] = Field(
-        "auto", description="auto uses masks/ where it exists: zero pixels count for nothing."
     )
 
 
@@ -227,6 +232,7 @@ class Config(Section):
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     inspect: Inspect = Field(default_factory=Inspect)
     views: Views = Field(default_factory=Views)
+    split: Split = Field(default_factory=Split)
     decode: Decode = Field(default_factory=Decode)
     features: Features = Field(default_factory=Features)
     matches: Matches = Field(default_factory=Matches)

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config.schema import Evaluate, Train, Views
+from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
@@ -42,7 +42,7 @@ class Protocol:
     near: float
 
 
-def choose_protocol(views: Sequence[View], split: Views, train: Train, has_alpha: bool) -> Protocol:
+def choose_protocol(views: Sequence[View], split: Split, train: Train, has_alpha: bool) -> Protocol:
     """The views to evaluate on (the held-out ones, else all) and the background.
 
     The background is the one trained on; where that was random (images with alpha), white, as

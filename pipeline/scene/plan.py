@@ -315,7 +315,7 @@ def _mask_lines(scan: Scan, config: Config) -> list[str]:
 
 
 def _split(config: Config) -> str:
-    every = config.views.holdout_every
+    every = config.split.holdout_every
     if every == 0:
         return "no view is held out: measured on the training views"
     return f"one view in {every}, sorted by name, is held out"

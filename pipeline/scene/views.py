@@ -21,7 +21,9 @@ def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
     )
 
 
-def load_views(manifest: Manifest, model: Reconstruction, views: schema.Views) -> list[View]:
+def load_views(
+    manifest: Manifest, model: Reconstruction, views: schema.Views, split: schema.Split
+) -> list[View]:
     """The photographs that have a pose, sorted by name, at the size ``views`` asks for.
 
     Intrinsics are scaled by the exact ratios of widths and of heights.
@@ -51,7 +53,7 @@ def load_views(manifest: Manifest, model: Reconstruction, views: schema.Views) -
                 cx=cx,
                 cy=cy,
                 world_to_camera=image.world_to_camera,
-                is_test=is_held_out(index, views.holdout_every),
+                is_test=is_held_out(index, split.holdout_every),
             )
         )
     return result

@@ -216,11 +216,11 @@ def test_cameras(tmp_path, group, share, model):
 
 def test_decisions_say_the_resolution_and_the_split(tmp_path):
     photos(tmp_path / "images", 2, (72, 128))
-    plan = plan_of(tmp_path, views={"max_long_side_px": 96, "holdout_every": 5})
+    plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"holdout_every": 5})
     assert plan.facts["view_size"] == [54, 96]
     assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
     assert "one view in 5" in plan.stages["evaluate"].reason
-    assert "no view" in plan_of(tmp_path, views={"holdout_every": 0}).stages["evaluate"].reason
+    assert "no view" in plan_of(tmp_path, split={"holdout_every": 0}).stages["evaluate"].reason
 
 
 def test_facts_and_warnings_go_with_the_plan(tmp_path):

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from pipeline.config.schema import Views
+from pipeline.config.schema import Split, Views
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Camera, Posed, Reconstruction
 from pipeline.scene.views import load_views, scene_extent, view_size
@@ -30,7 +30,7 @@ def test_sizes():
 
 def test_intrinsics_scale_by_the_exact_ratio_of_each_side():
     manifest, model = make(1)
-    (view,) = load_views(manifest, model, Views(max_long_side_px=100))
+    (view,) = load_views(manifest, model, Views(max_long_side_px=100), Split())
     assert (view.width, view.height) == (100, 66)
     ratio_x, ratio_y = 100 / 301, 66 / 200
     expected = (250 * ratio_x, 260 * ratio_y, 150 * ratio_x, 99 * ratio_y)
@@ -40,26 +40,28 @@ def test_intrinsics_scale_by_the_exact_ratio_of_each_side():
 def test_every_eighth_of_the_posed_photographs_by_name_is_held_out():
     manifest, model = make(20)
     del model.images[1]  # p00 has no pose: p01 is the first of the split.
-    views = load_views(manifest, model, Views())
+    views = load_views(manifest, model, Views(), Split())
     assert [view.name for view in views if view.is_test] == ["p01.jpg", "p09.jpg", "p17.jpg"]
-    assert not any(view.is_test for view in load_views(manifest, model, Views(holdout_every=0)))
+    assert not any(
+        view.is_test for view in load_views(manifest, model, Views(), Split(holdout_every=0))
+    )
 
 
 def test_masks_can_be_ignored():
     manifest, model = make(1)
-    assert load_views(manifest, model, Views())[0].mask == "/m/p00.jpg"
-    assert load_views(manifest, model, Views(masks="ignore"))[0].mask is None
+    assert load_views(manifest, model, Views(), Split())[0].mask == "/m/p00.jpg"
+    assert load_views(manifest, model, Views(masks="ignore"), Split())[0].mask is None
 
 
 def test_distorting_cameras_are_refused():
     manifest, model = make(1, Camera("SIMPLE_RADIAL", 301, 200, np.array([250.0, 150, 100, 0.1])))
     with pytest.raises(ValueError, match="SIMPLE_RADIAL"):
-        load_views(manifest, model, Views())
+        load_views(manifest, model, Views(), Split())
 
 
 def test_extent():
     manifest, model = make(9)
-    views = load_views(manifest, model, Views(holdout_every=8))
+    views = load_views(manifest, model, Views(), Split(holdout_every=8))
     # Training cameras stand at x = 1 ... 7: 3 from their mean.
     assert scene_extent(views) == pytest.approx(3.3)
     assert scene_extent(views[:1]) == 1.0

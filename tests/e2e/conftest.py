@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.harness import TINY, copy_project, environment, snakemake, subprocess, sys
+from tests.e2e.harness import TINY, TINY_DEMO, copy_project, environment, snakemake, subprocess, sys
 
 
 def make_scene(project: Path, scene: str, *options: str) -> None:
@@ -17,7 +17,7 @@ def make_scene(project: Path, scene: str, *options: str) -> None:
             "-m",
             "pipeline.demo",
             f"data/{scene}",
-            "--tiny",
+            *TINY_DEMO,
             *options,
         ],
         cwd=project,

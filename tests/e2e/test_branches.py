@@ -24,10 +24,10 @@ def project(tmp_path_factory):
     ("scene", "options", "expected"),
     [
         ("raw", ("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
-        ("distorted", ("--distortion",), ALWAYS | SFM | {"undistort"}),
+        ("distorted", ("--distortion", "simple_radial"), ALWAYS | SFM | {"undistort"}),
         ("posed", ("--poses", "colmap"), ALWAYS),
         ("bare", ("--poses", "transforms", "--no-points"), ALWAYS),
-        ("lens", ("--poses", "colmap", "--distortion"), ALWAYS | {"undistort"}),
+        ("lens", ("--poses", "colmap", "--distortion", "opencv"), ALWAYS | {"undistort"}),
         ("masked", ("--poses", "colmap", "--masks"), ALWAYS),
         ("alpha", ("--poses", "transforms", "--format", "png", "--alpha"), ALWAYS),
     ],

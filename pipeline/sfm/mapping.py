@@ -18,7 +18,8 @@ from pipeline.config import schema
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.judge import Evidence, Verdict, gather, judge
+from pipeline.sfm.evidence import gather
+from pipeline.sfm.judge import Evidence, Verdict, judge
 from pipeline.sfm.matching import shown
 from pipeline.sfm.models import Colors, color_points, write_model
 from pipeline.sfm.quiet import quiet_colmap

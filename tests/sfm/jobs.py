@@ -1,0 +1,98 @@
+"""What the tests run in processes of their own: pycolmap must not meet torch in pytest's."""
+
+from __future__ import annotations
+
+import hashlib
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from pipeline.config import schema
+from pipeline.scene.manifest import Manifest
+
+
+def digests(folder: Path) -> dict[str, str]:
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in files
+    }
+
+
+def match(
+    manifest: Manifest,
+    features: Path,
+    out: Path,
+    pairs: str = "exhaustive",
+    threads: int = 2,
+    sfm: schema.Sfm | None = None,
+) -> dict[str, Any]:
+    from pipeline.sfm.matching import match_features
+
+    config = schema.Matches.model_validate({"pairs": pairs})
+    report = match_features(
+        manifest, features, config, sfm or schema.Sfm(), out, threads=threads, seed=0
+    )
+    return asdict(report)
+
+
+def reconstruct(
+    manifest: Manifest, database: Path, config: schema.Sfm, out: Path, threads: int = 2
+) -> dict[str, Any]:
+    from pipeline.sfm import mapping
+
+    return asdict(mapping.reconstruct(manifest, database, config, out, threads=threads, seed=0))
+
+
+def match_and_reconstruct(
+    manifest: Manifest, features: Path, out: Path, config: schema.Sfm, threads: int = 2
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    matched = match(manifest, features, out / "matches", threads=threads, sfm=config)
+    database = out / "matches" / "database.db"
+    return matched, reconstruct(manifest, database, config, out / "sfm", threads)
+
+
+def database_cameras(path: Path) -> list[tuple[str, float, bool]]:
+    """(model, focal length, prior) of each camera of a database."""
+    import pycolmap
+
+    with pycolmap.Database.open(path) as database:
+        return [
+            (c.model_name, float(c.mean_focal_length()), bool(c.has_prior_focal_length))
+            for c in database.read_all_cameras()
+        ]
+
+
+def returned(value: Any) -> Any:
+    return value
+
+
+def raise_user_error() -> None:
+    from pipeline.runtime.errors import UserError
+
+    raise UserError("is wrong", file="a.jpg", fix="mend it")
+
+
+def raise_bug() -> None:
+    raise KeyError("lost")
+
+
+def die() -> None:
+    import os
+    import signal
+
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def sleep_forever(started: Path) -> None:
+    import os
+    import time
+
+    started.write_text(str(os.getpid()))
+    time.sleep(600)
+
+
+def wait_for_sleeper(started: Path) -> None:
+    from pipeline.sfm.isolate import run_isolated
+
+    run_isolated(sleep_forever, started)

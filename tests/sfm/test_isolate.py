@@ -1,0 +1,67 @@
+"""Processes that keep libraries apart hand back values and errors, and never stay behind."""
+
+from __future__ import annotations
+
+import multiprocessing
+import os
+import time
+
+import pytest
+
+from pipeline.runtime.errors import UserError
+from pipeline.sfm.isolate import run_isolated
+from tests.sfm import jobs
+
+
+def test_values_come_back():
+    assert run_isolated(jobs.returned, {"a": [1, 2]}) == {"a": [1, 2]}
+
+
+def test_a_user_error_keeps_its_parts():
+    with pytest.raises(UserError) as caught:
+        run_isolated(jobs.raise_user_error)
+    assert (caught.value.what, caught.value.file, caught.value.fix) == (
+        "is wrong",
+        "a.jpg",
+        "mend it",
+    )
+
+
+def test_a_bug_shows_its_traceback():
+    with pytest.raises(RuntimeError, match=r"raise_bug(.|\n)*KeyError: 'lost'"):
+        run_isolated(jobs.raise_bug)
+
+
+def test_a_killed_process_is_named_not_waited_for():
+    with pytest.raises(RuntimeError, match="SIGKILL"):
+        run_isolated(jobs.die)
+
+
+def test_a_process_dies_with_the_one_that_started_it(tmp_path):
+    started = tmp_path / "pid"
+    parent = multiprocessing.get_context("spawn").Process(
+        target=jobs.wait_for_sleeper, args=(started,)
+    )
+    parent.start()
+    for _ in range(600):
+        if started.exists() and started.read_text():
+            break
+        time.sleep(0.05)
+    child = int(started.read_text())
+    parent.kill()
+    parent.join()
+    for _ in range(200):
+        if not _alive(child):
+            return
+        time.sleep(0.05)
+    os.kill(child, 9)
+    pytest.fail("the process outlived its parent")
+
+
+def _alive(pid: int) -> bool:
+    """False for a zombie too, which only waits for init to collect it."""
+    try:
+        with open(f"/proc/{pid}/stat") as file:
+            return file.read().rsplit(")", 1)[1].split()[0] != "Z"
+    except FileNotFoundError:
+        return False

@@ -1,0 +1,269 @@
+"""From photographs to poses: right, the same for any threads, and never silently wrong."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.config import schema
+from pipeline.metrics.pose import pose_error
+from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import read_model, write_model
+from pipeline.sfm.features import extract_features
+from pipeline.sfm.isolate import run_isolated
+from pipeline.sfm.judge import Evidence, judge
+from pipeline.sfm.triangulation import triangulate
+from tests.sfm import corner, jobs
+
+FEATURES = schema.Features(max_features=1500)
+INCREMENTAL = schema.Sfm(mapper="incremental")
+
+
+def features(folder: Path, photos) -> Path:
+    extract_features(
+        corner.manifest(photos), FEATURES, folder / "features", cache=folder / "cache", threads=2
+    )
+    return folder / "features"
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Folder, photographs, true model, features of eight photographs of a room's corner."""
+    folder = tmp_path_factory.mktemp("room")
+    photos, truth = corner.write_scene(folder / "photos", 8, camera_group="a")
+    return folder, photos, truth, features(folder, photos)
+
+
+def test_poses_are_right_and_bytes_equal_on_one_and_two_threads(room, tmp_path):
+    _, photos, truth, found = room
+    manifest = corner.manifest(photos)
+    for threads in (1, 2):
+        matched, report = run_isolated(
+            jobs.match_and_reconstruct,
+            manifest,
+            found,
+            tmp_path / str(threads),
+            INCREMENTAL,
+            threads,
+        )
+    assert jobs.digests(tmp_path / "1") == jobs.digests(tmp_path / "2")
+    assert matched["components"] == [8] and matched["num_pairs"] == 28
+    assert report["registered"] == report["total"] == 8
+    assert report["verdict"] == "good" and report["warnings"] == []
+    assert report["mean_reprojection_error_px"] < 0.5
+    model = read_model(tmp_path / "1" / "sfm" / "sparse" / "0")
+    assert len(model.points) == report["num_points"] > 500
+    error = pose_error(model, truth)
+    assert error.rotation_median_deg < 0.1 and error.centre_relative_median < 0.003
+    # Coloured like the textures, not grey.
+    assert model.points.rgb.astype(float).std(axis=0).min() > 20
+
+
+def test_global_mapping_is_right_and_bytes_equal_on_one_and_two_threads(room, tmp_path):
+    _, photos, truth, found = room
+    manifest, config = corner.manifest(photos), schema.Sfm(mapper="global")
+    run_isolated(jobs.match, manifest, found, tmp_path / "matches")
+    database = tmp_path / "matches" / "database.db"
+    before = database.read_bytes()
+    for threads in (1, 2):
+        report = run_isolated(
+            jobs.reconstruct, manifest, database, config, tmp_path / str(threads), threads
+        )
+    assert jobs.digests(tmp_path / "1") == jobs.digests(tmp_path / "2")
+    assert database.read_bytes() == before, "a stage changed its input"
+    assert report["mapper"] == "global" and report["registered"] == 8
+    error = pose_error(read_model(tmp_path / "1" / "sparse" / "0"), truth)
+    assert error.rotation_median_deg < 0.2 and error.centre_relative_median < 0.005
+
+
+def test_two_scenes_in_one_folder_give_the_larger_and_say_so(room, tmp_path):
+    folder, photos, _, _ = room
+    others, _ = corner.write_scene(tmp_path / "photos", 4, seed=2, prefix="other ")
+    both = [*photos, *others]
+    extract_features(
+        corner.manifest(both), FEATURES, tmp_path / "f", cache=folder / "cache", threads=2
+    )
+    matched, report = run_isolated(
+        jobs.match_and_reconstruct, corner.manifest(both), tmp_path / "f", tmp_path, INCREMENTAL
+    )
+    assert matched["components"] == [8, 4]
+    assert matched["isolated"] == [photo.name for photo in others]
+    assert "fall into 2 sets" in matched["warnings"][0] and "8 of 12" in matched["warnings"][0]
+    assert report["registered"] == 8 and report["other_models"] == [4]
+    assert report["not_registered"] == [photo.name for photo in others]
+    assert report["verdict"] == "weak"
+    assert len(read_model(tmp_path / "sfm" / "other_models" / "1").images) == 4
+
+
+def test_photographs_of_nothing_in_common_end_in_one_message(tmp_path):
+    photos = []
+    for seed in range(3):
+        photos += corner.write_scene(tmp_path / "p", 1, seed=20 + seed, prefix=f"{seed} ")[0]
+    with pytest.raises(UserError, match="no two of the 3 photographs show the same thing") as e:
+        run_isolated(
+            jobs.match, corner.manifest(photos), features(tmp_path, photos), tmp_path / "m"
+        )
+    assert e.value.fix is not None
+
+
+def test_photographs_without_features_end_in_the_same_message(tmp_path):
+    tmp_path.joinpath("p").mkdir()
+    photos = []
+    for name in ("a.png", "b.png"):
+        cv2.imwrite(str(tmp_path / "p" / name), np.full((100, 120, 3), 90, np.uint8))
+        photos.append(corner.photo(tmp_path / "p" / name))
+    for pairs in ("exhaustive", "retrieval"):
+        with pytest.raises(UserError, match="no two of the 2 photographs"):
+            run_isolated(
+                jobs.match,
+                corner.manifest(photos),
+                features(tmp_path, photos),
+                tmp_path / "m",
+                pairs,
+            )
+
+
+def test_a_camera_that_only_turns_is_no_reconstruction(tmp_path):
+    rotation, translation = corner.poses(3)[1]
+    photos = []
+    for index, angle in enumerate(np.radians([-8, -4, 0, 4, 8])):
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        path = tmp_path / f"{index}.png"
+        cv2.imwrite(str(path), corner.picture(turn @ rotation, turn @ translation, 1))
+        photos.append(corner.photo(path))
+    found = features(tmp_path, photos)
+    try:
+        _, report = run_isolated(
+            jobs.match_and_reconstruct, corner.manifest(photos), found, tmp_path, INCREMENTAL
+        )
+    except UserError as error:
+        assert "no reconstruction" in str(error)
+    else:
+        assert report["verdict"] == "weak", report
+
+
+def test_a_photograph_missing_from_the_database_is_named(room, tmp_path):
+    _, photos, _, found = room
+    run_isolated(jobs.match, corner.manifest(photos[:3]), found, tmp_path)
+    with pytest.raises(UserError, match="1 photographs are not in the database.*view 04"):
+        run_isolated(
+            jobs.reconstruct,
+            corner.manifest(photos[:4]),
+            tmp_path / "database.db",
+            INCREMENTAL,
+            tmp_path / "out",
+        )
+
+
+@pytest.mark.parametrize(
+    ("sharing", "cameras"),
+    [
+        # Groups a and b; the prior of a is the median of its photographs' 300, 380 and 400.
+        ("group", [("SIMPLE_RADIAL", 380.0, True), ("SIMPLE_RADIAL", 480.0, False)]),
+        ("single", [("SIMPLE_RADIAL", 380.0, True)]),
+        (
+            "image",
+            [("SIMPLE_RADIAL", f, True) for f in (300.0, 380.0, 400.0)]
+            + [("SIMPLE_RADIAL", 480.0, False)],
+        ),
+    ],
+)
+def test_cameras_are_shared_as_configured_with_their_priors(room, tmp_path, sharing, cameras):
+    _, photos, _, found = room
+    facts = [("a", 300.0), ("a", 380.0), ("a", 400.0), ("b", None)]
+    chosen = [
+        photo.model_copy(update={"camera_group": group, "focal_px": focal})
+        for photo, (group, focal) in zip(photos, facts, strict=False)
+    ]
+    config = schema.Sfm(share_cameras=sharing)
+    run_isolated(jobs.match, corner.manifest(chosen), found, tmp_path, "sequential", 2, config)
+    assert run_isolated(jobs.database_cameras, tmp_path / "database.db") == cameras
+
+
+def test_known_poses_get_points_and_stay_as_they_are(room, tmp_path):
+    _, photos, truth, _ = room
+    # Given at half the size, as with images_2; one image has no photograph.
+    half = replace(truth, cameras={1: corner.camera().resized(200, 150)})
+    write_model(tmp_path / "given", half)
+    report = triangulate(
+        corner.manifest(photos[:7]),
+        tmp_path / "given",
+        tmp_path / "out",
+        FEATURES,
+        threads=2,
+        seed=0,
+    )
+    model = read_model(tmp_path / "out" / "sparse" / "0")
+    assert report.num_points == len(model.points) > 500
+    assert report.num_images == len(model.images) == 7
+    for image in model.images.values():
+        true = truth.by_name()[image.name]
+        np.testing.assert_allclose(image.world_to_camera, true.world_to_camera, atol=1e-12)
+    assert model.cameras[1].pinhole == pytest.approx(corner.camera().pinhole)
+    # Every point lies on the floor or on a wall: the nearest plane is x = 0, y = 0 or z = 0.
+    distance = np.abs(model.points.xyz).min(axis=1)
+    assert np.median(distance) < 0.003 and np.percentile(distance, 90) < 0.03
+
+
+def test_triangulation_without_matches_gives_no_points(tmp_path):
+    photos, truth = [], None
+    for seed in range(2):
+        more, truth = corner.write_scene(tmp_path / "p", 2, seed=30 + seed, prefix=f"{seed} ")
+        photos.append(more[seed])
+    images = {
+        i: replace(truth.images[i], name=photo.name) for i, photo in enumerate(photos, start=1)
+    }
+    write_model(tmp_path / "given", replace(truth, images=images))
+    report = triangulate(
+        corner.manifest(photos), tmp_path / "given", tmp_path / "out", FEATURES, threads=2, seed=0
+    )
+    assert report.num_points == 0
+    assert len(read_model(tmp_path / "out" / "sparse" / "0").images) == 2
+
+
+GOOD = Evidence(
+    registered=20,
+    total=20,
+    points=4000,
+    observations_per_image=800,
+    mean_track_length=4.0,
+    reprojection_px=0.5,
+    explained_matches=0.9,
+    behind_camera=0.0,
+    median_angle_deg=12.0,
+    focal_off=1.05,
+    focal_relative=0.9,
+    focal_prior_px={},
+)
+
+
+@pytest.mark.parametrize(
+    ("change", "grade", "reason"),
+    [
+        ({}, "good", None),
+        ({"focal_off": None}, "good", None),
+        ({"registered": 14}, "weak", "14 of 20 photographs"),
+        ({"registered": 9}, "failed", "9 of 20 photographs"),
+        ({"explained_matches": 0.3}, "weak", "30% of the verified matches"),
+        ({"explained_matches": 0.1}, "failed", "10% of the verified matches"),
+        ({"points": 100}, "failed", "5 points for each photograph"),
+        ({"focal_off": 1.5}, "weak", "1.5 times off"),
+        ({"focal_off": 2.5}, "failed", "2.5 times off"),
+        ({"focal_relative": 0.1}, "failed", "0.10 times the picture"),
+        ({"behind_camera": 0.2}, "failed", "20% of the points are behind"),
+        ({"median_angle_deg": 0.5}, "weak", "hardly moved"),
+    ],
+)
+def test_the_judge_by_its_evidence(change, grade, reason):
+    verdict = judge(replace(GOOD, **change), min_registered_share=0.5)
+    assert verdict.grade == grade
+    assert reason is None or reason in "; ".join(verdict.reasons)
+
+
+def test_no_model_is_a_failure():
+    assert judge(None, 0.5).grade == "failed"

@@ -26,10 +26,10 @@ SOURCES = Path(__file__).parent / "csrc"
 LIBRARY = "libsplatmake.so"
 # -march=native: the vector width of this machine. No -ffast-math: it folds the rounding inside
 # exp2 away. -ffp-contract=fast is GCC's default, said aloud: a * b + c is one rounding everywhere.
-FLAGS = (
-    "-std=c++17 -O3 -march=native -fno-math-errno -fno-trapping-math -ffp-contract=fast "
-    "-fopenmp -fPIC -Wall -Wno-psabi -Wno-maybe-uninitialized"
-).split()
+FLAGS = [
+    *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
+    *("-ffp-contract=fast", "-fopenmp", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-maybe-uninitialized"),
+]
 _lock = threading.Lock()
 _loaded: Path | None = None
 

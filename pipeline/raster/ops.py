@@ -113,7 +113,7 @@ def _pack_view(camera: RasterCamera, near: float) -> torch.Tensor:
         raise ValueError(f"camera: focal lengths must be positive, found {camera.fx}, {camera.fy}")
     if not (1 <= camera.width <= MAX_IMAGE_SIDE and 1 <= camera.height <= MAX_IMAGE_SIDE):
         raise ValueError(
-            f"camera: sides must be 1 to {MAX_IMAGE_SIDE} px, found {camera.width} x {camera.height}"
+            f"camera: {camera.width} x {camera.height} px, sides must be 1 to {MAX_IMAGE_SIDE}"
         )
     if not near > 0:
         raise ValueError(f"near must be positive, found {near}")
@@ -200,17 +200,20 @@ def backward(
         fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
         means2d_abs, threads,
     )  # fmt: skip
-    *parameters, means2d, absolute = ops.project_backward(
+    d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs = ops.project_backward(
         *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias, s.records,
         fwd.radii, s.slots, slot_gradients, means2d_abs, threads,
     )  # fmt: skip
-    return Gradients(*parameters, means2d, absolute if means2d_abs else None)
+    return Gradients(
+        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs if means2d_abs else None
+    )
 
 
 class _Render(torch.autograd.Function):
     @staticmethod
     def forward(ctx: Any, camera: RasterCamera, options: RasterOptions, *inputs: Any) -> Any:
-        fwd = forward(*inputs, camera, options)
+        means, log_scales, quats, opacity_logits, sh = inputs
+        fwd = forward(means, log_scales, quats, opacity_logits, sh, camera, options)
         ctx.fwd = fwd
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(fwd.median_depth, fwd.radii)

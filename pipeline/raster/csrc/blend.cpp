@@ -31,24 +31,22 @@ SPLAT_INLINE int64_t composite(const Record* records, const Pairs& pairs, int64_
                                const Tile& tile, f32x16* transmittance, Sum& sum) {
     tile.start(transmittance);
     int alive = tile.columns * tile.rows;
-    const int64_t end = pairs.tile_begin[index + 1];
-    int64_t e = pairs.tile_begin[index];
-    while (e < end && alive > 0) {
-        const Entry entry = pairs.entries[e++];
-        if (e + 4 < end) __builtin_prefetch(records + pairs.entries[e + 4].gaussian);
-        const Record& g = records[entry.gaussian];
-        const TileGaussian here(g, tile);
-        const int last = int(entry.rows >> 8);
-        for (int row = int(entry.rows & 255); row <= last; row++) {
-            const f32x16 before = transmittance[row];
-            const Step s = step(here.power(row, here.u_row(row)), before);
-            Mask16 stopped;
-            transmittance[row] = advance(s, before, stopped);
-            if (__builtin_expect(any(stopped), 0)) alive -= __builtin_popcount(bits(stopped));
-            sum.add(row, g, s, before);
-        }
-    }
-    return e;
+    return each_gaussian(
+        records, pairs.entries, pairs.tile_begin[index], pairs.tile_begin[index + 1], tile,
+        [](const Entry&) {},
+        [&](const TileGaussian& here) __attribute__((always_inline)) {
+            const Record& g = *here.record;
+            const int last = here.last_row();
+            for (int row = here.first_row(); row <= last; row++) {
+                const f32x16 before = transmittance[row];
+                const Step s = step(here.power(row, here.u_row(row)), before);
+                Mask16 stopped;
+                transmittance[row] = advance(s, before, stopped);
+                if (__builtin_expect(any(stopped), 0)) alive -= __builtin_popcount(bits(stopped));
+                sum.add(row, g, s, before);
+            }
+            return alive > 0;
+        });
 }
 
 // Writes the part of a row inside the image.

@@ -13,10 +13,15 @@
 namespace splat {
 namespace {
 
-// What a tile's pixels ask for.
+// What a tile's pixels ask for, and where they have come to. The gap keeps a row that is written
+// half a page off the same row of what is read: 4096 bytes apart, the processor takes a load for
+// one of what it has just stored, and waits.
 struct TileTargets {
-    f32x16 red[kTile], green[kTile], blue[kTile], alpha[kTile], depth[kTile];
+    f32x16 red[kTile], green[kTile], blue[kTile], alpha[kTile];
+    f32x16 gap[kTile / 2];
+    f32x16 transmittance[kTile];
     f32x16 behind[kTile];  // S: starts as the whole sum, ends as 0
+    f32x16 depth[kTile];
 
     TileTargets(const Tile& tile, const View& view, const ImageGradientsIn& in) {
         // Rows and columns outside the image ask for nothing.
@@ -63,17 +68,17 @@ constexpr RowNumbers kRows;
 
 // One Gaussian over its rows of a tile, to one slot.
 template <bool kDepthGradient, bool kAbsolute>
-SPLAT_INLINE void backward_gaussian(const Record& g, const Tile& tile, int first, int last,
-                                    f32x16* transmittance, TileTargets& t, float* slot) {
-    const TileGaussian here(g, tile);
+SPLAT_INLINE void backward_gaussian(const TileGaussian& here, TileTargets& t, float* slot) {
+    const Record& g = *here.record;
+    const int first = here.first_row(), last = here.last_row();
     const f32x16 zero = {};
     f32x16 v0 = zero, v1 = zero, v2 = zero;  // sums over rows of v, v * n, v * n^2
     f32x16 red = zero, green = zero, blue = zero, depth = zero, abs_x = zero, abs_y = zero;
     for (int row = first; row <= last; row++) {
-        const f32x16 before = transmittance[row], u = here.u_row(row);
+        const f32x16 before = t.transmittance[row], u = here.u_row(row);
         const Step s = step(here.power(row, u), before);
         Mask16 stopped;
-        transmittance[row] = advance(s, before, stopped);
+        t.transmittance[row] = advance(s, before, stopped);
         f32x16 e =
             t.alpha[row] + t.red[row] * g.rgb[0] + t.green[row] * g.rgb[1] + t.blue[row] * g.rgb[2];
         if (kDepthGradient) e += t.depth[row] * g.depth;
@@ -127,21 +132,18 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
         if (begin == end) continue;
         const Tile tile(index, view);
         TileTargets targets(tile, view, in);
-        f32x16 transmittance[kTile];
-        tile.start(transmittance);
-        for (int64_t e = begin; e < tile_end[index]; e++) {
-            const Entry entry = pairs.entries[e];
-            if (e + 4 < end) {
-                const Entry& ahead = pairs.entries[e + 4];
-                __builtin_prefetch(records + ahead.gaussian);
-                __builtin_prefetch(slot_gradients + int64_t(ahead.slot) * kSlotFloats, 1);
-            }
-            backward_gaussian<kDepthGradient, kAbsolute>(
-                records[entry.gaussian], tile, int(entry.rows & 255), int(entry.rows >> 8),
-                transmittance, targets, slot_gradients + int64_t(entry.slot) * kSlotFloats);
-        }
-        for (int64_t e = tile_end[index]; e < end; e++)
-            store(slot_gradients + int64_t(pairs.entries[e].slot) * kSlotFloats, f32x16{});
+        tile.start(targets.transmittance);
+        const auto slot_of = [=](const Entry& entry) {
+            return slot_gradients + int64_t(entry.slot) * kSlotFloats;
+        };
+        each_gaussian(
+            records, pairs.entries, begin, tile_end[index], tile,
+            [&](const Entry& entry) { __builtin_prefetch(slot_of(entry), 1); },
+            [&](const TileGaussian& here) __attribute__((always_inline)) {
+                backward_gaussian<kDepthGradient, kAbsolute>(here, targets, slot_of(here.entry));
+                return true;
+            });
+        for (int64_t e = tile_end[index]; e < end; e++) store(slot_of(pairs.entries[e]), f32x16{});
     }
 }
 

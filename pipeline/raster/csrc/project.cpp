@@ -1,7 +1,6 @@
 #include "project.h"
 
 #include <cmath>
-#include <limits>
 
 #include "project_math.h"
 #include "sh.h"
@@ -25,21 +24,30 @@ Center camera_center(const View& view) {
     return c;
 }
 
-// Eight Gaussians from `first` on; the last one fills the lanes beyond the end.
-Inputs load_inputs(const Gaussians& g, int64_t first) {
-    double field[11][kProjectLanes];
-    for (int lane = 0; lane < kProjectLanes; lane++) {
-        const int64_t i = first + lane < g.count ? first + lane : g.count - 1;
-        for (int k = 0; k < 3; k++) field[k][lane] = g.means[3 * i + k];
-        for (int k = 0; k < 3; k++) field[3 + k][lane] = g.log_scales[3 * i + k];
-        for (int k = 0; k < 4; k++) field[6 + k][lane] = g.quats[4 * i + k];
-        field[10][lane] = g.opacity_logits[i];
+// Field `k` of eight neighbours in an array of `width` floats each.
+SPLAT_INLINE Lanes gather(const float* from, int width, int k) {
+    const float* p = from + k;
+    return Lanes{p[0],         p[width],     p[2 * width], p[3 * width],
+                 p[4 * width], p[5 * width], p[6 * width], p[7 * width]};
+}
+
+// Eight Gaussians from `first` on; zeros, which no quaternion survives, beyond the end.
+SPLAT_INLINE Inputs load_inputs(const Gaussians& g, int64_t first) {
+    const float *means = g.means + 3 * first, *log_scales = g.log_scales + 3 * first;
+    const float *quats = g.quats + 4 * first, *opacity_logits = g.opacity_logits + first;
+    float padded[4][4 * kProjectLanes];
+    if (g.count - first < kProjectLanes) {
+        const size_t n = size_t(g.count - first) * sizeof(float);
+        std::memset(padded, 0, sizeof(padded));
+        means = static_cast<float*>(std::memcpy(padded[0], means, 3 * n));
+        log_scales = static_cast<float*>(std::memcpy(padded[1], log_scales, 3 * n));
+        quats = static_cast<float*>(std::memcpy(padded[2], quats, 4 * n));
+        opacity_logits = static_cast<float*>(std::memcpy(padded[3], opacity_logits, n));
     }
-    const auto get = [&](int k) { return load<Lanes>(field[k]); };
-    return {{get(0), get(1), get(2)},
-            {get(3), get(4), get(5)},
-            {get(6), get(7), get(8), get(9)},
-            get(10)};
+    return {{gather(means, 3, 0), gather(means, 3, 1), gather(means, 3, 2)},
+            {gather(log_scales, 3, 0), gather(log_scales, 3, 1), gather(log_scales, 3, 2)},
+            {gather(quats, 4, 0), gather(quats, 4, 1), gather(quats, 4, 2), gather(quats, 4, 3)},
+            gather(opacity_logits, 1, 0)};
 }
 
 // -1 in the lanes whose every input is finite and whose quaternion has a direction.
@@ -62,7 +70,9 @@ void project_block(const Gaussians& g, const View& view, int64_t first, Block& o
     const Projected p = project(in, view);
     const Lanes log2_opacity = log2(p.opacity);
     const Lanes reach = log2_opacity - double(kLog2AlphaMin);
-    const Lanes reach2 = clamp(reach, 0.0, 16.0) / kHalfLog2e;  // d^T inverse(cov) d at alpha_min
+    // d^T inverse(cov) d at alpha_min, and its root
+    const Lanes reach2 = clamp(reach, 0.0, 16.0) * (1 / kHalfLog2e), root = sqrt(reach2);
+    const Lanes inv_yy = 1.0 / p.yy;
     const Lanes uu = sqrt(kHalfLog2e * p.yy / p.det);
     const Lanes half_difference = 0.5 * (p.xx - p.yy);
     const Lanes longest =
@@ -71,12 +81,12 @@ void project_block(const Gaussians& g, const View& view, int64_t first, Block& o
     store(out.y, p.y);
     store(out.depth, p.cam.z);
     store(out.uu, uu);
-    store(out.uw, -uu * p.xy / p.yy);
-    store(out.ww, sqrt(kHalfLog2e / p.yy));
+    store(out.uw, -uu * p.xy * inv_yy);
+    store(out.ww, sqrt(kHalfLog2e * inv_yy));
     store(out.log2_opacity, log2_opacity);
-    store(out.extent_x, sqrt(reach2 * p.xx));
-    store(out.extent_y, sqrt(reach2 * p.yy));
-    store(out.radius, sqrt(reach2 * longest));
+    store(out.extent_x, root * sqrt(p.xx));
+    store(out.extent_y, root * sqrt(p.yy));
+    store(out.radius, root * sqrt(longest));
     store(out.usable, usable(in, p));
     // Depth is kept in float32: beyond its range it would be infinite.
     store(out.in_front, i64x8(p.cam.z > view.near));
@@ -93,8 +103,9 @@ bool holds_pixel(double center, double extent, int64_t size) {
     return (first > 0 ? first : 0) <= (last < size - 1 ? last : size - 1);
 }
 
+// To float32; `finite` falls where it would not fit with room for a small factor.
 float finite_float(double v, bool& finite) {
-    finite &= std::fabs(v) <= std::numeric_limits<float>::max();
+    finite &= std::fabs(v) <= 1e37;
     return float(v);
 }
 
@@ -225,6 +236,10 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         double moments[12][kProjectLanes] = {};
         const Record* record[kProjectLanes] = {};
         bool any_drawn = false;
+        // The slots lie by depth, not by index: ask for those of the blocks to come.
+        for (int64_t i = first + 4 * kProjectLanes; i < first + 5 * kProjectLanes; i++)
+            if (i < in.count)
+                __builtin_prefetch(slot_gradients + slots[i].first * int64_t(kSlotFloats));
         for (int lane = 0; lane < lanes; lane++) {
             const int64_t i = first + lane;
             if (!(radii[i] > 0) || slots[i].count == 0) continue;
@@ -260,7 +275,6 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
             float* d_sh = out.sh + sh_width * i;
             sh_backward(direction(in.means + 3 * i, center.xyz), view.sh_degree,
                         in.sh + sh_width * i, d_rgb, d_sh, d_mean);
-            for (int64_t k = 0; k < active; k++) finite &= std::isfinite(d_sh[k]);
             for (int64_t k = active; k < sh_width; k++) d_sh[k] = 0;
             for (int k = 0; k < 3; k++) {
                 out.means[3 * i + k] = finite_float(d_mean[k], finite);

@@ -2,6 +2,8 @@
 // of Sloan 2013, ordered and signed as in 3DGS).
 #pragma once
 
+#include <utility>
+
 #include "simd.h"
 
 namespace splat {
@@ -59,39 +61,101 @@ SPLAT_INLINE Direction direction(const float* mean, const double* center) {
     return {float(x * inv), float(y * inv), float(z * inv), inv};
 }
 
-// max(0, 1/2 + sum_k basis_k sh_k) into rgb; false when a coefficient is not a sane number.
-inline bool sh_color(const Direction& d, int degree, const float* sh, float limit, float* rgb) {
-    float basis[16];
-    sh_basis<false>(degree, d.x, d.y, d.z, basis, nullptr, nullptr, nullptr);
-    float sum[3] = {0.5f, 0.5f, 0.5f};
-    bool sane = true;
-    for (int k = 0; k < sh_count(degree); k++)
-        for (int c = 0; c < 3; c++) {
-            const float coefficient = sh[3 * k + c];
-            sane &= __builtin_fabsf(coefficient) <= limit;
-            sum[c] += basis[k] * coefficient;
+// The 16 x 3 coefficients of a Gaussian, flat as they are stored: float f is coefficient f / 3,
+// channel f % 3.
+struct ShVectors {
+    f32x16 part[3];
+
+    // Reads the active ones; zeros stand for the rest.
+    SPLAT_INLINE ShVectors(int degree, const float* sh) {
+        alignas(64) float padded[48] = {};
+        if (degree < 3) {
+            std::memcpy(padded, sh, 3 * sh_count(degree) * sizeof(float));
+            sh = padded;
         }
-    for (int c = 0; c < 3; c++) rgb[c] = sum[c] > 0 ? sum[c] : 0;
-    return sane;
+        for (int j = 0; j < 3; j++) part[j] = load<f32x16>(sh + 16 * j);
+    }
+    SPLAT_INLINE bool within(float limit) const {
+        const f32x16 bound = splat16(limit);
+        return bits(ge(bound, abs(part[0])) & ge(bound, abs(part[1])) & ge(bound, abs(part[2]))) ==
+               0xffff;
+    }
+};
+
+template <int kPart, int... kLanes>
+constexpr i32x16 coefficient_lanes(std::integer_sequence<int, kLanes...>) {
+    return i32x16{(16 * kPart + kLanes) / 3 ...};
+}
+template <int kPart, int... kLanes>
+constexpr i32x16 channel_lanes(std::integer_sequence<int, kLanes...>) {
+    return i32x16{(16 * kPart + kLanes) % 3 ...};
+}
+using SixteenLanes = std::make_integer_sequence<int, 16>;
+
+// A value per coefficient, and a value per channel (lanes 0 to 2), brought to part kPart's lanes.
+template <int kPart>
+SPLAT_INLINE f32x16 by_coefficient(f32x16 values) {
+    return __builtin_shuffle(values, coefficient_lanes<kPart>(SixteenLanes{}));
+}
+template <int kPart>
+SPLAT_INLINE f32x16 by_channel(f32x16 values) {
+    return __builtin_shuffle(values, channel_lanes<kPart>(SixteenLanes{}));
+}
+
+// max(0, 1/2 + sum_k basis_k sh_k) into rgb; false when a coefficient is not a sane number.
+SPLAT_INLINE bool sh_color(const Direction& d, int degree, const float* sh, float limit,
+                           float* rgb) {
+    alignas(64) float basis[16] = {};
+    sh_basis<false>(degree, d.x, d.y, d.z, basis, nullptr, nullptr, nullptr);
+    const f32x16 b = load<f32x16>(basis);
+    const ShVectors s(degree, sh);
+    const f32x16 terms[3] = {s.part[0] * by_coefficient<0>(b), s.part[1] * by_coefficient<1>(b),
+                             s.part[2] * by_coefficient<2>(b)};
+    f32x16 sums[4] = {};
+    for (int c = 0; c < 3; c++) {
+        f32x16 one = {};
+        one[c] = 1;
+        sums[c] = terms[0] * by_channel<0>(one) + terms[1] * by_channel<1>(one) +
+                  terms[2] * by_channel<2>(one);
+    }
+    const f32x16 total = sum_lanes(sums);
+    for (int c = 0; c < 3; c++) {
+        const float value = total[4 * c] + 0.5f;
+        rgb[c] = value > 0 ? value : 0;
+    }
+    return s.within(limit);
 }
 
 // Given dL/d(rgb), already zero where the clamp held: dL/d(sh) for the active coefficients, and
 // the view direction's share of dL/d(mean), added to d_mean.
-inline void sh_backward(const Direction& d, int degree, const float* sh, const float* d_rgb,
-                        float* d_sh, double* d_mean) {
-    float basis[16], dx[16], dy[16], dz[16];
+SPLAT_INLINE void sh_backward(const Direction& d, int degree, const float* sh, const float* d_rgb,
+                              float* d_sh, double* d_mean) {
+    alignas(64) float basis[16] = {}, dx[16] = {}, dy[16] = {}, dz[16] = {};
     sh_basis<true>(degree, d.x, d.y, d.z, basis, dx, dy, dz);
-    float gx = 0, gy = 0, gz = 0;
-    for (int k = 0; k < sh_count(degree); k++) {
-        const float along =
-            d_rgb[0] * sh[3 * k] + d_rgb[1] * sh[3 * k + 1] + d_rgb[2] * sh[3 * k + 2];
-        for (int c = 0; c < 3; c++) d_sh[3 * k + c] = basis[k] * d_rgb[c];
-        gx += along * dx[k];
-        gy += along * dy[k];
-        gz += along * dz[k];
-    }
+    const f32x16 b = load<f32x16>(basis);
+    const f32x16 x = load<f32x16>(dx), y = load<f32x16>(dy), z = load<f32x16>(dz);
+    const f32x16 channels = {d_rgb[0], d_rgb[1], d_rgb[2]};
+    const f32x16 c[3] = {by_channel<0>(channels), by_channel<1>(channels), by_channel<2>(channels)};
+    const ShVectors s(degree, sh);
+    const f32x16 pull[3] = {s.part[0] * c[0], s.part[1] * c[1], s.part[2] * c[2]};
+    const f32x16 sums[4] = {
+        pull[0] * by_coefficient<0>(x) + pull[1] * by_coefficient<1>(x) +
+            pull[2] * by_coefficient<2>(x),
+        pull[0] * by_coefficient<0>(y) + pull[1] * by_coefficient<1>(y) +
+            pull[2] * by_coefficient<2>(y),
+        pull[0] * by_coefficient<0>(z) + pull[1] * by_coefficient<1>(z) +
+            pull[2] * by_coefficient<2>(z),
+    };
+    const f32x16 total = sum_lanes(sums);
+    alignas(64) float out[48];
+    float* to = degree < 3 ? out : d_sh;
+    store(to, by_coefficient<0>(b) * c[0]);
+    store(to + 16, by_coefficient<1>(b) * c[1]);
+    store(to + 32, by_coefficient<2>(b) * c[2]);
+    if (degree < 3) std::memcpy(d_sh, out, 3 * sh_count(degree) * sizeof(float));
     // d(v / |v|) = (I - d d^T) dv / |v|
-    const double radial = double(gx) * d.x + double(gy) * d.y + double(gz) * d.z;
+    const double gx = total[0], gy = total[4], gz = total[8];
+    const double radial = gx * d.x + gy * d.y + gz * d.z;
     d_mean[0] += (gx - radial * d.x) * d.inv_length;
     d_mean[1] += (gy - radial * d.y) * d.inv_length;
     d_mean[2] += (gz - radial * d.z) * d.inv_length;

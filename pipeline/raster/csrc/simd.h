@@ -197,4 +197,13 @@ SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[12]) {
     return within<0, 2>(a, b) + within<1, 3>(a, b);
 }
 
+// The same for 4 vectors: sum(v[i]) lands in lane 4 i.
+SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[4]) {
+    const f32x16 a = quarters<0, 1, 0, 1>(v[0], v[1]) + quarters<2, 3, 2, 3>(v[0], v[1]);
+    const f32x16 b = quarters<0, 1, 0, 1>(v[2], v[3]) + quarters<2, 3, 2, 3>(v[2], v[3]);
+    const f32x16 part = quarters<0, 2, 0, 2>(a, b) + quarters<1, 3, 1, 3>(a, b);
+    const f32x16 pairs = within<0, 1>(part, part) + within<2, 3>(part, part);
+    return within<0, 2>(pairs, pairs) + within<1, 3>(pairs, pairs);
+}
+
 }  // namespace splat

@@ -63,8 +63,8 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
 
 
 def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
-    result = run(scene, tmp_path, tiny_config(150))
-    assert result.steps == 150
+    result = run(scene, tmp_path, tiny_config(500))
+    assert result.steps == 500
     assert result.curve[-1]["loss"] < 0.4 * result.curve[0]["loss"]
     assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 8
     assert result.gaussians.sh_degree == 1
@@ -159,7 +159,7 @@ def test_alpha_with_random_background_leaves_the_empty_empty(
     result = train(
         scene.alpha_views,
         start,
-        tiny_config(150),
+        tiny_config(500),
         seed=0,
         threads=1,
         extent=scene.extent,

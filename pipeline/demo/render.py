@@ -44,7 +44,8 @@ class Rendered:
         light: (H, W, 3) float64 linear RGB; multiplied by ``alpha`` where there is one.
         coverage: (H, W) float64, share of the pixel's light that the last thing of the scene
             gives (``visitor``) or that any object gives (``transparent``); else 1.
-        depth: (H, W) float32, z of the surface at the pixel's centre; 0 where there is none.
+        depth: (H, W) float32, z of the scene's surface at the pixel's centre, behind a visitor;
+            0 where there is none.
     """
 
     light: Array
@@ -95,7 +96,7 @@ def render(
     picture = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
 
     origin, direction = _world(posed, through.centres.reshape(2, -1))
-    t, index = trace(origin, direction, things)
+    t, index = trace(origin, direction, things[:-1] if visitor else things)
     depth = np.where((index == BACKGROUND) & transparent, 0.0, t).astype(np.float32)
     return Rendered(picture[..., :3], picture[..., 3], depth.reshape(camera.height, camera.width))
 

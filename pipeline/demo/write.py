@@ -135,7 +135,8 @@ def _write(folder: Path, spec: DemoSpec, threads: int) -> None:
 def _write_view(
     folder: Path, spec: DemoSpec, camera: Camera, through: Rays, number: int, posed: Posed
 ) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
-    """Render and write one view; its depth and colours are returned for the points."""
+    """Render and write one view. Its depth and colours are returned for the points; depth is 0
+    where they show nothing of the scene."""
     things = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
     seen = render(posed, camera, through, things, transparent=spec.alpha, visitor=spec.masks)
     stem = Path(posed.name).stem
@@ -152,10 +153,14 @@ def _write_view(
     else:
         write_picture(path, colour, taken)
     np.save(folder / "depth_gt" / f"{stem}.npy", seen.depth)
+    depth = seen.depth
     if spec.masks:
-        mask = np.where(seen.coverage > 1e-3, 0, 255).astype(np.uint8)
-        Image.fromarray(mask).save(folder / "masks" / f"{stem}.png")
-    return seen.depth, colour
+        visited = seen.coverage > 1e-3
+        Image.fromarray(np.where(visited, 0, 255).astype(np.uint8)).save(
+            folder / "masks" / f"{stem}.png"
+        )
+        depth = np.where(visited, np.float32(0), depth)
+    return depth, colour
 
 
 def _visitor(seed: int, number: int, posed: Posed) -> Thing:

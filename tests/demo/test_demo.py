@@ -182,6 +182,8 @@ def test_masks_hide_the_visitor_and_nothing_else(folder: Path, tmp_path: Path) -
         assert 0.01 < 1 - mask.mean() < 0.3
         assert np.abs(visited.astype(int) - plain)[mask].max() <= 1
         assert np.abs(visited.astype(int) - plain)[~mask].mean() > 10
+        depth = f"depth_gt/view_{i:03d}.npy"
+        assert (folder / depth).read_bytes() == (tmp_path / "s" / depth).read_bytes()
 
 
 def test_alpha_covers_the_objects_alone(folder: Path, tmp_path: Path) -> None:

@@ -43,24 +43,28 @@ class Adam:
         self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
     ) -> None:
         """Move ``gaussians`` in place; ``step`` counts from 1 (bias correction)."""
-        dc_before = gaussians.sh[:, 0].clone()
+        sh = gaussians.sh
+        rest = sh.shape[1] > 1
+        dc = sh[:, 0].clone() if rest else None
         for name, parameter in gaussians.tensors().items():
+            rate = (rates.shN if rest else rates.sh0) if name == "sh" else getattr(rates, name)
             adam_step(
                 parameter,
                 getattr(gradients, name),
                 self.first[name],
                 self.second[name],
-                rates.shN if name == "sh" else getattr(rates, name),
+                rate,
                 step,
                 BETA1,
                 BETA2,
                 EPSILON,
                 threads,
             )
-        # The constant coefficient shares the array and the moments but has a rate of its own.
-        scale = self.second["sh"][:, 0].clone().div_(1 - BETA2**step).sqrt_().add_(EPSILON)
-        move = self.first["sh"][:, 0].clone().div_(scale)
-        gaussians.sh[:, 0] = dc_before.sub_(move, alpha=rates.sh0 / (1 - BETA1**step))
+        if dc is not None:
+            # The constant coefficient shares array and moments, but has a rate of its own.
+            scale = self.second["sh"][:, 0].clone().div_(1 - BETA2**step).sqrt_().add_(EPSILON)
+            move = self.first["sh"][:, 0].clone().div_(scale)
+            sh[:, 0] = dc.sub_(move, alpha=rates.sh0 / (1 - BETA1**step))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""

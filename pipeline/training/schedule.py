@@ -91,5 +91,6 @@ class Schedule:
 
     def prunes_huge_after(self, step: int) -> bool:
         """Late enough for first Gaussians that had to be large (a distant background) to have
-        been split (3DGS: after the first opacity reset)."""
-        return step > self.reset_interval
+        been split (3DGS: after the first opacity reset), and early enough for what was taken
+        away by mistake to be filled again."""
+        return self.reset_interval < step and self.refines_after(step)

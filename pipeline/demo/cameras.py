@@ -9,8 +9,7 @@ from pipeline.scene.model import Camera, Posed
 
 Array = NDArray[np.float64]
 
-# The focal length a 35 mm camera would have, in mm on a sensor SENSOR_WIDTH_MM wide.
-FOCAL_35MM = 28
+FOCAL_MM = 28
 SENSOR_WIDTH_MM = 36.0
 # Neighbours farther apart than this share too little for SIFT: fewer views make a shorter arc.
 MAX_STEP_DEGREES = 12.0
@@ -26,9 +25,15 @@ LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
 def lens(distortion: str, width: int, height: int) -> Camera:
     """The demo's camera: ``distortion`` is a key of ``LENSES``; sizes in pixels."""
     model, coefficients = LENSES[distortion]
-    focal = FOCAL_35MM / SENSOR_WIDTH_MM * width
+    focal = FOCAL_MM / SENSOR_WIDTH_MM * width
     focals = [focal] if model.startswith("SIMPLE") else [focal, focal]
     return Camera(model, width, height, np.array([*focals, width / 2, height / 2, *coefficients]))
+
+
+def focal_35mm(width: int, height: int) -> int:
+    """EXIF's FocalLengthIn35mmFilm: by the diagonal, 43.27 mm on film (CIPA DCG-001)."""
+    sensor_diagonal = SENSOR_WIDTH_MM * float(np.hypot(1.0, height / width))
+    return round(FOCAL_MM * float(np.hypot(36.0, 24.0)) / sensor_diagonal)
 
 
 def orbit(names: list[str], seed: int) -> list[Posed]:

@@ -9,7 +9,7 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.demo.cameras import FOCAL_35MM, SENSOR_WIDTH_MM
+from pipeline.demo.cameras import FOCAL_MM, SENSOR_WIDTH_MM, focal_35mm
 
 Array = NDArray[np.float64]
 
@@ -48,10 +48,10 @@ def write_picture(path: Path, pixels: NDArray[np.uint8], taken: str) -> None:
     exif[271], exif[272], exif[274], exif[306] = MAKE, MODEL, 1, taken
     photo = exif.get_ifd(0x8769)
     photo[36867] = taken
-    photo[37386] = float(FOCAL_35MM)
+    photo[37386] = float(FOCAL_MM)
     photo[41486] = photo[41487] = pixels.shape[1] / SENSOR_WIDTH_MM * 10
     photo[41488] = 3  # pixels a centimetre
-    photo[41989] = FOCAL_35MM
+    photo[41989] = focal_35mm(pixels.shape[1], pixels.shape[0])
     exif[0x8769] = photo
     # Other formats pass over JPEG's two options.
     Image.fromarray(pixels).save(path, exif=exif, quality=JPEG_QUALITY, subsampling=0)
@@ -101,10 +101,16 @@ def write_dng(path: Path, mosaic: NDArray[np.uint16], taken: str) -> None:
         (33437, "2I", 1, (56, 10), True),  # FNumber
         (34855, "H", 1, 100, True),  # ISO
         (36867, "s", 0, taken, True),  # DateTimeOriginal
-        (37386, "2I", 1, (FOCAL_35MM, 1), True),  # FocalLength
+        (37386, "2I", 1, (FOCAL_MM, 1), True),  # FocalLength
         (41486, "2I", 1, rationals(np.array(mosaic.shape[1] / SENSOR_WIDTH_MM * 10)), True),
         (41488, "H", 1, 3, True),  # FocalPlaneResolutionUnit: centimetre
-        (41989, "H", 1, FOCAL_35MM, True),  # FocalLengthIn35mmFilm
+        (
+            41989,
+            "H",
+            1,
+            focal_35mm(mosaic.shape[1], mosaic.shape[0]),
+            True,
+        ),  # FocalLengthIn35mmFilm
         (50706, "B", 4, (1, 4, 0, 0), True),  # DNGVersion
         (50708, "s", 0, f"{MAKE} {MODEL}", True),  # UniqueCameraModel
         (50714, "I", 1, BLACK_LEVEL, True),

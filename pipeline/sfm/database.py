@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
@@ -100,6 +101,49 @@ def verified_inliers(path: Path) -> dict[tuple[str, str], int]:
             first, second = pycolmap.pair_id_to_image_pair(pair_id)
             found[names[first], names[second]] = count
     return dict(sorted(found.items()))
+
+
+def share_cameras_by_size(source: Path, target: Path) -> bool:
+    """Copy a database, giving photographs of one size one camera, without a focal prior;
+    False, and no copy, where they have one already."""
+    with pycolmap.Database.open(source) as database:
+        cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
+        used = {image.camera_id for image in database.read_all_images()}
+    kept: dict[tuple[int, int], int] = {}
+    merged = {}
+    for camera_id in sorted(used):
+        camera = cameras[camera_id]
+        merged[camera_id] = kept.setdefault((camera.width, camera.height), camera_id)
+    if len(kept) == len(used):
+        return False
+    shutil.copyfile(source, target)
+    with pycolmap.Database.open(target) as database:
+        for camera_id in kept.values():
+            camera = cameras[camera_id]
+            side = max(camera.width, camera.height)
+            shared = pycolmap.Camera.create_from_model_name(
+                camera_id,
+                camera.model_name,
+                DEFAULT_FOCAL_FACTOR * side,
+                camera.width,
+                camera.height,
+            )
+            database.update_camera(shared)
+    # A rig has its camera's id, and a frame is one image.
+    moves = [(new, old) for old, new in merged.items() if new != old]
+    connection = sqlite3.connect(target)
+    try:
+        for table, column in (("images", "camera_id"), ("frames", "rig_id")):
+            statement = f"UPDATE {table} SET {column} = ? WHERE {column} = ?"
+            connection.executemany(statement, moves)
+        connection.executemany("UPDATE frame_data SET sensor_id = ? WHERE sensor_id = ?", moves)
+        gone = [(old,) for _, old in moves]
+        connection.executemany("DELETE FROM rigs WHERE rig_id = ?", gone)
+        connection.executemany("DELETE FROM cameras WHERE camera_id = ?", gone)
+        connection.commit()
+    finally:
+        connection.close()
+    return True
 
 
 def _write_images(

@@ -18,6 +18,8 @@ MAX_FOCAL_OFF_FAILED, MAX_FOCAL_OFF_WEAK = 2.0, 1.3
 FOCAL_RANGE = (0.22, 17.0)
 MIN_SHARE_GOOD = 0.8
 MAX_REPROJECTION_WEAK_PX = 2.0
+# Matches that a camera which only turns would see as well, but for noise (half a pixel).
+MIN_PARALLAX_FAILED, MIN_PARALLAX_WEAK = 0.0015, 0.004
 # Half of the points seen under less than this: the camera hardly moved, depths are guesses.
 MIN_ANGLE_WEAK_DEG = 2.0
 
@@ -32,6 +34,8 @@ class Evidence:
         explained_matches: share of verified matches between registered images whose two keypoints
             are seen as one point.
         behind_camera: share of observations behind the camera that made them.
+        parallax: how far matches are from what a camera that only turns would see, over the
+            longer side.
         median_angle_deg: of the points, the largest angle between two of their rays, the median.
         focal_off: ratio of the focal length to its EXIF prior, either way up, of the median image
             with a prior; None without any (pictures cropped after they were taken have wrong ones).
@@ -47,6 +51,7 @@ class Evidence:
     reprojection_px: float
     explained_matches: float
     behind_camera: float
+    parallax: float
     median_angle_deg: float
     focal_off: float | None
     focal_relative: float
@@ -71,15 +76,18 @@ def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
     explained = f"only {e.explained_matches:.0%} of the verified matches fit the model"
     few = f"only {points:.0f} points for each photograph"
     prior = f"the focal length is {off:.1f} times off the one in EXIF"
+    turned = "the camera only turned, or hardly moved: nothing shows how far away things are"
     failed = [
         (share < min_registered_share, found),
         (e.explained_matches < MIN_EXPLAINED_FAILED, explained),
         (points < MIN_POINTS_AN_IMAGE_FAILED, few),
         (off > MAX_FOCAL_OFF_FAILED, prior),
         (not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1], focal),
+        (e.parallax < MIN_PARALLAX_FAILED, turned),
         (e.behind_camera > 0.01, f"{e.behind_camera:.0%} of the points are behind their cameras"),
     ]
     weak = [
+        (e.parallax < MIN_PARALLAX_WEAK, turned),
         (share < MIN_SHARE_GOOD, found),
         (e.explained_matches < MIN_EXPLAINED_WEAK, explained),
         (points < MIN_POINTS_AN_IMAGE_WEAK, few),

@@ -18,6 +18,7 @@ from pipeline.config import schema
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest
+from pipeline.sfm.database import share_cameras_by_size
 from pipeline.sfm.evidence import gather
 from pipeline.sfm.judge import Evidence, Verdict, judge
 from pipeline.sfm.matching import shown
@@ -88,6 +89,7 @@ class _Attempt:
     models: list[pycolmap.Reconstruction]  # largest first
     evidence: Evidence | None
     verdict: Verdict
+    database: Path
 
 
 def reconstruct(
@@ -127,7 +129,7 @@ def reconstruct(
         )
         decisions += refined
         # What the reader is told is of the model that is written.
-        evidence = gather(model, work, total)
+        evidence = gather(model, attempt.database, total)
     others = attempt.models[1:]
     folders = [out / "sparse" / "0"]
     folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]
@@ -169,17 +171,25 @@ def reconstruct(
 def _map_with_fallback(
     database: Path, first: Mapper, total: int, min_share: float, seed: int
 ) -> tuple[_Attempt, list[str]]:
-    """The first mapper's attempt, or the other's where that is better and the first not good."""
-    attempt = _attempt(database, first, total, min_share, seed)
-    decisions = [_told(attempt, total)]
-    if attempt.verdict.grade != "good":
-        other: Mapper = "global" if first == "incremental" else "incremental"
-        second = _attempt(database, other, total, min_share, seed)
-        decisions.append(_told(second, total))
-        if _rank(second) > _rank(attempt):
-            decisions.append(f"{other} mapping is taken: better than {first}")
-            attempt = second
-    return attempt, decisions
+    """The first mapper's attempt; where that is not good the best of it, of the other mapper's,
+    and of the first one's with one camera for all photographs of a size (EXIF of pictures that
+    were cropped or collected misleads), each tried only if nothing before was good."""
+    other: Mapper = "global" if first == "incremental" else "incremental"
+    shared = database.with_name("shared.db")
+    best = _attempt(database, first, total, min_share, seed)
+    decisions = [_told(best, total)]
+    for mapper, path in ((other, database), (first, shared)):
+        if best.verdict.grade == "good":
+            break
+        if path == shared and not share_cameras_by_size(database, shared):
+            break
+        attempt = _attempt(path, mapper, total, min_share, seed)
+        note = " with one camera for each size" if path == shared else ""
+        decisions.append(_told(attempt, total) + note)
+        if _rank(attempt) > _rank(best):
+            decisions.append(f"{mapper} mapping{note} is taken: it explains more")
+            best = attempt
+    return best, decisions
 
 
 def _attempt(database: Path, mapper: Mapper, total: int, min_share: float, seed: int) -> _Attempt:
@@ -191,7 +201,7 @@ def _attempt(database: Path, mapper: Mapper, total: int, min_share: float, seed:
     # Ties go to the model with more points, then to the first found.
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     evidence = gather(models[0], database, total) if models else None
-    return _Attempt(mapper, models, evidence, judge(evidence, min_share))
+    return _Attempt(mapper, models, evidence, judge(evidence, min_share), database)
 
 
 def _rank(attempt: _Attempt) -> tuple[int, float]:

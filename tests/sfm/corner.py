@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from functools import lru_cache
 from pathlib import Path
 
 import cv2
@@ -41,6 +42,7 @@ def poses(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
     return found
 
 
+@lru_cache
 def texture(seed: int) -> np.ndarray:
     """(512, 512, 3) uint8: blobs of all sizes, all different."""
     rng = np.random.default_rng(seed)

@@ -52,15 +52,21 @@ def match_and_reconstruct(
     return matched, reconstruct(manifest, database, config, out / "sfm", threads)
 
 
-def database_cameras(path: Path) -> list[tuple[str, float, bool]]:
-    """(model, focal length, prior) of each camera of a database."""
-    import pycolmap
+def planned_cameras(
+    manifest: Manifest, sharings: list[str]
+) -> dict[str, list[tuple[str, float, bool]]]:
+    """Sharing -> (model, focal length, whether that is a prior) of each camera."""
+    from pipeline.sfm.database import plan_cameras
 
-    with pycolmap.Database.open(path) as database:
-        return [
+    return {
+        sharing: [
             (c.model_name, float(c.mean_focal_length()), bool(c.has_prior_focal_length))
-            for c in database.read_all_cameras()
+            for c in plan_cameras(manifest, schema.Sfm.model_validate({"share_cameras": sharing}))[
+                0
+            ]
         ]
+        for sharing in sharings
+    }
 
 
 def returned(value: Any) -> Any:

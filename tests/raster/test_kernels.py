@@ -1,0 +1,187 @@
+"""The C++ kernels against the float64 twin, and what they promise by themselves."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+import torch
+
+from pipeline import raster
+from pipeline.raster import RasterOptions, twin
+from tests.raster.scenes import NAMES, Scene, camera, random_scene, relative
+
+CASES = [
+    (0, 300, (64, 48), RasterOptions()),
+    (1, 700, (97, 53), RasterOptions(background=(0.2, 0.5, 0.9))),
+    (2, 500, (71, 50), RasterOptions(antialias=True, sh_degree=1)),
+    (3, 200, (33, 17), RasterOptions(sh_degree=0, background=(1.0, 1.0, 1.0))),
+    (4, 300, (16, 80), RasterOptions(sh_degree=2, antialias=True, background=(0.0, 0.3, 0.0))),
+    (5, 60, (1, 1), RasterOptions()),
+    (6, 250, (130, 3), RasterOptions(near=3.5)),
+]
+
+
+def twin_image(scene: Scene, cam: raster.RasterCamera, options: RasterOptions):
+    inputs = [t.double().requires_grad_() for t in scene]
+    projection = twin.project(*inputs, cam, options)
+    colors = twin.sh_colors(
+        inputs[0][projection.index], inputs[4][projection.index], cam, options.sh_degree
+    )
+    return inputs, projection, twin.blend(projection, colors, cam, options)
+
+
+@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES)
+def test_kernels_match_the_twin(
+    seed: int, count: int, size: tuple[int, int], options: RasterOptions
+) -> None:
+    """Colour to 2e-6, gradients to 1e-5, away from pixels where a cut-off hangs on a rounding."""
+    scene, cam = random_scene(seed, count), camera(*size, turned=seed % 2 == 1)
+    fwd = raster.forward(*scene, cam, options)
+    inputs, projection, image = twin_image(scene, cam, options)
+    sure = image.margin > 1e-5
+    assert sure.double().mean() > 0.99
+    assert fwd.num_visible == len(projection.index) > 0
+    assert fwd.num_dropped == projection.num_dropped == 0
+    assert (fwd.color - image.color).abs().amax(-1)[sure].max() <= 2e-6
+    assert (fwd.alpha - image.alpha).abs()[sure].max() <= 2e-6
+    assert (fwd.depth - image.depth).abs()[sure].max() <= 2e-5
+    assert (fwd.median_depth - image.median_depth).abs()[sure].max() <= 1e-5
+    assert (fwd.radii - projection.radii).abs().max() <= 1e-4
+
+    gen = torch.Generator().manual_seed(seed + 100)
+    width, height = size
+    d_color = torch.randn(height, width, 3, generator=gen) * sure[..., None]
+    d_alpha = torch.randn(height, width, generator=gen) * sure
+    d_depth = torch.randn(height, width, generator=gen) * sure
+    for extra in ((None, None), (d_alpha, None), (d_alpha, d_depth)):
+        found = raster.backward(fwd, d_color, *extra)
+        total = (image.color * d_color).sum()
+        for part, weight in zip((image.alpha, image.depth), extra, strict=True):
+            total = total + (0 if weight is None else (part * weight).sum())
+        wanted = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
+        for name, want in zip(NAMES, wanted, strict=False):
+            assert relative(getattr(found, name), want) <= 1e-5, name
+        assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
+
+
+def test_absolute_gradients_are_the_sum_of_each_pixels() -> None:
+    """AbsGS: |dL/d(mean2d)| pixel by pixel, which no sum of signed gradients gives."""
+    scene, cam, options = random_scene(7, 30, size=0.2), camera(19, 18), RasterOptions()
+    gen = torch.Generator().manual_seed(1)
+    d_color = torch.randn(18, 19, 3, generator=gen)
+    found = raster.backward(raster.forward(*scene, cam, options), d_color)
+    _, projection, image = twin_image(scene, cam, options)
+    per_pixel = (image.color * d_color).sum(-1).reshape(-1)
+    wanted = torch.zeros(len(projection.index), 2, dtype=torch.float64)
+    for value in per_pixel:
+        wanted += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
+    assert found.means2d_abs is not None
+    assert relative(found.means2d_abs[projection.index], wanted) <= 1e-5
+    assert (
+        raster.backward(
+            raster.forward(*scene, cam, options), d_color, means2d_abs=False
+        ).means2d_abs
+        is None
+    )
+
+
+def single(mean: tuple[float, float, float], sigma: float, opacity: float = 0.9) -> Scene:
+    logit = math.log(opacity / (1 - opacity))
+    sh = torch.full((1, 1, 3), 1.0)
+    return (
+        torch.tensor([mean]), torch.full((1, 3), math.log(sigma)),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([logit]), sh,
+    )  # fmt: skip
+
+
+def test_pixel_centres_lie_at_half_integers() -> None:
+    """A Gaussian projected to (20.5, 10.5) peaks in column 20, row 10, alike on all sides."""
+    cam = raster.RasterCamera(41, 33, 50.0, 50.0, 20.5, 10.5, torch.eye(4))
+    scene = single((0.0, 0.0, 2.0), 0.08)
+    alpha = raster.forward(*scene, cam, RasterOptions(sh_degree=0)).alpha
+    assert divmod(int(alpha.argmax()), 41) == (10, 20)
+    assert abs(float(alpha[10, 20]) - 0.9) < 1e-6
+    around = torch.stack([alpha[9, 20], alpha[11, 20], alpha[10, 19], alpha[10, 21]])
+    assert (around - around[0]).abs().max() < 1e-6 and around[0] < 0.9
+
+
+def test_equal_depths_are_drawn_in_order_of_index() -> None:
+    first, second = single((0.0, 0.0, 2.0), 0.2), single((0.0, 0.0, 2.0), 0.2)
+    second[4].mul_(-1)  # dark
+    cam, options = camera(16, 16), RasterOptions(sh_degree=0)
+    bright = raster.forward(*(torch.cat(p) for p in zip(first, second, strict=True)), cam, options)
+    dark = raster.forward(*(torch.cat(p) for p in zip(second, first, strict=True)), cam, options)
+    assert bright.color.max() > 2 * dark.color.max()
+
+
+def test_results_are_bit_identical_for_any_number_of_threads() -> None:
+    for seed in range(8):
+        scene, cam = random_scene(seed, 100 + 700 * (seed % 3)), camera(50 + 13 * seed, 40)
+        d_color = torch.randn(40, cam.width, 3, generator=torch.Generator().manual_seed(seed))
+        runs = []
+        for threads in (1, 2, 3):
+            fwd = raster.forward(*scene, cam, RasterOptions(threads=threads))
+            g = raster.backward(fwd, d_color)
+            assert g.means2d_abs is not None
+            loss = raster.l1_ssim(fwd.color, d_color.abs(), 0.2, threads=threads)
+            param, m, v = scene[4].clone(), torch.zeros_like(scene[4]), torch.ones_like(scene[4])
+            raster.adam_step(param, g.sh, m, v, 1e-2, 3, threads=threads)
+            runs.append([
+                fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii, g.means,
+                g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d, g.means2d_abs,
+                loss.grad, torch.tensor([loss.loss, loss.l1, loss.ssim]), param, m, v,
+            ])  # fmt: skip
+        for other in runs[1:]:
+            assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
+
+
+def test_autograd_face_gives_the_same_gradients() -> None:
+    scene, cam = random_scene(11, 150), camera(40, 30)
+    leaves = [t.clone().requires_grad_() for t in scene]
+    options = RasterOptions(background=(0.1, 0.2, 0.3))
+    out = raster.render(*leaves, cam, options)
+    (out.color.square().sum() + out.depth.sum() + out.alpha.sum()).backward()
+    fwd = raster.forward(*scene, cam, options)
+    ones = torch.ones(30, 40)
+    g = raster.backward(fwd, 2 * fwd.color, ones, ones)
+    assert torch.equal(out.color, fwd.color) and torch.equal(out.median_depth, fwd.median_depth)
+    for name, leaf in zip(NAMES, leaves, strict=True):
+        assert leaf.grad is not None and torch.equal(leaf.grad, getattr(g, name)), name
+
+
+def test_a_step_against_the_gradient_lowers_the_loss() -> None:
+    """Forward and backward agree with each other: the loss falls as its gradient foretells."""
+    scene, cam = random_scene(12, 400), camera(64, 48)
+    target = raster.forward(*random_scene(13, 400), cam, RasterOptions()).color
+
+    def loss(gaussians: Scene) -> tuple[float, raster.Gradients]:
+        fwd = raster.forward(*gaussians, cam, RasterOptions())
+        result = raster.l1_ssim(fwd.color, target, 0.2)
+        return result.loss, raster.backward(fwd, result.grad)
+
+    before, g = loss(scene)
+    grads = [getattr(g, name) for name in NAMES]
+    slope = float(sum((t.double() ** 2).sum() for t in grads))
+    rate = 0.002 / slope
+    after, _ = loss(tuple(t - rate * d for t, d in zip(scene, grads, strict=True)))  # type: ignore
+    assert after - before == pytest.approx(-0.002, rel=0.3)
+
+
+def test_bad_arguments_are_refused_with_their_name() -> None:
+    scene, cam = random_scene(0, 5), camera(8, 8)
+    with pytest.raises(ValueError, match="quats"):
+        raster.forward(
+            scene[0], scene[1], scene[2][:, :3], scene[3], scene[4], cam, RasterOptions()
+        )
+    with pytest.raises(ValueError, match="means"):
+        raster.forward(scene[0].double(), *scene[1:], cam, RasterOptions())
+    with pytest.raises(ValueError, match="sh_degree"):
+        raster.forward(*scene[:4], scene[4][:, :9], cam, RasterOptions())
+    for change in ({"fx": 0.0}, {"width": 0}, {"cy": math.nan}):
+        broken = raster.RasterCamera(**{**cam.__dict__, **change})
+        with pytest.raises(ValueError, match="camera"):
+            raster.forward(*scene, broken, RasterOptions())
+    fwd = raster.forward(*scene, cam, RasterOptions())
+    with pytest.raises(ValueError, match="d_color"):
+        raster.backward(fwd, torch.zeros(8, 9, 3))

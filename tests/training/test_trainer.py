@@ -65,6 +65,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
 def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     result = run(scene, tmp_path, tiny_config(500))
     assert result.steps == 500
+    assert result.counters["changes"]["cloned"] + result.counters["changes"]["split"] > 0
     assert result.curve[-1]["loss"] < 0.4 * result.curve[0]["loss"]
     assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 8
     assert result.gaussians.sh_degree == 1

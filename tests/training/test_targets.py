@@ -1,0 +1,85 @@
+"""Targets: alpha and masks survive the reduction, and the reduced camera sees the same scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from PIL import Image
+
+from pipeline.photos.load import resize_area
+from pipeline.raster import RasterOptions, forward
+from pipeline.scene.model import View
+from pipeline.training.render import raster_camera
+from pipeline.training.targets import Targets, reduced_size, usable_factor
+from tests.training.conftest import TinyScene
+
+
+def view_of(path: Path, picture: np.ndarray, mask: np.ndarray | None = None) -> View:
+    Image.fromarray(picture).save(path)
+    mask_path = None
+    if mask is not None:
+        mask_path = str(path.with_suffix(".mask.png"))
+        Image.fromarray(mask).save(mask_path)
+    height, width = picture.shape[:2]
+    pose = np.eye(4)
+    return View("v", str(path), mask_path, width, height, 50.0, 50.0, 5.0, 5.0, pose, False)
+
+
+def test_hidden_colours_never_show(tmp_path: Path) -> None:
+    picture = np.full((8, 10, 4), 200, np.uint8)
+    picture[:4, :, 3] = 0
+    targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
+    assert targets.have_alpha
+    for factor in (1, 2, 4):
+        target = targets.get(0, factor)
+        over = target.over((1.0, 0.5, 0.0))
+        rows = over.shape[0] // 2
+        assert torch.allclose(over[:rows], torch.tensor([1.0, 0.5, 0.0]), atol=0.003)
+        visible = (200 * 200 / 255 + 55 * np.array([1.0, 0.5, 0.0])) / 255
+        assert np.allclose(over[rows:].numpy(), visible, atol=0.004)
+
+
+def test_opaque_alpha_is_no_alpha(tmp_path: Path) -> None:
+    picture = np.full((8, 10, 4), 255, np.uint8)
+    targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
+    assert not targets.have_alpha
+    assert targets.get(0, 1).over((0.3, 0.3, 0.3)).dtype == torch.uint8
+
+
+def test_a_reduced_pixel_counts_only_if_all_under_it_do(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(1, 255, (8, 8, 3), np.uint8)
+    mask = np.full((8, 8), 255, np.uint8)
+    mask[0, 0] = mask[6:, 4:] = 0
+    targets = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1)
+    ignored = targets.get(0, 2).ignored
+    assert ignored is not None
+    wanted = np.zeros((4, 4), bool)
+    wanted[0, 0] = wanted[3, 2:] = True
+    assert np.array_equal(ignored.numpy(), wanted)
+    assert not targets.get(0, 2).rgb[ignored].any()
+    assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
+
+
+def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:
+    view = replace(scene.views[1], width=39, height=33, cx=18.0, cy=17.5)
+    options = RasterOptions(sh_degree=1, threads=1)
+    soft = scene.truth.clone()
+    soft.log_scales += 1.0  # large, so that the dilation by 0.3 pixels hardly shows
+    full = forward(*soft.parameters(), raster_camera(view), options).color.numpy()
+    small = forward(*soft.parameters(), raster_camera(view, 2), options).color.numpy()
+    width, height = reduced_size(view, 2)
+    assert small.shape == (height, width, 3)
+    difference = np.abs(small - resize_area(full, width, height)).mean()
+    shifted = np.abs(small[:, 1:] - resize_area(full, width, height)[:, :-1]).mean()
+    assert difference < 0.01
+    assert difference < 0.3 * shifted
+
+
+def test_small_pictures_are_not_reduced() -> None:
+    sizes = [(800, 533, 4), (200, 150, 2), (100, 70, 1)]
+    for width, height, wanted in sizes:
+        view = View("", "", None, width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4), False)
+        assert usable_factor([view], 4) == wanted

@@ -116,9 +116,10 @@ def project(
     half = jacobian @ pose[:3, :3] @ axes
     cov = half @ half.mT
     xx, xy, yy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    det_plain = xx * yy - xy * xy
+    # |a|^2 |b|^2 - (a.b)^2 = |a x b|^2 (Lagrange): nothing cancels for a needle.
+    det_plain = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+    det = det_plain + DILATION * (xx + yy + DILATION)
     xx, yy = xx + DILATION, yy + DILATION
-    det = xx * yy - xy * xy
     opacities = torch.sigmoid(opacity_logits[index])
     if options.antialias:
         opacities = opacities * (det_plain / det).clamp(min=COMPENSATION_MIN).sqrt()

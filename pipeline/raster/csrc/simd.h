@@ -20,6 +20,9 @@ typedef float f32x16 __attribute__((vector_size(64)));
 typedef int32_t i32x16 __attribute__((vector_size(64)));
 typedef double f64x8 __attribute__((vector_size(64)));
 typedef int64_t i64x8 __attribute__((vector_size(64)));
+// Where bits are put together, or lanes may hold junk: these wrap around by definition.
+typedef uint32_t u32x16 __attribute__((vector_size(64)));
+typedef uint64_t u64x8 __attribute__((vector_size(64)));
 
 constexpr f32x16 kLane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
 
@@ -123,7 +126,7 @@ SPLAT_INLINE f32x16 exp2(f32x16 x) {
     const f32x16 mid = 0.05550713092088699f * f + 0.24022120237350464f;
     const f32x16 high = 0.001327647129073739f * f + 0.009675540961325169f;
     const f32x16 power = (high * f2 + mid) * f2 + low;
-    return f32x16(i32x16(power) + (i32x16(shifted) << 23));
+    return f32x16(u32x16(power) + (u32x16(shifted) << 23));
 }
 
 template <class V>
@@ -149,15 +152,14 @@ SPLAT_INLINE f64x8 exp(f64x8 x) {
                                             0.5,           1.0,          1.0};
     f64x8 p = splat8(1.0 / 39916800);
     for (double c : inverse_factorial) p = p * r + c;
-    return f64x8(i64x8(p) + (i64x8(shifted) << 52));
+    return f64x8(u64x8(p) + (u64x8(shifted) << 52));
 }
 
 // log2(x) in float64 for normal x > 0, absolute error under 1e-13: x = 2^e m with m in
 // [0.71, 1.42], ln m = 2 artanh((m - 1) / (m + 1)).
 SPLAT_INLINE f64x8 log2(f64x8 x) {
-    const i64x8 shifted = i64x8(x) - 0x3fe6a09e667f3bcdLL;  // bits of sqrt(0.5)
-    const i64x8 e = shifted >> 52;
-    const f64x8 m = f64x8(i64x8(x) - (e << 52));
+    const i64x8 e = i64x8(u64x8(x) - 0x3fe6a09e667f3bcdULL) >> 52;  // less the bits of sqrt(0.5)
+    const f64x8 m = f64x8(u64x8(x) - (u64x8(e) << 52));
     const f64x8 s = (m - 1.0) / (m + 1.0), s2 = s * s;
     f64x8 p = splat8(1.0 / 17);
     for (int n = 15; n > 0; n -= 2) p = p * s2 + 1.0 / n;

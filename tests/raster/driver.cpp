@@ -1,0 +1,167 @@
+// Runs every kernel over ordinary and wild scenes without torch, for builds under sanitizers and
+// for other instruction sets. Says what is wrong and exits with 1, or writes the ordinary scene's
+// image and gradients to the file named by the first argument.
+
+#include <cmath>
+#include <cstdio>
+#include <cstring>
+#include <limits>
+#include <memory>
+#include <random>
+#include <string>
+#include <vector>
+
+#include "adam.h"
+#include "bin.h"
+#include "blend.h"
+#include "loss.h"
+#include "project.h"
+
+using namespace splat;
+
+namespace {
+
+// An array on the heap of exactly its size, so that the sanitizer sees every step beyond it.
+template <class T>
+struct Array {
+    size_t size;
+    std::unique_ptr<T[]> data;
+    explicit Array(size_t n) : size(n), data(new T[n]()) {}
+    T* get() { return data.get(); }
+    T& operator[](size_t i) { return data[i]; }
+};
+
+struct Scene {
+    int64_t count;
+    int degree;
+    Array<float> means, log_scales, quats, opacity_logits, sh;
+    Scene(int64_t n, int degree)
+        : count(n),
+          degree(degree),
+          means(3 * n),
+          log_scales(3 * n),
+          quats(4 * n),
+          opacity_logits(n),
+          sh(3 * (degree + 1) * (degree + 1) * n) {}
+    Array<float>* fields[5] = {&means, &log_scales, &quats, &opacity_logits, &sh};
+};
+
+// Uniform in [-1, 1), the same with every standard library.
+float uniform(std::mt19937& random) { return float(random() >> 8) * (2.0f / 16777216.0f) - 1.0f; }
+
+Scene ordinary(std::mt19937& random, int64_t count, int degree) {
+    Scene s(count, degree);
+    for (int64_t i = 0; i < count; i++) {
+        for (int k = 0; k < 3; k++) {
+            s.means[3 * i + k] = 2 * uniform(random) + (k == 2 ? 4.0f : 0.0f);
+            s.log_scales[3 * i + k] = -2.5f + uniform(random);
+        }
+        for (int k = 0; k < 4; k++) s.quats[4 * i + k] = uniform(random) + (k == 0 ? 1.01f : 0);
+        s.opacity_logits[i] = 3 * uniform(random);
+    }
+    for (size_t i = 0; i < s.sh.size; i++) s.sh[i] = 0.5f * uniform(random);
+    return s;
+}
+
+void expect_finite(Array<float>& values, const char* what) {
+    for (size_t i = 0; i < values.size; i++)
+        if (!std::isfinite(values[i])) {
+            std::printf("%s[%zu] = %g\n", what, i, values[i]);
+            std::exit(1);
+        }
+}
+
+// All kernels over one view; the image and the gradients go to `out` if there is one.
+void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, std::FILE* out) {
+    const View view = {width,
+                       height,
+                       0.9 * width,
+                       0.9 * width,
+                       0.48 * width,
+                       0.53 * height,
+                       {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                       {0.1, -0.1, 0.2},
+                       0.01,
+                       antialias,
+                       s.degree};
+    const Gaussians in = {
+        s.count,       (s.degree + 1) * (s.degree + 1), s.means.get(), s.log_scales.get(),
+        s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
+    const size_t n = size_t(s.count), pixels = size_t(width * height);
+    Array<Record> records(n);
+    Array<float> radii(n);
+    project_view(in, view, threads, records.get(), radii.get());
+    Binner binner;
+    if (!binner.find(records.get(), radii.get(), s.count, view, threads)) return;
+    Array<Entry> entries(size_t(binner.intersections()));
+    Array<int64_t> begin(size_t(view.tiles() + 1)), end(size_t(view.tiles()));
+    Array<Slots> slots(n);
+    binner.write(entries.get(), begin.get(), slots.get());
+    const Pairs pairs = {entries.get(), begin.get()};
+    const float background[3] = {0.1f, 0.5f, 0.9f};
+    Array<float> color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);
+    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(), end.get());
+    blend_depth(records.get(), pairs, view, threads, depth.get(), median.get());
+    Array<float> target(3 * pixels), d_color(3 * pixels);
+    Array<uint8_t> mask(pixels);
+    for (size_t i = 0; i < 3 * pixels; i++) target[i] = float(i % 97) / 97;
+    for (size_t i = 0; i < pixels; i++) mask[i] = i % 5 == 0;
+    l1_ssim({width, height, color.get(), target.get(), nullptr, mask.get()}, 0.2, threads,
+            d_color.get());
+    l1_ssim({width, height, color.get(), target.get(), nullptr, nullptr}, 0.2, threads,
+            d_color.get());
+    Array<float> slot_gradients(entries.size * kSlotFloats);
+    Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
+    Array<float> d_means2d(2 * n), d_abs(2 * n);
+    for (const bool everything : {true, false}) {
+        blend_backward(records.get(), pairs, view,
+                       {color.get(), alpha.get(), depth.get(), d_color.get(),
+                        everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
+                        background, everything},
+                       end.get(), threads, slot_gradients.get());
+        project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
+                              slot_gradients.get(),
+                              {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
+                               d_sh.get(), d_means2d.get(), d_abs.get()});
+    }
+    Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
+    adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
+              {1e-2, 0.9, 0.999, 1e-15, 1}, threads);
+    Array<float>* results[] = {&color,    &alpha,   &depth,     &median, &d_color,   &d_means,
+                               &d_scales, &d_quats, &d_opacity, &d_sh,   &d_means2d, &param};
+    const char* names[] = {"color",    "alpha",   "depth",     "median", "d_color",   "d_means",
+                           "d_scales", "d_quats", "d_opacity", "d_sh",   "d_means2d", "param"};
+    for (int i = 0; i < 12; i++) {
+        expect_finite(*results[i], names[i]);
+        if (out) std::fwrite(results[i]->get(), sizeof(float), results[i]->size, out);
+    }
+}
+
+}  // namespace
+
+int main(int argc, char** argv) {
+    std::mt19937 random(7);
+    if (argc > 1) {
+        std::FILE* out = std::fopen(argv[1], "wb");
+        if (!out) return 2;
+        Scene scene = ordinary(random, 800, 3);
+        run(scene, 97, 61, false, 2, out);
+        std::fclose(out);
+        return 0;
+    }
+    constexpr float infinity = std::numeric_limits<float>::infinity();
+    const float wild[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
+                          1e-12f,        1e12f,    88,        -88, 27.6f,  -27.6f, 12,     100};
+    const int64_t sizes[][2] = {{1, 1}, {2, 3}, {17, 31}, {16, 16}, {53, 7}, {5, 90}};
+    for (int round = 0; round < 300; round++) {
+        Scene scene = ordinary(random, random() % 40, int(random() % 4));
+        for (int hit = int(random() % 16); hit > 0; hit--) {
+            Array<float>& field = *scene.fields[random() % 5];
+            const float value = wild[random() % 16];
+            if (field.size) field[random() % field.size] = value;
+        }
+        const int64_t* size = sizes[random() % 6];
+        run(scene, size[0], size[1], random() % 2, 1 + int(random() % 3), nullptr);
+    }
+    std::puts("clean");
+}

@@ -1,0 +1,119 @@
+"""Building: the cache, what is said where it cannot be, sanitizers, other instruction sets."""
+
+from __future__ import annotations
+
+import platform
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.raster import build
+from pipeline.runtime.errors import UserError
+
+DRIVER = Path(__file__).with_name("driver.cpp")
+REPOSITORY = Path(__file__).parents[2]
+
+
+def compile_driver(target: Path, *flags: str) -> None:
+    kernels = [str(p) for p in build.source_files() if p.suffix == ".cpp" and p.stem != "binding"]
+    command = [*build.compiler(), *flags, "-I", str(build.SOURCES), str(DRIVER), *kernels]
+    subprocess.run([*command, "-o", str(target)], check=True, capture_output=True, text=True)
+
+
+def test_source_hash_needs_no_torch_and_follows_the_sources(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    code = (
+        "import sys; from pipeline.raster.build import source_hash; print(source_hash());"
+        "assert 'torch' not in sys.modules"
+    )
+    run = [sys.executable, "-c", code]
+    done = subprocess.run(run, cwd=REPOSITORY, capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == build.source_hash()
+    copy = tmp_path / "csrc"
+    shutil.copytree(build.SOURCES, copy)
+    monkeypatch.setattr(build, "SOURCES", copy)
+    same = build.source_hash()
+    with open(copy / "constants.h", "a") as file:
+        file.write("\n")
+    assert same == done.stdout.strip() != build.source_hash()
+
+
+def test_the_key_follows_compiler_and_flags(monkeypatch: pytest.MonkeyPatch) -> None:
+    key = build.build_key()
+    monkeypatch.setattr(build, "FLAGS", [*build.FLAGS, "-g"])
+    assert build.build_key() != key
+
+
+def test_no_compiler_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("CXX", "no-such-compiler")
+    monkeypatch.setenv("SPLATMAKE_CACHE", str(tmp_path))
+    with pytest.raises(UserError, match=r"no C\+\+ compiler found \(no-such-compiler\)") as error:
+        build.build()
+    assert "install g++" in str(error.value)
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_failing_compiler_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    compiler = tmp_path / "broken"
+    compiler.write_text(
+        "#!/bin/sh\n[ $1 = --version ] || { echo 'x.cpp:1: error: no' >&2; exit 1; }\n"
+    )
+    compiler.chmod(0o755)
+    cache = tmp_path / "cache"
+    monkeypatch.setenv("CXX", str(compiler))
+    monkeypatch.setenv("SPLATMAKE_CACHE", str(cache))
+    with pytest.raises(UserError, match="error: no"):
+        build.build()
+    assert not list(cache.iterdir())
+
+
+@pytest.mark.slow
+def test_two_builds_at_once_leave_one_whole_library(tmp_path: Path) -> None:
+    command = [sys.executable, "-m", "pipeline.raster.build"]
+    env = {"SPLATMAKE_CACHE": str(tmp_path), "PATH": "/usr/bin:/bin:/usr/local/bin"}
+    runs = [
+        subprocess.Popen(command, cwd=REPOSITORY, env=env, stdout=subprocess.PIPE, text=True)
+        for _ in range(2)
+    ]
+    paths = {run.communicate()[0].strip() for run in runs}
+    assert [run.returncode for run in runs] == [0, 0]
+    assert len(paths) == 1 and Path(paths.pop()).exists()
+    assert [p.name for p in tmp_path.iterdir() if p.name.startswith(".")] == []
+
+
+@pytest.mark.slow
+def test_sanitizers_find_nothing(tmp_path: Path) -> None:
+    """Every kernel over 300 wild scenes under the address and undefined-behaviour sanitizers."""
+    compile_driver(
+        tmp_path / "driver",
+        *("-std=c++17", "-O1", "-g", "-march=native", "-fopenmp", "-Wno-psabi"),
+        *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
+    )
+    done = subprocess.run([tmp_path / "driver"], capture_output=True, text=True, timeout=600)
+    assert done.returncode == 0, done.stdout + done.stderr[-3000:]
+    assert done.stdout.strip() == "clean"
+
+
+@pytest.mark.slow
+def test_other_instruction_sets_give_the_same_answers(tmp_path: Path) -> None:
+    """The same scene with this machine's vectors and with narrower ones: equal to rounding."""
+    narrower = {"x86_64": ["-march=haswell", "-march=x86-64"]}.get(platform.machine(), [])
+    if not narrower:
+        pytest.skip("no narrower instruction set is known for this processor")
+    results = []
+    for i, march in enumerate(["-march=native", *narrower]):
+        program, output = tmp_path / f"driver{i}", tmp_path / f"out{i}"
+        flags = [f for f in build.FLAGS if not f.startswith(("-march", "-fPIC"))]
+        compile_driver(program, *flags, march)
+        subprocess.run([program, output], check=True, timeout=600)
+        results.append(np.fromfile(output, np.float32).astype(np.float64))
+    for other in results[1:]:
+        error = np.linalg.norm(other - results[0]) / np.linalg.norm(results[0])
+        assert error < 1e-5

@@ -56,7 +56,9 @@ def extract_features(
     out.mkdir(parents=True, exist_ok=True)
     cache.mkdir(parents=True, exist_ok=True)
     keys = {photo.name: _cache_key(photo, config) for photo in manifest.photos}
-    missing = [p for p in manifest.photos if not (cache / f"{keys[p.name]}.npz").exists()]
+    absent = [p for p in manifest.photos if not (cache / f"{keys[p.name]}.npz").exists()]
+    # One of each: copies of a photograph have one key, and would write one file at once.
+    missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
         progress = Progress("extracting features", len(missing), "photographs")
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv
@@ -74,7 +76,7 @@ def extract_features(
         target.unlink(missing_ok=True)
         _link_or_copy(source, target)
         counts[photo.name] = len(Keypoints.read(target))
-    num_cached = len(manifest.photos) - len(missing)
+    num_cached = len(manifest.photos) - len(absent)
     median = int(np.median(list(counts.values()))) if counts else 0
     return FeatureReport(
         counts=counts,
@@ -130,8 +132,13 @@ def _extract_opencv(
     cv2.setNumThreads(1)
     try:
         with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
-            for _ in pool.map(extract, photos):
-                progress.advance()
+            try:
+                for _ in pool.map(extract, photos):
+                    progress.advance()
+            except BaseException:
+                # One bad photograph: do not go through the others first.
+                pool.shutdown(cancel_futures=True)
+                raise
     finally:
         cv2.setNumThreads(before)
 

@@ -122,14 +122,18 @@ def reconstruct(
         )
         if attempt.verdict.grade == "failed" or attempt.evidence is None:
             raise UserError("no reconstruction: " + "; ".join(attempt.verdict.reasons), fix=REMEDY)
-        model, refined = refine(
-            attempt.models[0],
-            radial=config.refine_radial == "auto",
-            principal_point=config.refine_principal_point,
-        )
-        decisions += refined
-        # What the reader is told is of the model that is written.
-        evidence = gather(model, attempt.database, total)
+        model, evidence = attempt.models[0], attempt.evidence
+        if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
+            model, refined = refine(
+                model,
+                radial=config.refine_radial == "auto",
+                principal_point=config.refine_principal_point,
+            )
+            decisions += refined
+            # What the reader is told is of the model that is written.
+            evidence = gather(model, attempt.database, total)
+        else:
+            decisions.append("cameras not refined further: weak geometry bends to what is freed")
     others = attempt.models[1:]
     folders = [out / "sparse" / "0"]
     folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]

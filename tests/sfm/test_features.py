@@ -131,6 +131,13 @@ def test_one_more_photograph_extracts_one(tmp_path):
     assert (first.num_cached, second.num_cached) == (0, 2)
 
 
+def test_copies_of_a_photograph_are_extracted_once(tmp_path, pixels):
+    photos = [saved(tmp_path, f"{i}.png", pixels) for i in range(8)]
+    found, report = extract(tmp_path, photos, threads=4)
+    assert len(found) == 8 and report.num_cached == 0
+    assert len(list((tmp_path / "cache").iterdir())) == 1
+
+
 def test_what_changes_the_keypoints_misses_the_cache(tmp_path, pixels):
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.ones(pixels.shape[:2], np.uint8))

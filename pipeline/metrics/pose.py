@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.scene.model import Reconstruction
+from pipeline.scene.names import NameIndex
 
 Array = NDArray[np.float64]
 
@@ -68,7 +69,8 @@ def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:
 
 
 def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
-    """Compare poses of the images that both know by name.
+    """Compare poses of the images that both know by name, or by name without suffix (developed
+    RAW files have another).
 
     Images of the truth that the estimate lacks count as failures in the AUC, and in
     ``num_common`` against ``num_truth``; the other figures are over the common ones.
@@ -76,8 +78,11 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
     The rotation between the two worlds comes from the centres when they determine it, else (two
     common images, or centres on a line) from the rotations themselves.
     """
-    found, true = estimated.by_name(), truth.by_name()
+    posed, true = estimated.by_name(), truth.by_name()
     names = sorted(true)
+    index = NameIndex(posed)
+    matches = {name: index.find(name) for name in names}
+    found = {name: posed[match] for name, match in matches.items() if match is not None}
     common = [name for name in names if name in found]
     auc = _relative_pose_auc(found, true, names)
     if not common:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -133,6 +135,17 @@ def test_missing_images_fail_their_pairs():
     # 3 of the 10 pairs are known.
     assert error.auc == pytest.approx({1.0: 0.3, 5.0: 0.3, 10.0: 0.3})
     assert (error.num_common, error.num_truth) == (3, 5)
+
+
+def test_developed_raw_files_are_found_by_their_stems():
+    truth = scene(5, 5)
+    renamed = {
+        i: replace(image, name=image.name.rsplit(".", 1)[0] + ".png")
+        for i, image in truth.images.items()
+    }
+    error = pose_error(Reconstruction({}, renamed), truth)
+    assert error.num_common == 5
+    assert error.rotation_median_deg == pytest.approx(0, abs=1e-5)
 
 
 def test_nothing_in_common_is_no_crash():

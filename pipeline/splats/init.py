@@ -22,8 +22,10 @@ SH_C0 = 0.28209479177387814
 
 NEIGHBOURS = 3
 # A first Gaussian's standard deviation as seen from the nearest camera, radians: from a tenth of
-# a pixel (at a focal length of 1000) up to what still hides no other point's surroundings.
-MIN_ANGLE, MAX_ANGLE = 1e-4, 0.1
+# a pixel (at a focal length of 1000) up to half a view. Less leaves bare walls, where points are
+# few, black for long; more is a stray point's haze over everything.
+MIN_ANGLE, MAX_ANGLE = 1e-4, 0.5
+LONE_ANGLE = 0.1  # of a single Gaussian
 # Points nearer to a camera than this share of the usual distance are SfM errors (a point at a
 # camera's centre is a known one); points farther than this many usual distances, too.
 TOO_NEAR, TOO_FAR = 0.01, 100.0
@@ -94,7 +96,7 @@ def gaussians_from_points(
     if k:
         spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1)
     else:
-        spacing = np.full(1, MAX_ANGLE * usual)
+        spacing = np.full(1, LONE_ANGLE * usual)
     colour = points.rgb[kept].astype(np.float64) / 255.0
     result = _spheres(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
@@ -124,7 +126,7 @@ def gaussians_random(
         xyz = _in_frustums(views, scene_extent(list(views)), count, generator)
     distance = _nearest_distance(xyz, centres)
     k = min(NEIGHBOURS, count - 1)
-    spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else MAX_ANGLE * distance
+    spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
     colour = generator.random((count, 3))
     return _spheres(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
 

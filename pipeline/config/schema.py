@@ -89,7 +89,7 @@ class Matches(Section):
         "apart, sequential where times or names say they are one walk, else retrieval.",
     )
     neighbours: Positive = Field(
-        12, description="Pairs an image (sequential overlap, spatial or retrieval neighbours)."
+        16, description="Pairs an image (sequential overlap, spatial or retrieval neighbours)."
     )
     max_ratio: Share = Field(0.8, description="Lowe's ratio test.")
     min_inliers: Positive = Field(15, description="Fewer verified matches drop a pair.")

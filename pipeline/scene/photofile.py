@@ -23,6 +23,8 @@ _BASE, _GPS, _IFD = ExifTags.Base, ExifTags.GPS, ExifTags.IFD
 FULL_FRAME_DIAGONAL_MM = 43.27
 # Focal lengths over the longer side: from a 180 degree lens to a 35 mm equivalent of 700 mm.
 _FOCAL_RANGE = (0.25, 20.0)
+# Difference of aspect ratios above which a picture counts as cropped; rounding stays below.
+CROPPED = 0.02
 # Resized pictures often keep a focal plane resolution that is no longer true; beyond this it is
 # more likely wrong than a tele lens.
 _FOCAL_PLANE_RANGE = (0.3, 4.0)
@@ -186,9 +188,17 @@ def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | No
     """Focal length in pixels of a ``width`` x ``height`` picture, or None if EXIF won't tell.
 
     The 35 mm equivalent compares diagonals (CIPA DCG-001); else the focal length in mm over the
-    pixel pitch that FocalPlaneXResolution gives at the size EXIF says the picture had.
+    pixel pitch that FocalPlaneXResolution gives at the size EXIF says the picture had. A picture
+    of another shape than EXIF says was cropped since, and nobody knows by how much: None.
     """
     longer = max(width, height)
+    taken_width = _float(tags.get(_BASE.ExifImageWidth))
+    taken_height = _float(tags.get(_BASE.ExifImageHeight))
+    if not (_plausible(taken_width) and _plausible(taken_height)):
+        taken_width, taken_height = width, height
+    taken_longer, taken_shorter = max(taken_width, taken_height), min(taken_width, taken_height)
+    if abs(taken_longer / taken_shorter * min(width, height) / longer - 1) > CROPPED:
+        return None
     equivalent = _float(tags.get(_BASE.FocalLengthIn35mmFilm))
     if _plausible(equivalent):
         focal = equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
@@ -197,11 +207,8 @@ def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | No
     focal_mm = _float(tags.get(_BASE.FocalLength))
     resolution = _float(tags.get(_BASE.FocalPlaneXResolution))
     unit = _MM_PER_UNIT.get(tags.get(_BASE.FocalPlaneResolutionUnit, 2), 25.4)
-    taken_width = _float(tags.get(_BASE.ExifImageWidth)) or width
-    taken_height = _float(tags.get(_BASE.ExifImageHeight)) or height
-    if _plausible(focal_mm) and _plausible(resolution) and min(taken_width, taken_height) > 0:
-        resize = longer / max(taken_width, taken_height)
-        focal = focal_mm * resolution / unit * resize
+    if _plausible(focal_mm) and _plausible(resolution):
+        focal = focal_mm * resolution / unit * longer / taken_longer
         if _FOCAL_PLANE_RANGE[0] <= focal / longer <= _FOCAL_PLANE_RANGE[1]:
             return focal
     return None

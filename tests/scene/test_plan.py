@@ -178,8 +178,8 @@ def test_what_the_user_sets_stays(tmp_path):
 @pytest.mark.parametrize(
     "count, changes, pairs, mapper",
     [
-        (80, {}, "exhaustive", "incremental"),
-        (81, {}, "retrieval", "incremental"),
+        (40, {}, "exhaustive", "incremental"),
+        (41, {}, "retrieval", "incremental"),
         (151, {}, "retrieval", "global"),
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0)}, "spatial", "incremental"),
         # GPS noise around one place sorts nothing.

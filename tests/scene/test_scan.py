@@ -296,6 +296,8 @@ def test_exif_facts(tmp_path):
         ({0x920A: 50.0}, None),
         ({0xA405: 0, 0x920A: 0.0}, None),
         ({0xA405: 2000}, None),
+        # Cropped to another shape since: the 35 mm equivalent is of the whole picture.
+        ({0xA405: 43, 0xA002: 6400, 0xA003: 3600}, None),
     ],
 )
 def test_focal_lengths_and_their_sanity(tmp_path, exif, focal):

@@ -35,15 +35,28 @@ struct Window {
     }
 };
 
-// Rows of floats with the frame around them.
-struct Plane {
-    int64_t stride;
-    std::unique_ptr<float[]> data;
+// Memory kept by the calling thread from one loss to the next: touching new pages each time would
+// cost as much as the arithmetic.
+float* scratch(size_t floats) {
+    thread_local std::unique_ptr<float[]> kept;
+    thread_local size_t size = 0;
+    if (size < floats) {
+        kept.reset();
+        kept.reset(new float[floats]);
+        size = floats;
+    }
+    return kept.get();
+}
 
-    Plane(int64_t rows, int64_t stride) : stride(stride), data(new float[rows * stride]) {}
-    float* row(int64_t y) { return data.get() + (y + kRadius) * stride; }
-    const float* row(int64_t y) const { return data.get() + (y + kRadius) * stride; }
-    void clear_row(int64_t y) { std::memset(row(y), 0, stride * sizeof(float)); }
+// Rows of floats with the frame around them; row 0 is the image's first.
+struct Plane {
+    float* first;
+    int64_t stride;
+
+    float* row(int64_t y) const { return first + y * stride; }
+    void clear(int64_t y, int64_t from, int64_t to) const {
+        std::memset(row(y) + from, 0, (to - from) * sizeof(float));
+    }
 };
 
 SPLAT_INLINE f32x16 blur_across(const float* centre, const Window& k) {
@@ -61,27 +74,29 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
     // Vectors of a row start at kFrame; the last one, and its taps, must end inside the stride.
     const int64_t vectors = (values + 15) / 16;
     const int64_t stride = (kFrame + 16 * vectors + kFrame + 15) / 16 * 16;
-    Plane x(height + 2 * kRadius, stride), y(height + 2 * kRadius, stride);
-    Plane d_m(height + 2 * kRadius, stride), d_xx(height + 2 * kRadius, stride),
-        d_xy(height + 2 * kRadius, stride);
-    // 1 where a value counts: a plane with a mask, one row for all without.
     const bool masked = in.mask != nullptr;
-    Plane keep(masked ? height + 2 * kRadius : 2 * kRadius + 1, stride);
+    const int64_t plane = (height + 2 * kRadius) * stride;
+    float* memory = scratch(size_t((masked ? 6 : 5) * plane + stride)) + kRadius * stride;
+    const Plane x = {memory, stride}, y = {memory + plane, stride};
+    const Plane d_m = {memory + 2 * plane, stride}, d_xx = {memory + 3 * plane, stride};
+    const Plane d_xy = {memory + 4 * plane, stride};
+    // 1 where a value counts: a plane with a mask, one row for all without.
+    const Plane keep = {memory + 5 * plane - (masked ? 0 : kRadius * stride), stride};
     const auto keep_row = [&](int64_t r) { return keep.row(masked ? r : 0); };
     std::vector<int64_t> counted(height);
     std::vector<double> row_l1(height), row_ssim(height);
 
     for (int64_t r : {-5, -4, -3, -2, -1})
-        for (Plane* p : {&x, &y, &d_m, &d_xx, &d_xy}) p->clear_row(r), p->clear_row(height - 1 - r);
+        for (const Plane& p : {x, y, d_m, d_xx, d_xy})
+            p.clear(r, 0, stride), p.clear(height - 1 - r, 0, stride);
     if (!masked) {
-        keep.clear_row(0);
+        keep.clear(0, 0, stride);
         for (int64_t i = 0; i < values; i++) keep.row(0)[kFrame + i] = 1;
     }
 
 #pragma omp parallel for num_threads(threads) schedule(static)
     for (int64_t r = 0; r < height; r++) {
-        x.clear_row(r);
-        y.clear_row(r);
+        for (const Plane& p : {x, y}) p.clear(r, 0, kFrame), p.clear(r, kFrame + values, stride);
         float *to_x = x.row(r) + kFrame, *to_y = y.row(r) + kFrame;
         const float* rendered = in.rendered + r * values;
         if (in.target_float)
@@ -92,7 +107,7 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
         std::memcpy(to_x, rendered, values * sizeof(float));
         counted[r] = width;
         if (masked) {
-            keep.clear_row(r);
+            keep.clear(r, 0, stride);
             for (int64_t i = 0; i < width; i++) {
                 const bool out = in.mask[r * width + i] != 0;
                 counted[r] -= out;
@@ -140,7 +155,8 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
                 store(line[4] + i, m_xy);
             }
             f32x16 l1 = {}, ssim = {};
-            for (Plane* p : {&d_m, &d_xx, &d_xy}) p->clear_row(r);
+            for (const Plane& p : {d_m, d_xx, d_xy})
+                p.clear(r, 0, kFrame), p.clear(r, kFrame + values, stride);
             for (int64_t i = kFrame; i < kFrame + values; i += 16) {
                 const f32x16 m_x = blur_across(line[0] + i, window);
                 const f32x16 m_y = blur_across(line[1] + i, window);
@@ -169,13 +185,13 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
         const float ssim_scale = float(-ssim_weight / double(count));
 #pragma omp for schedule(static)
         for (int64_t r = 0; r < height; r++) {
-            const Plane* planes[3] = {&d_m, &d_xx, &d_xy};
+            const Plane planes[3] = {d_m, d_xx, d_xy};
             for (int k = 0; k < 3; k++)
                 for (int64_t i = 0; i < stride; i += 16) {
-                    f32x16 sum = load<f32x16>(planes[k]->row(r) + i) * window.tap[0];
+                    f32x16 sum = load<f32x16>(planes[k].row(r) + i) * window.tap[0];
                     for (int t = 1; t <= kRadius; t++)
-                        sum += (load<f32x16>(planes[k]->row(r - t) + i) +
-                                load<f32x16>(planes[k]->row(r + t) + i)) *
+                        sum += (load<f32x16>(planes[k].row(r - t) + i) +
+                                load<f32x16>(planes[k].row(r + t) + i)) *
                                window.tap[t];
                     store(line[k] + i, sum);
                 }

@@ -21,6 +21,10 @@ RUN = (
 )
 
 
+onerror:
+    project.explain_failures()
+
+
 wildcard_constraints:
     scene=r"[^/]+",
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import sys
+import time
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
@@ -32,6 +33,7 @@ class SnakemakeProject:
 
     def __init__(self, raw: Mapping[str, Any], basedir: str):
         self._raw = dict(raw)
+        self._started = time.time()
         self._project = _or_exit(lambda: load_project(self._raw))[0]
         self._plan = cache(self._make_plan)
         # Set here and not in the rules' text, which counts as code: moving the project or its
@@ -77,6 +79,13 @@ class SnakemakeProject:
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
         return canonical(public_plan(self._plan(wildcards.scene)[0]))
+
+    def explain_failures(self) -> None:
+        """Say again, last of all, what stopped the stages that failed in this run."""
+        for log in sorted(RESULTS.glob("*/logs/*.log")):
+            _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
+            if log.stat().st_mtime >= self._started and found:
+                print(f"\nerror in {message}", file=sys.stderr, end="")
 
     def _make_plan(self, scene: str) -> tuple[Plan, str, str]:
         def make() -> tuple[Plan, str, str]:

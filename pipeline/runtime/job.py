@@ -143,7 +143,8 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
 
 
 def _say_error(request: Request, error: UserError) -> None:
-    print(f"error in {request.stage}: {error}", file=sys.stderr, flush=True)
+    scene = request.out.parent.name
+    print(f"error in {request.stage} of {scene}: {error}", file=sys.stderr, flush=True)
 
 
 def _as_user_error(error: OSError) -> UserError | None:

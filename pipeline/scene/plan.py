@@ -143,7 +143,10 @@ def _pairs(scan: Scan, config: Config) -> Choice:
     if wanted != "auto":
         return wanted, f"{wanted} pairs, as configured"
     if count <= EXHAUSTIVE_PHOTOS:
-        return "exhaustive", f"exhaustive pairs: {count * (count - 1) // 2} of {count} photographs"
+        return (
+            "exhaustive",
+            f"exhaustive pairs: all {count * (count - 1) // 2} of {count} photographs",
+        )
     metres = _gps_extent(scan)
     if scan.num_gps >= SPATIAL_SHARE * count and metres >= SPATIAL_METRES:
         return "spatial", f"spatial pairs: GPS in {scan.num_gps} of {count}, {metres:.0f} m across"

@@ -126,7 +126,7 @@ SPLAT_INLINE void each_tile(const Record& r, int64_t tiles_x, int64_t tiles_y, c
 bool Binner::find(const Record* records, const float* radii, int64_t count, const View& view,
                   int threads) {
     threads_ = threads;
-    count_ = count;
+    touched_.assign(count, 0);
     tiles_ = view.tiles();
     std::vector<Key> keys = visible_keys(records, radii, count, threads);
     radix_sort(keys, threads);
@@ -144,12 +144,14 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
         for (int64_t k = begin; k < end && found.load() <= kMaxIntersections; k++) {
             if (k + 8 < end) __builtin_prefetch(records + keys[k + 8].gaussian);
             const uint32_t gaussian = keys[k].gaussian;
+            const size_t before = chunk.spans.size();
             each_tile(
                 records[gaussian], tiles_x, tiles_y,
                 [&](int64_t tile, uint32_t first_row, uint32_t last_row) {
                     chunk.tile_count[tile]++;
                     chunk.spans.push_back({gaussian, uint32_t(tile), first_row | last_row << 8});
                 });
+            touched_[gaussian] = uint32_t(chunk.spans.size() - before);
             if (int64_t(chunk.spans.size()) - reported > 65536) {
                 found += int64_t(chunk.spans.size()) - reported;
                 reported = int64_t(chunk.spans.size());
@@ -158,10 +160,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
         found += int64_t(chunk.spans.size()) - reported;
     }
     intersections_ = 0;
-    for (Chunk& chunk : chunks_) {
-        chunk.first_slot = intersections_;
-        intersections_ += int64_t(chunk.spans.size());
-    }
+    for (const Chunk& chunk : chunks_) intersections_ += int64_t(chunk.spans.size());
     return intersections_ <= kMaxIntersections;
 }
 
@@ -176,20 +175,22 @@ void Binner::write(Entry* entries, int64_t* tile_begin, Slots* slots) {
         }
     }
     tile_begin[tiles_] = total;
-#pragma omp parallel num_threads(threads_)
-    {
-#pragma omp for schedule(static)
-        for (int64_t i = 0; i < count_; i++) slots[i] = {0, 0};
-#pragma omp for schedule(static, 1)
-        for (int part = 0; part < threads_; part++) {
-            Chunk& chunk = chunks_[part];
-            uint32_t slot = uint32_t(chunk.first_slot);
-            for (const Span& span : chunk.spans) {
-                entries[chunk.tile_count[span.tile]++] = {span.gaussian, slot, span.rows};
-                Slots& own = slots[span.gaussian];
-                if (own.count++ == 0) own.first = slot;
-                slot++;
+    uint32_t first = 0;
+    for (size_t i = 0; i < touched_.size(); i++) {
+        slots[i] = {first, touched_[i]};
+        first += touched_[i];
+    }
+#pragma omp parallel for num_threads(threads_) schedule(static, 1)
+    for (int part = 0; part < threads_; part++) {
+        Chunk& chunk = chunks_[part];
+        // A Gaussian's spans are neighbours, and no other chunk has any.
+        uint32_t gaussian = UINT32_MAX, slot = 0;
+        for (const Span& span : chunk.spans) {
+            if (span.gaussian != gaussian) {
+                gaussian = span.gaussian;
+                slot = slots[gaussian].first;
             }
+            entries[chunk.tile_count[span.tile]++] = {gaussian, slot++, span.rows};
         }
     }
 }

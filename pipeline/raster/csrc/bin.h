@@ -30,11 +30,11 @@ class Binner {
     struct Chunk {
         std::vector<Span> spans;
         std::vector<uint32_t> tile_count;
-        int64_t first_slot = 0;
     };
 
     int threads_ = 1;
-    int64_t count_ = 0, tiles_ = 0, intersections_ = 0;
+    int64_t tiles_ = 0, intersections_ = 0;
+    std::vector<uint32_t> touched_;  // tiles, by Gaussian
     std::vector<Chunk> chunks_;
 };
 

@@ -236,10 +236,6 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         double moments[12][kProjectLanes] = {};
         const Record* record[kProjectLanes] = {};
         bool any_drawn = false;
-        // The slots lie by depth, not by index: ask for those of the blocks to come.
-        for (int64_t i = first + 4 * kProjectLanes; i < first + 5 * kProjectLanes; i++)
-            if (i < in.count)
-                __builtin_prefetch(slot_gradients + slots[i].first * int64_t(kSlotFloats));
         for (int lane = 0; lane < lanes; lane++) {
             const int64_t i = first + lane;
             if (!(radii[i] > 0) || slots[i].count == 0) continue;

@@ -44,7 +44,7 @@ struct alignas(64) Record {
 };
 static_assert(sizeof(Record) == 64);
 
-// One Gaussian in one tile. Slots count the pairs Gaussian by Gaussian, in order of depth: the
+// One Gaussian in one tile. Slots number the pairs Gaussian by Gaussian, in order of index: the
 // pairs of a Gaussian are neighbours there, whatever thread made them.
 struct Entry {
     uint32_t gaussian, slot;

@@ -88,8 +88,8 @@ void project_block(const Gaussians& g, const View& view, int64_t first, Block& o
     store(out.extent_y, root * sqrt(p.yy));
     store(out.radius, root * sqrt(longest));
     store(out.usable, usable(in, p));
-    // Depth is kept in float32: beyond its range it would be infinite.
     store(out.in_front, i64x8(p.cam.z > view.near));
+    // The centre may lie anywhere, but the depth is kept in float32.
     store(out.sound, i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
                          i64x8(p.yy < kCovarianceMax) & i64x8(p.x - p.x == 0.0) &
                          i64x8(p.y - p.y == 0.0) & i64x8(p.cam.z < 1e38));
@@ -178,9 +178,8 @@ Sums sum_slots(const Slots& slots, const float* slot_gradients) {
     return sums;
 }
 
-// From the moments of (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2), and
-// with L = [uu 0; uw ww], y = (u, w): d ln alpha / d centre = 2 ln 2 L y, and the covariance's
-// gradient is 2 (ln 2)^2 ... L (sum v y y^T) L^T with the factor worked out below.
+// From the moments of y = (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2) and
+// y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
 ImageGradients image_gradients(const double (*m)[kProjectLanes], const Record* const* records) {
     double uu[8], uw[8], ww[8];
     for (int lane = 0; lane < kProjectLanes; lane++) {

@@ -36,7 +36,7 @@ class Views(Section):
     """The pictures that training and evaluation see: resolution and masks."""
 
     max_long_side_px: Positive = Field(
-        960, description="Views with a longer side are resized (by area) down to this, in pixels."
+        800, description="Views with a longer side are resized (by area) down to this, in pixels."
     )
     masks: Literal["auto", "ignore"] = Field(
         "auto", description="auto uses masks/ where it exists: zero pixels count for nothing."
@@ -152,7 +152,7 @@ class Density(Section):
     """Adaptive density control after Kerbl et al. 2023, section 5.2."""
 
     start_step: int = Field(500, description="First densification.")
-    stop_share: Share = Field(0.5, description="Densify until this share of the steps.")
+    stop_share: Share = Field(0.7, description="Densify until this share of the steps.")
     interval: Positive = Field(100, description="Steps between densifications.")
     grad_threshold: Rate = Field(
         2e-4, description="Mean view-space positional gradient (in NDC) that densifies."
@@ -168,18 +168,22 @@ class Density(Section):
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
     prune_scale: Rate = Field(0.1, description="Larger ones (share of the extent) are removed.")
     opacity_reset_interval: Positive = Field(3000, description="Steps between opacity resets.")
-    max_gaussians: Positive = Field(300_000, description="Budget: never more Gaussians than this.")
+    max_gaussians: Positive = Field(150_000, description="Budget: never more Gaussians than this.")
 
 
 class Train(Section):
     """The optimisation of the Gaussians."""
 
-    steps: Positive = Field(7000, description="Optimiser steps, one view each.")
+    steps: Positive = Field(
+        4000,
+        description="Optimiser steps, one view each. Below 7000, the intervals that are counted in "
+        "steps shrink in proportion.",
+    )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
     coarse_until: Share = Field(
-        0.4, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
+        0.6, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."

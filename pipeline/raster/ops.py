@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -280,7 +280,7 @@ def adam_step(
     grad: torch.Tensor,
     exp_avg: torch.Tensor,
     exp_avg_sq: torch.Tensor,
-    lr: float,
+    lr: float | Sequence[float],
     step: int,
     beta1: float = 0.9,
     beta2: float = 0.999,
@@ -289,16 +289,18 @@ def adam_step(
 ) -> None:
     """One step of Adam in place, as torch.optim.Adam takes it; ``step`` counts from 1.
 
-    All four tensors: float32, contiguous, of one shape.
+    All four tensors: float32, contiguous, of one shape. ``lr`` may be several rates, which repeat
+    over the elements: one for each element of a row, say.
     """
     for tensor in (param, grad, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
             raise ValueError("adam_step: tensors must be float32 and contiguous")
         if tensor.shape != param.shape:
             raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
-    if step < 1 or not math.isfinite(lr):
+    rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
+    if step < 1 or not len(rates) or not rates.isfinite().all():
         raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
     _ops().adam_step(
-        param.detach(), grad.detach(), exp_avg, exp_avg_sq, lr, step, beta1, beta2, eps,
+        param.detach(), grad.detach(), exp_avg, exp_avg_sq, rates, step, beta1, beta2, eps,
         _threads(threads),
     )  # fmt: skip

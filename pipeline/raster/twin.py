@@ -11,6 +11,7 @@ N Gaussians, V visible ones among them, an image of H x W pixels.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -338,14 +339,18 @@ def adam_step(
     grad: torch.Tensor,
     exp_avg: torch.Tensor,
     exp_avg_sq: torch.Tensor,
-    lr: float,
+    lr: float | Sequence[float],
     step: int,
     beta1: float = 0.9,
     beta2: float = 0.999,
     eps: float = 1e-15,
 ) -> None:
-    """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1."""
+    """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
+    repeat over the elements."""
+    pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
+    repeats = -(-param.numel() // len(pattern))
+    rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
     exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
     exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
     denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
-    param.addcdiv_(exp_avg, denominator, value=-lr / (1 - beta1**step))
+    param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)

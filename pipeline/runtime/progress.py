@@ -48,6 +48,8 @@ class Progress:
     def start_at(self, done: int) -> None:
         """Begin at ``done`` units (resumed work), so that the rate stays true."""
         self.done = self._start_done = done
+        if done:
+            print(f"{self.label}: going on from {done}/{self.total} {self.unit}", file=sys.stderr)
 
     def advance(self, count: int = 1, note: str = "") -> None:
         """Count ``count`` more units done; ``note`` is shown at the line's end."""

@@ -43,11 +43,11 @@ class Adam:
         self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
     ) -> None:
         """Move ``gaussians`` in place; ``step`` counts from 1 (bias correction)."""
-        sh = gaussians.sh
-        rest = sh.shape[1] > 1
-        dc = sh[:, 0].clone() if rest else None
+        higher = gaussians.sh.shape[1] - 1
+        # The constant coefficient's three channels have a rate of their own.
+        sh_rates = [rates.sh0] * 3 + [rates.shN] * 3 * higher
         for name, parameter in gaussians.tensors().items():
-            rate = (rates.shN if rest else rates.sh0) if name == "sh" else getattr(rates, name)
+            rate = sh_rates if name == "sh" else getattr(rates, name)
             adam_step(
                 parameter,
                 getattr(gradients, name),
@@ -60,11 +60,6 @@ class Adam:
                 EPSILON,
                 threads,
             )
-        if dc is not None:
-            # The constant coefficient shares array and moments, but has a rate of its own.
-            scale = self.second["sh"][:, 0].clone().div_(1 - BETA2**step).sqrt_().add_(EPSILON)
-            move = self.first["sh"][:, 0].clone().div_(scale)
-            sh[:, 0] = dc.sub_(move, alpha=rates.sh0 / (1 - BETA1**step))
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""

@@ -102,6 +102,23 @@ def test_adam_takes_torchs_steps(shape: tuple[int, ...]) -> None:
     assert torch.allclose(ours.double(), theirs.detach(), rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize(("rows", "columns"), [(11, 3), (37, 12), (5, 27), (129, 48)])
+def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
+    gen = torch.Generator().manual_seed(3)
+    rates = torch.rand(columns, generator=gen, dtype=torch.float64).tolist()
+    ours, grad = (torch.randn(rows, columns, generator=gen) for _ in range(2))
+    expected = [ours[:, c].double().clone() for c in range(columns)]
+    m, v = torch.zeros_like(ours), torch.zeros_like(ours)
+    for step in (1, 2, 3):
+        raster.adam_step(ours, grad, m, v, rates, step)
+    for column, rate in enumerate(rates):
+        m64, v64 = (torch.zeros(rows, dtype=torch.float64) for _ in range(2))
+        for step in (1, 2, 3):
+            g64 = grad[:, column].double()
+            twin.adam_step(expected[column], g64, m64, v64, rate, step)
+    assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
+
+
 def test_adam_refuses_what_it_cannot_update_in_place() -> None:
     a = torch.zeros(4, 4)
     with pytest.raises(ValueError, match="contiguous"):

@@ -6,7 +6,9 @@
 namespace splat {
 
 struct AdamSettings {
-    double lr, beta1, beta2, eps;
+    const double* rates;  // learning rates, repeated over the elements
+    int64_t num_rates;    // at least 1
+    double beta1, beta2, eps;
     int64_t step;  // from 1
 };
 

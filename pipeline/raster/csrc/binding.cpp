@@ -181,10 +181,11 @@ std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const
 }
 
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
-               const Tensor& exp_avg_sq, double lr, int64_t step, double beta1, double beta2,
-               double eps, int64_t threads) {
+               const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
+               double beta2, double eps, int64_t threads) {
     splat::adam_step(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
-                     mutable_floats(exp_avg_sq), param.numel(), {lr, beta1, beta2, eps, step},
+                     mutable_floats(exp_avg_sq), param.numel(),
+                     {rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step},
                      int(threads));
 }
 
@@ -219,7 +220,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "(float, float, float, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
-        "float lr, int step, float beta1, float beta2, float eps, int threads) -> ()");
+        "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {

@@ -51,7 +51,7 @@ class Schedule:
             steps=config.steps,
             sh_degree=config.sh_degree,
             sh_interval=max(1, round(config.sh_interval * shrink)),
-            coarse_steps=round(config.coarse_until * config.steps),
+            coarse_steps=int(config.coarse_until * config.steps),
             refine_start=round(density.start_step * shrink),
             refine_stop=round(density.stop_share * config.steps),
             refine_interval=max(interval, round(density.interval * shrink)),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import pytest
 
-from pipeline.config.schema import Train
+from pipeline.config.schema import Density, Train
 from pipeline.training.schedule import Schedule
 
 
@@ -26,8 +26,6 @@ def test_phases_fit_into_the_run(steps: int) -> None:
         assert degrees[-1] == 3
         assert len(refines) >= 10
         assert set(factors) == {1, 2, 4}
-    if steps == 30_000:
-        assert resets == [3000, 6000, 9000, 12_000]
 
 
 def test_rates_decay_log_linearly() -> None:
@@ -35,3 +33,9 @@ def test_rates_decay_log_linearly() -> None:
     assert schedule.lr_means_at(1) == pytest.approx(1e-2)
     assert schedule.lr_means_at(51) == pytest.approx(1e-3)
     assert schedule.lr_means_at(101) == pytest.approx(1e-4)
+
+
+def test_opacity_resets_of_the_papers_protocol() -> None:
+    schedule = Schedule.of(Train(steps=30_000, density=Density(stop_share=0.5)))
+    resets = [step for step in range(1, 30_001) if schedule.resets_opacity_after(step)]
+    assert resets == [3000, 6000, 9000, 12_000]

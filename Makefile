@@ -22,7 +22,8 @@ $(VENV)/installed: pyproject.toml
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
 	@command -v $${CXX:-g++} >/dev/null || \
 	  { echo "error: no C++ compiler found ($${CXX:-g++}); install g++, or set CXX"; exit 2; }
-	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || \
+	  { echo "error: no virtual environment could be made; on Debian and Ubuntu install python3-venv"; exit 2; }
 	@$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
 	  print("\n".join(p["dependencies"] + p["optional-dependencies"]["dev"]))' > $(VENV)/requirements.txt
 	@echo "installing dependencies into $(VENV) (once; a minute or two)"

@@ -36,7 +36,7 @@ localrules:
 
 rule all:
     input:
-        expand("results/{scene}/metrics.json", scene=project.scenes()),
+        project.every_scene,
 
 
 rule plan:

@@ -1,8 +1,11 @@
-"""Develop RAW files, all views of a scene alike. Outputs: ``images/`` and ``images.json``."""
+"""Develop RAW files, all views of a scene alike. Outputs: ``images/``, ``images.json``, and
+the given poses, if there are any, under the developed pictures' names."""
 
 from pipeline.config.schema import Decode
 from pipeline.photos.raw import develop
 from pipeline.runtime.job import Job
+from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.given import renamed
 from pipeline.scene.manifest import Manifest
 from stages.command import main
 
@@ -12,6 +15,9 @@ def run(job: Job) -> None:
     report = develop(manifest, job.section(Decode), job.out, threads=job.threads)
     for text in report.warnings:
         job.warn(text)
+    sparse = job.inputs["photos"] / "sparse" / "0"
+    if sparse.is_dir():
+        write_model(job.out / "sparse" / "0", renamed(read_model(sparse), report.manifest))
     job.counters = {"developed": len(report.manifest.photos)}
 
 

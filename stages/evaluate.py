@@ -23,7 +23,7 @@ def run(job: Job) -> None:
     model = read_model(job.inputs["model"] / "sparse" / "0")
     views = load_views(manifest, model, job.section(Views), split)
     train = job.section(Train)
-    protocol = choose_protocol(views, split, train, any(photo.alpha for photo in manifest.photos))
+    protocol = choose_protocol(views, split, train)
     evaluation = evaluate_views(
         Gaussians.load(job.inputs["train"] / "gaussians.npz"),
         protocol,

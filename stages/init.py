@@ -1,6 +1,7 @@
 """The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
 
 from pipeline.config.schema import Features, Init, Split, Views
+from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
@@ -20,6 +21,11 @@ def run(job: Job) -> None:
     model = read_model(sparse)
     views = load_views(manifest, model, job.section(Views), job.section(Split))
     train = [view for view in views if not view.is_test]
+    if not train:
+        raise UserError(
+            "no photograph has a pose: there is nothing to train on",
+            fix="check that the poses name the photographs, or set poses: ignore",
+        )
     points = model.points
     if config.method != "random" and len(points) == 0:
         job.decide("the given poses come without points: triangulating them")

@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable, Mapping
 from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, NoReturn
 
 from pipeline.config.load import load_project, scene_config
 from pipeline.runtime.errors import UserError
@@ -34,8 +34,14 @@ class SnakemakeProject:
     def __init__(self, raw: Mapping[str, Any], basedir: str):
         self._raw = dict(raw)
         self._started = time.time()
-        self._project = _or_exit(lambda: load_project(self._raw))[0]
-        self._plan = cache(self._make_plan)
+        try:
+            self._project, named = load_project(self._raw)
+        except UserError as error:
+            _exit(error)
+        for name in named:
+            if not (Path(self._project.data_root) / name).is_dir():
+                print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
+        self._make_plan = cache(self._scan_and_plan)
         # Set here and not in the rules' text, which counts as code: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
@@ -47,12 +53,23 @@ class SnakemakeProject:
         # Spinning OpenMP threads slow whatever runs beside them.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-    def scenes(self) -> list[str]:
-        """Names of the folders below ``data_root``, sorted."""
+    def every_scene(self, wildcards: Any) -> list[str]:
+        """Input function: the metrics of all scenes below ``data_root``. A folder that is no
+        scene is left out with its message."""
         root = Path(self._project.data_root)
-        if not root.is_dir():
-            return []
-        return sorted(p.name for p in root.iterdir() if p.is_dir() and p.name[0] not in "._")
+        names = sorted(p.name for p in root.glob("*") if p.is_dir() and p.name[0] not in "._")
+        targets = []
+        for name in names:
+            try:
+                self._make_plan(name)
+            except UserError as error:
+                print(f"left out: {error}", file=sys.stderr)
+            else:
+                targets.append(str(RESULTS / name / "metrics.json"))
+        if not targets:
+            fix = "set data_root to the folder whose subfolders are scenes"
+            _exit(UserError("no scene here", file=root, fix=fix))
+        return targets
 
     def inputs(self, stage: str) -> Callable[[Any], dict[str, str]]:
         """Input function: role -> the ``stage.json`` that fills it."""
@@ -87,23 +104,23 @@ class SnakemakeProject:
             if log.stat().st_mtime >= self._started and found:
                 print(f"\nerror in {message}", file=sys.stderr, end="")
 
-    def _make_plan(self, scene: str) -> tuple[Plan, str, str]:
-        def make() -> tuple[Plan, str, str]:
-            config = scene_config(self._raw, scene)
-            folder = Path(self._project.data_root) / scene
-            found = scan(folder, scene, config, cache=RESULTS / scene / ".scratch" / "scan.json")
-            return make_plan(found, config), str(folder), found.fingerprint
+    def _plan(self, scene: str) -> tuple[Plan, str, str]:
+        """The scene's plan, folder and fingerprint; a UserError ends Snakemake."""
+        try:
+            return self._make_plan(scene)
+        except UserError as error:
+            _exit(error)
 
-        plan, folder, fingerprint = _or_exit(make)
+    def _scan_and_plan(self, scene: str) -> tuple[Plan, str, str]:
+        config = scene_config(self._raw, scene)
+        folder = Path(self._project.data_root) / scene
+        found = scan(folder, scene, config, cache=RESULTS / scene / ".scratch" / "scan.json")
+        plan = make_plan(found, config)
         print(describe(plan), file=sys.stderr)
-        return plan, folder, fingerprint
+        return plan, str(folder), found.fingerprint
 
 
-def _or_exit(work: Callable[[], Any]) -> Any:
+def _exit(error: UserError) -> NoReturn:
     """A user's error while the DAG is built ends Snakemake with its message alone."""
-    try:
-        return work()
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr, flush=True)
-        sys.stderr.flush()
-        raise SystemExit(2) from None
+    print(f"error: {error}", file=sys.stderr, flush=True)
+    raise SystemExit(2) from None

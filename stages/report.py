@@ -59,8 +59,7 @@ def compare(
     """The views to show, worst to best, each beside its photograph."""
     photos = {photo.name: photo for photo in manifest.photos}
     by_name = {view.name: view for view in views}
-    has_alpha = any(photo.alpha for photo in manifest.photos)
-    protocol = choose_protocol(views, job.section(Split), job.section(Train), has_alpha)
+    protocol = choose_protocol(views, job.section(Split), job.section(Train))
     shown = []
     for label, measured in ranked(evaluation["per_view"], job.section(Report).views):
         view = by_name[measured["name"]]

@@ -1,5 +1,8 @@
 """Optimise the Gaussians. Outputs: ``gaussians.npz`` and ``curve.json``."""
 
+import sys
+import time
+
 from pipeline.config.schema import Split, Train, Views
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
@@ -18,6 +21,7 @@ def run(job: Job) -> None:
         job.section(Views),
         job.section(Split),
     )
+    start = time.perf_counter()
     result = train(
         [view for view in views if not view.is_test],
         Gaussians.load(job.inputs["init"] / "gaussians.npz"),
@@ -26,9 +30,11 @@ def run(job: Job) -> None:
         threads=job.threads,
         extent=scene_extent(views),
         checkpoint_dir=job.scratch / "checkpoints",
+        on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
-    for text in result.warnings:
-        job.warn(text)
+    # After a kill: what earlier processes spent on the same training.
+    earlier = max(0.0, result.seconds - (time.perf_counter() - start))
+    job.warnings += result.warnings
     result.gaussians.save(job.out / "gaussians.npz")
     write_json(job.out / "curve.json", result.curve)
     job.counters = {
@@ -36,7 +42,7 @@ def run(job: Job) -> None:
         "steps": result.steps,
         **result.counters,
     }
-    job.timings = {"curve_seconds": result.curve_seconds}
+    job.timings = {"curve_seconds": result.curve_seconds, "earlier_s": round(earlier, 3)}
 
 
 if __name__ == "__main__":

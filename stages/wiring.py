@@ -9,14 +9,15 @@ from importlib.metadata import version
 from typing import Any
 
 from pipeline.config.schema import Config
+from pipeline.metrics.lpips import weights_found
 from pipeline.runtime.job import canonical
 from pipeline.runtime.source import stage_source_hash
 from pipeline.scene.plan import Plan
 
 _PHOTOS = ("decode", "inspect")
 _VIEWS = ("undistort", "decode", "inspect")
-_POSES = ("sfm", "inspect")
-_MODEL = ("undistort", "sfm", "inspect")
+_POSES = ("sfm", "decode", "inspect")
+_MODEL = ("undistort", *_POSES)
 
 # stage -> role -> stages that can fill it; the first one that the plan runs does.
 ROLES: dict[str, dict[str, tuple[str, ...]]] = {
@@ -69,9 +70,9 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "matches": ("pycolmap",),
     "sfm": ("pycolmap",),
     "undistort": ("opencv-contrib-python-headless",),
-    "init": ("pycolmap", "scipy"),
-    "train": ("torch", "numpy"),
-    "evaluate": ("torch", "scipy"),
+    "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
+    "train": ("torch", "numpy", "opencv-contrib-python-headless"),
+    "evaluate": ("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
 }
 
 
@@ -89,8 +90,8 @@ def stage_key(stage: str, plan: Plan, folder: str, fingerprint: str) -> str:
     Snakemake compares parameters as a set of ``repr(value)``, so only a single canonical string
     notices every change. It holds the config sections the stage reads (settled by the plan), the
     hash of its source, the versions of the packages that decide its result, the seed, for the
-    first stage the scene's folder and fingerprint, for the last the plan it shows. What changes
-    only the speed is not in it.
+    first stage the scene's folder and fingerprint, for evaluation the true poses and the LPIPS
+    weights at hand, for the last the plan it shows. What changes only the speed is not in it.
     """
     config: Config = plan.config
     dumped = config.model_dump(mode="json")
@@ -103,6 +104,10 @@ def stage_key(stage: str, plan: Plan, folder: str, fingerprint: str) -> str:
     }
     if stage == "inspect":
         key |= {"folder": folder, "fingerprint": fingerprint, "poses": config.poses}
+        key["truth"] = plan.facts["truth_digest"]
+    if stage == "evaluate":
+        key["lpips_weights"] = weights_found(config.evaluate.lpips_net)
+        key["truth"] = plan.facts["truth_digest"]
     if stage == "report":
         key["plan"] = public_plan(plan)
     return canonical(key)

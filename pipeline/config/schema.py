@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field
 
 Positive = Annotated[int, Field(gt=0)]
 Share = Annotated[float, Field(ge=0.0, le=1.0)]
@@ -43,10 +43,16 @@ class Views(Section):
     )
 
 
+def _not_all(every: int) -> int:
+    if every == 1:
+        raise ValueError("Input should be 0 or at least 2: 1 leaves no view to train on")
+    return every
+
+
 class Split(Section):
     """Which views training never sees."""
 
-    holdout_every: Annotated[int, Field(ge=0)] = Field(
+    holdout_every: Annotated[int, Field(ge=0), AfterValidator(_not_all)] = Field(
         8,
         description="Every n-th view, sorted by name, is held out of training and used only to "
         "evaluate; 0 trains on all and evaluates on the training views (said in the protocol).",
@@ -85,7 +91,7 @@ class Matches(Section):
 
     pairs: Literal["auto", "exhaustive", "sequential", "spatial", "retrieval"] = Field(
         "auto",
-        description="auto: exhaustive up to 80 photographs; above, spatial where GPS tells them "
+        description="auto: exhaustive up to 40 photographs; above, spatial where GPS tells them "
         "apart, sequential where times or names say they are one walk, else retrieval.",
     )
     neighbours: Positive = Field(
@@ -145,7 +151,11 @@ class Init(Section):
     )
     num_random: Positive = Field(50_000, description="Gaussians of a random start.")
     opacity: Share = Field(0.1, description="Opacity of a new Gaussian.")
-    max_points: Positive = Field(200_000, description="More sparse points are thinned to this.")
+    max_points: Positive = Field(
+        200_000,
+        description="More sparse points are thinned to this, or to "
+        "half of train.density.max_gaussians, so that room is left to densify.",
+    )
 
 
 class Density(Section):
@@ -167,7 +177,11 @@ class Density(Section):
     )
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
     prune_scale: Rate = Field(0.1, description="Larger ones (share of the extent) are removed.")
-    opacity_reset_interval: Positive = Field(3000, description="Steps between opacity resets.")
+    opacity_reset_interval: Positive = Field(
+        3000,
+        description="Steps between opacity resets; there is one only where as many steps of "
+        "density control still follow, so that short runs have none.",
+    )
     max_gaussians: Positive = Field(150_000, description="Budget: never more Gaussians than this.")
 
 
@@ -182,7 +196,7 @@ class Train(Section):
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
-    coarse_until: Share = Field(
+    coarse_until: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.6, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
     )
     background: Literal["auto", "black", "white", "random"] = Field(
@@ -190,7 +204,9 @@ class Train(Section):
     )
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
     lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")
-    lr_means_final: Rate = Field(1.6e-6, description="The same at the end (log-linear decay).")
+    lr_means_final: Annotated[float, Field(gt=0)] = Field(
+        1.6e-6, description="The same at the end (log-linear decay)."
+    )
     lr_scales: Rate = 5e-3
     lr_quats: Rate = 1e-3
     lr_opacities: Rate = 5e-2

@@ -13,7 +13,7 @@ from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
-from pipeline.metrics.lpips import LPIPS_VARIANTS, lpips_available
+from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
@@ -42,14 +42,14 @@ class Protocol:
     near: float
 
 
-def choose_protocol(views: Sequence[View], split: Split, train: Train, has_alpha: bool) -> Protocol:
+def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protocol:
     """The views to evaluate on (the held-out ones, else all) and the background.
 
     The background is the one trained on; where that was random (images with alpha), white, as
     the field does for NeRF-synthetic scenes.
     """
     held_out = [view for view in views if view.is_test]
-    white = train.background == "white" or (train.background in ("auto", "random") and has_alpha)
+    white = train.background in ("white", "random")
     return Protocol(
         held_out or list(views),
         split.holdout_every if held_out else 0,
@@ -77,6 +77,9 @@ def evaluate_views(
         missing, with ``lpips_reason``), ``per_view``, ``warnings`` and ``protocol``.
     """
     lpips, reason = lpips_available(config.lpips_net)
+    smallest = min(min(view.width, view.height) for view in protocol.views)
+    if lpips is not None and smallest < MIN_SIDE:
+        lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
     per_view: list[dict[str, Any]] = []
     progress = Progress("evaluating", len(protocol.views), "views")
@@ -118,7 +121,7 @@ def evaluate_views(
         "lpips_reason": reason,
         "per_view": per_view,
         "warnings": warnings,
-        "protocol": _describe(protocol, config, reason if lpips is None else None),
+        "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None),
     }
 
 
@@ -135,7 +138,9 @@ def to_bytes(image: Any) -> NDArray[np.uint8]:
     return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)
 
 
-def _describe(protocol: Protocol, config: Evaluate, no_lpips: str | None) -> dict[str, Any]:
+def _describe(
+    protocol: Protocol, config: Evaluate, num_views: int, no_lpips: str | None
+) -> dict[str, Any]:
     sizes = sorted({(view.width, view.height) for view in protocol.views})
     return {
         "resolution": [f"{w}x{h}" for w, h in sizes],
@@ -144,7 +149,8 @@ def _describe(protocol: Protocol, config: Evaluate, no_lpips: str | None) -> dic
             if protocol.every
             else "no view was held out: measured on the TRAINING views"
         ),
-        "num_views": len(protocol.views),
+        "poses_and_points": "from all photographs, the held-out ones included (the field's habit)",
+        "num_views": num_views,
         "psnr": "mean of the views' PSNR in dB, 8-bit renders, peak 1",
         "ssim": SSIM_VARIANT,
         "lpips": no_lpips or LPIPS_VARIANTS[config.lpips_net],

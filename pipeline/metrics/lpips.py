@@ -14,6 +14,7 @@ The published 3DGS numbers feed [0, 1] where the network was trained on [-1, 1];
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -102,6 +103,21 @@ _NETWORKS = {
 }
 
 
+def _weight_files(network: _Network) -> tuple[Path, Path]:
+    """The backbone and the linear heads, where they are or else should be: torch.hub's folder."""
+    cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
+    home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
+    folder = Path(home).expanduser() / "hub" / "checkpoints"
+    found = (folder / name for name in network.heads if (folder / name).is_file())
+    return folder / network.backbone, next(found, folder / network.heads[0])
+
+
+def weights_found(net: Net) -> dict[str, int]:
+    """Names and sizes in bytes of the weight files at hand; cheap, without torch."""
+    files = () if net == "none" else _weight_files(_NETWORKS[net])
+    return {file.name: file.stat().st_size for file in files if file.is_file()}
+
+
 def lpips_available(net: Net) -> tuple[Lpips | None, str]:
     """The metric, or None and why there is none.
 
@@ -115,15 +131,8 @@ def lpips_available(net: Net) -> tuple[Lpips | None, str]:
     """
     if net == "none":
         return None, "switched off"
-    import torch
-
     network = _NETWORKS[net]
-    folder = Path(torch.hub.get_dir()) / "checkpoints"
-    backbone_file = folder / network.backbone
-    heads_file = next(
-        (folder / name for name in network.heads if (folder / name).is_file()),
-        folder / network.heads[0],
-    )
+    backbone_file, heads_file = _weight_files(network)
     missing = [str(file) for file in (backbone_file, heads_file) if not file.is_file()]
     if missing:
         return None, (

@@ -73,7 +73,7 @@ def load_view(
     """Read a view and its mask, resized by area to exactly ``width`` x ``height`` pixels.
 
     Colours are averaged weighted by alpha, so that hidden colours never bleed in. A mask's pixel
-    counts if at least half of the pixels under it do.
+    counts only if all pixels under it do.
 
     Raises:
         UserError: as ``load_rgb``; or picture or mask is not of the asked shape.
@@ -105,8 +105,9 @@ def resize_rgba(
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize an (H, W) mask; a pixel counts if at least half of the pixels under it do."""
-    return np.asarray(resize_area(mask.astype(np.float32), width, height) >= 0.5)
+    """Resize an (H, W) mask; a pixel counts only if all pixels under it do: its colour is a mean
+    of theirs."""
+    return np.asarray(resize_area(mask.astype(np.float32), width, height) > 0.999)
 
 
 def resize_area(picture: Picture, width: int, height: int) -> Picture:

@@ -68,5 +68,8 @@ def collect_metrics(
 
 
 def _timing(run: dict[str, Any] | None) -> dict[str, Any]:
-    names = ("wall_s", "cpu_s", "peak_rss_mb")
-    return {name: run[name] if run else 0.0 for name in names}
+    if run is None:
+        return {"wall_s": 0.0, "cpu_s": 0.0, "peak_rss_mb": 0.0}
+    # Work that was killed and resumed counts its earlier processes, too.
+    wall = round(run["wall_s"] + run.get("earlier_s", 0.0), 3)
+    return {"wall_s": wall, "cpu_s": run["cpu_s"], "peak_rss_mb": run["peak_rss_mb"]}

@@ -18,11 +18,14 @@ import errno
 import fcntl
 import hashlib
 import json
+import os
 import platform
 import resource
 import shutil
+import sqlite3
 import subprocess
 import sys
+import tempfile
 import time
 import traceback
 from collections.abc import Callable, Iterator, Mapping
@@ -130,6 +133,10 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
         except MemoryError:
             _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))
             return EXIT_USER_ERROR
+        except sqlite3.OperationalError as error:
+            fix = "free some space and make results/ writable, then run again"
+            _say_error(request, UserError(f"the database cannot be written: {error}", fix=fix))
+            return EXIT_USER_ERROR
         except OSError as error:
             known = _as_user_error(error)
             if known is None:
@@ -186,6 +193,10 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
             shared_cache=scratch_root / f"{request.stage}-cache",
             threads=request.threads,
         )
+        # Temporary files belong on the results' disk, where a kill leaves them to be found.
+        os.environ["TMPDIR"] = str(scratch / "tmp")
+        (scratch / "tmp").mkdir(exist_ok=True)
+        tempfile.tempdir = None
         write_progress_to(scene_folder / ".scratch" / "progress.json")
         start = time.perf_counter()
         try:
@@ -211,9 +222,14 @@ def canonical(value: Any) -> str:
 
 
 def content_digest(folder: Path) -> str:
-    """Digest of what a finished stage made: its outputs, not how or from what it made them."""
+    """Digest of what a finished stage made: its outputs, not how or from what it made them.
+
+    Ground truth (below ``truth/``) is left out: no stage's result may depend on it, and those
+    that measure against it have it in their keys.
+    """
     record = read_stage(folder)
     content = {name: record[name] for name in ("outputs", "counters", "warnings")}
+    content["outputs"] = {k: v for k, v in content["outputs"].items() if not k.startswith("truth/")}
     return hashlib.sha256(canonical(content).encode()).hexdigest()
 
 

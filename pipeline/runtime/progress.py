@@ -5,6 +5,7 @@ No carriage returns, so that log files stay readable.
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import sys
@@ -90,9 +91,11 @@ class Progress:
             "seconds_left": self.seconds_left(),
             "note": note,
         }
-        temporary = _file.with_suffix(".tmp")
-        temporary.write_text(json.dumps(state))
-        os.replace(temporary, _file)
+        # Only a nicety: neither a full disk nor another run's file may end the work.
+        temporary = _file.with_suffix(f".{os.getpid()}.tmp")
+        with contextlib.suppress(OSError):
+            temporary.write_text(json.dumps(state))
+            os.replace(temporary, _file)
 
 
 def track(items: Iterable[T], label: str, total: int, unit: str = "it") -> Iterator[T]:

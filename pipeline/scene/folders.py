@@ -54,6 +54,10 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
         seen.add(real)
         prefix = Path(where).relative_to(folder)
         for name in files:
+            if not _is_text(name):
+                shown = os.fsencode(name).decode(errors="replace")
+                warnings.append(f"{where}: {shown} is left out: its name is not UTF-8; rename it")
+                continue
             suffix = suffix_of(name)
             if name[0] != "." and suffix in PHOTO_SUFFIXES:
                 names.append((prefix / name).as_posix())
@@ -66,6 +70,14 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
             "convert them to JPEG or PNG, keeping their EXIF"
         )
     return sorted(names)
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
 
 
 def relative_folders(folder: Path) -> list[str]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 
 import numpy as np
 
 from pipeline.runtime.errors import UserError
 from pipeline.scene.colmap import read_model
 from pipeline.scene.llff import read_poses_bounds
-from pipeline.scene.manifest import Photo
+from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
 from pipeline.scene.names import NameIndex
 from pipeline.scene.scan import Scan
@@ -125,3 +126,15 @@ def _points_in(points: Points, scale: Mapping[int, tuple[float, float]]) -> Poin
         points.track_image_id[kept],
         points.track_xy[kept] * row_factor[kept],
     )
+
+
+def renamed(model: Reconstruction, manifest: Manifest) -> Reconstruction:
+    """The model with its images under the manifest's names, found by their stems; those without a
+    photograph are left out."""
+    index = NameIndex(photo.name for photo in manifest.photos)
+    images = {
+        i: replace(image, name=name)
+        for i, image in model.images.items()
+        if (name := index.find(image.name)) is not None
+    }
+    return Reconstruction(model.cameras, images, model.points)

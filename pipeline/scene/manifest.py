@@ -35,6 +35,8 @@ class Photo(BaseModel):
     mask: str | None = None
     """Mask file; non-zero pixels count, zero ones are ignored."""
     depth: str | None = None
+    companions: str = ""
+    """Hex digest of the mask's and depth map's bytes that the user brought."""
     focal_px: float | None = None
     """Focal length prior from EXIF in pixels of this size."""
     camera_group: str = ""

@@ -77,6 +77,8 @@ def read_facts(path: Path) -> FileFacts:
             return _raw_facts(path, digest)
         with _quiet(), Image.open(path) as image:
             width, height = image.size
+            if _bits(image) > 16:
+                raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
             exif = _exif_of(lambda: _header_exif(image))
             return FileFacts(
                 digest=digest,

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 from pydantic import BaseModel, ConfigDict
@@ -42,6 +42,9 @@ SPATIAL_SHARE = 0.9
 # A collection by many people: photographs of one size need not share a lens.
 MIXED_BODIES = 3
 MIXED_GROUP_SHARE = 0.5
+
+# A plan is for people, and travels on a command line.
+FACTS_SHOWN = 20
 
 _EARTH_RADIUS_M = 6_371_000.0
 _POSE_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}
@@ -87,7 +90,12 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             "inspect": {"image_folder": scan.image_folder},
             "matches": {"pairs": pairs},
             "sfm": {"mapper": mapper, "camera_model": camera_model, "share_cameras": sharing},
-            "init": {"method": "points" if config.init.method == "auto" else config.init.method},
+            "init": {
+                "method": "points" if config.init.method == "auto" else config.init.method,
+                "max_points": min(
+                    config.init.max_points, max(1, config.train.density.max_gaussians // 2)
+                ),
+            },
             "train": {"background": background},
         },
     )
@@ -105,7 +113,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
         "matches": _pose_stage(poses, "pairs to find poses by", [pairs_reason]),
         "sfm": _pose_stage(poses, _why_sfm(config), [mapper_reason, model_reason, sharing_reason]),
         "undistort": _undistort(scan, settled),
-        "init": _init(scan, settled, pairs_reason),
+        "init": _init(scan, settled),
         "train": StagePlan(
             run=True,
             reason=f"{settled.train.steps} steps",
@@ -118,7 +126,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
     return Plan(
         scene=scan.manifest.scene,
         stages=stages,
-        warnings=list(scan.warnings),
+        warnings=_some(scan.warnings),
         config=settled,
         facts=_facts(scan, settled),
     )
@@ -223,9 +231,10 @@ def _background(scan: Scan, config: Config) -> Choice:
     wanted = config.train.background
     if wanted != "auto":
         return wanted, f"{wanted} background, as configured"
-    if scan.num_alpha:
+    if 2 * scan.num_alpha > len(scan.photos):
         return "random", f"random background: {scan.num_alpha} photographs have alpha"
-    return "black", "black background: no alpha"
+    few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
+    return "black", f"black background: {few}"
 
 
 def _settled(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:
@@ -284,7 +293,7 @@ def _undistort(scan: Scan, config: Config) -> StagePlan:
     return StagePlan(run=True, reason=f"{model} cameras distort")
 
 
-def _init(scan: Scan, config: Config, pairs_reason: str) -> StagePlan:
+def _init(scan: Scan, config: Config) -> StagePlan:
     if config.init.method == "random":
         return StagePlan(run=True, reason=f"{config.init.num_random} random Gaussians")
     if scan.poses is None:
@@ -295,7 +304,7 @@ def _init(scan: Scan, config: Config, pairs_reason: str) -> StagePlan:
     return StagePlan(
         run=True,
         reason="Gaussians from points triangulated at the given poses, which came without any",
-        decisions=[pairs_reason],
+        decisions=["pairs of cameras that stand close and look alike"],
     )
 
 
@@ -329,6 +338,19 @@ def _truth(scan: Scan) -> list[str]:
     return ["pose error against the truth in sparse_gt/"] if scan.truth is not None else []
 
 
+def _some(warnings: Sequence[str]) -> list[str]:
+    """The first warnings, and how many more there are; the inspect stage keeps them all."""
+    rest = len(warnings) - FACTS_SHOWN
+    return [*warnings[:FACTS_SHOWN], *([f"and {rest} more like these"] if rest > 0 else [])]
+
+
+def _commonest(counts: Counter[str]) -> dict[str, int]:
+    """The commonest and their counts; the rest together."""
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    rest = sum(count for _, count in ordered[FACTS_SHOWN:])
+    return dict(ordered[:FACTS_SHOWN]) | ({"others": rest} if rest else {})
+
+
 def _facts(scan: Scan, config: Config) -> dict[str, Any]:
     photos = scan.photos
     width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
@@ -345,8 +367,8 @@ def _facts(scan: Scan, config: Config) -> dict[str, Any]:
         "focal_priors": scan.num_focal,
         "turned_by_exif": sum(photo.orientation != 1 for photo in photos),
         "bits": max(photo.bits for photo in photos),
-        "sizes": dict(sorted(sizes.items(), key=lambda item: (-item[1], item[0]))),
-        "camera_groups": dict(sorted(groups.items(), key=lambda item: (-item[1], item[0]))),
+        "sizes": _commonest(sizes),
+        "camera_groups": _commonest(groups),
         "ordered": scan.ordered,
         "image_folder": scan.image_folder,
         "view_size": [width, height],

@@ -151,7 +151,9 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
     depths = companions(folder, [f"depths{step}", "depths"], sorted(facts))
     photos = [
-        _photo(folder, chosen.path, name, facts[name], masks.get(name), depths.get(name))
+        _photo(
+            folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
+        )
         for name in sorted(facts)
     ]
     truth = truth_folder(folder)
@@ -166,7 +168,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         ordered=why_ordered(photos),
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
-        fingerprint=_fingerprint(folder, photos, poses, facts_cache),
+        fingerprint=_fingerprint(folder, photos, sorted(chosen.names), poses, facts_cache),
     )
     facts_cache.save()
     return result
@@ -428,7 +430,9 @@ def _photo(
     facts: FileFacts,
     mask: Path | None,
     depth: Path | None,
+    cache: FactCache,
 ) -> Photo:
+    beside = [path for path in (mask, depth) if path is not None]
     return Photo(
         name=name,
         path=str(folder / image_folder / name),
@@ -441,6 +445,7 @@ def _photo(
         orientation=facts.orientation,
         mask=str(mask) if mask else None,
         depth=str(depth) if depth else None,
+        companions=_digest_files(folder, beside, cache) if beside else "",
         focal_px=facts.focal_px,
         camera_group=facts.camera_group,
         gps=facts.gps,
@@ -460,11 +465,16 @@ def _digest_files(folder: Path, files: Sequence[Path], cache: FactCache) -> str:
 
 
 def _fingerprint(
-    folder: Path, photos: Sequence[Photo], poses: GivenPoses | None, cache: FactCache
+    folder: Path,
+    photos: Sequence[Photo],
+    listed: Sequence[str],
+    poses: GivenPoses | None,
+    cache: FactCache,
 ) -> str:
     others = [Path(p) for photo in photos for p in (photo.mask, photo.depth) if p is not None]
     if poses is not None:
         others += pose_files(folder / poses.path)
     lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in photos]
-    lines.append(_digest_files(folder, others, cache))
+    # Files that could not be read count by name: a warning names them.
+    lines += [*listed, _digest_files(folder, others, cache)]
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import tempfile
 from concurrent.futures import ThreadPoolExecutor
@@ -73,8 +72,8 @@ def extract_features(
     for photo in manifest.photos:
         source = cache / f"{keys[photo.name]}.npz"
         target = keypoint_file(out, photo.name)
-        target.unlink(missing_ok=True)
-        _link_or_copy(source, target)
+        # A copy: damage to a stage's output must not reach the cache.
+        shutil.copyfile(source, target)
         counts[photo.name] = len(Keypoints.read(target))
     num_cached = len(manifest.photos) - len(absent)
     median = int(np.median(list(counts.values()))) if counts else 0
@@ -207,10 +206,3 @@ def _colmap_sift(
             data = database.read_descriptors(image.image_id).data
             found[image.name] = (matrix[:, :4], np.asarray(data).reshape(-1, 128))
     return found
-
-
-def _link_or_copy(source: Path, target: Path) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copyfile(source, target)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 import io
 from dataclasses import dataclass
 from pathlib import Path
@@ -55,7 +56,11 @@ class Keypoints:
 
 def keypoint_file(folder: Path, name: str) -> Path:
     """The keypoint file of the photograph ``name``: no two names share one."""
-    return folder / f"{quote(name, safe='')}.npz"
+    plain = quote(name, safe="")
+    # File systems take 255 bytes a name.
+    if len(plain) > 200:
+        plain = hashlib.sha256(name.encode()).hexdigest()
+    return folder / f"{plain}.npz"
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:

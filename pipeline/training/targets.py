@@ -103,17 +103,27 @@ def _target(pixels: ViewPixels) -> Target:
 
 
 def _reduce(target: Target, factor: int) -> Target:
-    """A reduced pixel is ignored if any pixel under it is."""
+    """The mean of the pixels that count; a reduced pixel is ignored if fewer than half of those
+    under it do."""
     height, width = target.rgb.shape[:2]
     size = max(1, round(width / factor)), max(1, round(height / factor))
-    rgb = resize_area(target.rgb.numpy(), *size)
-    alpha = None if target.alpha is None else resize_area(target.alpha.numpy(), *size)
-    ignored = None
-    if target.ignored is not None:
-        ignored = resize_area(target.ignored.numpy().astype(np.float32), *size) > 1e-6
-        rgb = np.where(ignored[..., None], np.uint8(0), rgb)
-        alpha = None if alpha is None else np.where(ignored, np.uint8(255), alpha)
-    return Target(_tensor(rgb), _tensor_or_none(alpha), _tensor_or_none(ignored))
+    rgb, alpha = target.rgb.numpy(), None if target.alpha is None else target.alpha.numpy()
+    if target.ignored is None:
+        small_alpha = None if alpha is None else resize_area(alpha, *size)
+        return Target(_tensor(resize_area(rgb, *size)), _tensor_or_none(small_alpha), None)
+    counts = (~target.ignored.numpy()).astype(np.float32)
+    share = resize_area(counts, *size)
+    ignored = share < 0.5
+
+    def mean(values: NDArray[np.uint8], hidden: int) -> NDArray[np.uint8]:
+        weight, total, behind = (
+            plane[..., None] if values.ndim == 3 else plane for plane in (counts, share, ignored)
+        )
+        small = np.rint(resize_area(values * weight, *size) / np.maximum(total, 1e-6))
+        return np.where(behind, hidden, small.clip(0, 255)).astype(np.uint8)
+
+    small_alpha = None if alpha is None else mean(alpha, 255)
+    return Target(_tensor(mean(rgb, 0)), _tensor_or_none(small_alpha), _tensor(ignored))
 
 
 def _tensor(array: NDArray[Any]) -> Tensor:

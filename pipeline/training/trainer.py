@@ -57,7 +57,7 @@ class TrainResult:
         counters: what happened, as plain values (see ``state.Counters``).
         near: the near plane it was trained with; render with the same.
         background: of the training: black, white or random.
-        warnings: for a person; deterministic except those about checkpoints.
+        warnings: for a person; deterministic.
         steps: optimiser steps done.
         seconds: training time in all, over every process that worked on it.
     """
@@ -157,12 +157,16 @@ class _Run:
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)
+        self.log(message)
+
+    def log(self, message: str) -> None:
         if self.on_log is not None:
             self.on_log(message)
 
     def train(self) -> TrainResult:
         state, steps = self.state, self.config.steps
-        found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.warn)
+        # What happened to checkpoints is told, but is no part of the result.
+        found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
         if found is not None:
             state.restore(found.step, found.arrays, found.values)
         started = saved = time.monotonic()

@@ -49,6 +49,8 @@ def environment(project: Path) -> dict[str, str]:
         # The compiled extension of the project under test: same sources, same key.
         "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "raster")),
         "NO_COLOR": "1",
+        # LPIPS weights of this machine would change what is expected.
+        "TORCH_HOME": str(project / "torch"),
     }
 
 

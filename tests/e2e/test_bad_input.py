@@ -147,6 +147,17 @@ def test_two_disconnected_sets_are_reported(project, photographs):
     assert record["counters"]["registered"] < record["counters"]["total"]
 
 
+def test_all_scenes_leave_out_a_folder_that_is_none(finished, tmp_path):
+    project = copy_run(finished, tmp_path / "project")
+    (project / "data" / "notes").mkdir()
+    done = snakemake(project, "-n", config=TINY)
+    assert "left out: data/notes" in done.stdout
+    assert "Nothing to be done" in done.stdout
+    lost = snakemake(project, config=TINY | {"data_root": "dta"}, check=False)
+    assert lost.returncode != 0
+    assert "dta: no scene here" in lost.stdout
+
+
 def test_results_that_cannot_be_written(project, tmp_path):
     """A small file system stands for a full disk; without the right to mount one, skip."""
     disk = tmp_path / "disk"

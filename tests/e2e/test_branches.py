@@ -24,6 +24,7 @@ def project(tmp_path_factory):
     ("scene", "options", "expected"),
     [
         ("raw", ("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
+        ("raw_posed", ("--format", "dng", "--poses", "colmap"), ALWAYS | {"decode"}),
         ("distorted", ("--distortion", "simple_radial"), ALWAYS | SFM | {"undistort"}),
         ("posed", ("--poses", "colmap"), ALWAYS),
         ("bare", ("--poses", "transforms", "--no-points"), ALWAYS),

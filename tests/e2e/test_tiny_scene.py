@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 import json
+import re
 import shutil
 import subprocess
+import sys
 import time
 
 import pytest
+from PIL import Image
 
 from tests.e2e.harness import (
+    ROOT,
     TINY,
     command,
     copy_run,
@@ -98,6 +102,47 @@ def test_changed_code_reruns_its_stage_and_unchanged_results_stop_there(project)
     assert "export" in rules_run(done)
     assert "train" not in rules_run(done)
     assert page.stat().st_mtime_ns == before
+
+
+def test_a_changed_mask_is_noticed_and_new_truth_measures_only(project):
+    """What stands beside the photographs counts as they do; ground truth is never an input."""
+    truth = project / "data/tiny/sparse_gt"
+    aside = truth.rename(truth.with_name("aside"))
+    done = snakemake(project, TARGET, config=TINY)
+    assert json.loads((project / TARGET).read_text())["pose_error"] is None
+    model = (project / "results/tiny/train/gaussians.npz").stat().st_mtime_ns
+    aside.rename(truth)
+    done = snakemake(project, TARGET, config=TINY)
+    assert json.loads((project / TARGET).read_text())["pose_error"] is not None
+    assert done.stdout.count("up to date, nothing to do") >= 5
+    assert (project / "results/tiny/train/gaussians.npz").stat().st_mtime_ns == model
+    masks = project / "data/tiny/masks"
+    masks.mkdir()
+    for photo in (project / "data/tiny/images").iterdir():
+        Image.new("L", Image.open(photo).size, 255).save(masks / f"{photo.stem}.png")
+    snakemake(project, "results/tiny/features/stage.json", config=TINY)
+    before = (project / "results/tiny/features/stage.json").read_text()
+    Image.new("L", Image.open(photo).size, 0).save(masks / f"{photo.stem}.png")
+    snakemake(project, "results/tiny/features/stage.json", config=TINY)
+    assert (project / "results/tiny/features/stage.json").read_text() != before
+
+
+def test_the_commands_of_the_readme_are_commands(project):
+    text = (ROOT / "README.md").read_text()
+    lines = re.findall(r"^    (snakemake .*?)(?:\s+#.*)?$", text, re.M)
+    assert len(lines) >= 5
+    (project / "mine.yaml").write_text("preset: fast\n")
+    for line in lines:
+        line = re.sub(r"(bicycle|garden)", "tiny", line)
+        done = subprocess.run(
+            f"{sys.executable} -m {line} -n" if "--unlock" not in line else "true",
+            shell=True,
+            cwd=project,
+            env=environment(project),
+            capture_output=True,
+            text=True,
+        )
+        assert done.returncode == 0, line + done.stdout + done.stderr
 
 
 @pytest.mark.parametrize(

@@ -22,10 +22,10 @@ def look(name: str) -> Scan:
 @pytest.mark.parametrize(
     "name, count, skipped, pairs, share",
     [
-        ("fox", 50, ["decode"], "exhaustive", "group"),
+        ("fox", 50, ["decode"], "retrieval", "group"),
         ("lund_door", 12, ["decode"], "exhaustive", "group"),
         ("liberty", 135, ["decode"], "retrieval", "image"),
-        ("reichstag", 74, ["decode"], "exhaustive", "image"),
+        ("reichstag", 74, ["decode"], "retrieval", "image"),
         ("mip360_bonsai", 292, ["decode", "features", "matches", "sfm"], None, None),
         ("nerf_lego", 100, ["decode", "features", "matches", "sfm", "undistort"], None, None),
     ],

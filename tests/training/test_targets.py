@@ -49,17 +49,20 @@ def test_opaque_alpha_is_no_alpha(tmp_path: Path) -> None:
     assert targets.get(0, 1).over((0.3, 0.3, 0.3)).dtype == torch.uint8
 
 
-def test_a_reduced_pixel_counts_only_if_all_under_it_do(tmp_path: Path) -> None:
+def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(1, 255, (8, 8, 3), np.uint8)
     mask = np.full((8, 8), 255, np.uint8)
     mask[0, 0] = mask[6:, 4:] = 0
+    picture[0, 0] = 255
     targets = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1)
     ignored = targets.get(0, 2).ignored
     assert ignored is not None
     wanted = np.zeros((4, 4), bool)
-    wanted[0, 0] = wanted[3, 2:] = True
+    wanted[3, 2:] = True
     assert np.array_equal(ignored.numpy(), wanted)
     assert not targets.get(0, 2).rgb[ignored].any()
+    counting = picture[:2, :2].reshape(4, 3)[1:]
+    assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
     assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
 
 

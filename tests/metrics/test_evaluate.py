@@ -1,0 +1,110 @@
+"""Evaluation: what is measured, on which background, and what masks take out."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.metrics.evaluate import choose_protocol, evaluate_views, reference
+from pipeline.photos.load import ViewPixels
+from pipeline.runtime.errors import UserError
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+
+SIZE = 32
+
+
+def view(folder, name, picture, mask=None, is_test=True, x=0.0):
+    Image.fromarray(picture).save(folder / f"{name}.png")
+    if mask is not None:
+        Image.fromarray(mask.astype(np.uint8) * 255).save(folder / f"{name}.mask.png")
+    pose = np.eye(4)
+    pose[0, 3] = x
+    return View(
+        name=name,
+        image=str(folder / f"{name}.png"),
+        mask=None if mask is None else str(folder / f"{name}.mask.png"),
+        width=SIZE,
+        height=SIZE,
+        fx=SIZE,
+        fy=SIZE,
+        cx=SIZE / 2,
+        cy=SIZE / 2,
+        world_to_camera=pose,
+        is_test=is_test,
+    )
+
+
+def nothing():
+    """Gaussians that no view sees: renders are the background."""
+    return Gaussians.from_arrays(
+        {
+            "means": np.array([[0, 0, -5.0]]),
+            "log_scales": np.zeros((1, 3)),
+            "quats": np.array([[1.0, 0, 0, 0]]),
+            "opacity_logits": np.zeros(1),
+            "sh": np.zeros((1, 1, 3)),
+        }
+    )
+
+
+def measure(views, out, **train):
+    config = Train(background=train.pop("background", "black"), **train)
+    protocol = choose_protocol(views, Split(), config)
+    return evaluate_views(nothing(), protocol, Evaluate(), config, out, threads=1)
+
+
+def black():
+    return np.zeros((SIZE, SIZE, 3), np.uint8)
+
+
+def test_only_held_out_views_are_measured(tmp_path):
+    junk = np.full_like(black(), 255)
+    views = [view(tmp_path, "a", black()), view(tmp_path, "b", junk, is_test=False, x=1.0)]
+    found = measure(views, tmp_path / "out")
+    assert [v["name"] for v in found["per_view"]] == ["a"]
+    assert found["psnr"] == 100
+    assert "held out" in found["protocol"]["split"]
+
+
+def test_measuring_on_training_views_is_said(tmp_path):
+    found = measure([view(tmp_path, "a", black(), is_test=False)], tmp_path / "out")
+    assert "TRAINING" in found["protocol"]["split"]
+
+
+def test_masked_pixels_count_for_nothing(tmp_path):
+    picture, mask = black(), np.ones((SIZE, SIZE), bool)
+    picture[:, :10], mask[:, :10] = 255, False
+    found = measure([view(tmp_path, "a", picture, mask)], tmp_path / "out")
+    assert found["psnr"] == 100
+    assert found["ssim"] == pytest.approx(1)
+    # The same picture without its mask is far off.
+    assert measure([view(tmp_path, "b", picture)], tmp_path / "out")["psnr"] < 10
+
+
+def test_a_view_that_its_mask_hides_is_left_out_and_named(tmp_path):
+    hidden = view(tmp_path, "a", black(), np.zeros((SIZE, SIZE), bool))
+    found = measure([hidden, view(tmp_path, "b", black(), x=1.0)], tmp_path / "out")
+    assert found["protocol"]["num_views"] == 1
+    assert "a: its mask" in found["warnings"][0]
+    with pytest.raises(UserError, match="masks"):
+        measure([hidden], tmp_path / "out")
+
+
+@pytest.mark.parametrize(("trained", "expected"), [("black", 0.0), ("white", 1.0), ("random", 1.0)])
+def test_the_background_is_the_trained_one_and_white_for_random(tmp_path, trained, expected):
+    views = [view(tmp_path, "a", black())]
+    protocol = choose_protocol(views, Split(), Train(background=trained))
+    assert protocol.background == (expected,) * 3
+    picture = measure(views, tmp_path / "out", background=trained)
+    assert (picture["psnr"] > 50) == (expected == 0)
+
+
+def test_transparent_photographs_are_laid_over_the_background():
+    rgb = np.full((1, 2, 3), 100, np.uint8)
+    alpha = np.array([[0, 255]], np.uint8)
+    over = reference(ViewPixels(rgb, alpha, None), (1.0, 1.0, 1.0))
+    assert over[0, 0].tolist() == [255] * 3
+    assert over[0, 1].tolist() == [100] * 3

@@ -176,7 +176,10 @@ class Density(Section):
         0.01, description="Gaussians larger than this share of the scene's extent split."
     )
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
-    prune_scale: Rate = Field(0.1, description="Larger ones (share of the extent) are removed.")
+    prune_scale: Rate = Field(
+        0.1,
+        description="Larger ones (share of the extent) are removed after the first opacity reset.",
+    )
     opacity_reset_interval: Positive = Field(
         3000,
         description="Steps between opacity resets; there is one only where as many steps of "

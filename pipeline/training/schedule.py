@@ -90,7 +90,8 @@ class Schedule:
         return step % self.reset_interval == 0 and step + self.reset_interval <= self.refine_stop
 
     def prunes_huge_after(self, step: int) -> bool:
-        """Late enough for first Gaussians that had to be large (a distant background) to have
-        been split (3DGS: after the first opacity reset), and early enough for what was taken
-        away by mistake to be filled again."""
-        return self.reset_interval < step and self.refines_after(step)
+        """After the first opacity reset, as 3DGS: Gaussians that had to be large at first (a
+        distant background) have been split by then. Runs too short for a reset never do it:
+        there, it takes the background away and nothing fills it again."""
+        resets = 2 * self.reset_interval <= self.refine_stop
+        return resets and self.reset_interval < step and self.refines_after(step)

@@ -39,3 +39,11 @@ def test_opacity_resets_of_the_papers_protocol() -> None:
     schedule = Schedule.of(Train(steps=30_000, density=Density(stop_share=0.5)))
     resets = [step for step in range(1, 30_001) if schedule.resets_opacity_after(step)]
     assert resets == [3000, 6000, 9000, 12_000]
+    huge = [step for step in range(1, 30_001) if schedule.prunes_huge_after(step)]
+    assert (huge[0], huge[-1]) == (3100, 15_000)
+
+
+def test_short_runs_keep_their_large_backgrounds() -> None:
+    """Without a reset, huge Gaussians are not yet split; pruning them cost 8 dB on a room."""
+    schedule = Schedule.of(Train())
+    assert not any(schedule.prunes_huge_after(step) for step in range(1, Train().steps + 1))

@@ -50,7 +50,7 @@ def environment(project: Path) -> dict[str, str]:
         "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "raster")),
         "NO_COLOR": "1",
         # LPIPS weights of this machine would change what is expected.
-        "TORCH_HOME": str(project / "torch"),
+        "TORCH_HOME": str(ROOT / "build" / "no-weights"),
     }
 
 

@@ -20,7 +20,7 @@ TINY_DEMO = ("--views", "20", "--size", "200x150")
 # Small enough for a full run in well under a minute, large enough to go through densification.
 TINY = {
     "views": {"max_long_side_px": 200},
-    "train": {"steps": 300, "density": {"max_gaussians": 6_000}},
+    "train": {"steps": 240, "density": {"max_gaussians": 6_000}},
 }
 
 

@@ -12,6 +12,7 @@ from tests.e2e.harness import TINY, copy_project, rules_run, snakemake
 pytestmark = pytest.mark.slow
 
 ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "export", "report"}
+PINHOLE = ("--distortion", "none")
 SFM = {"features", "matches", "sfm"}
 
 
@@ -24,13 +25,11 @@ def project(tmp_path_factory):
     ("scene", "options", "expected"),
     [
         ("raw", ("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
-        ("raw_posed", ("--format", "dng", "--poses", "colmap"), ALWAYS | {"decode"}),
-        ("distorted", ("--distortion", "simple_radial"), ALWAYS | SFM | {"undistort"}),
-        ("posed", ("--poses", "colmap"), ALWAYS),
-        ("bare", ("--poses", "transforms", "--no-points"), ALWAYS),
+        ("raw_posed", ("--format", "dng", "--poses", "colmap", *PINHOLE), ALWAYS | {"decode"}),
+        ("bare", ("--poses", "transforms", "--no-points", *PINHOLE), ALWAYS),
         ("lens", ("--poses", "colmap", "--distortion", "opencv"), ALWAYS | {"undistort"}),
-        ("masked", ("--poses", "colmap", "--masks"), ALWAYS),
-        ("alpha", ("--poses", "transforms", "--format", "png", "--alpha"), ALWAYS),
+        ("masked", ("--poses", "colmap", "--masks", *PINHOLE), ALWAYS),
+        ("alpha", ("--poses", "transforms", "--format", "png", "--alpha", *PINHOLE), ALWAYS),
     ],
 )
 def test_the_plan_runs_what_the_scene_needs(project, scene, options, expected):

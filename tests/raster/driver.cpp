@@ -125,8 +125,9 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
                                d_sh.get(), d_means2d.get(), d_abs.get()});
     }
     Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
+    const double rate = 1e-2;
     adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
-              {1e-2, 0.9, 0.999, 1e-15, 1}, threads);
+              {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
     Array<float>* results[] = {&color,    &alpha,   &depth,     &median, &d_color,   &d_means,
                                &d_scales, &d_quats, &d_opacity, &d_sh,   &d_means2d, &param};
     const char* names[] = {"color",    "alpha",   "depth",     "median", "d_color",   "d_means",

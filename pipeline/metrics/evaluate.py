@@ -22,6 +22,16 @@ from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.render import near_plane, render_view
 
+#: Training views that are rendered, too: what the model makes of pictures that it has seen.
+NUM_SEEN = 8
+#: Below this many dB on seen views the photographs contradict each other or the poses: scenes that
+#: train well reach 25 to 40 dB.
+LOW_SEEN_PSNR = 20.0
+#: This many dB between seen and held-out views is overfitting: well-covered scenes show 0 to 4.
+LARGE_GAP = 6.0
+
+Mask = NDArray[np.bool_]
+
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 
@@ -31,12 +41,14 @@ class Protocol:
 
     Attributes:
         views: those measured on.
+        seen: training views measured beside them, evenly spread; empty where ``every`` is 0.
         every: each this-many-th view was held out of training; 0: none was, these were seen.
         background: RGB in [0, 1] behind renders and transparent photographs.
         near: near plane of the renders, as in training; world unit.
     """
 
     views: list[View]
+    seen: list[View]
     every: int
     background: tuple[float, float, float]
     near: float
@@ -49,9 +61,12 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
     the field does for NeRF-synthetic scenes.
     """
     held_out = [view for view in views if view.is_test]
+    training = [view for view in views if not view.is_test]
+    picks = np.linspace(0, len(training) - 1, min(NUM_SEEN, len(training))).round().astype(int)
     white = train.background in ("white", "random")
     return Protocol(
         held_out or list(views),
+        [training[i] for i in picks] if held_out else [],
         split.holdout_every if held_out else 0,
         WHITE if white else BLACK,
         near_plane(scene_extent(list(views))),
@@ -74,7 +89,8 @@ def evaluate_views(
 
     Returns:
         ``psnr``, ``ssim``, ``lpips`` (means of the views' values; lpips null where its weights are
-        missing, with ``lpips_reason``), ``per_view``, ``warnings`` and ``protocol``.
+        missing, with ``lpips_reason``), ``train_psnr`` (mean over the seen views, null without
+        any), ``per_view``, ``warnings`` and ``protocol``.
     """
     lpips, reason = lpips_available(config.lpips_net)
     smallest = min(min(view.width, view.height) for view in protocol.views)
@@ -82,14 +98,11 @@ def evaluate_views(
         lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
     per_view: list[dict[str, Any]] = []
-    progress = Progress("evaluating", len(protocol.views), "views")
+    progress = Progress("evaluating", len(protocol.views) + len(protocol.seen), "views")
     warnings: list[str] = []
-    for index, view in enumerate(protocol.views):
+
+    def compare(view: View) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view.image, view.mask, view.width, view.height)
-        if pixels.mask is not None and not pixels.mask.any():
-            warnings.append(f"{view.name}: its mask leaves no pixel to measure")
-            progress.advance()
-            continue
         rendered = render_view(
             gaussians,
             view,
@@ -99,23 +112,41 @@ def evaluate_views(
             near=protocol.near,
             threads=threads,
         )
-        picture = to_bytes(rendered.rgb)
+        return to_bytes(rendered.rgb), reference(pixels, protocol.background), pixels.mask
+
+    for index, view in enumerate(protocol.views):
+        picture, photo, mask = compare(view)
+        if _hidden(mask):
+            warnings.append(f"{view.name}: its mask leaves no pixel to measure")
+            progress.advance()
+            continue
         Image.fromarray(picture).save(out / f"{index:04d}.png")
-        a, b = picture / 255.0, reference(pixels, protocol.background) / 255.0
+        a, b = picture / 255.0, photo / 255.0
         per_view.append(
             {
                 "name": view.name,
-                "psnr": psnr(a, b, pixels.mask),
-                "ssim": ssim(a, b, pixels.mask),
-                "lpips": lpips(a, b, pixels.mask) if lpips is not None else None,
+                "psnr": psnr(a, b, mask),
+                "ssim": ssim(a, b, mask),
+                "lpips": lpips(a, b, mask) if lpips is not None else None,
                 "render": f"{index:04d}.png",
             }
         )
         progress.advance(note=f"PSNR {per_view[-1]['psnr']:.2f} dB")
+    seen: list[float] = []
+    for view in protocol.seen:
+        picture, photo, mask = compare(view)
+        if not _hidden(mask):
+            seen.append(psnr(picture / 255.0, photo / 255.0, mask))
+        progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
+    mean_psnr = float(np.mean([v["psnr"] for v in per_view]))
+    train_psnr = float(np.mean(seen)) if seen else None
+    if train_psnr is not None:
+        warnings += diagnose(mean_psnr, train_psnr)
     return {
-        "psnr": float(np.mean([v["psnr"] for v in per_view])),
+        "psnr": mean_psnr,
+        "train_psnr": train_psnr,
         "ssim": float(np.mean([v["ssim"] for v in per_view])),
         "lpips": None if lpips is None else float(np.mean([v["lpips"] for v in per_view])),
         "lpips_reason": reason,
@@ -123,6 +154,26 @@ def evaluate_views(
         "warnings": warnings,
         "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None),
     }
+
+
+def diagnose(held_out: float, seen: float) -> list[str]:
+    """Warnings for what mean PSNR (dB) on held-out and on seen views says of a bad scene."""
+    if seen < LOW_SEEN_PSNR:
+        return [
+            f"the scene does not even reproduce the photographs it was trained on ({seen:.1f} dB): "
+            "look at the report's views; photographs that differ in exposure or season, things "
+            "that move, unmasked backgrounds, wrong poses and very short training do this"
+        ]
+    if seen - held_out > LARGE_GAP:
+        return [
+            f"views held out are much worse than views trained on ({held_out:.1f} against "
+            f"{seen:.1f} dB): too few photographs, too far apart, see some places only once"
+        ]
+    return []
+
+
+def _hidden(mask: Mask | None) -> bool:
+    return mask is not None and not mask.any()
 
 
 def reference(pixels: ViewPixels, background: tuple[float, float, float]) -> NDArray[np.uint8]:

@@ -53,6 +53,7 @@ def collect_metrics(
         "ssim": evaluation["ssim"],
         "lpips": evaluation["lpips"],
         "lpips_reason": evaluation["lpips_reason"],
+        "train_psnr": evaluation["train_psnr"],
         "per_view": evaluation["per_view"],
         "protocol": evaluation["protocol"],
         "num_gaussians": counters["train"]["num_gaussians"],

@@ -79,6 +79,8 @@ def _cards(data: ReportData) -> str:
     lpips = m.get("lpips")
     protocol = m.get("protocol") or {}
     registered, total = m.get("registered_images"), m.get("total_images")
+    seen = m.get("train_psnr")
+    beside = "" if seen is None else f"; training views: {fixed(seen, 2)} dB"
     whole = f'<span class="unit"> / {count(total)}</span>' if total is not None else ""
     ran = [s for s in stages if not s.get("skipped")]
     cpu, rss = sum(s["cpu_s"] for s in ran), max((s["peak_rss_mb"] for s in ran), default=0.0)
@@ -87,7 +89,7 @@ def _cards(data: ReportData) -> str:
             "first",
             "PSNR",
             f'{fixed(m.get("psnr"), 2)}<span class="unit"> dB</span>',
-            "mean of the views",
+            f"mean of the views{beside}",
         ),
         ("first", "SSIM", fixed(m.get("ssim"), 4), protocol.get("ssim", "")),
         (

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.metrics.evaluate import choose_protocol, evaluate_views, reference
+from pipeline.metrics.evaluate import NUM_SEEN, choose_protocol, diagnose, evaluate_views, reference
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
@@ -67,6 +67,27 @@ def test_only_held_out_views_are_measured(tmp_path):
     assert [v["name"] for v in found["per_view"]] == ["a"]
     assert found["psnr"] == 100
     assert "held out" in found["protocol"]["split"]
+
+
+def test_seen_views_are_measured_beside_the_held_out_ones(tmp_path):
+    junk = np.full_like(black(), 255)
+    views = [view(tmp_path, "a", black())]
+    views += [view(tmp_path, f"b{i}", junk, is_test=False, x=1.0 + i) for i in range(20)]
+    protocol = choose_protocol(views, Split(), Train())
+    assert len(protocol.seen) == NUM_SEEN
+    assert {"b0", "b19"} <= {v.name for v in protocol.seen}
+    found = measure(views, tmp_path / "out")
+    assert found["train_psnr"] == 0
+    assert any("trained on (0.0 dB)" in text for text in found["warnings"])
+
+
+@pytest.mark.parametrize(
+    ("held_out", "seen", "word"),
+    [(15, 16, "even"), (19, 28, "few"), (27, 30, None), (31, 30, None)],
+)
+def test_bad_scenes_are_told_from_good_ones(held_out, seen, word):
+    found = diagnose(held_out, seen)
+    assert [word in text for text in found] == ([] if word is None else [True])
 
 
 def test_measuring_on_training_views_is_said(tmp_path):

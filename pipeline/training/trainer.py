@@ -135,6 +135,7 @@ class _Run:
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
         self.identity = _identity(views, initial, config, seed, extent)
         self.targets = Targets(views, threads)
+        self.drop_hidden_views()
         self.background = config.background
         if self.background == "auto":
             self.background = "random" if self.targets.have_alpha else "black"
@@ -152,8 +153,19 @@ class _Run:
         density = GradientDensity(config.density, extent)
         density.start(len(gaussians))
         self.state = TrainState(
-            gaussians, Adam(gaussians), density, rng, rng.permutation(len(views))
+            gaussians, Adam(gaussians), density, rng, rng.permutation(len(self.views))
         )
+
+    def drop_hidden_views(self) -> None:
+        """A view that its mask hides asks for nothing, and would only feed Adam zeros."""
+        hidden = self.targets.hidden()
+        if len(hidden) == len(self.views):
+            raise UserError("the masks leave no pixel of any view to train on", fix="check masks/")
+        if hidden:
+            names = ", ".join(self.views[i].name for i in hidden[:5])
+            self.warn(f"views that their masks hide whole are left out ({len(hidden)}): {names}")
+            self.targets.drop(hidden)
+            self.views = [view for i, view in enumerate(self.views) if i not in hidden]
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)

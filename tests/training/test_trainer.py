@@ -156,6 +156,18 @@ def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) ->
     assert_same(*results)
 
 
+def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(tmp_path / "mask.png")
+    hidden = replace(scene.views[0], name="hidden", mask=str(tmp_path / "mask.png"))
+    with_it = run(scene, tmp_path / "a", views=[*scene.views[:3], hidden, *scene.views[3:]])
+    assert any("hidden" in text for text in with_it.warnings)
+    assert_same(with_it, run(scene, tmp_path / "b"))
+    with pytest.raises(UserError, match="masks"):
+        run(scene, tmp_path / "c", views=[hidden])
+
+
 def test_alpha_with_random_background_leaves_the_empty_empty(
     scene: TinyScene, tmp_path: Path
 ) -> None:

@@ -156,6 +156,27 @@ def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) ->
     assert_same(*results)
 
 
+def test_gains_explain_photographs_that_are_exposed_differently(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    gains = np.array([[0.5] * 3, [1.0] * 3] * (len(scene.views) // 2))
+    views = []
+    for index, (view, gain) in enumerate(zip(scene.views, gains, strict=True)):
+        picture = np.rint(np.array(Image.open(view.image)) * gain).astype(np.uint8)
+        Image.fromarray(picture).save(tmp_path / f"{index}.png")
+        views.append(replace(view, image=str(tmp_path / f"{index}.png")))
+    config = tiny_config(150)
+    common = {"seed": 0, "threads": 1, "extent": scene.extent}
+    with_gains = train(
+        views, scene.initial, config, checkpoint_dir=tmp_path / "a", gains=gains, **common
+    )
+    without = train(views, scene.initial, config, checkpoint_dir=tmp_path / "b", **common)
+    assert with_gains.curve[-1]["psnr"] > without.curve[-1]["psnr"] + 3
+    # The scene itself is the brighter photographs', as if there had been no other.
+    plain = run(scene, tmp_path / "c", config)
+    assert with_gains.curve[-1]["psnr"] > plain.curve[-1]["psnr"] - 1
+
+
 def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
     scene: TinyScene, tmp_path: Path
 ) -> None:

@@ -14,7 +14,7 @@ from pipeline.config.schema import Train
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import trainer
+from pipeline.training import targets, trainer
 from pipeline.training.checkpoint import PATTERN
 from pipeline.training.render import render_view
 from pipeline.training.trainer import TrainResult, train
@@ -78,12 +78,15 @@ def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     assert -10 * np.log10(error) > 25
 
 
-@pytest.mark.parametrize("call", [1, 2, 11, 23, 40])
+@pytest.mark.parametrize("call", [1, 2, 10, 11, 13, 23, 40])
 def test_killed_and_resumed_gives_the_same_bits(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
 ) -> None:
-    config = tiny_config(40)
+    # Resolution rises after steps 12 and 24, opacity is reset after step 10.
+    monkeypatch.setattr(targets, "MIN_SHORT_SIDE", 4)
+    config = tiny_config(40, coarse_until=0.6, density={"opacity_reset_interval": 1750})
     whole = run(scene, tmp_path / "whole", config, scene.alpha_views)
+    assert whole.counters["opacity_resets"] == 1
     monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
     with monkeypatch.context() as patch:
         interrupt_at(patch, call)

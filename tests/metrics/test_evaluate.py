@@ -78,12 +78,12 @@ def test_seen_views_are_measured_beside_the_held_out_ones(tmp_path):
     assert {"b0", "b19"} <= {v.name for v in protocol.seen}
     found = measure(views, tmp_path / "out")
     assert found["train_psnr"] == 0
-    assert any("trained on (0.0 dB)" in text for text in found["warnings"])
+    assert any("trained on badly (0.0 dB)" in text for text in found["warnings"])
 
 
 @pytest.mark.parametrize(
     ("held_out", "seen", "word"),
-    [(15, 16, "even"), (19, 28, "few"), (27, 30, None), (31, 30, None)],
+    [(15, 16, "badly"), (19, 28, "few"), (27, 30, None), (31, 30, None)],
 )
 def test_bad_scenes_are_told_from_good_ones(held_out, seen, word):
     found = diagnose(held_out, seen)

@@ -85,7 +85,7 @@ def encode_spz(gaussians: Gaussians) -> bytes:
         _pack_quats(quats),
         _to_bytes(sh[:, 1:] * 128 + 128),
     )
-    return gzip.compress(header + b"".join(s.tobytes() for s in sections), 9, mtime=0)
+    return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:

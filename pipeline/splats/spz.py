@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
+from pipeline.splats.codec import logit_of_byte, read_file, sigmoid, to_bytes
 from pipeline.splats.gaussians import Gaussians
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, 0
-_HAS_EXTENSIONS = 2
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 # Bytes of the DC coefficient a unit: less than a colour's, so that they reach beyond [0, 1].
 _DC_STEPS = 0.15 * 255
 _HIGHER = (0, 3, 8, 15, 24)  # SH coefficients above DC by degree; ours end at 3
@@ -37,9 +38,9 @@ MAX_GAUSSIANS = 10_000_000
 _FIX = "write the file again as SPZ version 3, or get a whole copy of it"
 
 
-def write_spz(path: Path, gaussians: Gaussians) -> None:
+def write_spz(path: Path, gaussians: Gaussians, *, antialias: bool = False) -> None:
     """Write ``encode_spz`` to a file that appears whole or not at all."""
-    write_bytes(path, encode_spz(gaussians))
+    write_bytes(path, encode_spz(gaussians, antialias=antialias))
 
 
 def read_spz(path: Path) -> Gaussians:
@@ -48,19 +49,15 @@ def read_spz(path: Path) -> Gaussians:
     Raises:
         UserError: also where it cannot be read.
     """
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(
-            f"expected an SPZ file, could not read it: {error.strerror}",
-            file=path,
-            fix="check the path and its permissions",
-        ) from error
-    return decode_spz(data, file=path)
+    return decode_spz(read_file(path, "an SPZ file"), file=path)
 
 
-def encode_spz(gaussians: Gaussians) -> bytes:
+def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
     """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
+
+    Args:
+        antialias: the Gaussians were trained with Mip-Splatting's opacity compensation, and
+            viewers should render them so.
 
     Raises:
         UserError: more Gaussians than readers of the format take.
@@ -76,14 +73,14 @@ def encode_spz(gaussians: Gaussians) -> bytes:
     )
     bits, shrink = _grid(means)
     steps = np.rint(means * shrink * 2.0**bits).astype("<i4")
-    header = _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, 0, 0)
+    header = _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
     sections = (
         steps.reshape(-1, 1).view(np.uint8)[:, :3],
-        _to_bytes(255 / (1 + np.exp(-logits))),
-        _to_bytes(sh[:, 0] * _DC_STEPS + 127.5),
-        _to_bytes((log_scales + np.log(shrink) + 10) * 16),
+        to_bytes(sigmoid(logits) * 255),
+        to_bytes(sh[:, 0] * _DC_STEPS + 127.5),
+        to_bytes((log_scales + np.log(shrink) + 10) * 16),
         _pack_quats(quats),
-        _to_bytes(sh[:, 1:] * 128 + 128),
+        to_bytes(sh[:, 1:] * 128 + 128),
     )
     return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
 
@@ -142,19 +139,14 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
     sh = np.empty((count, min(higher, _HIGHER[3]) + 1, 3), np.float32)
     sh[:, 0] = (dc - np.float32(127.5)) / np.float32(_DC_STEPS)
     sh[:, 1:] = (rest.reshape(count, higher, 3)[:, : sh.shape[1] - 1] - np.float32(128)) / 128
-    alpha = alphas[:, 0].clip(0.25, 254.75) / 255.0
     arrays = {
         "means": _unpack_positions(fixed) * 2.0**-bits,
         "log_scales": scales / 16.0 - 10,
         "quats": _unpack_three(quats) if version == 2 else _unpack_quats(quats),
-        "opacity_logits": np.log(alpha / (1 - alpha)),
+        "opacity_logits": logit_of_byte(alphas[:, 0]),
         "sh": sh,
     }
     return Gaussians.from_arrays(arrays)
-
-
-def _to_bytes(values: NDArray[np.float64]) -> NDArray[np.uint8]:
-    return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
 def _grid(means: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:

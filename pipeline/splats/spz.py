@@ -127,8 +127,11 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
         raise wrong(f"expected an SPZ file (gzip), could not read it: {error}") from None
     if len(body) < expected:
         raise wrong(f"expected {expected} bytes of {count} Gaussians, found {len(body)}")
-    if len(body) > expected and not flags & _HAS_EXTENSIONS:
-        raise wrong(f"expected {expected} bytes of {count} Gaussians, found more")
+    if not flags & _HAS_EXTENSIONS:
+        if len(body) > expected:
+            raise wrong(f"expected {expected} bytes of {count} Gaussians, found more")
+        if not stream.eof:  # The checksum is at the end.
+            raise wrong("expected a whole gzip stream, found its end missing")
 
     table = np.frombuffer(body, np.uint8, expected)
     ends = count * np.cumsum(widths)

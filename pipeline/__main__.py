@@ -70,7 +70,9 @@ def _evaluate(
     for view in found["per_view"]:
         print(f"{view['name']:<{width}}  {view['psnr']:6.2f} dB  SSIM {view['ssim']:.4f}")
     protocol = found["protocol"]
-    print(f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}, {protocol['num_views']} views")
+    lpips = "" if found["lpips"] is None else f", LPIPS {found['lpips']:.4f}"
+    means = f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}{lpips}"
+    print(f"{means}, {protocol['num_views']} views")
     print(f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)")
 
 

@@ -73,6 +73,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
     "train": ("torch", "numpy", "opencv-contrib-python-headless"),
     "evaluate": ("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
+    "export": ("torch", "numpy"),
 }
 
 

@@ -26,6 +26,8 @@ _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fractio
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 # Bytes of the DC coefficient a unit: less than a colour's, so that they reach beyond [0, 1].
 _DC_STEPS = 0.15 * 255
+# Higher coefficients keep all 8 bits. With 5 and 4, as other encoders have it, renders agree with
+# the unquantised Gaussians' at 35 to 39 dB instead of 53 to 57, for half of the bytes.
 _HIGHER = (0, 3, 8, 15, 24)  # SH coefficients above DC by degree; ours end at 3
 # Positions have 24 bits; more of them than this behind the point tell nothing.
 _MAX_FRACTION_BITS = 20

@@ -24,6 +24,16 @@ def test_every_format_is_written_and_read_by_its_suffix(tmp_path, suffix) -> Non
     assert not warnings
 
 
+@pytest.mark.parametrize(
+    "change",
+    [{"means": np.float32(1)}, {"sh": np.zeros(3)}, {"sh": np.zeros((5, 25, 3))}, {"quats": "w"}],
+)
+def test_an_archive_of_something_else_is_an_error(tmp_path, change) -> None:
+    np.savez(tmp_path / "a.npz", **(sample(5).arrays() | change))
+    with pytest.raises(UserError, match="Gaussians"):
+        read_gaussians(tmp_path / "a.npz", [])
+
+
 def test_an_unknown_suffix_is_an_error(tmp_path) -> None:
     with pytest.raises(UserError, match=r"'\.obj'"):
         write_gaussians(tmp_path / "a.obj", sample())

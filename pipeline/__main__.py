@@ -49,13 +49,16 @@ def _fail(error: UserError) -> int:
 def _convert(**options: Any) -> None:
     from pipeline.commands import convert
 
-    _tell(convert(**options))
+    warnings: list[str] = []
+    _tell(convert(**options, warnings=warnings), warnings)
 
 
 def _render(threads: int, background: str, antialias: bool, max_side: int, **options: Any) -> None:
     from pipeline.commands import Rendering, render
 
-    _tell(render(**options, how=Rendering(background, antialias, max_side, threads)))
+    warnings: list[str] = []
+    how = Rendering(background, antialias, max_side, threads)
+    _tell(render(**options, how=how, warnings=warnings), warnings)
 
 
 def _evaluate(
@@ -64,19 +67,24 @@ def _evaluate(
     from pipeline.commands import Rendering, evaluate
 
     found = evaluate(**options, how=Rendering(background, antialias, max_side, threads))
-    for text in found["warnings"]:
-        print(f"warning: {text}", file=sys.stderr)
     width = max(len(view["name"]) for view in found["per_view"])
-    for view in found["per_view"]:
-        print(f"{view['name']:<{width}}  {view['psnr']:6.2f} dB  SSIM {view['ssim']:.4f}")
     protocol = found["protocol"]
     lpips = "" if found["lpips"] is None else f", LPIPS {found['lpips']:.4f}"
     means = f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}{lpips}"
-    print(f"{means}, {protocol['num_views']} views")
-    print(f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)")
+    lines = [
+        *(
+            f"{view['name']:<{width}}  {view['psnr']:6.2f} dB  SSIM {view['ssim']:.4f}"
+            for view in found["per_view"]
+        ),
+        f"{means}, {protocol['num_views']} views",
+        f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)",
+    ]
+    _tell(lines, found["warnings"])
 
 
-def _tell(lines: list[str]) -> None:
+def _tell(lines: list[str], warnings: list[str]) -> None:
+    for text in warnings:
+        print(f"warning: {text}", file=sys.stderr)
     for line in lines:
         print(line)
 

@@ -49,53 +49,65 @@ class Rendering:
 
 
 def convert(
-    source: Path, target: Path, sh_degree: int, min_opacity: float, morton_order: bool
+    source: Path,
+    target: Path,
+    sh_degree: int,
+    min_opacity: float,
+    morton_order: bool,
+    warnings: list[str],
 ) -> list[str]:
     """Read Gaussians, leave out what is not wanted, write them in the format of ``target``'s
     suffix.
 
+    Args:
+        warnings: what is left out for being no number is added.
+
     Returns:
-        What to tell the user, line by line.
+        What was done, line by line.
 
     Raises:
         UserError: a file that cannot be read or written.
     """
     check_suffix(target)
-    notes: list[str] = []
-    found = read_gaussians(source, notes)
+    found = read_gaussians(source, warnings)
     made = prepare(found, sh_degree, min_opacity, morton_order)
     write_gaussians(target, made)
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"
-    return [*notes, f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]
+    return [f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]
 
 
 def render(
-    model: Path, cameras: Path, out: Path, names: Sequence[str], how: Rendering
+    model: Path,
+    cameras: Path,
+    out: Path,
+    names: Sequence[str],
+    how: Rendering,
+    warnings: list[str],
 ) -> list[str]:
     """Render a file of Gaussians as each camera sees it, to 8-bit PNG files named as the views.
 
     Args:
         cameras: see ``read_cameras``.
         names: views to render; empty for all.
+        warnings: what the renders lack is added.
 
     Returns:
-        What to tell the user, line by line.
+        What was done, line by line.
 
     Raises:
         UserError: a file that cannot be read, or no such view.
     """
-    notes: list[str] = []
     posed = read_cameras(cameras)
     views = camera_views(posed, how.max_side)
     if not views:
         raise UserError("expected cameras, found none", file=cameras, fix="give another model")
     if not all(posed.cameras[image.camera_id].is_pinhole for image in posed.images.values()):
-        notes.append(f"{cameras}: lens distortion is left out: the renders are pinhole pictures")
+        warnings.append(f"{cameras}: lens distortion is left out of the renders")
     # The near plane belongs to the scene, not to the views that are asked for.
     near = near_plane(scene_extent(views))
     chosen = choose_views(views, names, cameras) if names else views
-    gaussians = read_gaussians(model, notes)
+    gaussians = read_gaussians(model, warnings)
     files: set[Path] = set()
     for view in track(chosen, "rendering", len(chosen), unit="views"):
         picture = render_view(
@@ -111,7 +123,7 @@ def render(
         buffer = io.BytesIO()
         Image.fromarray(to_bytes(picture.rgb)).save(buffer, "PNG")
         write_bytes(file, buffer.getvalue())
-    return [*notes, f"{out}: {len(chosen)} views rendered"]
+    return [f"{out}: {len(chosen)} views rendered"]
 
 
 def _png(folder: Path, name: str, taken: set[Path]) -> Path:

@@ -38,7 +38,7 @@ class Scene:
         views: at the pictures' own size.
         antialias: how the Gaussians were trained.
         folder: where the files will be in the end.
-        points: name of the exported point cloud, None without one.
+        points: name of the exported point cloud, None without one or with an empty one.
     """
 
     gaussians: Gaussians
@@ -82,7 +82,7 @@ def run(job: Job) -> None:
         views=load_views(manifest, model, FULL_SIZE, split),
         antialias=train.antialias,
         folder=job.inputs["train"].parent / job.stage,
-        points=WRITERS["points"][0] if "points" in config.formats else None,
+        points=WRITERS["points"][0] if "points" in config.formats and len(model.points) else None,
     )
     files = []
     for name in config.formats:

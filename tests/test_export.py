@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import get_args
 
@@ -99,6 +100,14 @@ def test_transforms_name_the_pictures_from_where_they_end_up(scene):
     assert (camera.width, camera.pinhole) == (90, (50, 50, 45, 30))
     content = json.loads((out / "transforms.json").read_text())
     assert len(content["test_filenames"]) == 2 and content["ply_file_path"] == "points.ply"
+
+
+def test_transforms_start_from_no_empty_cloud(scene):
+    """Given poses may come without points."""
+    folder = scene / "undistort" / "sparse" / "0"
+    write_model(folder, replace(read_model(folder), points=Points.empty()))
+    out, _ = export(scene, formats=["transforms", "points"])
+    assert "ply_file_path" not in json.loads((out / "transforms.json").read_text())
 
 
 def test_frame_says_what_the_files_leave_open(scene):

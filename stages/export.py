@@ -1,31 +1,108 @@
 """Files for other programs.
 
-Outputs: ``point_cloud.ply`` (Gaussians), ``sparse/0`` (COLMAP), ``points.ply``.
+Outputs: of the Gaussians ``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``; the sparse points,
+``points.ply``; the cameras, ``sparse/0`` and ``sparse_text`` (COLMAP) and ``transforms.json``; and
+``frame.json``, which says what they leave open.
 """
 
-from pipeline.config.schema import Export
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.config.schema import Export, Split, Train, Views
+from pipeline.metrics.evaluate import choose_protocol
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.transforms import write_transforms
+from pipeline.scene.views import load_views, up_direction
+from pipeline.splats.files import prepare
+from pipeline.splats.frame import describe_frame
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gltf import write_gltf
 from pipeline.splats.ply import write_points_ply, write_splat_ply
+from pipeline.splats.splat import write_splat
+from pipeline.splats.spz import write_spz
 from stages.command import main
 
 
+@dataclass(frozen=True)
+class Scene:
+    """What is exported.
+
+    Attributes:
+        views: at the pictures' own size.
+        antialias: how the Gaussians were trained.
+        folder: where the files will be in the end.
+        points: name of the exported point cloud, None without one or with an empty one.
+    """
+
+    gaussians: Gaussians
+    model: Reconstruction
+    views: list[View]
+    antialias: bool
+    folder: Path
+    points: str | None
+
+
+# Cameras belong to the pictures as they are, whatever size training took them in.
+FULL_SIZE = Views(max_long_side_px=2**31)
+
+# format -> the file or folder, and what writes it.
+WRITERS: dict[str, tuple[str, Callable[[Path, Scene], None]]] = {
+    "ply": ("point_cloud.ply", lambda path, s: write_splat_ply(path, s.gaussians)),
+    "spz": ("point_cloud.spz", lambda path, s: write_spz(path, s.gaussians, antialias=s.antialias)),
+    "splat": ("point_cloud.splat", lambda path, s: write_splat(path, s.gaussians)),
+    "gltf": ("point_cloud.glb", lambda path, s: write_gltf(path, s.gaussians)),
+    "points": (
+        "points.ply",
+        lambda path, s: write_points_ply(path, s.model.points.xyz, s.model.points.rgb),
+    ),
+    "colmap": ("sparse/0", lambda path, s: write_model(path, s.model)),
+    "colmap_text": ("sparse_text", lambda path, s: write_model(path, s.model, text=True)),
+    "transforms": (
+        "transforms.json",
+        lambda path, s: write_transforms(path, s.views, s.folder, points=s.points),
+    ),
+}
+
+
 def run(job: Job) -> None:
-    config = job.section(Export)
+    config, train, split = job.section(Export), job.section(Train), job.section(Split)
+    manifest = Manifest.read(job.inputs["views"] / "images.json")
     model = read_model(job.inputs["model"] / "sparse" / "0")
-    if "ply" in config.formats:
-        gaussians = Gaussians.load(job.inputs["train"] / "gaussians.npz")
-        if config.sh_degree < gaussians.sh_degree:
-            gaussians = gaussians.with_sh_degree(config.sh_degree)
-        if config.min_opacity > 0:
-            gaussians = gaussians.select(gaussians.opacity_logits.sigmoid() >= config.min_opacity)
-        write_splat_ply(job.out / "point_cloud.ply", **gaussians.arrays())
-        job.counters["exported_gaussians"] = len(gaussians)
-    if "colmap" in config.formats:
-        write_model(job.out / "sparse" / "0", model)
-    if "points" in config.formats:
-        write_points_ply(job.out / "points.ply", model.points.xyz, model.points.rgb)
+    trained = Gaussians.load(job.inputs["train"] / "gaussians.npz")
+    scene = Scene(
+        gaussians=prepare(trained, config.sh_degree, config.min_opacity, config.morton_order),
+        model=model,
+        views=load_views(manifest, model, FULL_SIZE, split),
+        antialias=train.antialias,
+        folder=job.inputs["train"].parent / job.stage,
+        points=WRITERS["points"][0] if "points" in config.formats and len(model.points) else None,
+    )
+    files = []
+    for name in config.formats:
+        file, write = WRITERS[name]
+        write(job.out / file, scene)
+        files.append(file)
+    protocol = choose_protocol(scene.views, split, train)
+    orientation = {photo.name: photo.orientation for photo in manifest.photos}
+    up = up_direction(
+        np.stack([view.world_to_camera[:3, :3] for view in scene.views]),
+        [orientation[view.name] for view in scene.views],
+    )
+    render = {
+        "background": list(protocol.background),
+        "near": protocol.near,
+        "antialias": train.antialias,
+    }
+    frame = describe_frame(scene.gaussians, scene.views, up, render, files)
+    write_json(job.out / "frame.json", frame)
+    job.counters["exported_gaussians"] = len(scene.gaussians)
 
 
 if __name__ == "__main__":

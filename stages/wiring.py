@@ -44,7 +44,7 @@ ROLES: dict[str, dict[str, tuple[str, ...]]] = {
         "poses": _POSES,
         "train": ("train",),
         "evaluate": ("evaluate",),
-        "export": ("export",),
+        "export": ("export", "split", "train"),
     },
 }
 
@@ -59,7 +59,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "init": ("init", "views", "split", "features", "matches"),
     "train": ("train", "views", "split"),
     "evaluate": ("evaluate", "views", "split", "train"),
-    "export": ("export",),
+    "export": ("export", "split", "train"),
     "report": ("report", "views", "split", "train"),
 }
 
@@ -73,6 +73,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
     "train": ("torch", "numpy", "opencv-contrib-python-headless"),
     "evaluate": ("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
+    "export": ("torch", "numpy"),
 }
 
 

@@ -232,15 +232,28 @@ class Evaluate(Section):
     )
 
 
+ExportFormat = Literal[
+    "ply", "spz", "splat", "gltf", "points", "colmap", "colmap_text", "transforms"
+]
+
+
 class Export(Section):
     """Files for other programs."""
 
-    formats: tuple[Literal["ply", "colmap", "points"], ...] = Field(
-        ("ply", "colmap", "points"),
-        description="ply: Gaussians in INRIA's layout; colmap: the model; points: coloured cloud.",
+    formats: tuple[ExportFormat, ...] = Field(
+        ("ply", "spz", "points", "colmap", "transforms"),
+        description="The Gaussians: ply (INRIA's layout, exact), spz (a sixth of the size), splat "
+        "(without SH), gltf (.glb, KHR_gaussian_splatting). points: coloured sparse cloud. "
+        "The cameras: colmap (with the points), colmap_text (likewise), transforms "
+        "(nerfstudio's transforms.json).",
     )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Truncate SH to this.")
     min_opacity: Share = Field(0.0, description="Leave fainter Gaussians out.")
+    morton_order: bool = Field(
+        True,
+        description="Sort Gaussians along a Z-order curve, so that neighbours in space are "
+        "neighbours in the file (smaller, faster to show); otherwise they keep training's order.",
+    )
 
 
 class Report(Section):

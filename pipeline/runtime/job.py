@@ -138,7 +138,7 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
             _say_error(request, UserError(f"the database cannot be written: {error}", fix=fix))
             return EXIT_USER_ERROR
         except OSError as error:
-            known = _as_user_error(error)
+            known = as_user_error(error)
             if known is None:
                 traceback.print_exc(file=sys.stderr)
                 return 1
@@ -154,7 +154,7 @@ def _say_error(request: Request, error: UserError) -> None:
     print(f"error in {request.stage} of {scene}: {error}", file=sys.stderr, flush=True)
 
 
-def _as_user_error(error: OSError) -> UserError | None:
+def as_user_error(error: OSError) -> UserError | None:
     """Failures of disk and permissions are the surroundings' fault, not the program's."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"

@@ -1,4 +1,4 @@
-"""``transforms.json``: cameras as instant-ngp, nerfstudio and the NeRF-synthetic scenes store them.
+"""``transforms.json``: cameras as instant-ngp, nerfstudio and the NeRF-synthetic scenes keep them.
 
 ``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z backward); turning y
 and z over gives COLMAP's. nerfstudio may have moved the world by ``applied_transform`` and
@@ -10,8 +10,9 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import posixpath
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,8 +20,9 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.model import Camera, Posed, Reconstruction, View
 from pipeline.scene.names import NameIndex
 
 SPLITS = ("train", "test", "val")
@@ -105,6 +107,57 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
         by_id[camera_id] = camera
         images[number] = Posed(name, camera_id, frame.rotation, frame.translation)
     return Reconstruction(by_id, images)
+
+
+def write_transforms(
+    path: Path, views: Sequence[View], folder: Path, *, points: str | None = None
+) -> None:
+    """Write pinhole cameras as nerfstudio and instant-ngp read them, held-out views as test and
+    validation; ``read_transforms`` reads the same poses and intrinsics back.
+
+    Args:
+        path: the json; it appears whole or not at all.
+        folder: where the json will be in the end; pictures are named relative to it.
+        points: a point cloud to start from, relative to ``folder``.
+    """
+
+    def relative(file: str) -> str:
+        # Folders that are links are resolved: ".." leads out of what they point to.
+        parent, name = os.path.split(file)
+        inside = os.path.relpath(os.path.realpath(parent), os.path.realpath(folder))
+        return (Path(inside) / name).as_posix()
+
+    frames: list[dict[str, Any]] = []
+    intrinsics: list[dict[str, Any]] = []
+    for view in views:
+        to_world = np.eye(4)
+        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ _FLIP_YZ
+        to_world[:3, 3] = view.centre
+        frames.append(
+            {"file_path": relative(view.image), "transform_matrix": to_world.tolist()}
+            | ({"mask_path": relative(view.mask)} if view.mask else {})
+        )
+        # OPENCV without distortion is a pinhole that every reader knows.
+        intrinsics.append(
+            {"camera_model": "OPENCV", "w": view.width, "h": view.height}
+            | {"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy}
+            | {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+        )
+    content: dict[str, Any] = {"frames": frames}
+    if intrinsics and all(entry == intrinsics[0] for entry in intrinsics):
+        content |= intrinsics[0]
+    else:
+        for frame, entry in zip(frames, intrinsics, strict=True):
+            frame |= entry
+    held_out = [f["file_path"] for f, view in zip(frames, views, strict=True) if view.is_test]
+    if held_out:
+        content["train_filenames"] = [
+            f["file_path"] for f, view in zip(frames, views, strict=True) if not view.is_test
+        ]
+        content["val_filenames"] = content["test_filenames"] = held_out
+    if points is not None:
+        content["ply_file_path"] = points
+    write_json(path, content)
 
 
 def frame_camera_model(frame: Frame) -> str:

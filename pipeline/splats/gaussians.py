@@ -104,12 +104,15 @@ class Gaussians:
         try:
             with np.load(path) as archive:
                 gaussians = Gaussians.from_arrays({name: archive[name] for name in archive.files})
-        except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile, zlib.error) as error:
+            n, k = gaussians.means.shape[0], (min(gaussians.sh_degree, 3) + 1) ** 2
+        except (
+            *(OSError, ValueError, KeyError, IndexError, EOFError, TypeError),
+            *(zipfile.BadZipFile, zlib.error),
+        ) as error:
             raise UserError(
                 f"expected a file of Gaussians, could not read it: {error}", file=path, fix=FIX
             ) from error
         shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
-        n, k = shapes["means"][0], (gaussians.sh_degree + 1) ** 2
         wanted = {
             "means": (n, 3),
             "log_scales": (n, 3),

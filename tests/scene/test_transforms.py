@@ -9,9 +9,14 @@ import pytest
 
 from pipeline.photos.distortion import pixels
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import Reconstruction
+from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.rotations import quat_to_rotation
-from pipeline.scene.transforms import find_transforms, read_frames, read_transforms
+from pipeline.scene.transforms import (
+    find_transforms,
+    read_frames,
+    read_transforms,
+    write_transforms,
+)
 
 SIZES = {"images/a.png": (200, 100)}
 
@@ -171,3 +176,63 @@ def test_malformed_files_name_the_place(tmp_path, content, message):
 def test_no_file(tmp_path):
     with pytest.raises(UserError, match="found none"):
         read_frames(tmp_path)
+
+
+def views(folder: Path, count: int, same: bool) -> list[View]:
+    rng = np.random.default_rng(3)
+    found = []
+    for i in range(count):
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = quat_to_rotation(rng.normal(size=4)), rng.normal(size=3)
+        width = 200 if same else 200 + i
+        image = str(folder / "data" / f"p{i}.png")
+        mask = str(folder / "masks" / f"p{i}.png") if i == 1 else None
+        view = View(image, image, mask, width, 100, 120.5, 119.25, 101.0, 49.5, pose, i == 0)
+        found.append(view)
+    return found
+
+
+@pytest.mark.parametrize("same", [True, False])
+def test_written_cameras_are_read_back_as_they_were(tmp_path, same):
+    written = views(tmp_path, 3, same)
+    file = tmp_path / "results" / "export" / "transforms.json"
+    write_transforms(file, written, file.parent, points="points.ply")
+    names = [f"../../data/p{i}.png" for i in range(3)]
+    model = read_transforms(
+        file, {n: (v.width, v.height) for n, v in zip(names, written, strict=True)}
+    )
+    assert len(model.cameras) == (1 if same else 3)
+    for name, view in zip(names, written, strict=True):
+        image = model.by_name()[name]
+        camera = model.cameras[image.camera_id]
+        assert camera.model == "PINHOLE"
+        assert (camera.width, camera.height) == (view.width, view.height)
+        assert camera.pinhole == (view.fx, view.fy, view.cx, view.cy)
+        np.testing.assert_allclose(image.world_to_camera, view.world_to_camera, atol=1e-12)
+    frames = read_frames(file)
+    assert [frame.mask for frame in frames] == [None, "../../masks/p1.png", None]
+
+
+def test_written_axes_split_and_points_are_nerfstudios(tmp_path):
+    (view,) = views(tmp_path, 1, True)
+    file = tmp_path / "transforms.json"
+    write_transforms(file, [view], tmp_path, points="points.ply")
+    content = json.loads(file.read_text())
+    matrix = np.array(content["frames"][0]["transform_matrix"])
+    axes = view.world_to_camera[:3, :3]
+    np.testing.assert_allclose(matrix[:3, 1], -axes[1], atol=1e-12)  # up is against y
+    np.testing.assert_allclose(matrix[:3, 2], -axes[2], atol=1e-12)  # backward is against z
+    np.testing.assert_allclose(matrix[:3, 3], view.centre, atol=1e-12)
+    assert content["fl_x"] == 120.5 and content["w"] == 200
+    assert content["train_filenames"] == [] and content["test_filenames"] == ["data/p0.png"]
+    assert content["ply_file_path"] == "points.ply"
+
+
+def test_relative_names_hold_where_a_folder_is_a_link(tmp_path):
+    (tmp_path / "disk" / "deep" / "export").mkdir(parents=True)
+    (tmp_path / "results").symlink_to(tmp_path / "disk" / "deep")
+    (tmp_path / "data").mkdir()
+    (tmp_path / "data" / "p0.png").touch()
+    file = tmp_path / "results" / "export" / "transforms.json"
+    write_transforms(file, views(tmp_path, 1, True), file.parent)
+    assert (file.parent / read_frames(file)[0].path).is_file()

@@ -6,7 +6,7 @@ import pytest
 from pipeline.config.schema import Split, Views
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Camera, Posed, Reconstruction
-from pipeline.scene.views import load_views, scene_extent, view_size
+from pipeline.scene.views import load_views, scene_extent, up_direction, view_size
 
 
 def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruction]:
@@ -65,3 +65,29 @@ def test_extent():
     # Training cameras stand at x = 1 ... 7: 3 from their mean.
     assert scene_extent(views) == pytest.approx(3.3)
     assert scene_extent(views[:1]) == 1.0
+
+
+def test_up_is_what_the_cameras_agree_on():
+    """Cameras around a y-down world that look down at it: tilts cancel, up stays."""
+    rotations = []
+    for angle in np.arange(0, 2 * np.pi, 0.5 * np.pi):
+        forward = np.array([np.cos(angle), 0.6, np.sin(angle)]) / np.sqrt(1.36)
+        right = np.cross([0, 1.0, 0], forward)
+        right /= np.linalg.norm(right)
+        rotations.append([right, np.cross(forward, right), forward])
+    np.testing.assert_allclose(up_direction(np.array(rotations), [1] * 4), [0, -1, 0], atol=1e-9)
+
+
+@pytest.mark.parametrize("orientation, quarter_turns", [(1, 0), (8, 1), (3, 2), (6, 3)])
+def test_up_knows_cameras_that_were_turned(orientation, quarter_turns):
+    """EXIF says how the picture is to be turned (anticlockwise by 90 degrees for 8) to stand: a
+    camera turned clockwise sees the world's up to its right."""
+    angle = quarter_turns * np.pi / 2
+    c, s = np.cos(angle), np.sin(angle)
+    turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+    found = up_direction(turned[None], [orientation])
+    np.testing.assert_allclose(found, [0, -1, 0], atol=1e-9)
+
+
+def test_up_without_cameras_is_against_y():
+    assert up_direction(np.zeros((0, 3, 3)), []).tolist() == [0, -1, 0]

@@ -1,0 +1,214 @@
+"""``python -m pipeline``: convert, render and measure files of Gaussians, whoever trained them."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.job import EXIT_USER_ERROR, as_user_error
+
+MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
+EXAMPLES = """examples:
+  python -m pipeline convert point_cloud.ply scene.spz --min-opacity 0.02
+  python -m pipeline render scene.spz --cameras data/garden/sparse/0 -o renders
+  python -m pipeline evaluate point_cloud.ply --scene results/garden
+
+To reconstruct a scene from photographs: snakemake --cores all results/NAME/metrics.json
+"""
+
+
+def main(arguments: list[str] | None = None) -> int:
+    """Run a command and return the process's exit code: 2 where the user must mend something."""
+    options = vars(_parser().parse_args(arguments))
+    command: Callable[..., None] = options.pop("command")
+    try:
+        command(**options)
+    except UserError as error:
+        return _fail(error)
+    except OSError as error:
+        known = as_user_error(error)
+        if known is None:
+            raise
+        return _fail(known)
+    return 0
+
+
+def _fail(error: UserError) -> int:
+    print(f"error: {error}", file=sys.stderr)
+    return EXIT_USER_ERROR
+
+
+# Torch and all that is imported by the commands: --help and wrong options need none of it.
+
+
+def _convert(**options: Any) -> None:
+    from pipeline.commands import convert
+
+    warnings: list[str] = []
+    _tell(convert(**options, warnings=warnings), warnings)
+
+
+def _render(threads: int, background: str, antialias: bool, max_side: int, **options: Any) -> None:
+    from pipeline.commands import Rendering, render
+
+    warnings: list[str] = []
+    how = Rendering(background, antialias, max_side, threads)
+    _tell(render(**options, how=how, warnings=warnings), warnings)
+
+
+def _evaluate(
+    threads: int, background: str, antialias: bool, max_side: int, **options: Any
+) -> None:
+    from pipeline.commands import Rendering, evaluate
+
+    found = evaluate(**options, how=Rendering(background, antialias, max_side, threads))
+    width = max(len(view["name"]) for view in found["per_view"])
+    protocol = found["protocol"]
+    lpips = "" if found["lpips"] is None else f", LPIPS {found['lpips']:.4f}"
+    means = f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}{lpips}"
+    lines = [
+        *(
+            f"{view['name']:<{width}}  {view['psnr']:6.2f} dB  SSIM {view['ssim']:.4f}"
+            for view in found["per_view"]
+        ),
+        f"{means}, {protocol['num_views']} views",
+        f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)",
+    ]
+    _tell(lines, found["warnings"])
+
+
+def _tell(lines: list[str], warnings: list[str]) -> None:
+    for text in warnings:
+        print(f"warning: {text}", file=sys.stderr)
+    for line in lines:
+        print(line)
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m pipeline",
+        description=__doc__.split(": ", 1)[1] if __doc__ else None,
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    sub = commands.add_parser(
+        "convert", help="write Gaussians in another format, fewer or simpler ones if asked for"
+    )
+    sub.set_defaults(command=_convert)
+    sub.add_argument("source", type=Path, metavar="MODEL", help=MODEL)
+    sub.add_argument("target", type=Path, metavar="OUT", help="file to write, by its suffix")
+    sub.add_argument(
+        "--sh-degree", type=int, choices=range(4), default=3, help="cut higher bands (default 3)"
+    )
+    sub.add_argument(
+        "--min-opacity",
+        type=_share,
+        default=0.0,
+        metavar="SHARE",
+        help="leave fainter Gaussians out, 0 to 1 (default 0)",
+    )
+    sub.add_argument(
+        "--morton-order", action="store_true", help="sort along a Z-order curve: smaller files"
+    )
+
+    sub = commands.add_parser("render", help="render Gaussians as given cameras see them, to PNG")
+    sub.set_defaults(command=_render)
+    sub.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
+    sub.add_argument(
+        "--cameras",
+        type=Path,
+        required=True,
+        metavar="PATH",
+        help="COLMAP model (its folder, or one with sparse/0), transforms.json, or results/NAME",
+    )
+    sub.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the pictures"
+    )
+    sub.add_argument(
+        "--view",
+        dest="names",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="only this view, with or without suffix; may be given several times",
+    )
+    _add_rendering(sub, "black", "without")
+
+    sub = commands.add_parser(
+        "evaluate",
+        help="PSNR and SSIM of each view against its photograph",
+        description="Measure a model on the scene's held-out views: PSNR and SSIM of each view "
+        "against its photograph, and their means.",
+    )
+    sub.set_defaults(command=_evaluate)
+    sub.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
+    sub.add_argument(
+        "--scene",
+        type=Path,
+        required=True,
+        metavar="FOLDER",
+        help="finished scene (results/NAME), or photographs with poses (COLMAP's sparse/0, "
+        "transforms.json, poses_bounds.npy) without lens distortion",
+    )
+    sub.add_argument(
+        "-o", "--out", type=Path, metavar="FOLDER", help="keep renders and evaluation.json here"
+    )
+    sub.add_argument(
+        "--every",
+        type=_every,
+        metavar="N",
+        help="held-out views are each N-th, sorted by name; 0 measures on all "
+        "(default: as the scene was trained, else 8)",
+    )
+    _add_rendering(sub, "the scene's", "as the scene was trained")
+    return parser
+
+
+def _add_rendering(parser: argparse.ArgumentParser, background: str, antialias: str) -> None:
+    parser.add_argument(
+        "--background", choices=("black", "white"), help=f"behind the scene (default: {background})"
+    )
+    parser.add_argument(
+        "--antialias",
+        action=argparse.BooleanOptionalAction,
+        help=f"Mip-Splatting's opacity compensation (default: {antialias})",
+    )
+    parser.add_argument(
+        "--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this"
+    )
+    parser.add_argument(
+        "--threads", type=_positive, default=os.cpu_count() or 1, help="(default: all cores)"
+    )
+
+
+def _share(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        value = -1.0
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"expected a number from 0 to 1, found {text!r}")
+    return value
+
+
+def _positive(text: str) -> int:
+    if not text.isdecimal() or int(text) == 0:
+        raise argparse.ArgumentTypeError(f"expected a positive whole number, found {text!r}")
+    return int(text)
+
+
+def _every(text: str) -> int:
+    if not text.isdecimal() or int(text) == 1:
+        raise argparse.ArgumentTypeError(f"expected 0, 2 or more, found {text!r}")
+    return int(text)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,177 @@
+"""What ``python -m pipeline`` does: files of Gaussians converted, rendered, measured."""
+
+from __future__ import annotations
+
+import io
+import json
+import tempfile
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Any
+
+from PIL import Image
+
+from pipeline.config.schema import Evaluate
+from pipeline.metrics.evaluate import (
+    BLACK,
+    NO_GAINS,
+    WHITE,
+    choose_protocol,
+    evaluate_views,
+    to_bytes,
+)
+from pipeline.runtime.atomic import write_bytes, write_json
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.progress import track
+from pipeline.scene.cameras import camera_views, choose_views, posed_scene, read_cameras
+from pipeline.scene.views import scene_extent
+from pipeline.splats.files import check_suffix, prepare, read_gaussians, write_gaussians
+from pipeline.training.render import near_plane, render_view
+
+
+@dataclass(frozen=True)
+class Rendering:
+    """How Gaussians are rendered.
+
+    Attributes:
+        background: "black" or "white"; None: the scene's, else black.
+        antialias: with Mip-Splatting's opacity compensation; None: as the scene was trained, else
+            without.
+        max_side: views are reduced to this, in pixels; None: as they are.
+        threads: never changes a result.
+    """
+
+    background: str | None
+    antialias: bool | None
+    max_side: int | None
+    threads: int
+
+
+def convert(
+    source: Path,
+    target: Path,
+    sh_degree: int,
+    min_opacity: float,
+    morton_order: bool,
+    warnings: list[str],
+) -> list[str]:
+    """Read Gaussians, leave out what is not wanted, write them in the format of ``target``'s
+    suffix.
+
+    Args:
+        warnings: what is left out for being no number is added.
+
+    Returns:
+        What was done, line by line.
+
+    Raises:
+        UserError: a file that cannot be read or written.
+    """
+    check_suffix(target)
+    found = read_gaussians(source, warnings)
+    made = prepare(found, sh_degree, min_opacity, morton_order)
+    write_gaussians(target, made)
+    size = target.stat().st_size / 1e6
+    before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"
+    return [f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]
+
+
+def render(
+    model: Path,
+    cameras: Path,
+    out: Path,
+    names: Sequence[str],
+    how: Rendering,
+    warnings: list[str],
+) -> list[str]:
+    """Render a file of Gaussians as each camera sees it, to 8-bit PNG files named as the views.
+
+    Args:
+        cameras: see ``read_cameras``.
+        names: views to render; empty for all.
+        warnings: what the renders lack is added.
+
+    Returns:
+        What was done, line by line.
+
+    Raises:
+        UserError: a file that cannot be read, or no such view.
+    """
+    posed = read_cameras(cameras)
+    views = camera_views(posed, how.max_side)
+    if not views:
+        raise UserError("expected cameras, found none", file=cameras, fix="give another model")
+    if not all(posed.cameras[image.camera_id].is_pinhole for image in posed.images.values()):
+        warnings.append(f"{cameras}: lens distortion is left out of the renders")
+    # The near plane belongs to the scene, not to the views that are asked for.
+    near = near_plane(scene_extent(views))
+    chosen = choose_views(views, names, cameras) if names else views
+    gaussians = read_gaussians(model, warnings)
+    files: set[Path] = set()
+    for view in track(chosen, "rendering", len(chosen), unit="views"):
+        picture = render_view(
+            gaussians,
+            view,
+            background=WHITE if how.background == "white" else BLACK,
+            antialias=bool(how.antialias),
+            near=near,
+            threads=how.threads,
+        )
+        file = _png(out, view.name, files)
+        files.add(file)
+        buffer = io.BytesIO()
+        Image.fromarray(to_bytes(picture.rgb)).save(buffer, "PNG")
+        write_bytes(file, buffer.getvalue())
+    return [f"{out}: {len(chosen)} views rendered"]
+
+
+def _png(folder: Path, name: str, taken: set[Path]) -> Path:
+    """A file of its own for each view, inside ``folder`` whatever the view's name leads to."""
+    inside = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
+    plain = folder.joinpath(*inside)
+    short = plain.with_suffix(".png")
+    return short if short not in taken else plain.with_name(plain.name + ".png")
+
+
+def evaluate(
+    model: Path, scene: Path, out: Path | None, every: int | None, how: Rendering
+) -> dict[str, Any]:
+    """Measure a file of Gaussians, whoever trained it, against a scene's photographs.
+
+    Args:
+        scene, every: see ``posed_scene``.
+        out: folder for ``evaluation.json`` and ``renders/``; None keeps nothing.
+
+    Returns:
+        What ``evaluate_views`` does, and in ``warnings`` what is missing.
+
+    Raises:
+        UserError: a file or a scene that cannot be read.
+    """
+    warnings: list[str] = []
+    gaussians = read_gaussians(model, warnings)
+    posed = posed_scene(scene, how.max_side, every)
+    changed: dict[str, Any] = {"sh_degree": 3}
+    if how.background is not None:
+        changed["background"] = how.background
+    if how.antialias is not None:
+        changed["antialias"] = how.antialias
+    train = posed.train.model_copy(update=changed)
+    protocol = choose_protocol(posed.views, posed.split, train)
+    gains = json.loads(posed.gains.read_text()) if posed.gains else NO_GAINS
+    with tempfile.TemporaryDirectory() as scratch:
+        found = evaluate_views(
+            gaussians,
+            protocol,
+            Evaluate(),
+            train,
+            Path(scratch) if out is None else out / "renders",
+            gains=gains,
+            threads=how.threads,
+        )
+    found["warnings"] = [*warnings, *posed.warnings, *found["warnings"]]
+    found["model"] = {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+    if out is not None:
+        write_json(out / "evaluation.json", found)
+    return found

@@ -1,0 +1,49 @@
+"""What the file formats of Gaussians share: whole files in memory, and values as bytes."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.errors import UserError
+
+
+def read_file(path: Path, kind: str) -> bytes:
+    """A file's bytes.
+
+    Raises:
+        UserError: it cannot be read; ``kind`` ("an SPZ file") says what was expected.
+    """
+    try:
+        return path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"expected {kind}, could not read it: {error.strerror}",
+            file=path,
+            fix="check the path and its permissions",
+        ) from error
+
+
+def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+    """Rounded to whole numbers and cut to 0..255."""
+    return np.rint(values).clip(0, 255).astype(np.uint8)
+
+
+def sigmoid(logits: NDArray[Any]) -> NDArray[np.float64]:
+    """1 / (1 + exp(-x)) in float64, without overflow."""
+    return 1 / (1 + np.exp(-np.float64(logits).clip(-100, 100)))
+
+
+def logit(opacities: NDArray[Any], margin: float) -> NDArray[np.float64]:
+    """The inverse of the sigmoid; opacities within ``margin`` of 0 and 1, whose logits are huge or
+    infinite, count as that far inside."""
+    p = np.float64(opacities).clip(margin, 1 - margin)
+    return np.log(p / (1 - p))
+
+
+def logit_of_byte(opacities: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """Logits of opacities in 255ths; 0 and 1 count as a quarter of a step inside."""
+    return logit(opacities / 255, 0.25 / 255)

@@ -1,0 +1,60 @@
+"""``frame.json``: what files of Gaussians leave open: axes, unit, up, and how to render them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scene.model import View
+from pipeline.scene.views import scene_extent
+from pipeline.splats.gaussians import Gaussians
+
+AXES = (
+    "right-handed; the world of the cameras as COLMAP has it: a camera at the identity has x to "
+    "the right and y down in its picture, and looks along z"
+)
+UNIT = "that of the camera poses: arbitrary where they were reconstructed, else as they were given"
+OTHER_AXES = {
+    "point_cloud.glb": "turned by 180 degrees about z (x and y negated): glTF is y up",
+    "transforms.json": "this world; the cameras' own axes are OpenGL's (x right, y up, z backward)",
+}
+
+
+def describe_frame(
+    gaussians: Gaussians,
+    views: Sequence[View],
+    up: NDArray[np.float64],
+    render: dict[str, Any],
+    files: Sequence[str],
+) -> dict[str, Any]:
+    """The content of ``frame.json``.
+
+    Args:
+        views: all cameras of the scene.
+        up: (3,) in the world.
+        render: background (RGB in [0, 1]), near plane (world unit), antialias: those that the
+            Gaussians are to be rendered with.
+        files: names of the exported files; those with other axes are named with them.
+    """
+    centres = np.stack([view.centre for view in views])
+    return {
+        "axes": AXES,
+        "axes_of": {name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
+        "up": _rounded(up),
+        "unit": UNIT,
+        "cameras": {
+            "count": len(views),
+            "centre": _rounded(centres.mean(0)),
+            "extent": _rounded(scene_extent(list(views))),
+        },
+        "gaussians": {"count": len(gaussians), "sh_degree": gaussians.sh_degree},
+        "colour": "display-ready sRGB: 0.5 + spherical harmonics, blended as it is",
+        "render": render,
+    }
+
+
+def _rounded(values: Any) -> Any:
+    return np.round(values, 6).tolist()

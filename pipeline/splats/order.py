@@ -1,0 +1,34 @@
+"""An order of Gaussians in which neighbours in space are neighbours in the file."""
+
+from __future__ import annotations
+
+from torch import Tensor
+
+from pipeline.splats.gaussians import Gaussians
+
+_BITS = 21  # Three of them fit into 63.
+
+
+def in_morton_order(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians sorted along a Z-order curve through their bounding box, of 2^21 cells a side;
+    those of one cell keep their order."""
+    if not len(gaussians):
+        return gaussians
+    low, high = gaussians.means.double().aminmax(dim=0)
+    size = (high - low).clamp(min=1e-30)
+    cells = ((gaussians.means - low) / size * (2**_BITS - 1)).long()
+    code = _spread(cells[:, 0]) | _spread(cells[:, 1]) << 1 | _spread(cells[:, 2]) << 2
+    return gaussians.select(code.argsort(stable=True))
+
+
+def _spread(values: Tensor) -> Tensor:
+    """(N,) int64 of 21 bits with two zeros before each bit."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        values = (values | values << shift) & mask
+    return values

@@ -1,0 +1,135 @@
+"""The export stage: every format it offers, and a frame that is true of them."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+from typing import get_args
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Config, ExportFormat
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.job import Job
+from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.transforms import read_frames, read_transforms
+from pipeline.splats.files import read_gaussians
+from stages.export import WRITERS, run
+from tests.splats.samples import sample
+
+FORMATS = get_args(ExportFormat)
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """results/NAME with what the export reads: pictures of 90x60 whose camera stands for 180x120,
+    as poses of larger photographs are given."""
+    scene = tmp_path / "results" / "NAME"
+    camera = Camera("PINHOLE", 180, 120, np.array([100.0, 100, 90, 60]))
+    images = {i + 1: Posed(f"p{i}.png", 1, np.eye(3), np.array([float(i), 0, 4])) for i in range(9)}
+    points = Points(
+        np.array([[0.0, 1, 2]]),
+        np.array([[255, 0, 9]], np.uint8),
+        np.array([0.5]),
+        np.array([0, 1]),
+        np.array([1]),
+        np.array([[3.5, 4.5]]),
+    )
+    write_model(scene / "undistort" / "sparse" / "0", Reconstruction({1: camera}, images, points))
+    (scene / "undistort" / "images").mkdir()
+    photos = []
+    for i in range(9):
+        path = scene / "undistort" / "images" / f"p{i}.png"
+        path.touch()
+        photos.append(Photo(name=path.name, path=str(path), width=90, height=60, digest=""))
+    Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
+    (scene / "train").mkdir()
+    sample(50).save(scene / "train" / "gaussians.npz")
+    return scene
+
+
+def export(scene: Path, **options) -> tuple[Path, Job]:
+    config = Config().model_dump(mode="json")
+    config["export"] |= options
+    config["train"]["background"] = "random"
+    out = scene / ".scratch" / "out"
+    job = Job(
+        stage="export",
+        scene="NAME",
+        key={"seed": 0, "config": config},
+        inputs={"views": scene / "undistort", "model": scene / "undistort"}
+        | {"train": scene / "train"},
+        out=out,
+        scratch=out.parent,
+        shared_cache=out.parent,
+        threads=1,
+    )
+    run(job)
+    final = scene / "export"
+    out.rename(final)
+    return final, job
+
+
+def test_every_format_the_schema_offers_is_written(scene):
+    assert set(WRITERS) == set(FORMATS)
+    out, job = export(scene, formats=FORMATS, sh_degree=1, min_opacity=0.3, morton_order=False)
+    kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
+    assert job.counters == {"exported_gaussians": len(kept)}
+    for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
+        found = read_gaussians(out / f"point_cloud{suffix}", [])
+        assert len(found) == len(kept) and found.sh_degree == degree
+        np.testing.assert_allclose(found.means, kept.means, atol=1e-5)
+    for folder in ("sparse/0", "sparse_text"):
+        model = read_model(out / folder)
+        assert len(model.images) == 9 and len(model.points) == 1
+    assert (out / "sparse_text" / "cameras.txt").is_file()
+    assert b"element vertex 1\n" in (out / "points.ply").read_bytes()[:100]
+
+
+def test_transforms_name_the_pictures_from_where_they_end_up(scene):
+    out, _ = export(scene, formats=["transforms", "points"])
+    frames = read_frames(out)
+    assert [(out / frame.path).resolve().is_file() for frame in frames] == [True] * 9
+    model = read_transforms(out, {frame.path: (90, 60) for frame in frames})
+    (camera,) = model.cameras.values()
+    # Of the pictures as they are, not as the model's cameras say.
+    assert (camera.width, camera.pinhole) == (90, (50, 50, 45, 30))
+    content = json.loads((out / "transforms.json").read_text())
+    assert len(content["test_filenames"]) == 2 and content["ply_file_path"] == "points.ply"
+
+
+def test_transforms_start_from_no_empty_cloud(scene):
+    """Given poses may come without points."""
+    folder = scene / "undistort" / "sparse" / "0"
+    write_model(folder, replace(read_model(folder), points=Points.empty()))
+    out, _ = export(scene, formats=["transforms", "points"])
+    assert "ply_file_path" not in json.loads((out / "transforms.json").read_text())
+
+
+def test_frame_says_what_the_files_leave_open(scene):
+    out, _ = export(scene, formats=["ply", "gltf"])
+    found = json.loads((out / "frame.json").read_text())
+    assert found["up"] == [0, -1, 0]
+    assert found["cameras"]["centre"] == [-4, 0, -4]
+    assert found["gaussians"] == {"count": 50, "sh_degree": 3}
+    # Trained on random backgrounds, shown on white.
+    assert found["render"]["background"] == [1, 1, 1]
+    assert list(found["axes_of"]) == ["point_cloud.glb"]
+
+
+def test_the_default_is_what_viewers_and_tools_take(scene):
+    out, _ = export(scene)
+    written = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
+    assert written == {
+        *("point_cloud.ply", "point_cloud.spz", "points.ply", "transforms.json", "frame.json"),
+        *(f"sparse/0/{name}.bin" for name in ("cameras", "images", "points3D")),
+    }
+
+
+def test_pruning_everything_is_an_error(scene):
+    with pytest.raises(UserError, match="fainter"):
+        export(scene, min_opacity=1.0)

@@ -22,7 +22,7 @@ RUN = (
 
 
 onerror:
-    project.explain_failures()
+    project.after_failure()
 
 
 wildcard_constraints:
@@ -31,21 +31,54 @@ wildcard_constraints:
 
 localrules:
     all,
+    benchmark,
     plan,
+
+
+report: "pipeline/reporting/captions/workflow.rst"
 
 
 rule all:
     input:
-        project.every_scene,
+        "results/benchmark.csv",
+
+
+# All scenes under all configurations and seeds. When some fail, after_failure() writes these files
+# with what there is.
+rule benchmark:
+    input:
+        project.every_run,
+    output:
+        table=report(
+            "results/benchmark.csv",
+            caption="pipeline/reporting/captions/benchmark.rst",
+            category="Batch",
+        ),
+        data="results/benchmark.json",
+        page=report(
+            "results/index.html",
+            caption="pipeline/reporting/captions/index.rst",
+            category="Batch",
+        ),
+    params:
+        outcomes=project.outcomes,
+    shell:
+        "python -m stages.batch --results results --outcomes {params.outcomes:q}"
 
 
 rule plan:
     output:
-        "results/{scene}/plan.json",
+        plan="results/{scene}/plan.json",
+        picture=report(
+            "results/{scene}/plan.svg",
+            caption="pipeline/reporting/captions/plan.rst",
+            category="{scene}",
+        ),
     params:
         plan=project.plan,
     shell:
-        "python -m stages.plan --out {output:q} --plan {params.plan:q}"
+        "python -m stages.plan --out {output.plan:q} --picture {output.picture:q}"
+        " --plan {params.plan:q}"
 
 
 rule inspect:
@@ -230,8 +263,16 @@ rule report:
         plan="results/{scene}/plan.json",
     output:
         stage="results/{scene}/report/stage.json",
-        metrics="results/{scene}/metrics.json",
-        page="results/{scene}/report.html",
+        metrics=report(
+            "results/{scene}/metrics.json",
+            caption="pipeline/reporting/captions/metrics.rst",
+            category="{scene}",
+        ),
+        page=report(
+            "results/{scene}/report.html",
+            caption="pipeline/reporting/captions/page.rst",
+            category="{scene}",
+        ),
     log:
         "results/{scene}/logs/report.log",
     threads: THREADS

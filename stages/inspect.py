@@ -18,7 +18,8 @@ from stages.command import main
 def run(job: Job) -> None:
     config = Config(poses=job.key["poses"], inspect=job.section(Inspect), views=job.section(Views))
     cache = job.out.parents[2] / "scan.json"
-    found = scan(Path(job.key["folder"]), job.scene, config, cache=cache)
+    folder = Path(job.key["folder"])
+    found = scan(folder, folder.name, config, cache=cache)
     for text in found.warnings:
         job.warn(text)
     manifest, warnings = verify_photos(

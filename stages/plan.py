@@ -1,14 +1,21 @@
-"""Write the plan that the DAG was built from. Output: ``results/<scene>/plan.json``."""
+"""Write the plan that the DAG was built from.
+
+Outputs: ``results/<scene>/plan.json`` and a picture of it, ``plan.svg``.
+"""
 
 import argparse
 import json
 from pathlib import Path
 
-from pipeline.runtime.atomic import write_json
+from pipeline.reporting.dag import plan_svg
+from pipeline.runtime.atomic import write_json, write_text
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("stages.plan", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--picture", type=Path, required=True)
     parser.add_argument("--plan", required=True, help="the plan as JSON")
     args = parser.parse_args()
-    write_json(args.out, json.loads(args.plan))
+    plan = json.loads(args.plan)
+    write_json(args.out, plan)
+    write_text(args.picture, plan_svg(plan))

@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import os
+import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from functools import cache
+from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
 from pipeline.config.load import load_project, scene_config
+from pipeline.config.runs import Run, all_runs, parse_run
+from pipeline.reporting.batch import PUBLISHED
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import canonical
+from pipeline.runtime.job import canonical, file_digest, is_current
+from pipeline.runtime.source import stage_source_hash
 from pipeline.scene.plan import Plan, describe, make_plan
 from pipeline.scene.scan import scan
 from stages.wiring import public_plan, stage_key, upstream
 
 RESULTS = Path("results")
+# Written when a batch ends with failures and an input of the next one's tables from then on, so
+# that tables made by half a batch are made again.
+FAILURES = RESULTS / ".failures.json"
 
 
 class SnakemakeProject:
     """Binds scenes, their options and their plans to Snakemake's input functions.
+
+    The wildcard ``scene`` is the name of a run: a scene, alone or with a configuration and a seed
+    (see ``pipeline.config.runs``).
 
     Args:
         raw: Snakemake's ``config``.
@@ -38,10 +49,12 @@ class SnakemakeProject:
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
+        self._root = Path(self._project.data_root)
         for name in named:
-            if not (Path(self._project.data_root) / name).is_dir():
+            if not (self._root / name).is_dir():
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
+        self._described: dict[str, str] = {}
         # Set here and not in the rules' text, which counts as code: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
@@ -53,36 +66,19 @@ class SnakemakeProject:
         # Spinning OpenMP threads slow whatever runs beside them.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-    def every_scene(self, wildcards: Any) -> list[str]:
-        """Input function: the metrics of all scenes below ``data_root``. A folder that is no
-        scene is left out with its message."""
-        root = Path(self._project.data_root)
-        names = sorted(p.name for p in root.glob("*") if p.is_dir() and p.name[0] not in "._")
-        targets = []
-        for name in names:
-            try:
-                self._make_plan(name)
-            except UserError as error:
-                print(f"left out: {error}", file=sys.stderr)
-            else:
-                targets.append(str(RESULTS / name / "metrics.json"))
-        if not targets:
-            fix = "set data_root to the folder whose subfolders are scenes"
-            _exit(UserError("no scene here", file=root, fix=fix))
-        return targets
+    # --- one scene ------------------------------------------------------------------------
 
     def inputs(self, stage: str) -> Callable[[Any], dict[str, str]]:
         """Input function: role -> the ``stage.json`` that fills it."""
         return lambda wildcards: {
-            role: str(RESULTS / wildcards.scene / source / "stage.json")
-            for role, source in upstream(stage, self._plan(wildcards.scene)[0]).items()
+            role: str(folder / "stage.json")
+            for role, folder in self._inputs(stage, wildcards.scene).items()
         }
 
     def folders(self, stage: str) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""
         return lambda wildcards: [
-            f"{role}={RESULTS / wildcards.scene / source}"
-            for role, source in upstream(stage, self._plan(wildcards.scene)[0]).items()
+            f"{role}={folder}" for role, folder in self._inputs(stage, wildcards.scene).items()
         ]
 
     def published(self, *names: str) -> Callable[[Any], list[str]]:
@@ -97,27 +93,127 @@ class SnakemakeProject:
         """Params function: the plan as canonical JSON."""
         return canonical(public_plan(self._plan(wildcards.scene)[0]))
 
-    def explain_failures(self) -> None:
-        """Say again, last of all, what stopped the stages that failed in this run."""
-        for log in sorted(RESULTS.glob("*/logs/*.log")):
-            _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
-            if log.stat().st_mtime >= self._started and found:
-                print(f"\nerror in {message}", file=sys.stderr, end="")
+    def _inputs(self, stage: str, name: str) -> dict[str, Path]:
+        plan = self._plan(name)[0]
+        return {role: RESULTS / name / source for role, source in upstream(stage, plan).items()}
 
-    def _plan(self, scene: str) -> tuple[Plan, str, str]:
-        """The scene's plan, folder and fingerprint; a UserError ends Snakemake."""
+    def _plan(self, name: str) -> tuple[Plan, str, str]:
+        """The run's plan, folder and fingerprint; a UserError ends Snakemake."""
         try:
-            return self._make_plan(scene)
+            return self._make_plan(name)
         except UserError as error:
             _exit(error)
 
-    def _scan_and_plan(self, scene: str) -> tuple[Plan, str, str]:
-        config = scene_config(self._raw, scene)
-        folder = Path(self._project.data_root) / scene
-        found = scan(folder, scene, config, cache=RESULTS / scene / ".scratch" / "scan.json")
+    def _scan_and_plan(self, name: str) -> tuple[Plan, str, str]:
+        run = parse_run(name, self._project.configs, self._scenes)
+        config = scene_config(self._raw, run.scene, run.config, run.seed)
+        folder = self._root / run.scene
+        found = scan(folder, run.scene, config, cache=RESULTS / name / ".scratch" / "scan.json")
         plan = make_plan(found, config)
-        print(describe(plan), file=sys.stderr)
+        first = self._described.setdefault(describe(plan), name)
+        plan = plan.model_copy(update={"scene": name})
+        print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
         return plan, str(folder), found.fingerprint
+
+    # --- all of them ----------------------------------------------------------------------
+
+    @cached_property
+    def _scenes(self) -> list[str]:
+        folders = (path for path in self._root.glob("*") if path.is_dir())
+        return sorted(path.name for path in folders if path.name[0] not in "._")
+
+    @cached_property
+    def _batch(self) -> tuple[list[Run], dict[Run, str]]:
+        """The runs of all scenes under all configurations and seeds, and those of them that
+        cannot be planned with the reason: a folder that is no scene is left out."""
+        left_out: dict[Run, str] = {}
+        runs = all_runs(self._scenes, self._project.configs, self._project.seeds)
+        for run in runs:
+            try:
+                self._make_plan(run.name)
+            except UserError as error:
+                left_out[run] = str(error)
+        for message in dict.fromkeys(left_out.values()):
+            print(f"left out: {message}", file=sys.stderr)
+        if len(left_out) == len(runs):
+            fix = "set data_root to the folder whose subfolders are scenes"
+            _exit(UserError("no scene here", file=self._root, fix=fix))
+        return runs, left_out
+
+    def every_run(self, wildcards: Any) -> list[str]:
+        """Input function: the metrics of the whole batch."""
+        runs, left_out = self._batch
+        targets = [RESULTS / run.name / "metrics.json" for run in runs if run not in left_out]
+        return [str(path) for path in (*targets, FAILURES) if path in targets or path.exists()]
+
+    def outcomes(self, wildcards: Any) -> str:
+        """Params function: how each run ended, once all have ended well."""
+        runs, left_out = self._batch
+        return canonical(
+            {
+                "source": stage_source_hash("stages.batch"),
+                "published": file_digest(PUBLISHED),
+                "outcomes": [_outcome(run, left_out.get(run)) for run in runs],
+            }
+        )
+
+    # --- failures -------------------------------------------------------------------------
+
+    def after_failure(self) -> None:
+        """Say again, last of all, what stopped the stages that failed in this run. A batch's
+        tables are made all the same, with what there is."""
+        for log in sorted(RESULTS.glob("*/logs/*.log")):
+            message = self._error_in(log)
+            if message:
+                run = log.parents[1].name
+                print(f"\nerror in {log.stem} of {run}: {message}", file=sys.stderr)
+        if "_batch" in self.__dict__:
+            runs, left_out = self._batch
+            outcomes = [
+                _outcome(run, left_out[run]) if run in left_out else self._ended(run)
+                for run in runs
+            ]
+            command = [sys.executable, "-m", "stages.batch", "--results", str(RESULTS)]
+            text = canonical({"outcomes": outcomes})
+            subprocess.run([*command, "--outcomes", "-"], input=text, text=True, check=False)
+            lost = [outcome for outcome in outcomes if outcome["status"] != "ok"]
+            write_json(FAILURES, {"at": self._started, "lost": lost})
+            said = f"\n{len(lost)} of {len(runs)} runs have no result: see {RESULTS}/index.html"
+            print(said, file=sys.stderr)
+
+    def _ended(self, run: Run) -> dict[str, Any]:
+        """How a run of the batch ended."""
+        plan, *origin = self._make_plan(run.name)
+        for stage in filter(plan.runs, plan.stages):
+            folder = RESULTS / run.name
+            key = stage_key(stage, plan, *origin)
+            if not is_current(folder / stage, key, self._inputs(stage, run.name)):
+                log = folder / "logs" / f"{stage}.log"
+                if not self._began(log):
+                    return _outcome(run, "another failure stopped the batch", "not run", stage)
+                silent = f"it ended without a message, killed perhaps: see {log}"
+                return _outcome(run, self._error_in(log) or silent, "failed", stage)
+        return _outcome(run, None)
+
+    def _began(self, log: Path) -> bool:
+        return log.is_file() and log.stat().st_mtime >= self._started
+
+    def _error_in(self, log: Path) -> str:
+        """The message of a stage that ended in this run with a user's error; else empty."""
+        if not self._began(log):
+            return ""
+        _, _, message = f"\n{log.read_text()}".rpartition("\nerror in ")
+        return message.partition(": ")[2].rstrip()
+
+
+def _outcome(
+    run: Run, message: str | None, status: str = "left out", stage: str = ""
+) -> dict[str, Any]:
+    """See ``stages.batch``."""
+    named = {"run": [run.scene, run.config, run.seed]}
+    if message is None:
+        return named | {"status": "ok"}
+    return named | {"status": status, "stage": stage, "message": message.strip()}
 
 
 def _exit(error: UserError) -> NoReturn:

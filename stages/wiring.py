@@ -5,6 +5,7 @@ The Snakefile binds stages to one another from these tables and nothing else.
 
 from __future__ import annotations
 
+from functools import cache
 from importlib.metadata import version
 from typing import Any
 
@@ -77,6 +78,15 @@ PACKAGES: dict[str, tuple[str, ...]] = {
 }
 
 
+# Stages that draw random numbers, and the one that shows the seed. The others have no seed in their
+# keys, so that runs with other seeds share their work.
+SEEDED = ("matches", "sfm", "init", "train", "report")
+
+# Asked again for every run of a batch.
+_version = cache(version)
+_source_hash = cache(stage_source_hash)
+
+
 def upstream(stage: str, plan: Plan) -> dict[str, str]:
     """Role -> the stage that fills it, for a scene with this plan."""
     return {
@@ -90,17 +100,18 @@ def stage_key(stage: str, plan: Plan, folder: str, fingerprint: str) -> str:
 
     Snakemake compares parameters as a set of ``repr(value)``, so only a single canonical string
     notices every change. It holds the config sections the stage reads (settled by the plan), the
-    hash of its source, the versions of the packages that decide its result, the seed, for the
-    first stage the scene's folder and fingerprint, for evaluation the true poses and the LPIPS
-    weights at hand, for the last the plan it shows. What changes only the speed is not in it.
+    hash of its source, the versions of the packages that decide its result, the seed where it
+    matters, for the first stage the scene's folder and fingerprint, for evaluation the true poses
+    and the LPIPS weights at hand, for the last the plan it shows. What changes only the speed is
+    not in it.
     """
     config: Config = plan.config
     dumped = config.model_dump(mode="json")
     key: dict[str, Any] = {
         "stage": stage,
-        "seed": config.seed,
-        "source": stage_source_hash(f"stages.{stage}"),
-        "packages": {name: version(name) for name in PACKAGES.get(stage, ())},
+        "seed": config.seed if stage in SEEDED else None,
+        "source": _source_hash(f"stages.{stage}"),
+        "packages": {name: _version(name) for name in PACKAGES.get(stage, ())},
         "config": {name: dumped[name] for name in SECTIONS[stage]},
     }
     if stage == "inspect":
@@ -115,5 +126,9 @@ def stage_key(stage: str, plan: Plan, folder: str, fingerprint: str) -> str:
 
 
 def public_plan(plan: Plan) -> dict[str, Any]:
-    """What ``plan.json`` holds: every stage with run or skip, the reasons, facts, warnings."""
-    return plan.model_dump(mode="json", exclude={"config"})
+    """What ``plan.json`` holds: every stage with run or skip, the reasons, what feeds it, facts,
+    warnings."""
+    shown = plan.model_dump(mode="json", exclude={"config"})
+    for name, step in shown["stages"].items():
+        step["inputs"] = sorted(set(upstream(name, plan).values())) if step["run"] else []
+    return shown

@@ -112,6 +112,8 @@ def _values(info: FieldInfo) -> str:
     if get_origin(kind) is tuple:
         kind = get_args(kind)[0]
         return "list of " + ", ".join(f"`{v}`" for v in get_args(kind))
+    if get_origin(kind) is list:
+        return "list of whole numbers"
     choices = get_args(kind)
     if choices and not isinstance(choices[0], type):
         return ", ".join(f"`{v}`" for v in choices)

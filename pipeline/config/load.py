@@ -3,19 +3,48 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Annotated, Any
 
-from pydantic import Field, ValidationError
+from pydantic import BeforeValidator, Field, ValidationError
 
 from pipeline.config.presets import PRESETS
+from pipeline.config.runs import is_config_name
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
+
+
+def _named_configs(value: Any) -> Any:
+    """A list of presets is short for a mapping from their names to themselves."""
+    if isinstance(value, list | tuple):
+        unknown = [name for name in value if name not in PRESETS]
+        if unknown:
+            raise ValueError(
+                f"{unknown[0]} is no preset ({', '.join(PRESETS)}); configurations of your own are "
+                "a mapping from a name to its options"
+            )
+        return {name: {"preset": name} for name in value}
+    for name in value if isinstance(value, Mapping) else ():
+        if not is_config_name(str(name)):
+            raise ValueError(
+                f"{name!r} cannot name a configuration: letters, digits and . _ + - can, but "
+                "seed0 and its like are taken"
+            )
+    return value
 
 
 class Project(Config):
     """What a configuration file may hold: a scene's options, and these."""
 
     data_root: str = Field("data", description="Folder whose subfolders are scenes.")
+    configs: Annotated[dict[str, dict[str, Any]], BeforeValidator(_named_configs)] = Field(
+        default_factory=dict,
+        description="Configurations that a batch compares: a list of presets, or a mapping from a "
+        "name to options that win over the scene's, as {fast: {preset: fast}, sh0: {train: "
+        "{sh_degree: 0}}}.",
+    )
+    seeds: list[Annotated[int, Field(ge=0, lt=2**31)]] = Field(
+        default_factory=list, description="Seeds that a batch repeats every run with."
+    )
     scenes: dict[str, dict[str, Any]] = Field(
         default_factory=dict, description="Options for single scenes, by the scene's name."
     )
@@ -35,20 +64,36 @@ def load_project(raw: Mapping[str, Any]) -> tuple[Project, dict[str, Config]]:
     """
     project = _validated(Project, raw, "")
     named = {name: scene_config(raw, name) for name in project.scenes}
+    for config in project.configs:
+        for scene in ("", *project.scenes):
+            scene_config(raw, scene, config)
     return project, named
 
 
-def scene_config(raw: Mapping[str, Any], scene: str) -> Config:
-    """Options of one scene: schema <- preset <- project <- the scene's own.
+def scene_config(
+    raw: Mapping[str, Any], scene: str, config: str = "", seed: int | None = None
+) -> Config:
+    """Options of one scene: schema <- preset <- project <- the scene's own <- the configuration's.
+
+    Args:
+        raw: the configuration as nested dicts.
+        scene: its name.
+        config: name of one of ``configs``; empty for none of them.
+        seed: wins over all of these; or None.
 
     Raises:
         UserError: an unknown option or an impossible value, naming it.
     """
-    common = {k: v for k, v in raw.items() if k not in ("data_root", "scenes")}
     own = (raw.get("scenes") or {}).get(scene) or {}
-    chosen = merge(common, own)
+    chosen = merge({k: v for k, v in raw.items() if k in Config.model_fields}, own)
+    where = f"scenes.{scene}: "
+    if config:
+        chosen = merge(chosen, _named_configs(raw["configs"])[config])
+        where = f"configs.{config}: "
+    if seed is not None:
+        chosen["seed"] = seed
     preset = chosen.get("preset", Config().preset)
-    return _validated(Config, merge(PRESETS.get(preset, {}), chosen), f"scenes.{scene}: ")
+    return _validated(Config, merge(PRESETS.get(preset, {}), chosen), where)
 
 
 def merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:

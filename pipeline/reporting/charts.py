@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -109,6 +110,86 @@ def line_chart(
     marks = f'<polygon class="area" points="{area}"/><polyline class="line" points="{path}"/>'
     axes = _axes([(across(t), x_label(t)) for t in x_ticks], [(up(t), short(t)) for t in y_ticks])
     return _svg(title, x_title, axes + marks + dots)
+
+
+@dataclass(frozen=True)
+class Dot:
+    """A point of a trade-off chart: what it cost, what it left wrong, and what it is.
+
+    Attributes:
+        seconds, error: finite and positive.
+        name: written beside it; empty for a small dot that only has its tooltip.
+        tip: the tooltip.
+        colour: which of the page's colours; the same number, the same colour.
+    """
+
+    seconds: float
+    error: float
+    name: str
+    tip: str
+    colour: int = 0
+
+
+_COLOURS = ("--accent", "--test", "--train", "--bad", "--good")
+
+
+def trade_off_chart(dots: Sequence[Dot], *, title: str, x_title: str, y_label: Label) -> str:
+    """Time against error, both logarithmic, and the Pareto front of the named dots: a line through
+    those that no other one beats in both.
+
+    Args:
+        dots: at least one.
+        y_label: how an error reads at the axis.
+    """
+    xs, ys = [d.seconds for d in dots], [d.error for d in dots]
+    x_low, x_high, y_low, y_high = min(xs) / 1.3, max(xs) * 1.3, min(ys) / 1.12, max(ys) * 1.12
+    across = _scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT, log=True)
+    up = _scale(y_low, y_high, _HEIGHT - _BOTTOM, _TOP, log=True)
+    steps = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18_000, 36_000, 86_400)
+    x_ticks = [t for t in steps if x_low <= t <= x_high]
+    y_ticks = log_ticks(y_low, y_high)
+    if len(y_ticks) < 3:
+        y_ticks = [t for t in linear_ticks(y_low, y_high, 5) if t > 0]
+    step = math.ceil(len(x_ticks) / 7)
+    axes = _axes(
+        [(across(t), clock(t)) for t in x_ticks[::step]], [(up(t), y_label(t)) for t in y_ticks]
+    )
+    front = pareto_front([d for d in dots if d.name])
+    line = " ".join(f"{across(d.seconds):.1f},{up(d.error):.1f}" for d in front)
+    marks = f'<polyline class="front" points="{line}"/>'
+    taken: list[tuple[float, float]] = []
+    for dot in sorted(dots, key=lambda d: (bool(d.name), d.error)):
+        x, y = across(dot.seconds), up(dot.error)
+        paint = f'style="fill: var({_COLOURS[dot.colour % len(_COLOURS)]})"'
+        size, faint = (5.5, "") if dot.name else (3, ' opacity=".45"')
+        name = ""
+        if dot.name:
+            left = x + 16 + 7.5 * len(dot.name) > _WIDTH
+            heights = [y + d for d in (-6, 14, -20, 28)]
+            taken.append((x, next((h for h in heights if _free(x, h, taken)), y)))
+            name = (
+                f'<text class="name" x="{x + (-9 if left else 9):.1f}" y="{taken[-1][1]:.1f}" '
+                f'text-anchor="{"end" if left else "start"}">{escape(dot.name)}</text>'
+            )
+        marks += (
+            f'<g><title>{escape(dot.tip)}</title><circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
+            f"{paint}{faint}/>{name}</g>"
+        )
+    return _svg(title, x_title, axes + marks)
+
+
+def _free(x: float, y: float, taken: Sequence[tuple[float, float]]) -> bool:
+    """Whether a dot's name at height ``y`` keeps clear of those that stand already."""
+    return all(abs(x - other) > 90 or abs(y - height) > 11 for other, height in taken)
+
+
+def pareto_front(dots: Sequence[Dot]) -> list[Dot]:
+    """The dots that no other one beats in time and error, the quickest first."""
+    front: list[Dot] = []
+    for dot in sorted(dots, key=lambda d: (d.seconds, d.error)):
+        if not front or dot.error < front[-1].error:
+            front.append(dot)
+    return front
 
 
 def histogram(

@@ -9,11 +9,14 @@ when all is done, so that what exists is whole. Two sidecars stand beside the ou
 
 A stage whose key and inputs are those of its finished folder is not worked again: Snakemake
 deletes a job's declared outputs before it runs it, so a hidden copy of ``stage.json`` lets the
-stage see that the work is there, check the digests, and put the declared file back.
+stage see that the work is there, check the digests, and put the declared file back. Finished work
+of the same identity in a neighbouring folder (another configuration of the scene) is taken over by
+hard links in the same way.
 """
 
 from __future__ import annotations
 
+import contextlib
 import errno
 import fcntl
 import hashlib
@@ -33,13 +36,13 @@ from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Any, TextIO, TypeVar
+from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.progress import write_progress_to
+from pipeline.runtime.progress import Console, write_progress_to
 
 SIDE_CARS = ("stage.json", "run.json", ".stage.json")
 EXIT_USER_ERROR = 2
@@ -80,6 +83,7 @@ class Job:
 
     @property
     def seed(self) -> int:
+        """The run's seed; only stages that have it in their key may ask."""
         return int(self.key["seed"])
 
     def section(self, model: type[S]) -> S:
@@ -124,7 +128,7 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
     0: done, or there already. 2: the user must mend something (one clear message). Any other
     exception is a bug of the program: exit code 1, with a traceback.
     """
-    with _logging_to(request.log):
+    with _logging_to(request.log, request.out.parent.name):
         try:
             return _run_locked(request, work)
         except UserError as error:
@@ -183,6 +187,9 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
         if out.exists():
             shutil.rmtree(out)
         out.mkdir(parents=True)
+        if _taken_over(request, digests, out):
+            shutil.rmtree(stage_scratch, ignore_errors=True)
+            return 0
         job = Job(
             stage=request.stage,
             scene=scene_folder.name,
@@ -244,6 +251,17 @@ def read_stage(folder: Path) -> dict[str, Any]:
         ) from None
 
 
+def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
+    """Whether the stage that owns ``folder`` has finished with this key and with what its inputs
+    (folder by role) now contain."""
+    try:
+        record = read_stage(folder)
+        digests = {role: content_digest(path) for role, path in inputs.items()}
+    except (UserError, OSError, ValueError):
+        return False
+    return canonical(record["key"]) == key and record["inputs"] == digests
+
+
 def _identity(key: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
     return hashlib.sha256(canonical({"key": key, "inputs": inputs}).encode()).hexdigest()
 
@@ -258,6 +276,45 @@ def _is_done(request: Request, inputs: dict[str, str]) -> bool:
     except (ValueError, KeyError):
         return False
     return same and _digests(request.out) == record["outputs"]
+
+
+def _taken_over(request: Request, inputs: dict[str, str], out: Path) -> bool:
+    """Put a neighbour's finished work in place, if one has done exactly what is asked for.
+
+    Its files are hard links where the file system has them. Stages replace files and never write
+    into them, so that neither folder can change the other; the digests are those of the links.
+    """
+    wanted = _identity(request.key, inputs)
+    for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/.stage.json")):
+        source = hidden.parent
+        try:
+            record = json.loads(hidden.read_text())
+            run = json.loads((source / "run.json").read_text())
+            if source == request.out or _identity(record["key"], record["inputs"]) != wanted:
+                continue
+        except (OSError, ValueError, KeyError):
+            continue
+        with contextlib.suppress(OSError):  # It may be replaced at this moment.
+            shutil.copytree(source, out, copy_function=_link, dirs_exist_ok=True)
+        if _digests(out) == record["outputs"]:
+            record["scene"] = request.out.parent.name
+            write_json(out / "run.json", run | {"taken_from": source.parent.name})
+            write_json(out / ".stage.json", record)
+            write_json(out / "stage.json", record)
+            replace_folder(out, request.out)
+            _publish(request)
+            print(f"{request.stage}: taken over from {source.parent.name}", file=sys.stderr)
+            return True
+        shutil.rmtree(out)
+        out.mkdir()
+    return False
+
+
+def _link(source: str, target: str) -> None:
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
 
 
 def _recover(out: Path) -> None:
@@ -311,7 +368,7 @@ def run_facts(job: Job, wall: float) -> dict[str, Any]:
         "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in (own, children)), 3),
         "peak_rss_mb": round(max(own.ru_maxrss, children.ru_maxrss) / unit, 1),
         "threads": job.threads,
-        "seed": job.seed,
+        "seed": job.key["seed"],
         "host": platform.node(),
         "platform": platform.platform(),
         "versions": versions(),
@@ -373,33 +430,8 @@ def _locked(path: Path, request: Request) -> Iterator[None]:
         yield
 
 
-class _Tee:
-    """stderr that is written to the log as well, and outlives a terminal that went away."""
-
-    def __init__(self, terminal: TextIO, log: TextIO):
-        self._terminal: TextIO | None = terminal
-        self._log = log
-
-    def write(self, text: str) -> int:
-        self._log.write(text)
-        if self._terminal is not None:
-            try:
-                self._terminal.write(text)
-            except OSError:
-                self._terminal = None
-        return len(text)
-
-    def flush(self) -> None:
-        self._log.flush()
-        if self._terminal is not None:
-            try:
-                self._terminal.flush()
-            except OSError:
-                self._terminal = None
-
-
 @contextmanager
-def _logging_to(path: Path | None) -> Iterator[None]:
+def _logging_to(path: Path | None, name: str) -> Iterator[None]:
     if path is None:
         yield
         return
@@ -412,9 +444,11 @@ def _logging_to(path: Path | None) -> Iterator[None]:
         yield
         return
     with log:
-        sys.stderr = _Tee(terminal, log)  # type: ignore[assignment]
+        console = Console(terminal, log, f"{name}: ")
+        sys.stderr = console  # type: ignore[assignment]
         try:
             yield
         finally:
-            sys.stderr.flush()
+            console.clear()
+            console.flush()
             sys.stderr = terminal

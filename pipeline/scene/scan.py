@@ -37,6 +37,7 @@ from pipeline.scene.posefiles import (
     transforms_photos,
     truth_folder,
 )
+from pipeline.scene.protocols import MIP_NERF_360, benchmark_scene
 
 _STEPS = ("", "_2", "_4", "_8")
 _ADD_PHOTOS = "put the photographs into images/ inside the scene folder"
@@ -253,7 +254,8 @@ def _choose_size(
     cache: FactCache,
     warnings: list[str],
 ) -> PhotoFolder:
-    """Of images/ and its smaller copies, the smallest that is still large enough."""
+    """Of images/ and its smaller copies, the smallest that is still large enough; for scenes of
+    Mip-NeRF 360 the one that papers use."""
     need = config.views.max_long_side_px
     if poses is None:
         need = max(need, config.features.max_long_side_px)
@@ -269,13 +271,19 @@ def _choose_size(
     longest, full = found[0]
     usable = [entry for entry in found if _same_photographs(folder, entry[1], full, poses, config)]
     enough = [entry for entry in usable if entry[0] >= need]
-    if enough:
+    habit = MIP_NERF_360.get(benchmark_scene(folder.name))
+    customary = [entry for entry in usable if entry[1].path == habit]
+    if customary:
+        longest, best = customary[0]
+    elif enough:
         longest, best = min(enough, key=lambda entry: entry[0])
     else:
         longest, best = max(usable, key=lambda entry: entry[0])
     others = [f"{entry.path}/ ({size} px)" for size, entry in found if entry is not best]
     reason = f"{best.path}/ ({longest} px long side)"
-    if others:
+    if customary:
+        reason += f": the copy that papers use of {benchmark_scene(folder.name)} of Mip-NeRF 360"
+    elif others:
         is_enough = "the smallest not below" if longest >= need else "the largest; none reaches"
         reason += f": {is_enough} {need} px; others: {', '.join(others)}"
     return PhotoFolder(best.path, "images", reason, best.names)

@@ -73,12 +73,16 @@ def _child(
 ) -> None:
     threading.Thread(target=_die_with_parent, args=(leash,), daemon=True).start()
     progress.write_progress_to(progress_file)
+    if progress_file is not None:
+        sys.stderr = progress.Console(sys.stderr, None)  # type: ignore[assignment]
     try:
         results.send(("value", function(*args, **kwargs)))
     except UserError as error:
         results.send(("user error", {"what": error.what, "file": error.file, "fix": error.fix}))
     except Exception:
         results.send(("error", traceback.format_exc()))
+    if isinstance(sys.stderr, progress.Console):
+        sys.stderr.clear()
     # Destructors of extension libraries have nothing left to do that is worth a crash here.
     sys.stdout.flush()
     sys.stderr.flush()

@@ -3,6 +3,7 @@
 import json
 import multiprocessing
 import time
+from dataclasses import replace
 
 import pytest
 
@@ -69,6 +70,31 @@ def test_damaged_outputs_are_made_again(tmp_path, damage):
     assert run_stage(request(tmp_path), write("a")) == 0
     assert (out / "result.txt").read_text() == "a"
     assert not (out / "stranger.txt").exists()
+
+
+def test_a_neighbours_same_work_is_taken_over(tmp_path):
+    run_stage(request(tmp_path), write("a"))
+    other = replace(request(tmp_path), out=tmp_path / "scene@fast" / "work")
+    assert run_stage(other, fail) == 0
+    mine, its = tmp_path / "scene@fast" / "work", tmp_path / "scene" / "work"
+    assert (mine / "result.txt").samefile(its / "result.txt")
+    record = json.loads((mine / "stage.json").read_text())
+    assert record == json.loads((its / "stage.json").read_text()) | {"scene": "scene@fast"}
+    assert json.loads((mine / "run.json").read_text())["taken_from"] == "scene"
+    # The neighbour made anew does not change what was taken.
+    run_stage(request(tmp_path, key=KEY | {"seed": 1}), write("b"))
+    assert (mine / "result.txt").read_text() == "a"
+
+
+@pytest.mark.parametrize("difference", ["key", "damage"])
+def test_a_neighbours_other_or_damaged_work_is_not_taken(tmp_path, difference):
+    run_stage(request(tmp_path), write("a"))
+    if difference == "damage":
+        (tmp_path / "scene" / "work" / "result.txt").write_text("damaged")
+    key = KEY | {"seed": 1} if difference == "key" else KEY
+    other = replace(request(tmp_path, key=key), out=tmp_path / "scene@fast" / "work")
+    assert run_stage(other, write("mine")) == 0
+    assert (tmp_path / "scene@fast/work/result.txt").read_text() == "mine"
 
 
 def test_a_changed_key_works_again(tmp_path):

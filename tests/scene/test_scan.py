@@ -119,6 +119,22 @@ def test_smaller_copies_match_the_model_by_stem(tmp_path, long_side, chosen):
     np.testing.assert_allclose(model.points.track_xy, [np.array(size) / 2] * 2)
 
 
+@pytest.mark.parametrize(
+    ("scene", "chosen"),
+    [("garden", "images_4"), ("mip360_bonsai", "images_2"), ("360_v2-room", "images_2")],
+)
+def test_scenes_of_mip_nerf_360_get_the_size_that_papers_use(tmp_path, scene, chosen):
+    folder = tmp_path / scene
+    for n in (1, 2, 4, 8):
+        name = "images" if n == 1 else f"images_{n}"
+        photos(folder / name, 2, (64 // n, 48 // n))
+    result = look(folder, config(views={"max_long_side_px": 1}))
+    assert result.image_folder == chosen
+    assert "Mip-NeRF 360" in result.image_folder_reason
+    shutil.rmtree(folder / chosen)
+    assert look(folder, config(views={"max_long_side_px": 64})).image_folder == "images"
+
+
 def test_without_poses_features_get_the_resolution_they_ask_for(tmp_path):
     photos(tmp_path / "images", 2, (64, 48))
     photos(tmp_path / "images_2", 2, (32, 24))

@@ -1,0 +1,144 @@
+"""A picture of a scene's plan: what runs, what feeds it, what was skipped and why."""
+
+from __future__ import annotations
+
+import textwrap
+from collections.abc import Mapping
+from typing import Any
+
+from pipeline.reporting.text import escape
+from pipeline.scene.plan import STAGES
+
+_BOX_W, _BOX_H = 92, 34
+_GAP_X, _GAP_Y = 26, 16
+_MARGIN = 8
+_REASON_CHARS, _REASON_LINES, _LINE_H = 20, 5, 12
+# Colours come from the page where there is one, so that the picture follows its dress.
+_STYLE = (
+    ".plan text{font:600 13px system-ui,sans-serif;fill:var(--ink,#16191d);text-anchor:middle}"
+    ".plan .why{font-size:10px;font-weight:400;fill:var(--soft,#5d6673)}"
+    ".plan rect{fill:var(--card,#fff);stroke:var(--accent,#0d7d74);stroke-width:1.5}"
+    ".plan .skipped rect{stroke:var(--soft,#5d6673);stroke-width:1;stroke-dasharray:4 3;"
+    "fill:none}.plan .skipped .name{fill:var(--soft,#5d6673);font-weight:400}"
+    ".plan path{fill:none;stroke:var(--accent,#0d7d74);stroke-width:1.5}"
+    ".plan .head{fill:var(--accent,#0d7d74);stroke:none}"
+)
+
+
+def plan_svg(plan: Mapping[str, Any]) -> str:
+    """The plan as one ``<svg>`` element, usable inside a page and as a file of its own.
+
+    Args:
+        plan: the content of ``plan.json``: ``stages`` maps a name to ``run``, ``reason``,
+            ``decisions`` and ``inputs`` (the stages whose output it reads).
+
+    Returns:
+        Running stages from left to right with the arrows of what they read (those that another
+        way implies left out); below them, dashed, the skipped ones with the reason. Each box has
+        its reason and decisions as a tooltip.
+    """
+    stages: dict[str, Mapping[str, Any]] = {
+        name: plan["stages"][name] for name in STAGES if name in plan["stages"]
+    }
+    edges = _edges(stages)
+    places, columns, lanes = _places(stages, edges)
+    skip_y = _MARGIN + lanes * (_BOX_H + _GAP_Y)
+    skipped = any(not stage["run"] for stage in stages.values())
+    height = skip_y - _GAP_Y + _MARGIN
+    if skipped:
+        height = skip_y + _BOX_H + _REASON_LINES * _LINE_H + _MARGIN
+    width = 2 * _MARGIN + columns * (_BOX_W + _GAP_X) - _GAP_X
+    corner = {
+        name: (
+            _MARGIN + column * (_BOX_W + _GAP_X),
+            _MARGIN + lane * (_BOX_H + _GAP_Y) if stages[name]["run"] else skip_y,
+        )
+        for name, (column, lane) in places.items()
+    }
+    parts = [_arrow(corner[source], corner[target]) for source, target in edges]
+    parts += [_box(name, stage, *corner[name]) for name, stage in stages.items()]
+    label = escape(f"plan of {plan.get('scene', 'the scene')}")
+    return (
+        f'<svg class="plan" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
+        f'role="img" aria-label="{label}"><style>{_STYLE}</style>{"".join(parts)}</svg>'
+    )
+
+
+def _edges(stages: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+    """What feeds what, without the edges that a longer way implies."""
+    inputs = {name: list(stage.get("inputs") or []) for name, stage in stages.items()}
+
+    def reaches(target: str) -> set[str]:
+        found: set[str] = set()
+        queue = list(inputs[target])
+        while queue:
+            name = queue.pop()
+            if name not in found:
+                found.add(name)
+                queue += inputs[name]
+        return found
+
+    before = {name: reaches(name) for name in stages}
+    return [
+        (source, target)
+        for target, sources in inputs.items()
+        for source in sources
+        if not any(source in before[other] for other in sources)
+    ]
+
+
+def _places(
+    stages: Mapping[str, Mapping[str, Any]], edges: list[tuple[str, str]]
+) -> tuple[dict[str, tuple[int, int]], int, int]:
+    """Column and lane of each stage, and how many there are of both. A running stage that does
+    not wait for the one before it stands under it, in the same column."""
+    places: dict[str, tuple[int, int]] = {}
+    column, lane, lanes = -1, 0, 1
+    together: set[str] = set()
+    for name, stage in stages.items():
+        waits = any(target == name and source in together for source, target in edges)
+        if stage["run"] and together and not waits and any(t == name for _, t in edges):
+            lane += 1
+        else:
+            column, lane, together = column + 1, 0, set()
+        if stage["run"]:
+            together.add(name)
+        lanes = max(lanes, lane + 1)
+        places[name] = (column, lane)
+    return places, column + 1, lanes
+
+
+def _box(name: str, stage: Mapping[str, Any], x: float, y: float) -> str:
+    tip = "\n".join([stage["reason"], *stage.get("decisions", [])])
+    why = "" if stage["run"] else _reason(stage["reason"], x + _BOX_W / 2, y + _BOX_H + _LINE_H)
+    return (
+        f'<g class="{"run" if stage["run"] else "skipped"}"><title>{escape(name)}: {escape(tip)}'
+        f'</title><rect x="{x}" y="{y}" width="{_BOX_W}" height="{_BOX_H}" rx="8"/>'
+        f'<text class="name" x="{x + _BOX_W / 2}" y="{y + _BOX_H / 2 + 4.5}">{escape(name)}</text>'
+        f"{why}</g>"
+    )
+
+
+def _reason(text: str, x: float, y: float) -> str:
+    lines = textwrap.wrap(text, _REASON_CHARS, max_lines=_REASON_LINES, placeholder=" \u2026")
+    return "".join(
+        f'<text class="why" x="{x}" y="{y + i * _LINE_H}">{escape(line)}</text>'
+        for i, line in enumerate(lines)
+    )
+
+
+def _arrow(source: tuple[float, float], target: tuple[float, float]) -> str:
+    x0, y0 = source[0] + _BOX_W, source[1] + _BOX_H / 2
+    x1, y1 = target[0], target[1] + _BOX_H / 2
+    # Bend beside the boxes: between them there may be others in the same lane.
+    bend = _GAP_X / 2
+    middle = (
+        f"L{x0} {y0}" if y0 == y1 else f"C{x0 + bend} {y0} {x0 + bend} {y1} {x0 + 2 * bend} {y1}"
+    )
+    if y1 < y0:
+        start = x1 - 2 * bend
+        middle = f"L{start} {y0} C{start + bend} {y0} {start + bend} {y1} {x1 - 6} {y1}"
+    return (
+        f'<path d="M{x0} {y0} {middle} L{x1 - 5} {y1}"/>'
+        f'<path class="head" d="M{x1} {y1} l-8 -4.5 v9 z"/>'
+    )

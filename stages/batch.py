@@ -1,0 +1,90 @@
+"""What a batch of runs gave: ``benchmark.csv``, ``benchmark.json`` and the page that shows them."""
+
+import argparse
+import json
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.config.runs import Run
+from pipeline.metrics.evaluate import reference
+from pipeline.photos.load import load_view
+from pipeline.reporting.batch import Result, as_csv, as_json
+from pipeline.reporting.data import ranked
+from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
+from pipeline.runtime.atomic import write_json, write_text
+from pipeline.scene.manifest import Manifest
+
+
+def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
+    """Write the three files into the folder ``results``.
+
+    Args:
+        outcomes: for each run ``run`` (scene, config, seed) and ``status``; where that is not ok,
+            ``stage`` and ``message`` as well (see ``pipeline.reporting.batch.Result``).
+        results: the folder of the runs.
+    """
+    found = [result_of(outcome, results) for outcome in outcomes]
+    write_text(results / "benchmark.csv", as_csv(found))
+    write_json(results / "benchmark.json", as_json(found))
+    write_text(results / "index.html", index_html(batch_of(found, results)))
+
+
+def result_of(outcome: dict[str, Any], results: Path) -> Result:
+    """A run's outcome together with what its folder holds."""
+    run = Run(*outcome["run"])
+    if outcome["status"] != "ok":
+        return Result(run, outcome["status"], outcome["stage"], outcome["message"])
+    folder = results / run.name
+    ply = folder / "export" / "point_cloud.ply"
+    facts = read_json(folder / "train" / "run.json")
+    return Result(
+        run,
+        "ok",
+        metrics=read_json(folder / "metrics.json"),
+        size_mb=round(ply.stat().st_size / 1e6, 3) if ply.is_file() else None,
+        machine={name: facts.get(name) for name in ("host", "threads", "commit")},
+    )
+
+
+def batch_of(found: list[Result], results: Path) -> Batch:
+    """The page's content; the pictures of a scene all show the view that is its first run's
+    median."""
+    renders: dict[str, Thumbnail] = {}
+    photos: dict[str, Thumbnail] = {}
+    plans: dict[str, dict[str, Any]] = {}
+    views: dict[str, str] = {}
+    for result in (r for r in found if r.ok):
+        scene, folder = result.run.scene, results / result.run.name
+        per_view = result.metrics["per_view"]
+        plan = plans.setdefault(scene, read_json(folder / "plan.json"))
+        name = views.setdefault(scene, ranked(per_view, 1)[0][1]["name"])
+        measured = next((v for v in per_view if v["name"] == name), per_view[0])
+        source = next(s for s in ("undistort", "decode", "inspect") if plan["stages"][s]["run"])
+        manifest = Manifest.read(folder / source / "images.json")
+        photo = next(p for p in manifest.photos if p.name == measured["name"])
+        with Image.open(folder / "evaluate" / "renders" / measured["render"]) as opened:
+            render = np.asarray(opened.convert("RGB"))
+        renders[result.run.name] = thumbnail(render, photo.orientation, name)
+        if scene not in photos:
+            height, width = render.shape[:2]
+            pixels = load_view(photo.path, None, width, height)
+            background = tuple(result.metrics["protocol"]["background"])
+            photos[scene] = thumbnail(reference(pixels, background), photo.orientation, name)
+    return Batch(found, renders, photos, plans)
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser("stages.batch", description=__doc__)
+    parser.add_argument("--results", type=Path, required=True, help="the folder of the runs")
+    parser.add_argument("--outcomes", required=True, help="how each run ended (JSON), or - (stdin)")
+    args = parser.parse_args()
+    text = sys.stdin.read() if args.outcomes == "-" else args.outcomes
+    write_batch(json.loads(text)["outcomes"], args.results)

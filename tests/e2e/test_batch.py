@@ -1,0 +1,74 @@
+"""A batch through Snakemake: two scenes, one of them broken, two configurations."""
+
+from __future__ import annotations
+
+import csv
+import json
+import re
+import shutil
+
+import pytest
+
+from tests.e2e.conftest import make_scene
+from tests.e2e.harness import TINY, copy_project, rules_run, snakemake
+from tests.e2e.test_bad_input import noise
+
+pytestmark = pytest.mark.slow
+
+TABLE = "results/benchmark.csv"
+CONFIG = TINY | {
+    "train": {"steps": 60, "density": {"max_gaussians": 6_000}},
+    "configs": {"plain": {}, "sh0": {"train": {"sh_degree": 0}}},
+}
+
+
+def rows(project) -> dict[str, dict[str, str]]:
+    with open(project / TABLE) as file:
+        return {f"{row['scene']}@{row['config']}": row for row in csv.DictReader(file)}
+
+
+def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path):
+    project = copy_project(tmp_path / "project")
+    make_scene(project, "good", "--poses", "colmap", "--distortion", "none")
+    noise(project / "data/broken/images", 4)
+    (project / "data/notes").mkdir()
+
+    failed = snakemake(project, TABLE, config=CONFIG, check=False)
+    assert failed.returncode != 0
+    assert "Traceback" not in failed.stdout, failed.stdout
+    found = rows(project)
+    assert {name: row["status"] for name, row in found.items()} == {
+        "broken@plain": "failed",
+        "broken@sh0": "failed",
+        "good@plain": "ok",
+        "good@sh0": "ok",
+        "notes@plain": "left out",
+        "notes@sh0": "left out",
+    }
+    assert found["broken@plain"]["failed_stage"] in ("matches", "sfm")
+    assert "what to do" in found["broken@plain"]["message"]
+    assert float(found["good@plain"]["psnr"]) > 15
+    assert "broken@plain" in (project / "results/index.html").read_text()
+    told = json.loads((project / "results/benchmark.json").read_text())
+    assert told["configs_over_scenes"] == ["good"]
+
+    # What differs in training alone shares what comes before it.
+    init = "results/good@{}/init/run.json"
+    taken = [json.loads((project / init.format(c)).read_text()) for c in ("plain", "sh0")]
+    assert sum("taken_from" in run for run in taken) == 1
+
+    # Tables of half a batch are made again though no run is new, and then nothing is left to do.
+    shutil.rmtree(project / "data/broken")
+    done = snakemake(project, TABLE, config=CONFIG)
+    assert rules_run(done) == {"benchmark"}
+    assert {row["status"] for row in rows(project).values()} == {"ok", "left out"}
+    assert "Nothing to be done" in snakemake(project, TABLE, config=CONFIG).stdout
+
+    # A further configuration runs alone.
+    more = CONFIG | {"configs": CONFIG["configs"] | {"sh1": {"train": {"sh_degree": 1}}}}
+    done = snakemake(project, "-n", TABLE, config=more)
+    assert set(re.findall(r"wildcards: scene=(\S+)", done.stdout)) == {"good@sh1"}
+
+    (project / "report").mkdir()
+    snakemake(project, TABLE, "--report", "report/all.html", config=CONFIG)
+    assert "What the scene needed" in (project / "report/all.html").read_text()

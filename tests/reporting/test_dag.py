@@ -1,0 +1,64 @@
+"""The picture of a plan: what it says of running and skipped stages, as a file and in a page."""
+
+import xml.etree.ElementTree as ET
+
+from pipeline.config.schema import Config
+from pipeline.reporting.dag import plan_svg
+from pipeline.scene.plan import STAGES, Plan, StagePlan
+from stages.wiring import public_plan
+
+SVG = "{http://www.w3.org/2000/svg}"
+
+
+def plan(*skipped: str) -> dict:
+    stages = {
+        name: StagePlan(run=name not in skipped, reason=f"why {name} <&", decisions=["so"])
+        for name in STAGES
+    }
+    shown = Plan(scene="fox", stages=stages, warnings=[], config=Config(), facts={})
+    return public_plan(shown)
+
+
+def drawn(found: dict) -> tuple[dict[str, tuple[float, float]], ET.Element]:
+    """Corner of each box by stage."""
+    root = ET.fromstring(plan_svg(found))
+    boxes = {}
+    for group in root.iter(f"{SVG}g"):
+        rect, name = group.find(f"{SVG}rect"), group.find(f"{SVG}text")
+        assert rect is not None and name is not None
+        boxes[name.text] = (float(rect.get("x", "")), float(rect.get("y", "")))
+    return boxes, root
+
+
+def test_every_stage_has_a_box_of_its_own_inside_the_picture():
+    for skipped in ((), ("decode",), ("decode", "features", "matches", "sfm", "undistort")):
+        boxes, root = drawn(plan(*skipped))
+        assert list(boxes) == list(STAGES)
+        assert len(set(boxes.values())) == len(boxes)
+        _, _, width, height = map(float, root.get("viewBox", "").split())
+        assert all(0 <= x <= width - 92 and 0 <= y <= height - 34 for x, y in boxes.values())
+
+
+def test_skipped_stages_stand_below_with_their_reason():
+    boxes, root = drawn(plan("decode", "sfm"))
+    assert boxes["decode"][1] == boxes["sfm"][1] > boxes["inspect"][1] == boxes["train"][1]
+    groups = {g.find(f"{SVG}text").text: g for g in root.iter(f"{SVG}g")}
+    assert groups["decode"].get("class") == "skipped"
+    assert "why decode <&" in "".join(t.text for t in groups["decode"].iter(f"{SVG}text"))
+    title = groups["train"].find(f"{SVG}title")
+    assert title is not None and title.text == "train: why train <&\nso"
+
+
+def test_arrows_are_what_feeds_what_and_no_more():
+    """All run: a chain, and evaluate and export side by side between train and report."""
+    boxes, root = drawn(plan())
+    assert boxes["evaluate"][0] == boxes["export"][0]
+    heads = [p for p in root.iter(f"{SVG}path") if p.get("class") == "head"]
+    assert len(heads) == len(STAGES)  # ten of the chain, one more around export
+    assert len([p for p in drawn(plan("decode"))[1].iter(f"{SVG}path")]) == 2 * (len(STAGES) - 1)
+
+
+def test_a_plan_as_read_from_its_file_gives_the_same_picture():
+    found = plan("decode")
+    alphabetical = found | {"stages": dict(sorted(found["stages"].items()))}
+    assert plan_svg(alphabetical) == plan_svg(found)

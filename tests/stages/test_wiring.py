@@ -34,9 +34,9 @@ def test_seeds_share_what_draws_nothing():
 
 
 def test_configurations_share_what_stands_before_their_difference():
-    """The stages after it differ by what they read; evaluate and report read train's options."""
+    """The stages after it differ by what they read: train's options."""
     changed = Config.model_validate({"train": {"sh_degree": 0}})
-    assert differing(plan(Config()), plan(changed)) == {"train", "evaluate", "report"}
+    assert differing(plan(Config()), plan(changed)) == {"train", "evaluate", "export", "report"}
 
 
 def test_runs_share_all_but_the_page_that_names_them():

@@ -28,8 +28,9 @@ NUM_SEEN = 8
 #: Below this many dB on seen views the photographs contradict each other or the poses: scenes that
 #: train well reach 25 to 40 dB.
 LOW_SEEN_PSNR = 22.0
-#: This many dB between seen and held-out views is overfitting: well-covered scenes show 0 to 4.
-LARGE_GAP = 6.0
+#: This many dB between seen and held-out views, where these are bad, is overfitting: well-covered
+#: scenes show 0 to 4.
+LARGE_GAP, LOW_PSNR = 6.0, 25.0
 
 NO_GAINS: Mapping[str, Sequence[float]] = MappingProxyType({})
 EXPOSURE_PROTOCOL = (
@@ -184,7 +185,7 @@ def diagnose(held_out: float, seen: float) -> list[str]:
             "look at the report's views; photographs that differ in exposure or season, things "
             "that move, unmasked backgrounds, wrong poses and very short training do this"
         ]
-    if seen - held_out > LARGE_GAP:
+    if held_out < LOW_PSNR and seen - held_out > LARGE_GAP:
         return [
             f"views held out are much worse than views trained on ({held_out:.1f} against "
             f"{seen:.1f} dB): too few photographs, too far apart, see some places only once"

@@ -83,7 +83,7 @@ def test_seen_views_are_measured_beside_the_held_out_ones(tmp_path):
 
 @pytest.mark.parametrize(
     ("held_out", "seen", "word"),
-    [(15, 16, "badly"), (19, 28, "few"), (27, 30, None), (31, 30, None)],
+    [(15, 16, "badly"), (19, 28, "few"), (27, 30, None), (31, 30, None), (32, 39, None)],
 )
 def test_bad_scenes_are_told_from_good_ones(held_out, seen, word):
     found = diagnose(held_out, seen)

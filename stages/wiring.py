@@ -59,7 +59,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "init": ("init", "views", "split", "features"),
     "train": ("train", "views", "split"),
     "evaluate": ("evaluate", "views", "split", "train"),
-    "export": ("export",),
+    "export": ("export", "views", "split", "train"),
     "report": ("report", "views", "split", "train"),
 }
 
@@ -73,6 +73,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
     "train": ("torch", "numpy", "opencv-contrib-python-headless"),
     "evaluate": ("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
+    "export": ("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 }
 
 

@@ -229,12 +229,21 @@ class Evaluate(Section):
 class Export(Section):
     """Files for other programs."""
 
-    formats: tuple[Literal["ply", "colmap", "points"], ...] = Field(
+    formats: tuple[
+        Literal["ply", "colmap", "points", "renders", "depths", "mesh", "video"], ...
+    ] = Field(
         ("ply", "colmap", "points"),
-        description="ply: Gaussians in INRIA's layout; colmap: the model; points: coloured cloud.",
+        description="ply: Gaussians in INRIA's layout; colmap: the model; points: coloured cloud. "
+        "Drawn from every view, and off unless asked for: renders (PNG), depths (float TIFF), "
+        "mesh (PLY and GLB), video (a camera path).",
     )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Truncate SH to this.")
     min_opacity: Share = Field(0.0, description="Leave fainter Gaussians out.")
+    mesh_voxel: Annotated[float, Field(gt=0)] | None = Field(
+        None,
+        description="Side of the mesh's voxels in the scene's unit; null takes 2.5 pixels at the "
+        "median depth. Larger where 24 million voxels would not do.",
+    )
 
 
 class Report(Section):

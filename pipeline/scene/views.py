@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config import schema
 from pipeline.scene.manifest import Manifest
@@ -59,6 +62,28 @@ def load_views(
             )
         )
     return result
+
+
+def up_direction(
+    rotations: NDArray[np.float64], orientations: Sequence[int]
+) -> NDArray[np.float64]:
+    """(3,) unit vector of the world that the cameras together hold up.
+
+    Args:
+        rotations: (N, 3, 3) world to camera.
+        orientations: the photographs' EXIF orientations, 1 to 8: a camera held upright has its
+            sensor's rows run down the photograph.
+
+    Without cameras, or where they disagree entirely, it is -y: up for a camera at the identity.
+    """
+    # Where the picture's top is on the sensor. Source: EXIF 2.3, tag Orientation.
+    top = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
+    total = np.zeros(3)
+    for rotation, orientation in zip(rotations, orientations, strict=True):
+        right, down = top.get(orientation, (0, -1))
+        total += right * rotation[0] + down * rotation[1]
+    length = float(np.linalg.norm(total))
+    return total / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
 
 
 def scene_extent(views: list[View]) -> float:

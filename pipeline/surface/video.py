@@ -17,14 +17,14 @@ Frames = Sequence[NDArray[np.uint8]]
 
 
 def write_video(folder: Path, frames: Frames, fps: int) -> Path:
-    """Write ``video.mp4`` (H.264) where ffmpeg is on the PATH, else ``video.webm`` (VP9, by
-    OpenCV), else an animated ``video.webp``; returns the file.
+    """Write ``video.mp4``, in H.264 where ffmpeg is on the PATH, else in VP9 by OpenCV's own
+    encoder, or, where that is missing too, an animated ``video.webp``; returns the file.
 
     Args:
         frames: (H, W, 3) uint8 RGB each, one size, even sides.
     """
     folder.mkdir(parents=True, exist_ok=True)
-    for name, encode in (("mp4", _ffmpeg), ("webm", _opencv), ("webp", _pillow)):
+    for name, encode in (("mp4", _ffmpeg), ("mp4", _opencv), ("webp", _pillow)):
         path = folder / f"video.{name}"
         temporary = folder / f".video.{os.getpid()}.{name}"
         try:
@@ -55,7 +55,8 @@ def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
 
 def _opencv(path: Path, frames: Frames, fps: int) -> bool:
     height, width = frames[0].shape[:2]
-    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"VP90"), fps, (width, height))
+    # MP4 and not WebM, which is stamped with a random number: the same frames, the same bytes.
+    writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
     if not writer.isOpened():
         return False
     for frame in frames:

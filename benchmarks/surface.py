@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import PurePosixPath
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -96,7 +97,7 @@ def true_points(views: list[View], frame: Similarity) -> Array:
     return np.asarray(points[seen >= MIN_VIEWS])
 
 
-def sample(vertices: Array, faces: NDArray[np.int64], count: int) -> Array:
+def sample(vertices: NDArray[Any], faces: NDArray[Any], count: int) -> Array:
     """(count, 3) points spread over the triangles by area; always the same ones."""
     rng = np.random.default_rng(0)
     a, b, c = (vertices[faces[:, i]] for i in range(3))
@@ -108,7 +109,7 @@ def sample(vertices: Array, faces: NDArray[np.int64], count: int) -> Array:
 
 
 def measure(
-    vertices: Array, faces: NDArray[np.int64], truth: Array, frame: Similarity
+    vertices: NDArray[Any], faces: NDArray[Any], truth: Array, frame: Similarity
 ) -> dict[str, Accuracy]:
     """Accuracy in the ``foreground``, whose size is its diameter, and of the whole ``room``, whose
     size is the diagonal of what is seen of it.

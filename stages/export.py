@@ -2,7 +2,8 @@
 
 Outputs: of the Gaussians ``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``; the sparse points,
 ``points.ply``; the cameras, ``sparse/0`` and ``sparse_text`` (COLMAP) and ``transforms.json``; and
-``frame.json``, which says what they leave open.
+``frame.json``, which says what they leave open. Where asked for ``renders/``, ``depths/``,
+``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
 """
 
 from collections.abc import Callable
@@ -10,6 +11,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.schema import Export, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol
@@ -85,7 +87,7 @@ def run(job: Job) -> None:
         points=WRITERS["points"][0] if "points" in config.formats and len(model.points) else None,
     )
     files = []
-    for name in config.formats:
+    for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]
         write(job.out / file, scene)
         files.append(file)
@@ -103,6 +105,30 @@ def run(job: Job) -> None:
     frame = describe_frame(scene.gaussians, scene.views, up, render, files)
     write_json(job.out / "frame.json", frame)
     job.counters["exported_gaussians"] = len(scene.gaussians)
+    if not set(config.formats) <= WRITERS.keys():
+        draw(job, trained, load_views(manifest, model, job.section(Views), split), up)
+
+
+def draw(job: Job, trained: Gaussians, views: list[View], up: NDArray[np.float64]) -> None:
+    """What shows the Gaussians as they were trained, from the views they were trained on."""
+    # Not for everybody, and heavy: marching cubes, video encoders.
+    from pipeline.surface.depth import Look
+    from pipeline.surface.outputs import write_drawn
+
+    config, train, split = job.section(Export), job.section(Train), job.section(Split)
+    told = write_drawn(
+        job.out,
+        config.formats,
+        trained,
+        views,
+        Look(choose_protocol(views, split, train), train, job.threads),
+        up=up,
+        mesh_voxel=config.mesh_voxel,
+    )
+    for text in told.decisions:
+        job.decide(text)
+    for text in told.warnings:
+        job.warn(text)
 
 
 if __name__ == "__main__":

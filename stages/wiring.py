@@ -45,7 +45,7 @@ ROLES: dict[str, dict[str, tuple[str, ...]]] = {
         "poses": _POSES,
         "train": ("train",),
         "evaluate": ("evaluate",),
-        "export": ("export", "split", "train"),
+        "export": ("export", "views", "split", "train"),
     },
 }
 
@@ -74,7 +74,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
     "train": ("torch", "numpy", "opencv-contrib-python-headless"),
     "evaluate": ("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
-    "export": ("torch", "numpy"),
+    "export": ("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 }
 
 

@@ -233,7 +233,18 @@ class Evaluate(Section):
 
 
 ExportFormat = Literal[
-    "ply", "spz", "splat", "gltf", "points", "colmap", "colmap_text", "transforms"
+    "ply",
+    "spz",
+    "splat",
+    "gltf",
+    "points",
+    "colmap",
+    "colmap_text",
+    "transforms",
+    "renders",
+    "depths",
+    "mesh",
+    "video",
 ]
 
 
@@ -245,7 +256,8 @@ class Export(Section):
         description="The Gaussians: ply (INRIA's layout, exact), spz (a sixth of the size), splat "
         "(without SH), gltf (.glb, KHR_gaussian_splatting). points: coloured sparse cloud. "
         "The cameras: colmap (with the points), colmap_text (likewise), transforms "
-        "(nerfstudio's transforms.json).",
+        "(nerfstudio's transforms.json). Drawn from every view, and off unless asked for: renders "
+        "(PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera path).",
     )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Truncate SH to this.")
     min_opacity: Share = Field(0.0, description="Leave fainter Gaussians out.")
@@ -253,6 +265,11 @@ class Export(Section):
         True,
         description="Sort Gaussians along a Z-order curve, so that neighbours in space are "
         "neighbours in the file (smaller, faster to show); otherwise they keep training's order.",
+    )
+    mesh_voxel: Annotated[float, Field(gt=0)] | None = Field(
+        None,
+        description="Side of the mesh's voxels in the scene's unit; null takes 2.5 pixels at the "
+        "median depth. Larger where 24 million voxels would not do.",
     )
 
 

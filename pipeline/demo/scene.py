@@ -94,6 +94,13 @@ def trace(origin: Array, direction: Array, things: tuple[Thing, ...]) -> tuple[A
     return best, index
 
 
+def distance(point: Array) -> Array:
+    """(N,) signed distances of (3, N) points from the scene's surface; the empty part of the room
+    is positive."""
+    shapes = (ROOM, *(thing.shape for thing in OBJECTS))
+    return np.asarray(np.min([shape.distance(point) for shape in shapes], axis=0))
+
+
 def shade(
     origin: Array,
     direction: Array,

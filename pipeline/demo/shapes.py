@@ -26,6 +26,10 @@ class Shape(Protocol):
         """(3, N) unit normals, outwards, at points on the surface."""
         ...
 
+    def distance(self, point: Array) -> Array:
+        """(N,) exact signed distances, negative inside what is solid."""
+        ...
+
 
 @dataclass(frozen=True)
 class Sphere:
@@ -42,6 +46,10 @@ class Sphere:
 
     def normal(self, point: Array) -> Array:
         return np.asarray((point - np.array(self.centre)[:, None]) / self.radius)
+
+    def distance(self, point: Array) -> Array:
+        offset = point - np.array(self.centre)[:, None]
+        return np.asarray(np.sqrt((offset**2).sum(0)) - self.radius)
 
 
 @dataclass(frozen=True)
@@ -76,6 +84,10 @@ class Cylinder:
         up = np.where(point[2] > (self.top + self.bottom) / 2, 1.0, -1.0)
         return np.stack([np.where(on_cap, 0, x), np.where(on_cap, 0, y), np.where(on_cap, up, 0)])
 
+    def distance(self, point: Array) -> Array:
+        flat = np.hypot(*(point[:2] - np.array(self.centre)[:, None])) - self.radius
+        return _outside(np.stack([flat, np.maximum(self.bottom - point[2], point[2] - self.top)]))
+
 
 @dataclass(frozen=True)
 class Box:
@@ -108,6 +120,17 @@ class Box:
         c, s = np.cos(self.yaw), np.sin(self.yaw)
         turned = np.stack([c * n[0] - s * n[1], s * n[0] + c * n[1], n[2]])
         return -turned if self.inside else turned
+
+    def distance(self, point: Array) -> Array:
+        local = self._local(point - np.array(self.centre)[:, None])
+        signed = _outside(np.abs(local) - np.array(self.half)[:, None])
+        return -signed if self.inside else signed
+
+
+def _outside(excess: Array) -> Array:
+    """Signed distance from how far (K, N) points are past each of K perpendicular bounds."""
+    beyond = np.sqrt((np.maximum(excess, 0) ** 2).sum(0))
+    return np.asarray(beyond + np.minimum(excess.max(0), 0))
 
 
 def _quadratic(a: Array, half_b: Array, c: Array) -> tuple[Array, Array]:

@@ -21,11 +21,14 @@ class Render(NamedTuple):
         rgb: (H, W, 3) float32, over the background, clamped to [0, 1].
         alpha: (H, W) float32 in [0, 1].
         depth: (H, W) float32, camera z summed by weight, not divided by alpha; world unit.
+        median_depth: (H, W) float32, camera z of the Gaussian that takes the transmittance below
+            one half; 0 where none does.
     """
 
     rgb: NDArray[np.float32]
     alpha: NDArray[np.float32]
     depth: NDArray[np.float32]
+    median_depth: NDArray[np.float32]
 
 
 def near_plane(extent: float) -> float:
@@ -75,4 +78,9 @@ def render_view(
         threads=threads,
     )
     result = forward(*gaussians.parameters(), raster_camera(view), options)
-    return Render(result.color.clamp(0.0, 1.0).numpy(), result.alpha.numpy(), result.depth.numpy())
+    return Render(
+        result.color.clamp(0.0, 1.0).numpy(),
+        result.alpha.numpy(),
+        result.depth.numpy(),
+        result.median_depth.numpy(),
+    )

@@ -1,0 +1,72 @@
+"""``python -m benchmarks.mesh``: the mesh of the finished demo scene against its exact surface.
+
+make demo && python -m benchmarks.mesh results/demo data/demo
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import resource
+import sys
+import time
+from dataclasses import asdict
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+from benchmarks.surface import align, measure, true_points
+from pipeline.config.schema import Split, Train, Views
+from pipeline.metrics.evaluate import choose_protocol
+from pipeline.scene.colmap import read_model
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.views import load_views
+from pipeline.splats.gaussians import Gaussians
+from pipeline.surface.depth import DepthMaps, Look, Pictures
+from pipeline.surface.mesh import build_mesh
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.mesh", description=__doc__)
+    parser.add_argument("results", type=Path, help="the demo's results, for example results/demo")
+    parser.add_argument("data", type=Path, help="the demo scene, for example data/demo")
+    parser.add_argument("--voxel", type=float, help="as export.mesh_voxel")
+    parser.add_argument("--threads", type=int, default=2)
+    options = parser.parse_args()
+    stage = json.loads((options.results / "train" / "stage.json").read_text())
+    sections = stage["key"]["config"]
+    split = Split.model_validate(sections["split"])
+    train = Train.model_validate(sections["train"])
+    pinhole = options.results / "undistort"
+    views = load_views(
+        Manifest.read(pinhole / "images.json"),
+        read_model(pinhole / "sparse" / "0"),
+        Views.model_validate(sections["views"]),
+        split,
+    )
+    gaussians = Gaussians.load(options.results / "train" / "gaussians.npz")
+    look = Look(choose_protocol(views, split, train), train, options.threads)
+    start, cpu = time.monotonic(), time.process_time()
+    with TemporaryDirectory() as folder:
+        pictures = Pictures(gaussians, views, look, Path(folder))
+        mesh, grid = build_mesh(DepthMaps(pictures), options.voxel, options.threads)
+    seconds = {"wall": time.monotonic() - start, "cpu": time.process_time() - cpu}
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    if mesh is None or grid is None:
+        print("no mesh: the views' depths agree on no surface", file=sys.stderr)
+        return 1
+    frame = align(views, read_model(options.data / "sparse_gt"))
+    found = measure(mesh.vertices, mesh.faces, true_points(views, frame), frame)
+    report = {
+        "triangles": len(mesh.faces),
+        "voxel_m": grid.voxel * frame.scale,
+        "voxels": len(grid.blocks) * 512,
+        "seconds": seconds,
+        "peak_mb": peak,
+        **{name: asdict(accuracy) for name, accuracy in found.items()},
+    }
+    print(json.dumps(report, indent=2))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,127 @@
+"""Meshes as files: PLY and binary glTF 2.0 (.glb)."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.atomic import write_bytes
+from pipeline.surface.mesh import Mesh
+
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125  # glTF's component types
+_ARRAY, _ELEMENT = 34962, 34963  # and its buffer targets
+
+
+def write_mesh_ply(path: Path, mesh: Mesh) -> None:
+    """Binary little-endian: float positions and normals, uchar red, green, blue (sRGB); faces as
+    lists of three ints."""
+    vertex = np.zeros(
+        len(mesh.vertices),
+        [("xyz", "<f4", 3), ("normal", "<f4", 3), ("rgb", "u1", 3)],
+    )
+    vertex["xyz"], vertex["normal"], vertex["rgb"] = mesh.vertices, mesh.normals, mesh.colors
+    face = np.zeros(len(mesh.faces), [("count", "u1"), ("corner", "<i4", 3)])
+    face["count"], face["corner"] = 3, mesh.faces
+    header = [
+        "ply",
+        "format binary_little_endian 1.0",
+        f"element vertex {len(vertex)}",
+        *(f"property float {name}" for name in ("x", "y", "z", "nx", "ny", "nz")),
+        *(f"property uchar {name}" for name in ("red", "green", "blue")),
+        f"element face {len(face)}",
+        "property list uchar int vertex_indices",
+        "end_header",
+        "",
+    ]
+    write_bytes(path, "\n".join(header).encode() + vertex.tobytes() + face.tobytes())
+
+
+def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
+    """Binary glTF 2.0: positions in the world's frame, normals, COLOR_0, unlit (the colours hold
+    the light already).
+
+    Args:
+        up: (3,) the world's up; the node turns it to glTF's, +y.
+    """
+    linear = _linear(mesh.colors / 255.0)
+    color = np.full((len(linear), 4), 65535, np.uint16)
+    color[:, :3] = np.rint(linear * 65535)
+    arrays = [
+        (mesh.vertices.astype("<f4"), _FLOAT, "VEC3", _ARRAY),
+        (mesh.normals.astype("<f4"), _FLOAT, "VEC3", _ARRAY),
+        (color.astype("<u2"), _USHORT, "VEC4", _ARRAY),
+        (mesh.faces.astype("<u4").reshape(-1), _UINT, "SCALAR", _ELEMENT),
+    ]
+    views: list[dict[str, Any]] = []
+    accessors: list[dict[str, Any]] = []
+    body = b""
+    parts = []
+    offset = 0
+    for i, (array, kind, shape, target) in enumerate(arrays):
+        data = array.tobytes()
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
+        accessors.append(
+            {"bufferView": i, "componentType": kind, "count": len(array), "type": shape}
+        )
+        parts.append(data)
+        offset += len(data)  # every element is a multiple of 4 bytes: all stay aligned
+    accessors[0] |= {
+        "min": mesh.vertices.min(axis=0).astype(float).tolist(),
+        "max": mesh.vertices.max(axis=0).astype(float).tolist(),
+    }
+    accessors[2]["normalized"] = True
+    body = b"".join(parts)
+    document = {
+        "asset": {"version": "2.0", "generator": "splatmake"},
+        "extensionsUsed": ["KHR_materials_unlit"],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0, "rotation": _turn_up(up)}],
+        "meshes": [
+            {
+                "primitives": [
+                    {
+                        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
+                        "indices": 3,
+                        "material": 0,
+                    }
+                ]
+            }
+        ],
+        "materials": [
+            {
+                "extensions": {"KHR_materials_unlit": {}},
+                "pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 1.0},
+                "doubleSided": True,
+            }
+        ],
+        "buffers": [{"byteLength": len(body)}],
+        "bufferViews": views,
+        "accessors": accessors,
+    }
+    text = json.dumps(document, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    chunks = [(b"JSON", text), (b"BIN\0", body)]
+    total = 12 + sum(8 + len(data) for _, data in chunks)
+    out = [b"glTF", np.array([2, total], "<u4").tobytes()]
+    for name, data in chunks:
+        out += [np.array([len(data)], "<u4").tobytes(), name, data]
+    write_bytes(path, b"".join(out))
+
+
+def _linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Linear light of sRGB values in [0, 1] (IEC 61966-2-1)."""
+    return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
+
+
+def _turn_up(up: NDArray[np.float64]) -> list[float]:
+    """Quaternion xyzw of the shortest turn that takes the unit vector ``up`` to +y."""
+    cosine = float(up[1])
+    if cosine < -1 + 1e-9:
+        return [1.0, 0.0, 0.0, 0.0]
+    quaternion = np.array([-up[2], 0.0, up[0], 1 + cosine])
+    return (quaternion / np.linalg.norm(quaternion)).tolist()

@@ -1,0 +1,206 @@
+"""Triangle meshes: out of a distance field, cleaned and coloured."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import coo_matrix
+from scipy.sparse.csgraph import connected_components
+from skimage.measure import marching_cubes
+
+from pipeline.surface.depth import DepthMap, DepthMaps
+from pipeline.surface.tsdf import (
+    BLOCK,
+    Grid,
+    Tsdf,
+    camera_space,
+    choose_grid,
+    chunks,
+    fuse,
+    pixels_of,
+)
+
+#: Fewer views that saw a surface in a voxel's neighbourhood, and there is none.
+MIN_VIEWS = 2
+#: Connected pieces with a smaller share of the triangles are floaters.
+SMALL_PIECE = 0.002
+
+# Blocks along the side of the cubes that marching cubes runs over.
+_CHUNK = 8
+_VERTICES = 1 << 16
+
+
+@dataclass(frozen=True)
+class Mesh:
+    """Triangles.
+
+    Attributes:
+        vertices: (V, 3) float32, world.
+        faces: (F, 3) int32, counter-clockwise seen from in front of the surface.
+        normals: (V, 3) float32, unit length, out of the surface.
+        colors: (V, 3) uint8, sRGB.
+    """
+
+    vertices: NDArray[np.float32]
+    faces: NDArray[np.int32]
+    normals: NDArray[np.float32]
+    colors: NDArray[np.uint8]
+
+
+def extract(field: Tsdf, min_weight: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Marching cubes (Lewiner et al. 2003) over cells of which all corners were seen.
+
+    Args:
+        min_weight: voxels of less weight count as not seen.
+
+    Returns:
+        vertices (V, 3) float64 in the world, faces (F, 3); each edge of the grid has one vertex.
+    """
+    grid, side = field.grid, _CHUNK * BLOCK + 1
+    parts: list[NDArray[np.float64]] = []
+    faces: list[NDArray[np.int64]] = []
+    count = 0
+    for first, rows in chunks(grid, _CHUNK):
+        values, known = np.ones((side,) * 3, np.float32), np.zeros((side,) * 3, bool)
+        for row, at in zip(rows, (grid.blocks[rows] - first) * BLOCK, strict=True):
+            size = np.minimum(BLOCK, side - at)
+            to = tuple(slice(a, a + n) for a, n in zip(at, size, strict=True))
+            of = (row, *(slice(0, n) for n in size))
+            values[to], known[to] = field.distance[of], field.weight[of] >= min_weight
+        # A vertex on a corner would belong to several edges.
+        values[values == 0] = 1e-6
+        # skimage's mask names a cell by its last corner.
+        cells = np.zeros_like(known)
+        corners = [slice(0, -1), slice(1, None)]
+        cells[1:, 1:, 1:] = np.logical_and.reduce(
+            [known[i, j, k] for i in corners for j in corners for k in corners]
+        )
+        below = values < 0
+        if not (cells.any() and below[known].any() and not below[known].all()):
+            continue
+        try:
+            points, triangles, *_ = marching_cubes(values, 0.0, mask=cells)
+        except RuntimeError:  # no surface in the cells that count
+            continue
+        parts.append(points.astype(np.float64) + first * BLOCK)
+        faces.append(triangles.astype(np.int64) + count)
+        count += len(points)
+    if not parts:
+        return np.zeros((0, 3)), np.zeros((0, 3), np.int64)
+    vertices, triangles = _weld(np.concatenate(parts), np.concatenate(faces))
+    return vertices * grid.voxel, triangles
+
+
+def _weld(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """One vertex for each edge of the grid, where chunks brought several; voxel units."""
+    base = np.floor(vertices).astype(np.int64)
+    # The axis of the edge that the vertex lies on; 3 for the few inside a cell.
+    loose = vertices != base
+    axis = np.where(loose.sum(axis=1) == 1, loose.argmax(axis=1), 3)
+    inner = np.where(axis == 3, np.arange(len(vertices)), -1)
+    keys = np.column_stack([base, axis, inner])
+    order = np.lexsort(keys.T)
+    new = np.ones(len(order), bool)
+    new[1:] = np.any(keys[order[1:]] != keys[order[:-1]], axis=1)
+    target = np.empty(len(order), np.int64)
+    target[order] = np.cumsum(new) - 1
+    faces = target[faces]
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return vertices[order[new]], faces[distinct]
+
+
+def drop_small(
+    vertices: NDArray[np.float64], faces: NDArray[np.int64], min_faces: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Without the connected pieces of fewer triangles, and without loose vertices."""
+    count = len(vertices)
+    links = coo_matrix(
+        (np.ones(2 * len(faces), np.int8), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
+        shape=(count, count),
+    )
+    _, piece = connected_components(links, directed=False)
+    size = np.bincount(piece[faces[:, 0]], minlength=int(piece.max(initial=0)) + 1)
+    faces = faces[size[piece[faces[:, 0]]] >= min_faces]
+    used = np.zeros(count, bool)
+    used[faces] = True
+    return vertices[used], (np.cumsum(used) - 1)[faces]
+
+
+def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
+    """(V, 3) unit normals, the mean of the triangles' weighted by area."""
+    a, b, c = (vertices[faces[:, i]] for i in range(3))
+    across = np.cross(b - a, c - a)
+    total = np.stack(
+        [np.bincount(faces.ravel(), np.repeat(across[:, i], 3), len(vertices)) for i in range(3)],
+        axis=1,
+    )
+    length = np.linalg.norm(total, axis=1, keepdims=True)
+    return np.asarray(np.where(length > 0, total / np.maximum(length, 1e-300), (0.0, 0.0, 1.0)))
+
+
+def vertex_colors(
+    vertices: NDArray[np.float64],
+    normals: NDArray[np.float64],
+    depths: Iterable[DepthMap],
+    tolerance: float,
+    threads: int,
+) -> NDArray[np.uint8]:
+    """(V, 3) uint8: the mean of what the views show there, those that look straight at the surface
+    counting more; grey where none does.
+
+    Args:
+        tolerance: a view sees a vertex if its depth differs by no more, world unit.
+    """
+    total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
+    parts = [slice(i, i + _VERTICES) for i in range(0, len(vertices), _VERTICES)]
+
+    def add(depth: DepthMap, part: slice) -> None:
+        view, normal = depth.view, normals[part]
+        x, y, z = camera_space(view, vertices[part])
+        pixel, seen = pixels_of(view, x, y, z)
+        found = depth.depth.reshape(-1)[pixel]
+        ray = vertices[part] - view.centre
+        facing = -(ray * normal).sum(axis=1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
+        gain = np.where(seen & (np.abs(found - z) < tolerance), np.clip(facing, 0, 1) ** 2, 0.0)
+        weight[part] += gain
+        total[part] += gain[:, None] * depth.rgb.reshape(-1, 3)[pixel]
+
+    with ThreadPoolExecutor(max(1, threads)) as pool:
+        for depth in depths:
+            for _ in pool.map(partial(add, depth), parts):
+                pass
+    mean = total / np.maximum(weight, 1e-12)[:, None]
+    return np.where(weight[:, None] > 0, np.rint(mean), 128).astype(np.uint8)
+
+
+def build_mesh(
+    depths: DepthMaps, voxel: float | None, threads: int
+) -> tuple[Mesh | None, Grid | None]:
+    """The surface that the depth maps agree on, coloured and cleaned; the same bits at any number
+    of threads. None where there is no surface.
+
+    Args:
+        voxel: side of a voxel, world unit; None chooses one (see ``choose_grid``).
+    """
+    grid = choose_grid(depths, voxel)
+    if grid is None:
+        return None, None
+    field = fuse(grid, depths, threads)
+    vertices, faces = extract(field, min(MIN_VIEWS, len(depths)))
+    del field
+    vertices, faces = drop_small(vertices, faces, int(np.ceil(SMALL_PIECE * len(faces))))
+    if len(faces) == 0:
+        return None, grid
+    normals = vertex_normals(vertices, faces)
+    colors = vertex_colors(vertices, normals, depths, grid.truncation, threads)
+    mesh = Mesh(
+        vertices.astype(np.float32), faces.astype(np.int32), normals.astype(np.float32), colors
+    )
+    return mesh, grid

@@ -1,0 +1,148 @@
+"""Drawn from real Gaussians to real files: depth maps, renders, mesh, video."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+
+import cv2
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+import pipeline.surface.path as path_module
+import pipeline.surface.video as video
+from pipeline.config.schema import Split, Train
+from pipeline.metrics.evaluate import choose_protocol
+from pipeline.splats.gaussians import Gaussians
+from pipeline.surface.depth import DepthMaps, Look, Pictures
+from pipeline.surface.outputs import write_drawn
+from tests.surface.scenes import view_at
+
+UP = np.array([0.0, 0.0, 1.0])
+
+
+@pytest.fixture(scope="module")
+def ball():
+    """Opaque flat Gaussians all over the unit ball."""
+    i = np.arange(3000)
+    z = 1 - (2 * i + 1) / len(i)
+    angle = i * np.pi * (3 - np.sqrt(5))
+    flat = np.sqrt(1 - z * z)
+    means = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
+    # From (0, 0, 1) to the normal: the disc's thin axis.
+    quats = np.stack([1 + z, -means[:, 1], means[:, 0], 0 * z], axis=1)
+    return Gaussians(
+        torch.tensor(means, dtype=torch.float32),
+        torch.log(torch.tensor([0.04, 0.04, 0.004])).repeat(len(i), 1),
+        torch.tensor(quats, dtype=torch.float32),
+        torch.full((len(i),), 5.0),
+        torch.tensor([1.0, 0.0, -1.0]).repeat(len(i), 1)[:, None, :],
+    )
+
+
+@pytest.fixture
+def views(tmp_path):
+    """A dozen views around the ball, two of one name but for the suffix, one of them masked."""
+    found = []
+    for i in range(12):
+        a, b = i * np.pi / 6, (-0.9, 0.0, 0.9)[i % 3]
+        centre = 3 * np.array([np.cos(a) * np.cos(b), np.sin(a) * np.cos(b), np.sin(b)])
+        name = f"a/{i:02d}.jpg" if i != 1 else "a/00.png"
+        photo = tmp_path / f"{i}.png"
+        Image.fromarray(np.full((80, 80, 3), 90, np.uint8)).save(photo)
+        view = view_at(centre, (0, 0, 0), 80, 80.0, name=name)
+        found.append(replace(view, image=str(photo), is_test=i == 4))
+    mask = np.full((80, 80), 255, np.uint8)
+    mask[:40] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    found[2] = replace(found[2], mask=str(tmp_path / "mask.png"))
+    return found
+
+
+def look(views):
+    train = Train()
+    return Look(choose_protocol(views, Split(), train), train, threads=2)
+
+
+def test_depth_maps_and_renders_open_in_other_programs(tmp_path, ball, views):
+    out = tmp_path / "out"
+    write_drawn(out, {"depths", "renders"}, ball, views, look(views), up=UP, mesh_voxel=None)
+    names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
+    assert len(names) == 3 * len(views)
+    assert {"depths/median/a/00.jpg.tiff", "depths/median/a/00.png.tiff"} <= names
+    assert "renders/a/05.png" in names
+    for kind in ("median", "expected"):
+        depth = cv2.imread(str(out / "depths" / kind / "a" / "05.tiff"), cv2.IMREAD_UNCHANGED)
+        assert depth.dtype == np.float32 and depth.shape == (80, 80)
+        # The camera is 3 from the middle of a ball of radius 1; z, not the ray's length.
+        # Light passes between the discs: the mean reaches a little deeper.
+        assert abs(depth[40, 40] - 2) < 0.06
+        assert depth[0, 0] == 0
+    picture = np.asarray(Image.open(out / "renders" / "a" / "05.png"))
+    assert picture[40, 40, 0] > 180 > 100 > picture[40, 40, 2]
+
+
+def test_masks_alpha_and_held_out_views_in_depth_maps(tmp_path, ball, views):
+    clear = np.zeros((80, 80, 4), np.uint8)
+    clear[30:, :, 3] = 255
+    Image.fromarray(clear).save(tmp_path / "alpha.png")
+    views[3] = replace(views[3], image=str(tmp_path / "alpha.png"))
+    pictures = Pictures(ball, views, look(views), tmp_path / "drawn")
+    maps = {depth.view.name: depth.depth for depth in DepthMaps(pictures)}
+    assert len(maps) == len(DepthMaps(pictures)) == len(views) - 1
+    assert "a/04.jpg" not in maps
+    masked = maps["a/02.jpg"]
+    assert (masked[:40] == 0).all() and (masked[45, 35:45] > 0).all()
+    transparent = maps["a/03.jpg"]
+    assert np.isinf(transparent[:30]).all() and np.isfinite(transparent[30:]).all()
+
+
+def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
+    told = write_drawn(tmp_path, {"mesh"}, ball, views, look(views), up=UP, mesh_voxel=0.05)
+    assert "triangles from 11 views" in told.decisions[0] and not told.warnings
+    data = (tmp_path / "mesh.ply").read_bytes()
+    count = int(data.split(b"element vertex ")[1].split()[0])
+    start = data.index(b"end_header\n") + 11
+    vertex = np.frombuffer(
+        data, [("xyz", "<f4", 3), ("n", "<f4", 3), ("rgb", "u1", 3)], count, start
+    )
+    assert np.median(np.abs(np.linalg.norm(vertex["xyz"], axis=1) - 1)) < 0.05
+    assert (vertex["rgb"][:, 0] > 150).mean() > 0.9
+    assert (tmp_path / "mesh.glb").stat().st_size > 1000
+
+
+def test_nothing_to_mesh_is_a_warning_and_no_file(tmp_path, ball, views):
+    faint = replace(ball, opacity_logits=torch.full((len(ball),), -6.0))
+    told = write_drawn(
+        tmp_path / "out", {"mesh"}, faint, views, look(views), up=UP, mesh_voxel=None
+    )
+    assert told.warnings and "no mesh" in told.warnings[0]
+    assert not (tmp_path / "out" / "mesh.ply").exists()
+
+
+def test_video_and_its_path(tmp_path, ball, views, monkeypatch):
+    monkeypatch.setattr(path_module, "FRAMES", 12)
+    for out in ("one", "two"):
+        write_drawn(tmp_path / out, {"video"}, ball, views, look(views), up=UP, mesh_voxel=None)
+    one, two = (tmp_path / out / "video.mp4" for out in ("one", "two"))
+    assert one.read_bytes() == two.read_bytes()
+    capture = cv2.VideoCapture(str(one))
+    frames = []
+    while (read := capture.read())[0]:
+        frames.append(read[1])
+    assert len(frames) == 12 and frames[0].shape == (40, 40, 3)
+    assert frames[3][20, 20, 2] > 180, "the ball is red, and in the middle"
+    told = json.loads((tmp_path / "one" / "path.json").read_text())
+    assert len(told["world_to_camera"]) == 12
+    assert sorted(p.name for p in one.parent.iterdir()) == ["path.json", "video.mp4"]
+
+
+def test_without_encoders_the_video_is_an_animated_picture(tmp_path, monkeypatch):
+    monkeypatch.setattr(video, "_ffmpeg", lambda *_: False)
+    monkeypatch.setattr(video, "_opencv", lambda *_: False)
+    frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 120, 240)]
+    written = video.write_video(tmp_path, frames, 30)
+    assert written.name == "video.webp"
+    assert Image.open(written).n_frames == 3

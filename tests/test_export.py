@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from pipeline.config.schema import Config, ExportFormat
 from pipeline.runtime.errors import UserError
@@ -18,6 +19,7 @@ from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
 from pipeline.scene.transforms import read_frames, read_transforms
 from pipeline.splats.files import read_gaussians
+from pipeline.surface.outputs import DRAWN
 from stages.export import WRITERS, run
 from tests.splats.samples import sample
 
@@ -44,7 +46,7 @@ def scene(tmp_path: Path) -> Path:
     photos = []
     for i in range(9):
         path = scene / "undistort" / "images" / f"p{i}.png"
-        path.touch()
+        Image.new("RGB", (90, 60), (90, 80, 70)).save(path)
         photos.append(Photo(name=path.name, path=str(path), width=90, height=60, digest=""))
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
     (scene / "train").mkdir()
@@ -75,8 +77,10 @@ def export(scene: Path, **options) -> tuple[Path, Job]:
 
 
 def test_every_format_the_schema_offers_is_written(scene):
-    assert set(WRITERS) == set(FORMATS)
-    out, job = export(scene, formats=FORMATS, sh_degree=1, min_opacity=0.3, morton_order=False)
+    assert set(WRITERS) | DRAWN == set(FORMATS)
+    out, job = export(
+        scene, formats=list(WRITERS), sh_degree=1, min_opacity=0.3, morton_order=False
+    )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
     assert job.counters == {"exported_gaussians": len(kept)}
     for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
@@ -88,6 +92,16 @@ def test_every_format_the_schema_offers_is_written(scene):
         assert len(model.images) == 9 and len(model.points) == 1
     assert (out / "sparse_text" / "cameras.txt").is_file()
     assert b"element vertex 1\n" in (out / "points.ply").read_bytes()[:100]
+
+
+def test_what_is_drawn_is_drawn_on_demand(scene):
+    out, job = export(scene, formats=["renders", "depths", "mesh", "video"])
+    assert len(list((out / "renders").glob("*.png"))) == 9
+    assert len(list((out / "depths" / "median").iterdir())) == 9
+    assert (out / "path.json").is_file()
+    # Fifty scattered Gaussians have no surface, or a poor one: either way it is said.
+    assert (out / "mesh.ply").is_file() == any("mesh" in text for text in job.decisions)
+    assert any("mesh" in text for text in (*job.decisions, *job.warnings))
 
 
 def test_transforms_name_the_pictures_from_where_they_end_up(scene):

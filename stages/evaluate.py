@@ -3,6 +3,7 @@
 Outputs: ``evaluation.json`` and ``renders/``.
 """
 
+import json
 from dataclasses import asdict
 
 from pipeline.config.schema import Evaluate, Split, Train, Views
@@ -30,6 +31,7 @@ def run(job: Job) -> None:
         job.section(Evaluate),
         train,
         job.out / "renders",
+        gains=json.loads((job.inputs["train"] / "exposure.json").read_text()),
         threads=job.threads,
     )
     for text in evaluation.pop("warnings"):

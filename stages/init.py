@@ -1,6 +1,6 @@
 """The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
 
-from pipeline.config.schema import Features, Init, Split, Views
+from pipeline.config.schema import Features, Init, Matches, Split, Views
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
@@ -29,14 +29,19 @@ def run(job: Job) -> None:
     points = model.points
     if config.method != "random" and len(points) == 0:
         job.decide("the given poses come without points: triangulating them")
-        triangulate(
+        report = triangulate(
             manifest,
             sparse,
             job.scratch / "triangulation",
             job.section(Features),
+            job.section(Matches),
             threads=job.threads,
             seed=job.seed,
         )
+        for text in report.decisions:
+            job.decide(text)
+        for text in report.warnings:
+            job.warn(text)
         points = read_model(job.scratch / "triangulation" / "sparse" / "0").points
         job.counters["triangulated_points"] = len(points)
     method = config.method

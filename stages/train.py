@@ -1,34 +1,43 @@
-"""Optimise the Gaussians. Outputs: ``gaussians.npz`` and ``curve.json``."""
+"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``."""
 
 import sys
 import time
 
+import numpy as np
+
 from pipeline.config.schema import Split, Train, Views
+from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.trainer import train
 from stages.command import main
 
+# Standard deviation in stops from which photographs are taken for differently exposed: cameras that
+# hold their exposure show 0 to 0.1, collections from the internet 0.5.
+EXPOSURES_DIFFER = 0.2
+
 
 def run(job: Job) -> None:
-    views = load_views(
-        Manifest.read(job.inputs["views"] / "images.json"),
-        read_model(job.inputs["model"] / "sparse" / "0"),
-        job.section(Views),
-        job.section(Split),
-    )
+    manifest = Manifest.read(job.inputs["views"] / "images.json")
+    model = read_model(job.inputs["model"] / "sparse" / "0")
+    views = load_views(manifest, model, job.section(Views), job.section(Split))
+    has_alpha = any(photo.alpha for photo in manifest.photos)
+    gains = {} if has_alpha else choose_gains(job, views, model)
+    training = [view for view in views if not view.is_test]
     start = time.perf_counter()
     result = train(
-        [view for view in views if not view.is_test],
+        training,
         Gaussians.load(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
         seed=job.seed,
         threads=job.threads,
         extent=scene_extent(views),
+        gains=np.array([gains[view.name] for view in training]) if gains else None,
         checkpoint_dir=job.scratch / "checkpoints",
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
@@ -37,12 +46,31 @@ def run(job: Job) -> None:
     job.warnings += result.warnings
     result.gaussians.save(job.out / "gaussians.npz")
     write_json(job.out / "curve.json", result.curve)
-    job.counters = {
+    write_json(job.out / "exposure.json", gains)
+    job.counters |= {
         "num_gaussians": len(result.gaussians),
         "steps": result.steps,
         **result.counters,
     }
     job.timings = {"curve_seconds": result.curve_seconds, "earlier_s": round(earlier, 3)}
+
+
+def choose_gains(job: Job, views: list[View], model: Reconstruction) -> dict[str, list[float]]:
+    """Each view's gains by name; empty where the photographs are exposed alike."""
+    wanted = job.section(Train).exposure
+    if wanted == "off":
+        return {}
+    if wanted == "auto":
+        spread = measure_exposures(sample_views(views), model).spread
+        job.counters["exposure_spread_stops"] = round(spread, 4)
+        if spread < EXPOSURES_DIFFER:
+            return {}
+    found = measure_exposures(views, model)
+    job.decide(
+        f"exposures differ by {found.spread:.2f} stops: renders are compared through gains that "
+        f"were measured in {found.measured} of {len(views)} photographs"
+    )
+    return {v.name: gain.tolist() for v, gain in zip(views, found.gains, strict=True)}
 
 
 if __name__ == "__main__":

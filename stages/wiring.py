@@ -56,7 +56,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "matches": ("matches", "sfm"),
     "sfm": ("sfm",),
     "undistort": ("undistort", "views"),
-    "init": ("init", "views", "split", "features"),
+    "init": ("init", "views", "split", "features", "matches"),
     "train": ("train", "views", "split"),
     "evaluate": ("evaluate", "views", "split", "train"),
     "export": ("export",),

@@ -205,6 +205,12 @@ class Train(Section):
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."
     )
+    exposure: Literal["auto", "on", "off"] = Field(
+        "auto",
+        description="on: each photograph's brightness and white balance, measured at the sparse "
+        "points, are laid over the render before it is compared; auto: where they differ between "
+        "photographs by over 0.2 stops (standard deviation).",
+    )
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
     lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")
     lr_means_final: Annotated[float, Field(gt=0)] = Field(

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -30,6 +31,11 @@ LOW_SEEN_PSNR = 20.0
 #: This many dB between seen and held-out views is overfitting: well-covered scenes show 0 to 4.
 LARGE_GAP = 6.0
 
+NO_GAINS: Mapping[str, Sequence[float]] = MappingProxyType({})
+EXPOSURE_PROTOCOL = (
+    "renders multiplied by each photograph's gains (one a channel), which were measured at the "
+    "sparse points, in held-out photographs too; psnr_without_gains is as rendered"
+)
 Mask = NDArray[np.bool_]
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -80,17 +86,21 @@ def evaluate_views(
     train: Train,
     out: Path,
     *,
+    gains: Mapping[str, Sequence[float]] = NO_GAINS,
     threads: int,
 ) -> dict[str, Any]:
     """Render each view, save it as 8-bit PNG, and measure that picture.
 
     Args:
+        gains: by view's name, each channel's factor from the scene's typical exposure to the
+            view's; empty where views are exposed alike.
         out: folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:
         ``psnr``, ``ssim``, ``lpips`` (means of the views' values; lpips null where its weights are
         missing, with ``lpips_reason``), ``train_psnr`` (mean over the seen views, null without
-        any), ``per_view``, ``warnings`` and ``protocol``.
+        any), ``psnr_without_gains`` (null where there are none), ``per_view``, ``warnings`` and
+        ``protocol``.
     """
     lpips, reason = lpips_available(config.lpips_net)
     smallest = min(min(view.width, view.height) for view in protocol.views)
@@ -100,8 +110,9 @@ def evaluate_views(
     per_view: list[dict[str, Any]] = []
     progress = Progress("evaluating", len(protocol.views) + len(protocol.seen), "views")
     warnings: list[str] = []
+    without: list[float] = []
 
-    def compare(view: View) -> tuple[NDArray[np.uint8], NDArray[np.uint8], Mask | None]:
+    def compare(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view.image, view.mask, view.width, view.height)
         rendered = render_view(
             gaussians,
@@ -112,14 +123,19 @@ def evaluate_views(
             near=protocol.near,
             threads=threads,
         )
-        return to_bytes(rendered.rgb), reference(pixels, protocol.background), pixels.mask
+        photo = reference(pixels, protocol.background)
+        return rendered.rgb, photo, pixels.mask
+
+    def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
+        return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)
 
     for index, view in enumerate(protocol.views):
-        picture, photo, mask = compare(view)
+        rgb, photo, mask = compare(view)
         if _hidden(mask):
             warnings.append(f"{view.name}: its mask leaves no pixel to measure")
             progress.advance()
             continue
+        picture = exposed(rgb, view)
         Image.fromarray(picture).save(out / f"{index:04d}.png")
         a, b = picture / 255.0, photo / 255.0
         per_view.append(
@@ -131,12 +147,14 @@ def evaluate_views(
                 "render": f"{index:04d}.png",
             }
         )
+        if gains:
+            without.append(psnr(to_bytes(rgb) / 255.0, b, mask))
         progress.advance(note=f"PSNR {per_view[-1]['psnr']:.2f} dB")
     seen: list[float] = []
     for view in protocol.seen:
-        picture, photo, mask = compare(view)
+        rgb, photo, mask = compare(view)
         if not _hidden(mask):
-            seen.append(psnr(picture / 255.0, photo / 255.0, mask))
+            seen.append(psnr(exposed(rgb, view) / 255.0, photo / 255.0, mask))
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
@@ -147,12 +165,14 @@ def evaluate_views(
     return {
         "psnr": mean_psnr,
         "train_psnr": train_psnr,
+        "psnr_without_gains": float(np.mean(without)) if gains else None,
         "ssim": float(np.mean([v["ssim"] for v in per_view])),
         "lpips": None if lpips is None else float(np.mean([v["lpips"] for v in per_view])),
         "lpips_reason": reason,
         "per_view": per_view,
         "warnings": warnings,
-        "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None),
+        "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None)
+        | {"exposure": EXPOSURE_PROTOCOL if gains else None},
     }
 
 

@@ -54,6 +54,7 @@ def collect_metrics(
         "lpips": evaluation["lpips"],
         "lpips_reason": evaluation["lpips_reason"],
         "train_psnr": evaluation["train_psnr"],
+        "psnr_without_gains": evaluation["psnr_without_gains"],
         "per_view": evaluation["per_view"],
         "protocol": evaluation["protocol"],
         "num_gaussians": counters["train"]["num_gaussians"],

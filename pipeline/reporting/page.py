@@ -81,6 +81,8 @@ def _cards(data: ReportData) -> str:
     registered, total = m.get("registered_images"), m.get("total_images")
     seen = m.get("train_psnr")
     beside = "" if seen is None else f"; training views: {fixed(seen, 2)} dB"
+    plain = m.get("psnr_without_gains")
+    beside += "" if plain is None else f"; without exposure gains: {fixed(plain, 2)} dB"
     whole = f'<span class="unit"> / {count(total)}</span>' if total is not None else ""
     ran = [s for s in stages if not s.get("skipped")]
     cpu, rss = sum(s["cpu_s"] for s in ran), max((s["peak_rss_mb"] for s in ran), default=0.0)

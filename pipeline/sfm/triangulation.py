@@ -15,8 +15,6 @@ from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import keypoint_file
 
-DEFAULT_MATCHES = schema.Matches()
-
 
 @dataclass(frozen=True)
 class TriangulationReport:
@@ -42,7 +40,7 @@ def triangulate(
     sparse: Path,
     out: Path,
     features: schema.Features,
-    matches: schema.Matches = DEFAULT_MATCHES,
+    matches: schema.Matches,
     *,
     threads: int,
     seed: int,

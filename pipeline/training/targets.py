@@ -62,6 +62,18 @@ class Targets:
     def have_alpha(self) -> bool:
         return any(target.alpha is not None for target in self._full)
 
+    def hidden(self) -> list[int]:
+        """Indices of the views of which no pixel counts."""
+        return [
+            index
+            for index, target in enumerate(self._full)
+            if target.ignored is not None and bool(target.ignored.all())
+        ]
+
+    def drop(self, indices: Sequence[int]) -> None:
+        """Forget these views; the others move up."""
+        self._full = [t for index, t in enumerate(self._full) if index not in indices]
+
     def get(self, index: int, factor: int) -> Target:
         """View ``index`` at 1 / ``factor`` of its size (see ``reduced_size``)."""
         full = self._full[index]

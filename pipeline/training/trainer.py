@@ -17,6 +17,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Train
@@ -82,6 +83,7 @@ def train(
     threads: int,
     extent: float,
     checkpoint_dir: Path,
+    gains: NDArray[np.float64] | None = None,
     on_log: Callable[[str], None] | None = None,
 ) -> TrainResult:
     """Optimise ``initial`` until its renders look like ``views``.
@@ -93,6 +95,9 @@ def train(
         views: training views only.
         threads: of the native operators; torch itself runs on one, so that sums are the same.
         extent: the scene's size in the world's unit (``scene.views.scene_extent``).
+        gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
+            (``photos.exposure``): renders are multiplied before they are compared. Only for
+            views without alpha.
         on_log: called with one line for each warning.
 
     Raises:
@@ -108,7 +113,8 @@ def train(
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _Run(views, initial, config, seed, threads, extent, checkpoint_dir, on_log).train()
+        run = _Run(views, initial, config, seed, threads, extent, gains, checkpoint_dir, on_log)
+        return run.train()
     finally:
         torch.set_num_threads(torch_threads)
 
@@ -124,6 +130,7 @@ class _Run:
         seed: int,
         threads: int,
         extent: float,
+        gains: NDArray[np.float64] | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
     ):
@@ -133,8 +140,10 @@ class _Run:
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
-        self.identity = _identity(views, initial, config, seed, extent)
+        self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
+        self.identity = _identity(views, initial, config, seed, extent, gains)
         self.targets = Targets(views, threads)
+        self.drop_hidden_views()
         self.background = config.background
         if self.background == "auto":
             self.background = "random" if self.targets.have_alpha else "black"
@@ -152,8 +161,21 @@ class _Run:
         density = GradientDensity(config.density, extent)
         density.start(len(gaussians))
         self.state = TrainState(
-            gaussians, Adam(gaussians), density, rng, rng.permutation(len(views))
+            gaussians, Adam(gaussians), density, rng, rng.permutation(len(self.views))
         )
+
+    def drop_hidden_views(self) -> None:
+        """A view that its mask hides asks for nothing, and would only feed Adam zeros."""
+        hidden = self.targets.hidden()
+        if len(hidden) == len(self.views):
+            raise UserError("the masks leave no pixel of any view to train on", fix="check masks/")
+        if hidden:
+            names = ", ".join(self.views[i].name for i in hidden[:5])
+            self.warn(f"views that their masks hide whole are left out ({len(hidden)}): {names}")
+            self.targets.drop(hidden)
+            kept = [index for index in range(len(self.views)) if index not in hidden]
+            self.views = [self.views[index] for index in kept]
+            self.gains = None if self.gains is None else self.gains[kept]
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)
@@ -205,16 +227,19 @@ class _Run:
         )
         rendered = forward(*state.gaussians.parameters(), camera, options)
         wanted = target.over(background)
-        loss = l1_ssim(rendered.color, wanted, config.ssim_weight, target.ignored, self.threads)
+        gain = None if self.gains is None else self.gains[index]
+        seen = rendered.color if gain is None else rendered.color * gain
+        loss = l1_ssim(seen, wanted, config.ssim_weight, target.ignored, self.threads)
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
-        gradients = backward(rendered, loss.grad, means2d_abs=config.density.absolute_gradient)
+        d_color = loss.grad if gain is None else loss.grad * gain
+        gradients = backward(rendered, d_color, means2d_abs=config.density.absolute_gradient)
         state.density.observe(rendered, gradients, camera.width, camera.height)
         state.adam.step(state.gaussians, gradients, self.rates(step), step, self.threads)
 
         state.window.loss += float(loss.loss)
         state.window.steps += 1
         if (step - 1) % min(PSNR_EVERY, max(1, config.steps // CURVE_RECORDS)) == 0:
-            state.window.psnr += _psnr(rendered.color, wanted, target)
+            state.window.psnr += _psnr(seen, wanted, target)
             state.window.samples += 1
         self.control_density(step)
 
@@ -336,7 +361,12 @@ class _Run:
 
 
 def _identity(
-    views: Sequence[View], initial: Gaussians, config: Train, seed: int, extent: float
+    views: Sequence[View],
+    initial: Gaussians,
+    config: Train,
+    seed: int,
+    extent: float,
+    gains: NDArray[np.float64] | None,
 ) -> str:
     """A digest of all that determines the result, apart from the pixels (whose stage's key names
     the folder of checkpoints)."""
@@ -345,7 +375,8 @@ def _identity(
         (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
         for v in views
     ]
-    text = json.dumps([STATE_VERSION, config.model_dump(), seed, extent, described])
+    exposures = None if gains is None else gains.tolist()
+    text = json.dumps([STATE_VERSION, config.model_dump(), seed, extent, described, exposures])
     digest.update(text.encode())
     for array in initial.arrays().values():
         digest.update(array.tobytes())

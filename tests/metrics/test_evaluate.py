@@ -90,6 +90,24 @@ def test_bad_scenes_are_told_from_good_ones(held_out, seen, word):
     assert [word in text for text in found] == ([] if word is None else [True])
 
 
+def test_gains_are_laid_over_the_renders(tmp_path):
+    grey = np.full_like(black(), 100)
+    views = [view(tmp_path, "a", grey), view(tmp_path, "b", grey // 2, x=1.0)]
+    config = Train(background="white")
+    found = evaluate_views(
+        nothing(),
+        choose_protocol(views, Split(), config),
+        Evaluate(),
+        config,
+        tmp_path / "out",
+        gains={"a": [100 / 255] * 3, "b": [50 / 255] * 3},
+        threads=1,
+    )
+    assert found["psnr"] == 100
+    assert found["psnr_without_gains"] < 5
+    assert "gains" in found["protocol"]["exposure"]
+
+
 def test_measuring_on_training_views_is_said(tmp_path):
     found = measure([view(tmp_path, "a", black(), is_test=False)], tmp_path / "out")
     assert "TRAINING" in found["protocol"]["split"]

@@ -185,6 +185,7 @@ def test_known_poses_get_points_and_stay_as_they_are(room, tmp_path):
         tmp_path / "given",
         tmp_path / "out",
         FEATURES,
+        schema.Matches(),
         threads=2,
         seed=0,
     )
@@ -210,7 +211,13 @@ def test_triangulation_without_matches_gives_no_points(tmp_path):
     }
     write_model(tmp_path / "given", replace(truth, images=images))
     report = triangulate(
-        corner.manifest(photos), tmp_path / "given", tmp_path / "out", FEATURES, threads=2, seed=0
+        corner.manifest(photos),
+        tmp_path / "given",
+        tmp_path / "out",
+        FEATURES,
+        schema.Matches(),
+        threads=2,
+        seed=0,
     )
     assert report.num_points == 0
     assert len(read_model(tmp_path / "out" / "sparse" / "0").images) == 2

@@ -14,7 +14,7 @@ from pipeline.config.schema import Train
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import trainer
+from pipeline.training import targets, trainer
 from pipeline.training.checkpoint import PATTERN
 from pipeline.training.render import render_view
 from pipeline.training.trainer import TrainResult, train
@@ -78,12 +78,15 @@ def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     assert -10 * np.log10(error) > 25
 
 
-@pytest.mark.parametrize("call", [1, 2, 11, 23, 40])
+@pytest.mark.parametrize("call", [1, 2, 10, 11, 13, 23, 40])
 def test_killed_and_resumed_gives_the_same_bits(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
 ) -> None:
-    config = tiny_config(40)
+    # Resolution rises after steps 12 and 24, opacity is reset after step 10.
+    monkeypatch.setattr(targets, "MIN_SHORT_SIDE", 4)
+    config = tiny_config(40, coarse_until=0.6, density={"opacity_reset_interval": 1750})
     whole = run(scene, tmp_path / "whole", config, scene.alpha_views)
+    assert whole.counters["opacity_resets"] == 1
     monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
     with monkeypatch.context() as patch:
         interrupt_at(patch, call)
@@ -154,6 +157,39 @@ def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) ->
             views.append(replace(view, image=str(path), mask=str(tmp_path / "mask.png")))
         results.append(run(scene, tmp_path / f"c{seed}", views=views))
     assert_same(*results)
+
+
+def test_gains_explain_photographs_that_are_exposed_differently(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    gains = np.array([[0.5] * 3, [1.0] * 3] * (len(scene.views) // 2))
+    views = []
+    for index, (view, gain) in enumerate(zip(scene.views, gains, strict=True)):
+        picture = np.rint(np.array(Image.open(view.image)) * gain).astype(np.uint8)
+        Image.fromarray(picture).save(tmp_path / f"{index}.png")
+        views.append(replace(view, image=str(tmp_path / f"{index}.png")))
+    config = tiny_config(150)
+    common = {"seed": 0, "threads": 1, "extent": scene.extent}
+    with_gains = train(
+        views, scene.initial, config, checkpoint_dir=tmp_path / "a", gains=gains, **common
+    )
+    without = train(views, scene.initial, config, checkpoint_dir=tmp_path / "b", **common)
+    assert with_gains.curve[-1]["psnr"] > without.curve[-1]["psnr"] + 3
+    # The scene itself is the brighter photographs', as if there had been no other.
+    plain = run(scene, tmp_path / "c", config)
+    assert with_gains.curve[-1]["psnr"] > plain.curve[-1]["psnr"] - 1
+
+
+def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(tmp_path / "mask.png")
+    hidden = replace(scene.views[0], name="hidden", mask=str(tmp_path / "mask.png"))
+    with_it = run(scene, tmp_path / "a", views=[*scene.views[:3], hidden, *scene.views[3:]])
+    assert any("hidden" in text for text in with_it.warnings)
+    assert_same(with_it, run(scene, tmp_path / "b"))
+    with pytest.raises(UserError, match="masks"):
+        run(scene, tmp_path / "c", views=[hidden])
 
 
 def test_alpha_with_random_background_leaves_the_empty_empty(

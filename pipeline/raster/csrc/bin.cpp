@@ -93,7 +93,7 @@ TileRange tile_range(double center, double extent, int64_t tiles) {
             last < 0 ? -1 : (last < tiles - 1 ? int64_t(last) : tiles - 1)};
 }
 
-// Calls emit(tile, first_row, last_row) for every tile in which the ellipse {alpha >= 1/255}
+// Calls emit(tile, blocks) for every tile in which the ellipse {alpha >= 1/255}
 // comes near a pixel centre. In each row of pixels the ellipse is an interval,
 //     |uu d_x + uw d_y| <= sqrt(reach - (ww d_y)^2),
 // found for the 16 rows of a tile at once; a column of tiles is then two comparisons.
@@ -113,10 +113,19 @@ SPLAT_INLINE void each_tile(const Record& r, int64_t tiles_x, int64_t tiles_y, c
         const f32x16 half = sqrt(max(left_over, splat16(0))) * inv_uu + abs(middle) * 2e-6f + 1e-3f;
         const f32x16 low = middle - half, high = middle + half;
         for (int64_t tx = columns.first; tx <= columns.last; tx++) {
-            const float left = float(tx * kTile + 0.5 - r.x);
-            const uint32_t hit =
-                bits(inside & ge(splat16(left + (kTile - 1)), low) & ge(high, splat16(left)));
-            if (hit) emit(ty * tiles_x + tx, __builtin_ctz(hit), 31 - __builtin_clz(hit));
+            // The rows in which the interval meets each column of blocks, 16 bits a column.
+            uint64_t hit = 0;
+            for (int column = 0; column < kTile / kBlock; column++) {
+                const float left = float(tx * kTile + kBlock * column + 0.5 - r.x);
+                const Mask16 meets =
+                    inside & ge(splat16(left + (kBlock - 1)), low) & ge(high, splat16(left));
+                hit |= uint64_t(bits(meets)) << 16 * column;
+            }
+            if (!hit) continue;
+            hit |= hit >> 1;  // any of a block's four rows
+            hit |= hit >> 2;
+            hit &= 0x1111111111111111;
+            emit(ty * tiles_x + tx, uint32_t(hit | hit >> 15 | hit >> 30 | hit >> 45) & 0xffff);
         }
     }
 }
@@ -145,12 +154,10 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
             if (k + 8 < end) __builtin_prefetch(records + keys[k + 8].gaussian);
             const uint32_t gaussian = keys[k].gaussian;
             const size_t before = chunk.spans.size();
-            each_tile(
-                records[gaussian], tiles_x, tiles_y,
-                [&](int64_t tile, uint32_t first_row, uint32_t last_row) {
-                    chunk.tile_count[tile]++;
-                    chunk.spans.push_back({gaussian, uint32_t(tile), first_row | last_row << 8});
-                });
+            each_tile(records[gaussian], tiles_x, tiles_y, [&](int64_t tile, uint32_t blocks) {
+                chunk.tile_count[tile]++;
+                chunk.spans.push_back({gaussian, uint32_t(tile), blocks});
+            });
             touched_[gaussian] = uint32_t(chunk.spans.size() - before);
             if (int64_t(chunk.spans.size()) - reported > 65536) {
                 found += int64_t(chunk.spans.size()) - reported;
@@ -190,7 +197,7 @@ void Binner::write(Entry* entries, int64_t* tile_begin, Slots* slots) {
                 gaussian = span.gaussian;
                 slot = slots[gaussian].first;
             }
-            entries[chunk.tile_count[span.tile]++] = {gaussian, slot++, span.rows};
+            entries[chunk.tile_count[span.tile]++] = {gaussian, slot++, span.blocks};
         }
     }
 }

@@ -25,7 +25,7 @@ class Binner {
 
   private:
     struct Span {
-        uint32_t gaussian, tile, rows;
+        uint32_t gaussian, tile, blocks;
     };
     struct Chunk {
         std::vector<Span> spans;

@@ -6,22 +6,22 @@ namespace splat {
 namespace {
 
 struct ColorSum {
-    f32x16 red[kTile] = {}, green[kTile] = {}, blue[kTile] = {};
+    f32x16 red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {};
 
-    SPLAT_INLINE void add(int row, const Record& g, const Step& s, f32x16) {
-        red[row] += s.weight * g.rgb[0];
-        green[row] += s.weight * g.rgb[1];
-        blue[row] += s.weight * g.rgb[2];
+    SPLAT_INLINE void add(int block, const TileGaussian& g, const Step& s, f32x16) {
+        red[block] += s.weight * g.rgb[0];
+        green[block] += s.weight * g.rgb[1];
+        blue[block] += s.weight * g.rgb[2];
     }
 };
 
 struct DepthSum {
-    f32x16 mean[kTile] = {}, median[kTile] = {};
+    f32x16 mean[kBlocks] = {}, median[kBlocks] = {};
 
-    SPLAT_INLINE void add(int row, const Record& g, const Step& s, f32x16 before) {
-        mean[row] += s.weight * g.depth;
+    SPLAT_INLINE void add(int block, const TileGaussian& g, const Step& s, f32x16 before) {
+        mean[block] += s.weight * g.depth;
         const Mask16 crossing = s.drawn & ge(before, splat16(0.5f)) & lt(s.after, splat16(0.5f));
-        median[row] = select(crossing, splat16(g.depth), median[row]);
+        median[block] = select(crossing, splat16(g.depth), median[block]);
     }
 };
 
@@ -30,31 +30,20 @@ template <class Sum>
 SPLAT_INLINE int64_t composite(const Record* records, const Pairs& pairs, int64_t index,
                                const Tile& tile, f32x16* transmittance, Sum& sum) {
     tile.start(transmittance);
-    int alive = tile.columns * tile.rows;
-    return each_gaussian(
-        records, pairs.entries, pairs.tile_begin[index], pairs.tile_begin[index + 1], tile,
-        [](const Entry&) {},
-        [&](const TileGaussian& here) __attribute__((always_inline)) {
-            const Record& g = *here.record;
-            const int last = here.last_row();
-            for (int row = here.first_row(); row <= last; row++) {
-                const f32x16 before = transmittance[row];
-                const Step s = step(here.power(row, here.u_row(row)), before);
-                Mask16 stopped;
-                transmittance[row] = advance(s, before, stopped);
-                if (__builtin_expect(any(stopped), 0)) alive -= __builtin_popcount(bits(stopped));
-                sum.add(row, g, s, before);
-            }
-            return alive > 0;
-        });
-}
-
-// Writes the part of a row inside the image.
-SPLAT_INLINE void write_row(f32x16 v, const Tile& tile, int row, int64_t width, float* image) {
-    alignas(64) float lanes[kTile];
-    store(lanes, v);
-    float* to = image + (tile.y + row) * width + tile.x;
-    for (int i = 0; i < tile.columns; i++) to[i] = lanes[i];
+    uint32_t alive = alive_blocks(transmittance);
+    int64_t entry = pairs.tile_begin[index];
+    const int64_t end = pairs.tile_begin[index + 1];
+    Batch batch;
+    while (entry < end && alive) {
+        entry = batch.fill(records, pairs.entries, entry, end, tile, alive);
+        for (int i = 0; i < batch.pairs(); i++) {
+            const TileGaussian& g = batch.gaussian[batch.pair[i] / kBlocks];
+            const int block = int(batch.pair[i] % kBlocks);
+            const f32x16 before = transmittance[block];
+            sum.add(block, g, step(batch.alpha[i], block, transmittance, alive), before);
+        }
+    }
+    return entry;
 }
 
 }  // namespace
@@ -65,19 +54,19 @@ void blend(const Record* records, const Pairs& pairs, const View& view, const fl
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
     for (int64_t index = 0; index < tiles; index++) {
         const Tile tile(index, view);
-        f32x16 transmittance[kTile];
+        f32x16 transmittance[kBlocks];
         ColorSum sum;
         tile_end[index] = composite(records, pairs, index, tile, transmittance, sum);
-        for (int row = 0; row < tile.rows; row++) {
-            const f32x16 left = abs(transmittance[row]);
-            alignas(64) float rgb[3][kTile];
-            store(rgb[0], sum.red[row] + left * background[0]);
-            store(rgb[1], sum.green[row] + left * background[1]);
-            store(rgb[2], sum.blue[row] + left * background[2]);
-            float* to = color + 3 * ((tile.y + row) * view.width + tile.x);
-            for (int i = 0; i < tile.columns; i++)
-                for (int c = 0; c < 3; c++) to[3 * i + c] = rgb[c][i];
-            write_row(1.0f - left, tile, row, view.width, alpha);
+        for (int block = 0; block < kBlocks; block++) {
+            const f32x16 left = abs(transmittance[block]);
+            alignas(64) float pixels[3 * 16];
+            interleave(
+                {sum.red[block] + left * background[0], sum.green[block] + left * background[1],
+                 sum.blue[block] + left * background[2]},
+                pixels);
+            tile.write<3>(block, pixels, view.width, color);
+            store(pixels, 1.0f - left);
+            tile.write<1>(block, pixels, view.width, alpha);
         }
     }
 }
@@ -88,12 +77,15 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
     for (int64_t index = 0; index < tiles; index++) {
         const Tile tile(index, view);
-        f32x16 transmittance[kTile];
+        f32x16 transmittance[kBlocks];
         DepthSum sum;
         composite(records, pairs, index, tile, transmittance, sum);
-        for (int row = 0; row < tile.rows; row++) {
-            write_row(sum.mean[row], tile, row, view.width, depth);
-            write_row(sum.median[row], tile, row, view.width, median);
+        for (int block = 0; block < kBlocks; block++) {
+            alignas(64) float pixels[16];
+            store(pixels, sum.mean[block]);
+            tile.write<1>(block, pixels, view.width, depth);
+            store(pixels, sum.median[block]);
+            tile.write<1>(block, pixels, view.width, median);
         }
     }
 }

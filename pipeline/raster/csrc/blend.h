@@ -10,8 +10,8 @@ struct Pairs {
     const int64_t* tile_begin;
 };
 
-// color (H, W, 3) with the background (3) under it; alpha (H, W); tile_end (tiles): the entry
-// after the last one that any pixel of the tile came to.
+// color (H, W, 3) with the background (3) under it; alpha (H, W); tile_end (tiles): an entry
+// behind which no pixel of the tile draws.
 void blend(const Record* records, const Pairs& pairs, const View& view, const float* background,
            int threads, float* color, float* alpha, int64_t* tile_end);
 

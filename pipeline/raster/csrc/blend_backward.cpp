@@ -13,112 +13,77 @@
 namespace splat {
 namespace {
 
-// What a tile's pixels ask for, and where they have come to. The gap keeps a row that is written
-// half a page off the same row of what is read: 4096 bytes apart, the processor takes a load for
-// one of what it has just stored, and waits.
+// What a tile's pixels ask for, and where they have come to.
 struct TileTargets {
-    f32x16 red[kTile], green[kTile], blue[kTile], alpha[kTile];
-    f32x16 gap[kTile / 2];
-    f32x16 transmittance[kTile];
-    f32x16 behind[kTile];  // S: starts as the whole sum, ends as 0
-    f32x16 depth[kTile];
+    f32x16 red[kBlocks], green[kBlocks], blue[kBlocks], alpha[kBlocks], depth[kBlocks];
+    f32x16 transmittance[kBlocks];
+    f32x16 behind[kBlocks];  // S: starts as the whole sum, ends as 0
 
+    // Pixels outside the image ask for nothing.
     TileTargets(const Tile& tile, const View& view, const ImageGradientsIn& in) {
-        // Rows and columns outside the image ask for nothing.
-        alignas(64) float lanes[6][kTile];
-        for (int row = 0; row < kTile; row++) {
-            std::memset(lanes, 0, sizeof(lanes));
-            const int columns = row < tile.rows ? tile.columns : 0;
-            for (int i = 0; i < columns; i++) {
-                const int64_t pixel = (tile.y + row) * view.width + tile.x + i;
-                const float* c = in.color + 3 * pixel;
-                const float* d = in.d_color + 3 * pixel;
-                // The background shows through 1 - alpha.
-                const float under =
-                    d[0] * in.background[0] + d[1] * in.background[1] + d[2] * in.background[2];
-                const float d_alpha = in.d_alpha ? in.d_alpha[pixel] : 0;
-                float whole =
-                    c[0] * d[0] + c[1] * d[1] + c[2] * d[2] - under + in.alpha[pixel] * d_alpha;
-                if (in.d_depth) {
-                    whole += in.depth[pixel] * in.d_depth[pixel];
-                    lanes[5][i] = in.d_depth[pixel];
-                }
-                for (int k = 0; k < 3; k++) lanes[k][i] = d[k];
-                lanes[3][i] = d_alpha - under;
-                lanes[4][i] = whole;
+        alignas(64) float pixels[3 * 16];
+        const auto plane = [&](int block, const float* image) {
+            tile.read<1>(block, image, view.width, pixels);
+            return load<f32x16>(pixels);
+        };
+        const auto rgb = [&](int block, const float* image) {
+            tile.read<3>(block, image, view.width, pixels);
+            return deinterleave(pixels);
+        };
+        const float* background = in.background;
+        for (int block = 0; block < kBlocks; block++) {
+            const Rgb c = rgb(block, in.color), d = rgb(block, in.d_color);
+            // The background shows through 1 - alpha.
+            const f32x16 under =
+                d.red * background[0] + d.green * background[1] + d.blue * background[2];
+            red[block] = d.red;
+            green[block] = d.green;
+            blue[block] = d.blue;
+            alpha[block] = -under;
+            behind[block] = c.red * d.red + c.green * d.green + c.blue * d.blue - under;
+            if (in.d_alpha) {
+                const f32x16 d_alpha = plane(block, in.d_alpha);
+                alpha[block] += d_alpha;
+                behind[block] += plane(block, in.alpha) * d_alpha;
             }
-            red[row] = load<f32x16>(lanes[0]);
-            green[row] = load<f32x16>(lanes[1]);
-            blue[row] = load<f32x16>(lanes[2]);
-            alpha[row] = load<f32x16>(lanes[3]);
-            behind[row] = load<f32x16>(lanes[4]);
-            depth[row] = load<f32x16>(lanes[5]);
+            if (in.d_depth) {
+                depth[block] = plane(block, in.d_depth);
+                behind[block] += plane(block, in.depth) * depth[block];
+            }
         }
+        tile.start(transmittance);
     }
 };
 
-// 0, 1, ... and their squares: rows counted from a Gaussian's first.
-struct RowNumbers {
-    float value[kTile], square[kTile];
-    constexpr RowNumbers() : value(), square() {
-        for (int i = 0; i < kTile; i++) value[i] = float(i), square[i] = float(i * i);
-    }
-};
-constexpr RowNumbers kRows;
-
-// One Gaussian over its rows of a tile, to one slot.
+// One Gaussian over one block: adds to the lanes' moments.
 template <bool kDepthGradient, bool kAbsolute>
-SPLAT_INLINE void backward_gaussian(const TileGaussian& here, TileTargets& t, float* slot) {
-    const Record& g = *here.record;
-    const int first = here.first_row(), last = here.last_row();
-    const f32x16 zero = {};
-    f32x16 v0 = zero, v1 = zero, v2 = zero;  // sums over rows of v, v * n, v * n^2
-    f32x16 red = zero, green = zero, blue = zero, depth = zero, abs_x = zero, abs_y = zero;
-    for (int row = first; row <= last; row++) {
-        const f32x16 before = t.transmittance[row], u = here.u_row(row);
-        const Step s = step(here.power(row, u), before);
-        Mask16 stopped;
-        t.transmittance[row] = advance(s, before, stopped);
-        f32x16 e =
-            t.alpha[row] + t.red[row] * g.rgb[0] + t.green[row] * g.rgb[1] + t.blue[row] * g.rgb[2];
-        if (kDepthGradient) e += t.depth[row] * g.depth;
-        const f32x16 behind = t.behind[row] - s.weight * e;
-        t.behind[row] = behind;
-        const f32x16 odds = s.alpha * reciprocal(1.0f - s.alpha);
-        // Where alpha is held at its maximum it does not move with the Gaussian.
-        const f32x16 v =
-            keep(s.drawn & lt(s.raw, splat16(kAlphaMax)), s.weight * e - odds * behind);
-        const int n = row - first;
-        v0 += v;
-        v1 += v * kRows.value[n];
-        v2 += v * kRows.square[n];
-        red += s.weight * t.red[row];
-        green += s.weight * t.green[row];
-        blue += s.weight * t.blue[row];
-        if (kDepthGradient) depth += s.weight * t.depth[row];
-        if (kAbsolute) {
-            abs_x += abs(v * u);
-            abs_y += abs(v * (u * g.uw + here.w[row] * g.ww));
-        }
+SPLAT_INLINE void backward_pair(const TileGaussian& g, int block, f32x16 alpha, TileTargets& t,
+                                uint32_t& alive, f32x16 (&moments)[12]) {
+    const f32x16 u = g.u_at(block), w = g.w_at(block);
+    const Step s = step(alpha, block, t.transmittance, alive);
+    f32x16 e = t.alpha[block] + t.red[block] * g.rgb[0] + t.green[block] * g.rgb[1] +
+               t.blue[block] * g.rgb[2];
+    if (kDepthGradient) e += t.depth[block] * g.depth;
+    const f32x16 behind = t.behind[block] - s.weight * e;
+    t.behind[block] = behind;
+    const f32x16 odds = alpha * reciprocal(1.0f - alpha);
+    // Where alpha is held at its maximum it does not move with the Gaussian.
+    const f32x16 v = keep(s.drawn & lt(alpha, splat16(kAlphaMax)), s.weight * e - odds * behind);
+    const f32x16 vu = v * u, vw = v * w;
+    moments[kV] += v;
+    moments[kVU] += vu;
+    moments[kVW] += vw;
+    moments[kVUU] += vu * u;
+    moments[kVUW] += vu * w;
+    moments[kVWW] += vw * w;
+    moments[kRed] += s.weight * t.red[block];
+    moments[kGreen] += s.weight * t.green[block];
+    moments[kBlue] += s.weight * t.blue[block];
+    if (kDepthGradient) moments[kDepth] += s.weight * t.depth[block];
+    if (kAbsolute) {
+        moments[kAbsX] += abs(vu * g.uu);
+        moments[kAbsY] += abs(vu * g.uw + vw * g.ww);
     }
-    // u = p + n uw, w = q + n ww, with n counted from the first row, so that nothing cancels.
-    const f32x16 p = here.u_row(first);
-    const f32x16 q = splat16(here.w[first]);
-    const f32x16 vu = p * v0 + g.uw * v1, vw = q * v0 + g.ww * v1;
-    const f32x16 vu1 = p * v1 + g.uw * v2, vw1 = q * v1 + g.ww * v2;  // weighted by n
-    const f32x16 moments[12] = {v0,
-                                vu,
-                                vw,
-                                p * vu + g.uw * vu1,
-                                q * vu + g.ww * vu1,
-                                q * vw + g.ww * vw1,
-                                red,
-                                green,
-                                blue,
-                                depth,
-                                abs_x * g.uu,
-                                abs_y};
-    store(slot, sum_lanes(moments));
 }
 
 template <bool kDepthGradient, bool kAbsolute>
@@ -128,22 +93,30 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
     const int64_t tiles = view.tiles();
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
     for (int64_t index = 0; index < tiles; index++) {
-        const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
-        if (begin == end) continue;
+        int64_t entry = pairs.tile_begin[index];
+        const int64_t last = tile_end[index], end = pairs.tile_begin[index + 1];
+        if (entry == end) continue;
         const Tile tile(index, view);
         TileTargets targets(tile, view, in);
-        tile.start(targets.transmittance);
-        const auto slot_of = [=](const Entry& entry) {
-            return slot_gradients + int64_t(entry.slot) * kSlotFloats;
-        };
-        each_gaussian(
-            records, pairs.entries, begin, tile_end[index], tile,
-            [&](const Entry& entry) { __builtin_prefetch(slot_of(entry), 1); },
-            [&](const TileGaussian& here) __attribute__((always_inline)) {
-                backward_gaussian<kDepthGradient, kAbsolute>(here, targets, slot_of(here.entry));
-                return true;
-            });
-        for (int64_t e = tile_end[index]; e < end; e++) store(slot_of(pairs.entries[e]), f32x16{});
+        uint32_t alive = alive_blocks(targets.transmittance);
+        Batch batch;
+        while (entry < last) {
+            entry = batch.fill(records, pairs.entries, entry, last, tile, alive);
+            const auto slot = [&](int n) {
+                return slot_gradients + int64_t(batch.gaussian[n].slot) * kSlotFloats;
+            };
+            for (int n = 0; n < batch.count; n++) __builtin_prefetch(slot(n), 1);
+            for (int n = 0; n < batch.count; n++) {
+                f32x16 moments[12] = {};
+                for (int i = batch.first[n]; i < batch.first[n + 1]; i++)
+                    backward_pair<kDepthGradient, kAbsolute>(
+                        batch.gaussian[n], int(batch.pair[i] % kBlocks), batch.alpha[i], targets,
+                        alive, moments);
+                store(slot(n), sum_lanes(moments));
+            }
+        }
+        for (; entry < end; entry++)
+            store(slot_gradients + int64_t(pairs.entries[entry].slot) * kSlotFloats, f32x16{});
     }
 }
 

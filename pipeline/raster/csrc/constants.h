@@ -47,8 +47,8 @@ constexpr int64_t kMaxIntersections = int64_t(1) << 27;
 
 // ---- Layout ----
 
-// A tile is 16 x 16 pixels: a row of it is one 512-bit vector of float32.
-constexpr int kTile = 16;
+// A tile is 16 x 16 pixels: 4 x 4 blocks of 4 x 4 pixels, each one 512-bit vector of float32.
+constexpr int kTile = 16, kBlock = 4, kBlocks = 16;
 
 // Slack of the ellipse-tile test, in log2(alpha). The blend kernel decides pixel by pixel and
 // errs by under 3e-5 in this unit; the test must never leave out what it would draw.

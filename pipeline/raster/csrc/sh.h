@@ -2,8 +2,6 @@
 // of Sloan 2013, ordered and signed as in 3DGS).
 #pragma once
 
-#include <utility>
-
 #include "simd.h"
 
 namespace splat {
@@ -90,7 +88,6 @@ template <int kPart, int... kLanes>
 constexpr i32x16 channel_lanes(std::integer_sequence<int, kLanes...>) {
     return i32x16{(16 * kPart + kLanes) % 3 ...};
 }
-using SixteenLanes = std::make_integer_sequence<int, 16>;
 
 // A value per coefficient, and a value per channel (lanes 0 to 2), brought to part kPart's lanes.
 template <int kPart>

@@ -5,6 +5,7 @@
 
 #include <cstdint>
 #include <cstring>
+#include <utility>
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 #include <immintrin.h>
 #define SPLAT_AVX512 1
@@ -98,6 +99,22 @@ SPLAT_INLINE bool any(Mask16 m) {
 #endif
 }
 
+// Writes base + i for every bit i of `bits`, lowest first; returns how many. May write junk up to
+// to[15].
+SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
+#if SPLAT_AVX512
+    const __m512i all =
+        _mm512_add_epi32(_mm512_set1_epi32(int(base)),
+                         _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
+    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), all));
+    return __builtin_popcount(bits);
+#else
+    int n = 0;
+    for (; bits; bits &= bits - 1) to[n++] = base + uint32_t(__builtin_ctz(bits));
+    return n;
+#endif
+}
+
 // The sign bit alone turns: -x where m.
 SPLAT_INLINE f32x16 negate_where(Mask16 m, f32x16 v) { return select(m, -v, v); }
 
@@ -117,16 +134,20 @@ SPLAT_INLINE f32x16 reciprocal(f32x16 x) {
 
 // 2^x in float32, relative error under 2e-7 for x in [-126, 126]; junk, but no trap, outside.
 // Rounds by the magic number 1.5 * 2^23, whose low bits are then the exponent.
-SPLAT_INLINE f32x16 exp2(f32x16 x) {
+template <int kCount>
+SPLAT_INLINE void exp2(const f32x16 (&x)[kCount], f32x16 (&out)[kCount]) {
     const float magic = 12582912.0f;
-    const f32x16 shifted = x + magic;
-    const f32x16 f = x - (shifted - magic);
-    const f32x16 f2 = f * f;
-    const f32x16 low = 0.6931469440460205f * f + 1.0000001192092896f;
-    const f32x16 mid = 0.05550713092088699f * f + 0.24022120237350464f;
-    const f32x16 high = 0.001327647129073739f * f + 0.009675540961325169f;
-    const f32x16 power = (high * f2 + mid) * f2 + low;
-    return f32x16(u32x16(power) + (u32x16(shifted) << 23));
+    f32x16 shifted[kCount], f[kCount], f2[kCount];
+    for (int i = 0; i < kCount; i++) shifted[i] = x[i] + magic;
+    for (int i = 0; i < kCount; i++) f[i] = x[i] - (shifted[i] - magic);
+    for (int i = 0; i < kCount; i++) f2[i] = f[i] * f[i];
+    for (int i = 0; i < kCount; i++) {
+        const f32x16 low = 0.6931469440460205f * f[i] + 1.0000001192092896f;
+        const f32x16 mid = 0.05550713092088699f * f[i] + 0.24022120237350464f;
+        const f32x16 high = 0.001327647129073739f * f[i] + 0.009675540961325169f;
+        const f32x16 power = (high * f2[i] + mid) * f2[i] + low;
+        out[i] = f32x16(u32x16(power) + (u32x16(shifted[i]) << 23));
+    }
 }
 
 template <class V>
@@ -164,6 +185,40 @@ SPLAT_INLINE f64x8 log2(f64x8 x) {
     f64x8 p = splat8(1.0 / 17);
     for (int n = 15; n > 0; n -= 2) p = p * s2 + 1.0 / n;
     return __builtin_convertvector(e, f64x8) + 2.8853900817779268 * s * p;
+}
+
+// ---- Pixels of three channels ----
+
+struct Rgb {
+    f32x16 red, green, blue;
+};
+
+template <int kPart, int... kLanes>
+SPLAT_INLINE f32x16 interleave_part(const Rgb& v, std::integer_sequence<int, kLanes...>) {
+    const auto lane = [](int i, int channel) { return (16 * kPart + i) % 3 == channel; };
+    const i32x16 two = {(lane(kLanes, 1) ? 16 : 0) + (16 * kPart + kLanes) / 3 ...};
+    const i32x16 three = {(lane(kLanes, 2) ? 16 + (16 * kPart + kLanes) / 3 : kLanes)...};
+    return __builtin_shuffle(__builtin_shuffle(v.red, v.green, two), v.blue, three);
+}
+template <int kChannel, int... kLanes>
+SPLAT_INLINE f32x16 channel(const float* pixels, std::integer_sequence<int, kLanes...>) {
+    const i32x16 two = {(3 * kLanes + kChannel) % 32 ...};
+    const i32x16 three = {(3 * kLanes + kChannel < 32 ? kLanes : 3 * kLanes + kChannel - 16)...};
+    return __builtin_shuffle(
+        __builtin_shuffle(load<f32x16>(pixels), load<f32x16>(pixels + 16), two),
+        load<f32x16>(pixels + 32), three);
+}
+using SixteenLanes = std::make_integer_sequence<int, 16>;
+
+// 16 pixels red, green, blue, red, ... to and from a vector per channel.
+SPLAT_INLINE void interleave(const Rgb& v, float* pixels) {
+    store(pixels, interleave_part<0>(v, SixteenLanes{}));
+    store(pixels + 16, interleave_part<1>(v, SixteenLanes{}));
+    store(pixels + 32, interleave_part<2>(v, SixteenLanes{}));
+}
+SPLAT_INLINE Rgb deinterleave(const float* pixels) {
+    return {channel<0>(pixels, SixteenLanes{}), channel<1>(pixels, SixteenLanes{}),
+            channel<2>(pixels, SixteenLanes{})};
 }
 
 // ---- Sums over lanes ----

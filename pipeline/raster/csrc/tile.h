@@ -7,7 +7,12 @@
 
 namespace splat {
 
-// The pixels of one tile, 16 rows of 16.
+// Lane i of a block is its pixel (i % 4, i / 4), block i of a tile its block (i % 4, i / 4):
+// compact blocks, because more lanes of them lie inside a small ellipse than of a row of 16 pixels.
+constexpr f32x16 kColumn = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+constexpr f32x16 kRow = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+
+// The pixels of one tile.
 struct Tile {
     int64_t x, y;       // of the first pixel
     int columns, rows;  // inside the image
@@ -22,90 +27,158 @@ struct Tile {
 
     // Transmittance before the first Gaussian: 1 inside, a stopped pixel's outside.
     SPLAT_INLINE void start(f32x16* transmittance) const {
-        const Mask16 inside = lt(kLane, splat16(float(columns)));
-        for (int row = 0; row < kTile; row++)
-            transmittance[row] = row < rows ? select(inside, splat16(1), splat16(-1)) : splat16(-1);
-    }
-};
-
-// log2(alpha) of a Gaussian over a tile, row by row: power(row) = rest[row] - (across + u[row])^2.
-// The rows' terms are found 16 at once; the origin's are taken in float64, so that a centre a
-// thousand pixels away costs no digits.
-struct TileGaussian {
-    alignas(64) float u[kTile], rest[kTile], w[kTile];
-    f32x16 across;
-    const Record* record;
-    Entry entry;
-
-    SPLAT_INLINE void set(const Record& g, const Entry& from, const Tile& tile) {
-        const double dx = double(tile.x) + 0.5 - g.x, dy = double(tile.y) + 0.5 - g.y;
-        const f32x16 w_rows = float(g.ww * dy) + kLane * g.ww;
-        store(u, float(g.uu * dx + g.uw * dy) + kLane * g.uw);
-        store(w, w_rows);
-        store(rest, g.log2_opacity - w_rows * w_rows);
-        across = kLane * g.uu;
-        record = &g;
-        entry = from;
-    }
-    SPLAT_INLINE int first_row() const { return int(entry.rows & 255); }
-    SPLAT_INLINE int last_row() const { return int(entry.rows >> 8); }
-    SPLAT_INLINE f32x16 u_row(int row) const { return across + u[row]; }
-    SPLAT_INLINE f32x16 power(int row, f32x16 u_row) const { return rest[row] - u_row * u_row; }
-};
-
-// Goes through entries [begin, end) of a tile while visit(TileGaussian) says so; returns the entry
-// after the last one visited. `announce` hears of an entry some time before its visit. Each
-// Gaussian is set up before its predecessor's rows are drawn: when the processor mispredicts the
-// end of those rows, as it often does, the next rows' terms are there already.
-template <class Announce, class Visit>
-SPLAT_INLINE int64_t each_gaussian(const Record* records, const Entry* entries, int64_t begin,
-                                   int64_t end, const Tile& tile, const Announce& announce,
-                                   const Visit& visit) {
-    constexpr int kAhead = 6;
-    if (begin == end) return end;
-    TileGaussian two[2];
-    two[begin & 1].set(records[entries[begin].gaussian], entries[begin], tile);
-    for (int64_t e = begin; e < end; e++) {
-        if (e + kAhead < end) {
-            __builtin_prefetch(records + entries[e + kAhead].gaussian);
-            announce(entries[e + kAhead]);
+        for (int block = 0; block < kBlocks; block++) {
+            const Mask16 inside = lt(kColumn, splat16(float(columns - kBlock * (block % 4)))) &
+                                  lt(kRow, splat16(float(rows - kBlock * (block / 4))));
+            transmittance[block] = select(inside, splat16(1), splat16(-1));
         }
-        const Entry& next = entries[e + 1 < end ? e + 1 : e];
-        two[(e + 1) & 1].set(records[next.gaussian], next, tile);
-        if (!visit(two[e & 1])) return e + 1;
     }
-    return end;
-}
 
-// One Gaussian over one row of pixels.
-struct Step {
-    Mask16 drawn;       // contributes
-    Mask16 visible;     // alpha reaches its minimum
-    f32x16 raw, alpha;  // unbounded, and at most kAlphaMax
-    f32x16 weight;      // transmittance before * alpha where drawn, else 0
-    f32x16 after;       // transmittance after, where drawn
+    // Calls visit(row in the block, pixel in an image of this width, number of pixels) for each of
+    // a block's rows that the image has.
+    template <class Visit>
+    SPLAT_INLINE void each_row(int block, int64_t width, const Visit& visit) const {
+        const int left = kBlock * (block % 4), top = kBlock * (block / 4);
+        const int across = columns - left < kBlock ? columns - left : kBlock;
+        const int down = rows - top < kBlock ? rows - top : kBlock;
+        if (across == kBlock)  // a constant, for the compiler
+            for (int row = 0; row < down; row++)
+                visit(row, (y + top + row) * width + x + left, kBlock);
+        else if (across > 0)
+            for (int row = 0; row < down; row++)
+                visit(row, (y + top + row) * width + x + left, across);
+    }
+    // A block of an image of `kChannels` floats a pixel; zeros outside it.
+    template <int kChannels>
+    SPLAT_INLINE void read(int block, const float* image, int64_t width, float* pixels) const {
+        std::memset(pixels, 0, kChannels * 16 * sizeof(float));
+        each_row(block, width,
+                 [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
+                     std::memcpy(pixels + kChannels * kBlock * row, image + kChannels * pixel,
+                                 kChannels * count * sizeof(float));
+                 });
+    }
+    template <int kChannels>
+    SPLAT_INLINE void write(int block, const float* pixels, int64_t width, float* image) const {
+        each_row(block, width,
+                 [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
+                     std::memcpy(image + kChannels * pixel, pixels + kChannels * kBlock * row,
+                                 kChannels * count * sizeof(float));
+                 });
+    }
 };
 
-// A stopped pixel has its transmittance's sign turned: its next one is negative too, under the
-// minimum, so it never draws again.
-SPLAT_INLINE Step step(f32x16 power, f32x16 transmittance) {
+// log2(alpha) of a Gaussian over a tile: log2_opacity - u^2 - w^2, where u and w are those of the
+// first block plus what a block's place adds. The origin's are found in float64, so that a centre
+// a thousand pixels away costs no digits.
+struct alignas(64) TileGaussian {
+    f32x16 u, w;
+    float u_step[kBlocks], w_step[kBlocks];
+    float uu, uw, ww, log2_opacity;  // as in the Record
+    float rgb[3], depth;
+    uint32_t slot;
+
+    SPLAT_INLINE void set(const Record& g, uint32_t slot_, const Tile& tile) {
+        const double dx = double(tile.x) + 0.5 - g.x, dy = double(tile.y) + 0.5 - g.y;
+        const f32x16 across = kColumn * g.uu + kRow * g.uw, down = kRow * g.ww;
+        u = float(g.uu * dx + g.uw * dy) + across;
+        w = float(g.ww * dy) + down;
+        store(u_step, float(kBlock) * across);  // blocks lie in a tile as pixels do in a block
+        store(w_step, float(kBlock) * down);
+        std::memcpy(&uu, &g.uu, 8 * sizeof(float));
+        slot = slot_;
+    }
+    SPLAT_INLINE f32x16 u_at(int block) const { return u + u_step[block]; }
+    SPLAT_INLINE f32x16 w_at(int block) const { return w + w_step[block]; }
+    SPLAT_INLINE f32x16 power(f32x16 u_here, f32x16 w_here) const {
+        return log2_opacity - u_here * u_here - w_here * w_here;
+    }
+};
+
+// Some Gaussians of a tile, and their (Gaussian, block) pairs in order: one flat list, because the
+// end of a short loop over a Gaussian's blocks would be mispredicted as often as not.
+struct Batch {
+    static constexpr int kSize = 16, kAbreast = 4;
+    TileGaussian gaussian[kSize];
+    f32x16 alpha[kSize * kBlocks + kAbreast];   // of a pair; 0 where less than kAlphaMin
+    uint32_t pair[kSize * kBlocks + kAbreast];  // number in the batch * 16 + block
+    int first[kSize + 1];                       // pair of each Gaussian, and the number of pairs
+    int count;
+
+    SPLAT_INLINE int pairs() const { return first[count]; }
+
+    // Fills the batch from entries [from, end), looking at `alive` blocks only; returns the entry
+    // after the last one taken.
+    SPLAT_INLINE int64_t fill(const Record* records, const Entry* entries, int64_t from,
+                              int64_t end, const Tile& tile, uint32_t alive) {
+        constexpr int64_t kAhead = 16;
+        count = 0;
+        int pairs = 0;
+        const int64_t stop = end - from < kSize ? end : from + kSize;
+        for (int64_t e = from; e < stop; e++) {
+            if (e + kAhead < end) __builtin_prefetch(records + entries[e + kAhead].gaussian);
+            gaussian[count].set(records[entries[e].gaussian], entries[e].slot, tile);
+            first[count] = pairs;
+            pairs += list_bits(entries[e].blocks & alive, count * kBlocks, pair + pairs);
+            count++;
+        }
+        first[count] = pairs;
+        for (int i = 0; i < kAbreast; i++) pair[pairs + i] = 0;
+        // Some at once: one alone is a chain of some fifty cycles, and few fit into the
+        // processor's window.
+        for (int i = 0; i < pairs; i += kAbreast) {
+            f32x16 power[kAbreast];
+            for (int k = 0; k < kAbreast; k++) {
+                const TileGaussian& g = gaussian[pair[i + k] / kBlocks];
+                const int block = int(pair[i + k] % kBlocks);
+                power[k] = g.power(g.u_at(block), g.w_at(block));
+            }
+            f32x16 raw[kAbreast];
+            exp2(power, raw);
+            // Zero where nothing is seen: junk there could be denormal, which costs a hundred
+            // cycles.
+            for (int k = 0; k < kAbreast; k++)
+                alpha[i + k] =
+                    keep(ge(power[k], splat16(kLog2AlphaMin)), min(raw[k], splat16(kAlphaMax)));
+        }
+        return stop;
+    }
+};
+
+// The blending of one Gaussian over one block of pixels.
+struct Step {
+    Mask16 drawn;   // contributes
+    f32x16 weight;  // transmittance before * alpha where drawn, else 0
+    f32x16 after;   // transmittance after, where drawn
+};
+
+// Takes a block's transmittance one Gaussian further. A stopped pixel has its transmittance's sign
+// turned: its next one is negative too, under the minimum, so it never draws again. A block whose
+// last pixel stops leaves `alive`.
+SPLAT_INLINE Step step(f32x16 alpha, int block, f32x16* transmittance, uint32_t& alive) {
     Step s;
-    s.visible = ge(power, splat16(kLog2AlphaMin));
-    s.raw = exp2(power);
-    // Zero where nothing is seen: junk there could be denormal, which costs a hundred cycles.
-    s.alpha = keep(s.visible, min(s.raw, splat16(kAlphaMax)));
-    const f32x16 weight = s.alpha * transmittance;
-    s.after = transmittance - weight;
-    s.drawn = s.visible & ge(s.after, splat16(kTransmittanceMin));
+    const f32x16 before = transmittance[block], zero = {};
+    const f32x16 weight = alpha * before;
+    s.after = before - weight;
+    const Mask16 visible = lt(zero, alpha);
+    s.drawn = visible & ge(s.after, splat16(kTransmittanceMin));
     s.weight = keep(s.drawn, weight);
+    f32x16 next = select(s.drawn, s.after, before);
+    const Mask16 stopped = and_not(visible, s.drawn) & lt(zero, before);
+    if (__builtin_expect(any(stopped), 0)) {
+        next = negate_where(stopped, next);
+        if (!any(lt(zero, next))) alive &= ~(1u << block);
+    }
+    transmittance[block] = next;
     return s;
 }
 
-// The transmittance to carry on with, and in `stopped` the pixels that end here.
-SPLAT_INLINE f32x16 advance(const Step& s, f32x16 before, Mask16& stopped) {
-    stopped = and_not(s.visible, s.drawn) & lt(splat16(0), before);
-    const f32x16 next = select(s.drawn, s.after, before);
-    return __builtin_expect(any(stopped), 0) ? negate_where(stopped, next) : next;
+// The blocks that have a pixel to draw.
+SPLAT_INLINE uint32_t alive_blocks(const f32x16* transmittance) {
+    uint32_t alive = 0;
+    for (int block = 0; block < kBlocks; block++)
+        alive |= uint32_t(any(lt(splat16(0), transmittance[block]))) << block;
+    return alive;
 }
 
 }  // namespace splat

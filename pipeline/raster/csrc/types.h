@@ -48,7 +48,7 @@ static_assert(sizeof(Record) == 64);
 // pairs of a Gaussian are neighbours there, whatever thread made them.
 struct Entry {
     uint32_t gaussian, slot;
-    uint32_t rows;  // first row | last row << 8, within the tile
+    uint32_t blocks;  // bit i: near block i of the tile
 };
 static_assert(sizeof(Entry) == 12);
 

@@ -14,7 +14,7 @@ from pipeline.splats.spz import encode_spz
 
 # Gaussians that tell how far all of them can be compressed, and what that may err by.
 _SAMPLE = 20_000
-_MARGIN = 0.97
+_MARGIN = 0.95
 
 
 @dataclass(frozen=True)
@@ -62,4 +62,4 @@ def prominence(gaussians: Gaussians, centres: NDArray[np.float64]) -> Tensor:
     for centre in some:
         inverse += 1 / (gaussians.means - centre).square().sum(1).clamp(min=1e-12)
     longer = gaussians.log_scales.sort(1).values[:, 1:].sum(1)
-    return gaussians.opacity_logits.sigmoid() * (longer.exp() * inverse / len(some)).sqrt()
+    return gaussians.opacity_logits.sigmoid() * (longer.exp() * inverse / max(len(some), 1)).sqrt()

@@ -110,14 +110,18 @@ function start(data) {
     return points;
   }
 
-  // Pyramids, but for the cameras at the eye, which would stand in the view.
+  // Pyramids, but for the cameras about the eye, which would stand in its view.
   function drawFrusta() {
+    for (const { geometry, material } of frusta.children) {
+      geometry.dispose();
+      material.dispose();
+    }
     frusta.clear();
     const style = getComputedStyle(box);
     for (const test of [false, true]) {
       const corners = [];
       for (const camera of cameras) {
-        if (camera.test !== test || camera.position.distanceTo(eye.position) < 4 * data.size) continue;
+        if (camera.test !== test || camera.position.distanceTo(eye.position) < 8 * data.size) continue;
         const { width, height, fx, fy, cx, cy, position, quaternion } = camera;
         const depth = 2 * data.size / Math.max(width / fx, height / fy);
         const [a, b, c, d] = [[0, 0], [width, 0], [width, height], [0, height]].map(([x, y]) =>
@@ -170,6 +174,7 @@ function start(data) {
     controls.zoomToCursor = true;
     controls.update();
     controls.addEventListener("change", redraw);
+    controls.addEventListener("end", drawFrusta);
   }
 
   function lookThrough(index) {

@@ -20,7 +20,7 @@ def run(job: Job) -> None:
             gaussians = gaussians.with_sh_degree(config.sh_degree)
         if config.min_opacity > 0:
             gaussians = gaussians.select(gaussians.opacity_logits.sigmoid() >= config.min_opacity)
-        write_splat_ply(job.out / "point_cloud.ply", **gaussians.arrays())
+        write_splat_ply(job.out / "point_cloud.ply", gaussians)
         job.counters["exported_gaussians"] = len(gaussians)
     if "colmap" in config.formats:
         write_model(job.out / "sparse" / "0", model)

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
+from pipeline.splats.gaussians import Gaussians
 
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
@@ -42,46 +43,14 @@ _MAX_HEADER = 1 << 16
 _FIX = "write the file again, or get a whole copy of it"
 
 
-@dataclass(frozen=True)
-class SplatArrays:
-    """Gaussians as float32 numpy arrays: means (N, 3), log_scales (N, 3), quats (N, 4) wxyz as
-    stored (not normalised), opacity_logits (N,), sh (N, K, 3) with K = (degree + 1)^2."""
-
-    means: NDArray[np.float32]
-    log_scales: NDArray[np.float32]
-    quats: NDArray[np.float32]
-    opacity_logits: NDArray[np.float32]
-    sh: NDArray[np.float32]
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    @property
-    def sh_degree(self) -> int:
-        return round(self.sh.shape[1] ** 0.5) - 1
-
-
-def write_splat_ply(
-    path: Path,
-    means: NDArray[Any],
-    log_scales: NDArray[Any],
-    quats: NDArray[Any],
-    opacity_logits: NDArray[Any],
-    sh: NDArray[Any],
-) -> None:
+def write_splat_ply(path: Path, gaussians: Gaussians) -> None:
     """Write Gaussians in INRIA's layout: 62 floats each at SH degree 3, fewer at lower ones.
 
     Args:
         path: appears whole or not at all.
-        means, log_scales: (N, 3). quats: (N, 4) wxyz. opacity_logits: (N,).
-        sh: (N, K, 3), K = 1, 4, 9 or 16.
     """
+    means, log_scales, quats, logits, sh = gaussians.arrays().values()
     count, bands = sh.shape[:2]
-    shapes = (means.shape, log_scales.shape, quats.shape, opacity_logits.shape, sh.shape)
-    if shapes != ((count, 3), (count, 3), (count, 4), (count,), (count, bands, 3)):
-        raise ValueError(f"arrays that do not belong together: {shapes}")
-    if bands not in (1, 4, 9, 16):
-        raise ValueError(f"{bands} SH coefficients; 1, 4, 9 or 16 make whole bands")
     rest = [f"f_rest_{i}" for i in range(3 * (bands - 1))]
     names = [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
     columns = (
@@ -89,7 +58,7 @@ def write_splat_ply(
         np.zeros((count, 3)),
         sh[:, 0],
         sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),
-        opacity_logits[:, None],
+        logits[:, None],
         log_scales,
         quats,
     )
@@ -131,7 +100,7 @@ def _write(path: Path, count: int, properties: list[tuple[str, str]], body: byte
     write_bytes(path, "\n".join([*lines, "end_header", ""]).encode() + body)
 
 
-def read_splat_ply(path: Path) -> SplatArrays:
+def read_splat_ply(path: Path) -> Gaussians:
     """Read Gaussians by property name: any order, normals optional, SH degree 0 to 3, any
     number type; binary of either byte order, or ASCII.
 
@@ -169,12 +138,14 @@ def read_splat_ply(path: Path) -> SplatArrays:
     for channel in range(3):
         for band in range(bands - 1):
             sh[:, band + 1, channel] = table[f"f_rest_{channel * (bands - 1) + band}"]
-    return SplatArrays(
-        columns(_POSITION),
-        columns(_SCALE),
-        columns(_ROTATION),
-        table["opacity"].astype(np.float32),
-        sh,
+    return Gaussians.from_arrays(
+        {
+            "means": columns(_POSITION),
+            "log_scales": columns(_SCALE),
+            "quats": columns(_ROTATION),
+            "opacity_logits": table["opacity"],
+            "sh": sh,
+        }
     )
 
 

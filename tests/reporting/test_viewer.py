@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import base64
 import io
+import re
 import shutil
 import time
 from collections.abc import Callable, Iterator
@@ -18,6 +19,7 @@ from PIL import Image
 
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
+from pipeline.splats.ply import write_splat_ply
 from pipeline.training.render import render_view
 from tests.reporting.made import gaussians, report, trained
 
@@ -115,12 +117,19 @@ def test_the_scene_appears_and_nothing_is_asked_of_a_network(page: Any, file: Pa
     assert page.locator("#space-tools select").is_enabled()
 
 
-@pytest.mark.parametrize("antialias", [False, True])
-def test_the_viewer_draws_what_we_draw(page: Any, tmp_path: Path, antialias: bool) -> None:
-    """Spark's render of the page's SPZ against the rasterizer's of the Gaussians themselves."""
+@pytest.mark.parametrize(("kind", "antialias"), [("spz", False), ("spz", True), ("ply", False)])
+def test_the_viewer_draws_what_we_draw(
+    page: Any, tmp_path: Path, kind: str, antialias: bool
+) -> None:
+    """Spark's render of the page's SPZ, and of our PLY in its place, against the rasterizer's of
+    the Gaussians themselves."""
     path = tmp_path / "report.html"
     scene = trained(gaussians=gaussians(3000), background=(0.2, 0.5, 1.0), antialias=antialias)
     write_report(report(trained=scene), path)
+    if kind == "ply":
+        write_splat_ply(tmp_path / "scene.ply", scene.gaussians)
+        ply = base64.b64encode((tmp_path / "scene.ply").read_bytes()).decode()
+        path.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, path.read_text("utf-8")), "utf-8")
     page.goto(path.as_uri())
     for view in scene.views[:3]:
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))

@@ -26,7 +26,7 @@ import { OrbitControls } from "three/addons/controls/OrbitControls.js";
 import { LineMaterial } from "three/addons/lines/LineMaterial.js";
 import { LineSegments2 } from "three/addons/lines/LineSegments2.js";
 import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js";
-import { SparkRenderer, SplatFileType, SplatMesh } from "@sparkjsdev/spark";
+import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const FAR = 1e4;
 const CLICK_PX = 5; // a press that moves less is a click
@@ -76,7 +76,6 @@ function start(data) {
   });
   const splats = new SplatMesh({
     fileBytes: bytes(document.getElementById("splats").textContent),
-    fileType: SplatFileType.SPZ,
     extSplats: true,
   });
   frame.decompose(splats.position, splats.quaternion, splats.scale);
@@ -121,7 +120,8 @@ function start(data) {
     for (const test of [false, true]) {
       const corners = [];
       for (const camera of cameras) {
-        if (camera.test !== test || camera.position.distanceTo(eye.position) < 8 * data.size) continue;
+        const about = camera.position.distanceTo(eye.position) < 8 * data.size;
+        if (about || camera.test !== test) continue;
         const { width, height, fx, fy, cx, cy, position, quaternion } = camera;
         const depth = 2 * data.size / Math.max(width / fx, height / fy);
         const [a, b, c, d] = [[0, 0], [width, 0], [width, height], [0, height]].map(([x, y]) =>
@@ -294,8 +294,8 @@ function start(data) {
     redraw();
   });
 
-  /* The splats alone as a camera of the world sees them, as a PNG's data URL. The camera is COLMAP's
-     pinhole: width, height, fx, fy, cx, cy in pixels, world_to_camera the rows of a 3x4 matrix. */
+  // The splats alone as a camera of the world sees them, as a PNG's data URL. The camera is
+  // COLMAP's pinhole, with the names that data.cameras has.
   async function picture({ width, height, fx, fy, cx, cy, world_to_camera }) {
     await ready;
     const camera = new THREE.PerspectiveCamera();

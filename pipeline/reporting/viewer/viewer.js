@@ -98,7 +98,7 @@ function start(data) {
     const xyz = new Int16Array(bytes(data.points).buffer);
     geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(bytes(data.colours), 3, true));
-    const material = new THREE.PointsMaterial({ size: 0.008, vertexColors: true });
+    const material = new THREE.PointsMaterial({ size: 0.02, vertexColors: true });
     // The colours are meant for the screen as they are.
     material.onBeforeCompile = shader => {
       shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");

@@ -6,7 +6,7 @@ CORES ?= all
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint format docs setup clean
+.PHONY: demo test lint format docs viewer setup clean
 .DEFAULT_GOAL := help
 
 help:
@@ -15,6 +15,7 @@ help:
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
 	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
+	@echo "make viewer rebuild the pages' viewer (needs Node 20 or newer)"
 	@echo "make clean  remove results/ and data/demo"
 
 $(VENV)/installed: pyproject.toml
@@ -57,6 +58,13 @@ format: $(VENV)/installed
 
 docs: $(VENV)/installed
 	@$(BIN)/python -m pipeline.config.docs
+
+VIEWER := pipeline/reporting/viewer
+viewer:
+	@mkdir -p build/viewer
+	@cp $(VIEWER)/package.json $(VIEWER)/package-lock.json $(VIEWER)/viewer.js build/viewer
+	@cd build/viewer && npm ci --ignore-scripts && npm run build
+	@cp build/viewer/viewer.min.js $(VIEWER)
 
 clean:
 	rm -rf results data/demo

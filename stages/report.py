@@ -12,7 +12,7 @@ from pipeline.config.schema import Report, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol, reference
 from pipeline.photos.load import load_view
 from pipeline.reporting.collect import collect_metrics
-from pipeline.reporting.data import Comparison, ReportData, ranked
+from pipeline.reporting.data import Comparison, ReportData, TrainedScene, ranked
 from pipeline.reporting.headline import headline
 from pipeline.reporting.page import write_report
 from pipeline.runtime.atomic import write_json
@@ -21,6 +21,7 @@ from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views
+from pipeline.splats.gaussians import Gaussians
 from stages.command import main
 
 
@@ -31,7 +32,8 @@ def run(job: Job) -> None:
     model = read_model(job.inputs["model"] / "sparse" / "0")
     views = load_views(manifest, model, job.section(Views), job.section(Split))
     evaluation = read_json(job.inputs["evaluate"] / "evaluation.json")
-    comparisons = compare(job, manifest, views, evaluation)
+    protocol = choose_protocol(views, job.section(Split), job.section(Train))
+    comparisons = compare(job, manifest, views, evaluation, protocol.background)
     own = run_facts(job, time.perf_counter() - start)
     results = job.inputs["inspect"].parent
     metrics = collect_metrics(job.scene, plan, results, evaluation, own)
@@ -43,10 +45,14 @@ def run(job: Job) -> None:
         decisions=stage_decisions(plan, results),
         curve=curve_of(job.inputs["train"]),
         comparisons=comparisons,
-        camera_centres=np.array([view.centre for view in views]),
-        camera_rotations=np.array([view.world_to_camera[:3, :3] for view in views]),
-        camera_names=[view.name for view in views],
-        camera_is_test=[view.is_test for view in views],
+        trained=TrainedScene(
+            gaussians=Gaussians.load(job.inputs["train"] / "gaussians.npz"),
+            views=views,
+            orientations={photo.name: photo.orientation for photo in manifest.photos},
+            background=protocol.background,
+            antialias=job.section(Train).antialias,
+            near=protocol.near,
+        ),
         **points_of(model),
     )
     write_report(data, job.out / "report.html")
@@ -54,12 +60,15 @@ def run(job: Job) -> None:
 
 
 def compare(
-    job: Job, manifest: Manifest, views: list[View], evaluation: dict[str, Any]
+    job: Job,
+    manifest: Manifest,
+    views: list[View],
+    evaluation: dict[str, Any],
+    background: tuple[float, float, float],
 ) -> list[Comparison]:
     """The views to show, worst to best, each beside its photograph."""
     photos = {photo.name: photo for photo in manifest.photos}
     by_name = {view.name: view for view in views}
-    protocol = choose_protocol(views, job.section(Split), job.section(Train))
     shown = []
     for label, measured in ranked(evaluation["per_view"], job.section(Report).views):
         view = by_name[measured["name"]]
@@ -69,7 +78,7 @@ def compare(
                 Comparison(
                     label=label,
                     name=view.name,
-                    photograph=reference(pixels, protocol.background),
+                    photograph=reference(pixels, background),
                     render=np.asarray(render),
                     mask=pixels.mask,
                     psnr=measured["psnr"],

@@ -9,6 +9,9 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+
 
 @dataclass(frozen=True)
 class Comparison:
@@ -33,6 +36,25 @@ class Comparison:
     orientation: int = 1
 
 
+@dataclass(frozen=True)
+class TrainedScene:
+    """What was trained and what is needed to look at it.
+
+    Attributes:
+        gaussians: in the world of the views.
+        views: training and held-out ones.
+        orientations: name of a view -> EXIF orientation of its photograph; 1 where there is none.
+        background: RGB in [0, 1] behind the Gaussians. antialias, near: as in training.
+    """
+
+    gaussians: Gaussians
+    views: Sequence[View]
+    orientations: Mapping[str, int]
+    background: tuple[float, float, float]
+    antialias: bool
+    near: float
+
+
 def _empty(*shape: int) -> NDArray[np.float64]:
     return np.zeros(shape)
 
@@ -49,8 +71,7 @@ class ReportData:
         curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, where it
             is known, ``seconds`` since the start of training; a missing or null value is a gap.
         comparisons: pictures to show, worst first.
-        camera_centres: (C, 3) world. camera_rotations: (C, 3, 3) world to camera.
-        camera_names, camera_is_test: C each.
+        trained: the Gaussians and their views.
         points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
         reprojection_errors: pixels, one a sparse point. track_lengths: images, one a point.
     """
@@ -61,10 +82,7 @@ class ReportData:
     decisions: Mapping[str, Sequence[str]] = field(default_factory=dict)
     curve: Sequence[Mapping[str, float | None]] = ()
     comparisons: Sequence[Comparison] = ()
-    camera_centres: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
-    camera_rotations: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3, 3))
-    camera_names: Sequence[str] = ()
-    camera_is_test: Sequence[bool] = ()
+    trained: TrainedScene | None = None
     points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
     points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
     reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))

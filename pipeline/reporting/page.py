@@ -14,16 +14,23 @@ from typing import Any
 import numpy as np
 
 from pipeline.reporting.charts import histogram, line_chart
-from pipeline.reporting.cloud import cloud
 from pipeline.reporting.data import Comparison, ReportData
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
 from pipeline.reporting.script import JS
+from pipeline.reporting.space import space_section, viewer_script
 from pipeline.reporting.style import CSS
 from pipeline.reporting.tables import definitions, per_view_table, stages_table
 from pipeline.reporting.text import count, duration, escape, fixed
 from pipeline.runtime.atomic import write_text
 
-_POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'"
+# The viewer decodes and sorts in WebAssembly, in a worker.
+_POLICY = (
+    "default-src 'none'; img-src data:; style-src 'unsafe-inline'; "
+    "script-src 'unsafe-inline' 'wasm-unsafe-eval'; worker-src blob:"
+)
+
+# Of the whole page. Mail and chat programs, which pages travel by, take 15 MB and more.
+_MAX_BYTES = 14_500_000
 
 
 def write_report(data: ReportData, path: Path) -> None:
@@ -33,15 +40,17 @@ def write_report(data: ReportData, path: Path) -> None:
 
 def report_html(data: ReportData) -> str:
     """The page as a string."""
+    viewer = "" if data.trained is None else f"<script>{viewer_script()}</script>"
     sections = [
         ("pictures", "Photograph and render", _pictures(data.comparisons)),
         ("training", "Training", _curves(data)),
-        ("geometry", "Cameras and points", _space(data)),
         ("reconstruction", "Reconstruction", _reconstruction(data)),
         ("views", "Every view", per_view_table(data.metrics.get("per_view") or [])),
         ("stages", "Stages", stages_table(data.metrics.get("stages") or {})),
         ("how", "Decisions and protocol", _how(data)),
     ]
+    room = _MAX_BYTES - len(viewer) - sum(len(inside) for _, _, inside in sections)
+    sections.insert(0, ("scene", "Scene", space_section(data, room)))
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in sections)
     body = "".join(
         f'<section id="{key}"><h2>{title}</h2>{inside}</section>' for key, title, inside in sections
@@ -56,7 +65,7 @@ def report_html(data: ReportData) -> str:
         f'<div class="top"><h1>{scene}</h1><p class="lead">{_lead(data)}</p>'
         f"<nav>{links}</nav>{_cards(data)}</div>\n<main>{_warnings(data)}{body}</main>"
         '<div class="foot">Made by splatmake. This page needs no network.</div>'
-        f"<script>{JS}</script></body></html>\n"
+        f"<script>{JS}</script>{viewer}</body></html>\n"
     )
 
 
@@ -223,23 +232,6 @@ def _curves(data: ReportData) -> str:
     )
 
 
-def _space(data: ReportData) -> str:
-    if not len(data.camera_centres) and not len(data.points_xyz):
-        return _nothing("There are no cameras and no points.")
-    test = sum(bool(t) for t in data.camera_is_test)
-    train = len(data.camera_centres) - test
-    return (
-        '<p class="hint">Drag to turn, shift and drag to move, double click to reset; click it '
-        "first to zoom with the wheel. Point at a camera for its name.</p>"
-        '<div id="space"><canvas tabindex="0" aria-label="cameras and sparse points"></canvas>'
-        "<output></output></div>"
-        f'<div class="keys"><span><i style="background: var(--train)"></i>{count(train)} training '
-        f'cameras</span><span><i style="background: var(--test)"></i>{count(test)} held-out '
-        f"cameras</span><span>{count(len(data.points_xyz))} sparse points</span></div>"
-        f'<script type="application/json" id="cloud">{_json(cloud(data))}</script>'
-    )
-
-
 def _reconstruction(data: ReportData) -> str:
     parts = []
     errors = np.asarray(data.reprojection_errors, np.float64)
@@ -282,8 +274,3 @@ def _how(data: ReportData) -> str:
 def _raw(name: str, value: Mapping[str, Any]) -> str:
     text = json.dumps(value, indent=2, ensure_ascii=False)
     return f"<details><summary>{name}</summary><pre>{escape(text)}</pre></details>"
-
-
-def _json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
-    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

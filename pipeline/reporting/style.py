@@ -111,14 +111,26 @@ nav + .cards { margin-top: 22px; }
 .median { stroke: var(--test); stroke-width: 1.5; stroke-dasharray: 4 3; }
 .by-time { display: none; }
 .timed .by-time { display: grid; } .timed .by-step { display: none; }
-#space { position: relative; height: min(62vh, 560px); border-radius: 10px; overflow: hidden;
-  background: var(--page); border: 1px solid var(--line); }
-#space canvas { width: 100%; height: 100%; display: block; touch-action: pan-y; cursor: grab; }
+#space { position: relative; height: min(72vh, 680px); border-radius: 10px; overflow: hidden;
+  background: #000; }
+#space canvas { position: absolute; width: 100%; height: 100%; cursor: grab; }
 #space canvas:active { cursor: grabbing; }
 #space canvas:focus-visible { outline: 2px solid var(--accent); outline-offset: -2px; }
 #space output { position: absolute; pointer-events: none; font-size: 12px; background: var(--ink);
   color: var(--page); border-radius: 6px; padding: 1px 8px; transform: translate(10px, -28px); }
 #space output:empty { display: none; }
+#space p { position: absolute; inset: auto 12px 12px; margin: 0; padding: 5px 12px;
+  width: fit-content; border-radius: 9px; background: var(--card); font-size: 13.5px; }
+#space-tools fieldset { border: 0; margin: 12px 0 0; padding: 0; min-width: 0; display: flex;
+  flex-wrap: wrap; gap: 8px 10px; align-items: center; font-size: 13.5px; }
+#space-tools > :disabled { opacity: .5; }
+#space-tools select, #space-tools button { font: inherit; color: inherit; background: var(--page);
+  border: 1px solid var(--line); border-radius: 9px; padding: 5px 11px; min-height: 34px; }
+#space-tools select { max-width: min(52vw, 300px); margin-left: 6px; }
+#space-tools button { cursor: pointer; }
+#space-tools [name=previous], #space-tools [name=next] { font-size: 17px; line-height: 1; }
+#space-tools label:has([type=checkbox]) { display: flex; gap: 6px; align-items: center; }
+#space-tools :focus-visible { outline: 2px solid var(--accent); outline-offset: 1px; }
 .keys { display: flex; flex-wrap: wrap; gap: 4px 18px; margin: 10px 0 0; font-size: 13.5px;
   color: var(--soft); }
 .keys i { display: inline-block; width: 11px; height: 11px; border-radius: 3px; margin-right: 6px; }
@@ -164,7 +176,7 @@ pre { overflow: auto; max-height: 460px; font-size: 12.5px; line-height: 1.45; m
   .triple.tall figcaption { left: 4px; top: 4px; font-size: 10.5px; padding: 0 5px; }
   .sliding .tall .render figcaption { left: auto; right: 4px; }
   dl { grid-template-columns: 1fr; gap: 0; } dd { margin-bottom: 8px; }
-  #space { height: 380px; }
+  #space { height: 62vh; }
 }
 @media print { body { background: none; } section { break-inside: avoid; box-shadow: none; } }
 """

@@ -21,7 +21,8 @@ def stage_source_hash(module: str) -> str:
     """Hash of ``module`` and of all modules of the project that it imports, at any depth.
 
     Python counts by its syntax tree without docstrings, C++ by its text without comments and
-    spacing, so that neither comments nor formatting change the hash.
+    spacing, so that neither comments nor formatting change the hash; the pages' viewer by its
+    bytes.
     """
     digest = hashlib.sha256()
     for name in sorted(_reachable(module)):
@@ -84,6 +85,8 @@ def _module_hash(module: str) -> str:
             if file.suffix in (".cpp", ".h"):
                 text = _COMMENT.sub(lambda m: m.group(1) or " ", file.read_text())
                 digest.update(f"{file.name}={' '.join(text.split())}\n".encode())
+    if module == "pipeline.reporting.space":
+        digest.update((ROOT / "pipeline/reporting/viewer/viewer.min.js").read_bytes())
     return digest.hexdigest()
 
 

@@ -65,3 +65,15 @@ def test_kernels_count_without_their_comments(project):
     kernel.write_text("int f() { return 2; }\n")
     assert hash_of("draw") != before
     assert hash_of("work") == hash_of("work")
+
+
+def test_the_viewer_counts_for_what_makes_pages(project):
+    root, hash_of = project
+    viewer = root / "pipeline/reporting/viewer/viewer.min.js"
+    viewer.parent.mkdir(parents=True)
+    viewer.write_text("one")
+    (root / "pipeline/reporting/space.py").write_text("")
+    (root / "stages/page.py").write_text("import pipeline.reporting.space\n")
+    before = hash_of("page"), hash_of("draw")
+    viewer.write_text("two")
+    assert hash_of("page") != before[0] and hash_of("draw") == before[1]

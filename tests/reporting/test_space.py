@@ -1,0 +1,173 @@
+"""What the page's viewer is given: upright, in the scene's size, within the page's."""
+
+from __future__ import annotations
+
+import base64
+import dataclasses
+import hashlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.reporting.fit import fit, prominence
+from pipeline.reporting.page import report_html
+from pipeline.reporting.pictures import upright
+from pipeline.reporting.space import space_section, upright_camera, viewer_data, viewer_script
+from pipeline.scene.model import View
+from pipeline.splats.spz import decode_spz, encode_spz
+from tests.reporting.made import gaussians, report, ring, trained
+
+VIEWER = Path(__file__).parents[2] / "pipeline" / "reporting" / "viewer"
+
+
+def tilted(views: list[View], tilt: np.ndarray) -> list[View]:
+    """The same cameras in a world turned by ``tilt`` (3, 3)."""
+    turn = np.eye(4)
+    turn[:3, :3] = tilt.T
+    return [dataclasses.replace(v, world_to_camera=v.world_to_camera @ turn) for v in views]
+
+
+def rotation(seed: int) -> np.ndarray:
+    tilt = np.linalg.qr(np.random.default_rng(seed).normal(size=(3, 3)))[0]
+    return tilt * np.sign(np.linalg.det(tilt))
+
+
+def test_the_frame_is_upright_robust_and_keeps_shapes() -> None:
+    """Upright cameras around the origin in a tilted world; one stray point."""
+    rng, tilt = np.random.default_rng(0), rotation(0)
+    points = np.concatenate([rng.normal(0, 0.5, (200, 3)) @ tilt.T, [[1e6, 0, 0]]])
+    scene = trained(views=tilted(ring(12), tilt))
+    data = report(trained=scene, points_xyz=points, points_rgb=np.zeros((201, 3), np.uint8))
+    made = viewer_data(data, scene)
+    frame = np.array(made["frame"]).reshape(4, 4).T
+    scale = np.cbrt(np.linalg.det(frame[:3, :3]))
+    np.testing.assert_allclose(frame[:3, :3] @ frame[:3, :3].T, scale**2 * np.eye(3), atol=1e-9)
+    np.testing.assert_allclose(frame[:3, :3] @ tilt @ [0, 0, 1], [0, scale, 0], atol=1e-9)
+    for view, camera in zip(scene.views, made["cameras"], strict=True):
+        np.testing.assert_allclose(camera["world_to_camera"], view.world_to_camera[:3].ravel())
+        placed = frame @ [*view.centre, 1]
+        assert 0.5 < np.abs(placed[:3]).max() < 1.5
+    packed = np.frombuffer(base64.b64decode(made["points"]), "<i2").reshape(-1, 3)
+    assert len(packed) == 200  # the stray one is left out
+    placed = points[:200] @ frame[:3, :3].T + frame[:3, 3]
+    np.testing.assert_allclose(packed * made["step"], placed, atol=made["step"])
+
+
+def test_from_the_air_up_is_what_lies_behind_the_cameras() -> None:
+    """Looking straight down, flown to and fro: their own ups cancel out."""
+    views = []
+    for i, side in enumerate([1.0, -1.0] * 4):
+        pose = np.eye(4)
+        pose[:3, :3] = [[side, 0, 0], [0, -side, 0], [0, 0, -1]]
+        pose[:3, 3] = -pose[:3, :3] @ [i, 0.0, 10.0]
+        views.append(dataclasses.replace(ring()[0], world_to_camera=pose))
+    scene = trained(views=views)
+    frame = np.array(viewer_data(report(), scene)["frame"]).reshape(4, 4).T
+    up = frame[:3, :3] @ [0, 0, 1]
+    np.testing.assert_allclose(up / np.linalg.norm(up), [0, 1, 0], atol=1e-9)
+
+
+def test_many_points_are_thinned() -> None:
+    rng, many = np.random.default_rng(0), np.zeros((60_000, 3), np.uint8)
+    data = report(points_xyz=rng.normal(size=many.shape), points_rgb=many)
+    made = viewer_data(data, trained())
+    assert len(base64.b64decode(made["points"])) == 25_000 * 6
+    assert len(base64.b64decode(made["colours"])) == 25_000 * 3
+
+
+@pytest.mark.parametrize("orientation", [0, 1, 3, 6, 8])
+def test_cameras_turn_with_their_photographs(orientation: int) -> None:
+    """A point's pixel, found by the turned camera, is the turned picture's pixel of that point."""
+    view = ring(3, width=40, height=30)[1]
+    picture = np.zeros((30, 40, 3), np.uint8)
+    column, row = 31, 4
+    picture[row, column] = 255
+    point = 2.0 * np.array(
+        [(column + 0.5 - view.cx) / view.fx, (row + 0.5 - view.cy) / view.fy, 1.0]
+    )
+    pose = view.world_to_camera
+    world = pose[:3, :3].T @ (point - pose[:3, 3])
+    camera = upright_camera(view, orientation)
+    turned = upright(picture, orientation)
+    assert (camera["height"], camera["width"]) == turned.shape[:2]
+    matrix = np.array(camera["world_to_camera"]).reshape(3, 4)
+    assert np.linalg.det(matrix[:, :3]) == pytest.approx(1)
+    x, y, z = matrix @ [*world, 1]
+    u, v = camera["fx"] * x / z + camera["cx"], camera["fy"] * y / z + camera["cy"]
+    assert turned[int(v), int(u), 0] == 255
+
+
+def test_the_view_of_median_quality_comes_first() -> None:
+    median = dataclasses.replace(report().comparisons[0], label="median", name="3.jpg")
+    assert viewer_data(report(comparisons=[median]), trained())["start"] == 3
+    assert viewer_data(report(), trained())["start"] == 2
+    assert viewer_data(report(), trained(views=[]))["start"] is None
+
+
+MANY = gaussians(5000)
+CENTRES = np.array([view.centre for view in ring()])
+
+
+def test_what_fits_is_whole() -> None:
+    whole = gaussians(3000)
+    packed = fit(whole, CENTRES, 1_000_000)
+    read = decode_spz(packed.spz)
+    assert (packed.count, packed.sh_degree) == (3000, 3) == (len(read), read.sh_degree)
+    assert float((read.means - whole.means).abs().max()) < 1e-3
+
+
+def size(degree: int) -> int:
+    return len(encode_spz(MANY.with_sh_degree(degree)))
+
+
+def test_harmonics_go_first_then_what_is_least_prominent() -> None:
+    rooms = [size(3) * 1.1, size(1) * 1.1, size(0) * 0.6, size(0) * 0.2]
+    kept = [fit(MANY, CENTRES, int(room)) for room in rooms]
+    assert [packed.sh_degree for packed in kept] == [3, 1, 0, 0]
+    assert [packed.count for packed in kept[:2]] == [len(MANY)] * 2
+    assert 0.5 < kept[2].count / len(MANY) < 0.6
+    for packed, room in zip(kept, rooms, strict=True):
+        assert len(packed.spz) <= 1.02 * room
+    read = decode_spz(kept[3].spz)
+    assert len(read) == kept[3].count
+    values = prominence(MANY, CENTRES)
+    limit = values.sort(descending=True).values[len(read) - 1]
+    assert float((read.means - MANY.means[values >= limit]).abs().max()) < 1e-3
+
+
+def test_prominence_is_opacity_times_the_angle_seen() -> None:
+    one = gaussians(1)
+    four = type(one)(*(tensor.expand(4, *tensor.shape[1:]).clone() for tensor in one.parameters()))
+    four.means[:] = torch.tensor([[0.0, 0, 2], [0, 0, 2], [0, 0, 2], [0, 0, 4]])
+    four.opacity_logits[:] = torch.tensor([0.5, 0.25, 0.5, 0.5]).logit()
+    four.log_scales[:] = torch.tensor([0.1, 0.2, 0.3]).log()
+    four.log_scales[2] += np.log(2)
+    values = prominence(four, np.zeros((1, 3)))
+    np.testing.assert_allclose(values / values[0], [1, 0.5, 2, 0.5], rtol=1e-5)
+
+
+def test_the_page_says_what_it_left_out() -> None:
+    data = report(trained=trained(gaussians=MANY))
+    assert "5,000 Gaussians</span>" in space_section(data, 10_000_000)
+    small = space_section(data, size(0) * 3 // 2)
+    assert "5,000 Gaussians (this page, to stay small, has SH of degree 0 instead of 3;" in small
+    smaller = space_section(data, size(0) // 2)
+    assert "most prominent with SH of degree 0 instead of 3; the exports are whole)" in smaller
+
+
+def test_a_page_of_a_hundred_thousand_gaussians_stays_under_15_mb() -> None:
+    html = report_html(report(trained=trained(gaussians=gaussians(100_000))))
+    assert len(html.encode()) < 15_000_000
+    assert "100,000 Gaussians</span>" in html
+
+
+def test_the_viewer_is_built_from_its_sources_and_stays_inside_its_script() -> None:
+    """``make viewer`` after a change; the notices of what it holds are kept."""
+    script = viewer_script()
+    sources = (VIEWER / "package-lock.json").read_bytes() + (VIEWER / "viewer.js").read_bytes()
+    assert script.endswith(f"// sources: {hashlib.sha256(sources).hexdigest()}\n")
+    assert "</script" not in script and "<!--" not in script
+    for notice in ("MIT License", "World Labs Technologies", "three.js authors", "Arjun Barrett"):
+        assert notice in script

@@ -48,7 +48,7 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
             file=path,
             fix="leave out fewer, or more, faint ones (min_opacity)",
         )
-    means, log_scales, quats, logits, sh = _half_turn(gaussians).arrays().values()
+    means, log_scales, quats, logits, sh = half_turn(gaussians).arrays().values()
     opacity = sigmoid(logits)
     rgba = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacity[:, None]], 1)
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
@@ -142,7 +142,7 @@ def read_gltf(path: Path) -> Gaussians:
     except ValueError as error:
         raise UserError(str(error), file=path, fix=_FIX) from None
     degree = max(part.sh_degree for part in parts)
-    return _half_turn(concat([part.with_sh_degree(degree) for part in parts]))
+    return half_turn(concat([part.with_sh_degree(degree) for part in parts]))
 
 
 class _View(BaseModel):
@@ -275,7 +275,7 @@ def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.flo
     return table.astype(np.float32)
 
 
-def _half_turn(gaussians: Gaussians) -> Gaussians:
+def half_turn(gaussians: Gaussians) -> Gaussians:
     """The Gaussians turned by 180 degrees about z, twice what they were.
 
     x and y change their signs, and so does every harmonic of odd order, which is every

@@ -1,5 +1,6 @@
 """What is written is what other programs read: Niantic's and Adobe's SPZ library, PlayCanvas's
-splat-transform, gsply, Khronos's glTF validator. Each is skipped where it is not installed."""
+splat-transform, gsply, Khronos's glTF validator, glTF Transform. Each is skipped where it is not
+installed."""
 
 from __future__ import annotations
 
@@ -16,6 +17,7 @@ import pytest
 
 from pipeline.splats.files import write_gaussians
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gltf import half_turn
 from pipeline.splats.spz import write_spz
 from tests.splats.samples import Within, sample
 from tests.splats.test_spz import OURS as SPZ
@@ -124,11 +126,38 @@ def test_khronos_finds_our_glb_valid(tmp_path) -> None:
     """But for the names of the extension's attributes, which the validator does not know."""
     needs_node("gltf-validator")
     write_gaussians(tmp_path / "a.glb", sample(50))
-    found = json.loads(node(HERE / "read.mjs", tmp_path / "a.glb"))
+    found = json.loads(node(HERE / "read.mjs", "validate", tmp_path / "a.glb"))
     codes = {message["code"] for message in found["issues"]["messages"]}
     assert codes == {"UNSUPPORTED_EXTENSION", "MESH_PRIMITIVE_INVALID_ATTRIBUTE"}
     assert not found["issues"]["truncated"]
     assert found["info"]["totalVertexCount"] == 50
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
+    """The attributes as KHR_gaussian_splatting names and encodes them."""
+    needs_node("@gltf-transform/core")
+    write_gaussians(tmp_path / "a.glb", sample(50, degree))
+    found = json.loads(node(HERE / "read.mjs", "attributes", tmp_path / "a.glb"))
+    assert found["MODE"] == 0, "points"
+
+    def column(name: str, width: int) -> np.ndarray:
+        return np.reshape(found[f"KHR_gaussian_splatting:{name}"], (50, width))
+
+    opacity = column("OPACITY", 1)[:, 0]
+    sh = [column(f"SH_DEGREE_{d}_COEF_{i}", 3) for d in range(degree + 1) for i in range(2 * d + 1)]
+    decoded = gaussians_of(
+        {
+            "means": np.reshape(found["POSITION"], (50, 3)),
+            "log_scales": np.log(column("SCALE", 3)),
+            "quats": column("ROTATION", 4)[:, [3, 0, 1, 2]],
+            "opacity_logits": np.log(opacity / (1 - opacity)),
+            "dc": sh[0],
+            "higher": np.concatenate([sh[0][:, :0], *sh[1:]], axis=1),
+        }
+    )
+    # glTF's frame: y up, half a turn about z from ours.
+    Within(1e-6, 2e-6, 2e-6, 0.05, 1e-6, 1e-6).check(half_turn(decoded), sample(50, degree))
 
 
 @pytest.mark.parametrize(("suffix", "within"), [(".ply", EXACT), (".spz", SPZ)])

@@ -82,13 +82,12 @@ struct ShBlock {
     SPLAT_INLINE void read(int degree, const float* sh, int64_t width, uint32_t lanes) {
         const int active = 3 * sh_count(degree);
         for (int lane = 0; lane < 16; lane++) {
-            alignas(64) float row[48] = {};
-            const float* from = sh + width * lane;
-            if (lanes >> lane & 1) {
-                if (degree < 3)
-                    std::memcpy(row, from, active * sizeof(float));
-                else
-                    std::memcpy(row, from, sizeof(row));
+            const float* row = sh + width * lane;
+            alignas(64) float padded[48];
+            if (degree < 3 || !(lanes >> lane & 1)) {
+                std::memset(padded, 0, sizeof(padded));
+                if (lanes >> lane & 1) std::memcpy(padded, row, active * sizeof(float));
+                row = padded;
             }
             for (int j = 0; j < 3; j++) value[16 * j + lane] = load<f32x16>(row + 16 * j);
         }
@@ -101,9 +100,11 @@ struct ShBlock {
         for (int lane = 0; lane < 16; lane++)
             if (lanes >> lane & 1)
                 for (int j = 0; 16 * j < active; j++) {
-                    const int left = active - 16 * j;
-                    std::memcpy(sh + width * lane + 16 * j, &value[16 * j + lane],
-                                (left < 16 ? left : 16) * sizeof(float));
+                    float* const to = sh + width * lane + 16 * j;
+                    if (16 * j + 16 <= active)
+                        store(to, value[16 * j + lane]);
+                    else
+                        std::memcpy(to, &value[16 * j + lane], (active - 16 * j) * sizeof(float));
                 }
     }
 };

@@ -96,7 +96,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     Array<Entry> entries(size_t(binner.intersections()));
     Array<int64_t> begin(size_t(view.tiles() + 1)), end(size_t(view.tiles()));
     Array<Slots> slots(n);
-    binner.write(entries.get(), begin.get(), slots.get());
+    binner.write(records.get(), entries.get(), begin.get(), slots.get());
     const Pairs pairs = {entries.get(), begin.get()};
     const float background[3] = {0.1f, 0.5f, 0.9f};
     Array<float> color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);

@@ -10,6 +10,7 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from benchmarks.raster_stress import FAMILIES, Tally, run
 from pipeline import raster
 from pipeline.raster import RasterOptions
 from tests.raster.scenes import NAMES, Scene, camera, random_scene
@@ -115,6 +116,25 @@ def extreme(**fields: object) -> Scene:
 )
 def test_extremes(fields: dict[str, object], antialias: bool) -> None:
     check(extreme(**fields), camera(37, 23), RasterOptions(antialias=antialias))
+
+
+@pytest.mark.parametrize("family", FAMILIES)
+def test_stress_families_stay_finite_and_near_the_twin(family: str) -> None:
+    """A few calls of what ``python -m benchmarks.raster_stress`` does by the million."""
+    tally = Tally()
+    for call in range(2):
+        run(family, call, tally)
+    assert tally.not_finite == 0
+    # Of what is thin and large at once, float32 keeps fewer digits, and a gradient is a difference
+    # of what it cannot tell apart.
+    colour, gradient = {
+        "any value anywhere": (1e-2, math.inf),
+        "needles 1e6 : 1": (4e-6, 0.1),
+        "scales 1e-3 to 1e2": (4e-6, 0.1),
+        "scales 1e-12 to 1e12": (4e-6, math.inf),
+    }.get(family, (4e-6, 1e-5))
+    assert tally.colour <= colour
+    assert tally.gradient(1.0) <= gradient
 
 
 def test_a_hundred_thousand_in_one_pixel() -> None:

@@ -1,16 +1,17 @@
 // Stage 2: which Gaussians touch which tile, front to back.
 #pragma once
 
+#include <memory>
 #include <vector>
 
 #include "types.h"
 
 namespace splat {
 
-// Sorts the visible Gaussians by depth (ties by index), tests their ellipses row by row against
-// the tiles, and splits the pairs by tile without disturbing their order. The result does not
-// depend on the number of threads: every chunk of the sorted list writes where the chunks before
-// it end.
+// Tests the visible Gaussians' ellipses row by row against the blocks of the tiles, in order of
+// index; lists the pairs by tile without disturbing that order; sorts each tile's list by depth,
+// stably, so that equal depths stay in order of index. The result does not depend on the number
+// of threads: every part of the Gaussians writes where the parts before it end.
 class Binner {
   public:
     // Finds the pairs. False when there would be more than kMaxIntersections.
@@ -20,22 +21,28 @@ class Binner {
     int64_t intersections() const { return intersections_; }
 
     // Writes entries (intersections), tile_begin (tiles + 1) and slots (N; zeros where a Gaussian
-    // touches nothing).
-    void write(Entry* entries, int64_t* tile_begin, Slots* slots);
+    // touches nothing), after find and with its records.
+    void write(const Record* records, Entry* entries, int64_t* tile_begin, Slots* slots);
 
   private:
+    // One Gaussian in one tile.
     struct Span {
-        uint32_t gaussian, tile, blocks;
+        uint32_t tile, blocks;
     };
-    struct Chunk {
-        std::vector<Span> spans;
+    // A run of the Gaussians.
+    struct Part {
+        int64_t begin, end;
+        std::unique_ptr<Span[]> spans;  // not a vector, which would write zeros first
+        int64_t used = 0, capacity = 0;
         std::vector<uint32_t> tile_count;
+
+        void make_room(int64_t spans_more);
     };
 
     int threads_ = 1;
     int64_t tiles_ = 0, intersections_ = 0;
-    std::vector<uint32_t> touched_;  // tiles, by Gaussian
-    std::vector<Chunk> chunks_;
+    std::unique_ptr<uint32_t[]> touched_;  // tiles, by Gaussian
+    std::vector<Part> parts_;
 };
 
 }  // namespace splat

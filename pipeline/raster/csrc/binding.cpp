@@ -95,7 +95,8 @@ std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor
     Tensor tile_begin = torch::stable::empty({v.tiles() + 1}, ScalarType::Long);
     Tensor slots = torch::stable::empty({records.size(0), 2}, ScalarType::Int);
     if (fits)
-        binner.write(reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
+        binner.write(records_from(records),
+                     reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
                      tile_begin.mutable_data_ptr<int64_t>(),
                      reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
     return {entries, tile_begin, slots, fits};

@@ -59,14 +59,33 @@ i64x8 usable(const Inputs& in, const Projected& p) {
     return i64x8(sum - sum == 0.0) & i64x8(p.norm2 >= kQuatNorm2Min);
 }
 
+// Gaussians that are worked on at once: the lanes of a float32 vector, and two of float64.
+constexpr int kBlockSize = 16;
+
 struct Block {
-    double x[8], y[8], depth[8], uu[8], uw[8], ww[8], log2_opacity[8], extent_x[8], extent_y[8],
-        radius[8];
-    int64_t usable[8], in_front[8], sound[8], reaches[8];
+    double x[16], y[16], depth[16], uu[16], uw[16], ww[16], log2_opacity[16], extent_x[16],
+        extent_y[16], radius[16];
+    int64_t usable[16], in_front[16], sound[16], reaches[16];
 };
 
-void project_block(const Gaussians& g, const View& view, int64_t first, Block& out) {
-    const Inputs in = load_inputs(g, first);
+// The directions from the camera's centre to eight Gaussians, in lanes `at` to `at` + 7.
+struct DirectionLanes {
+    alignas(64) float x[16] = {}, y[16] = {}, z[16] = {}, inv_length[16] = {};
+
+    SPLAT_INLINE void set(const Vec3& mean, const Center& center, int at) {
+        const Vec3 d = {mean.x - center.xyz[0], mean.y - center.xyz[1], mean.z - center.xyz[2]};
+        const Lanes length = sqrt(dot(d, d));
+        const Lanes inv = select(length > 0.0, 1.0 / length, splat8(0.0));
+        const Lanes all[4] = {d.x * inv, d.y * inv, d.z * inv, inv};
+        float* const to[4] = {x, y, z, inv_length};
+        for (int k = 0; k < 4; k++) store(to[k] + at, __builtin_convertvector(all[k], f32x8));
+    }
+    SPLAT_INLINE Directions get() const {
+        return {load<f32x16>(x), load<f32x16>(y), load<f32x16>(z), load<f32x16>(inv_length)};
+    }
+};
+
+void project_half(const Inputs& in, const View& view, int at, Block& out) {
     const Projected p = project(in, view);
     const Lanes log2_opacity = log2(p.opacity);
     const Lanes reach = log2_opacity - double(kLog2AlphaMin);
@@ -77,23 +96,23 @@ void project_block(const Gaussians& g, const View& view, int64_t first, Block& o
     const Lanes half_difference = 0.5 * (p.xx - p.yy);
     const Lanes longest =
         0.5 * (p.xx + p.yy) + sqrt(half_difference * half_difference + p.xy * p.xy);
-    store(out.x, p.x);
-    store(out.y, p.y);
-    store(out.depth, p.cam.z);
-    store(out.uu, uu);
-    store(out.uw, -uu * p.xy * inv_yy);
-    store(out.ww, sqrt(kHalfLog2e * inv_yy));
-    store(out.log2_opacity, log2_opacity);
-    store(out.extent_x, root * sqrt(p.xx));
-    store(out.extent_y, root * sqrt(p.yy));
-    store(out.radius, root * sqrt(longest));
-    store(out.usable, usable(in, p));
-    store(out.in_front, i64x8(p.cam.z > view.near));
+    store(out.x + at, p.x);
+    store(out.y + at, p.y);
+    store(out.depth + at, p.cam.z);
+    store(out.uu + at, uu);
+    store(out.uw + at, -uu * p.xy * inv_yy);
+    store(out.ww + at, sqrt(kHalfLog2e * inv_yy));
+    store(out.log2_opacity + at, log2_opacity);
+    store(out.extent_x + at, root * sqrt(p.xx));
+    store(out.extent_y + at, root * sqrt(p.yy));
+    store(out.radius + at, root * sqrt(longest));
+    store(out.usable + at, usable(in, p));
+    store(out.in_front + at, i64x8(p.cam.z > view.near));
     // The centre may lie anywhere, but the depth is kept in float32.
-    store(out.sound, i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
-                         i64x8(p.yy < kCovarianceMax) & i64x8(p.x - p.x == 0.0) &
-                         i64x8(p.y - p.y == 0.0) & i64x8(p.cam.z < 1e38));
-    store(out.reaches, i64x8(reach > 0.0));
+    store(out.sound + at, i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
+                              i64x8(p.yy < kCovarianceMax) & i64x8(p.x - p.x == 0.0) &
+                              i64x8(p.y - p.y == 0.0) & i64x8(p.cam.z < 1e38));
+    store(out.reaches + at, i64x8(reach > 0.0));
 }
 
 // Whether [center - extent, center + extent] holds the centre of a pixel among `size`.
@@ -103,53 +122,60 @@ bool holds_pixel(double center, double extent, int64_t size) {
     return (first > 0 ? first : 0) <= (last < size - 1 ? last : size - 1);
 }
 
-// To float32; `finite` falls where it would not fit with room for a small factor.
-float finite_float(double v, bool& finite) {
-    finite &= std::fabs(v) <= 1e37;
-    return float(v);
-}
-
 }  // namespace
 
 ProjectCounts project_view(const Gaussians& in, const View& view, int threads, Record* records,
                            float* radii) {
     const Center center = camera_center(view);
-    const int64_t blocks = (in.count + kProjectLanes - 1) / kProjectLanes;
+    const int64_t blocks = (in.count + kBlockSize - 1) / kBlockSize;
+    const int64_t sh_width = 3 * in.sh_coefficients;
     int64_t visible = 0, dropped = 0;
 #pragma omp parallel for num_threads(threads) schedule(static) reduction(+ : visible, dropped)
     for (int64_t block = 0; block < blocks; block++) {
+        const int64_t first = block * kBlockSize;
+        const int lanes = int(in.count - first < kBlockSize ? in.count - first : kBlockSize);
         Block b;
-        const int64_t first = block * kProjectLanes;
-        project_block(in, view, first, b);
-        for (int lane = 0; lane < kProjectLanes && first + lane < in.count; lane++) {
-            const int64_t i = first + lane;
-            radii[i] = 0;
-            if (!b.usable[lane] || (b.in_front[lane] && !b.sound[lane])) {
+        DirectionLanes directions;
+        for (int at = 0; at < lanes; at += kProjectLanes) {
+            const Inputs inputs = load_inputs(in, first + at);
+            project_half(inputs, view, at, b);
+            directions.set(inputs.mean, center, at);
+        }
+        uint32_t drawn = 0;
+        for (int lane = 0; lane < lanes; lane++) {
+            radii[first + lane] = 0;
+            if (!b.usable[lane] || (b.in_front[lane] && !b.sound[lane]))
                 dropped++;
-                continue;
-            }
-            if (!b.in_front[lane] || !b.reaches[lane] ||
-                !holds_pixel(b.x[lane], b.extent_x[lane], view.width) ||
-                !holds_pixel(b.y[lane], b.extent_y[lane], view.height))
-                continue;
+            else if (b.in_front[lane] && b.reaches[lane] &&
+                     holds_pixel(b.x[lane], b.extent_x[lane], view.width) &&
+                     holds_pixel(b.y[lane], b.extent_y[lane], view.height))
+                drawn |= 1u << lane;
+        }
+        if (!drawn) continue;
+        ShBlock sh;
+        sh.read(view.sh_degree, in.sh + sh_width * first, sh_width, drawn);
+        f32x16 rgb[3];
+        const uint32_t sane = sh_colors(directions.get(), view.sh_degree, sh, kShMax, rgb);
+        alignas(64) float channels[3][kBlockSize];
+        for (int c = 0; c < 3; c++) store(channels[c], rgb[c]);
+        dropped += __builtin_popcount(drawn & ~sane);
+        drawn &= sane;
+        visible += __builtin_popcount(drawn);
+        for (; drawn; drawn &= drawn - 1) {
+            const int lane = __builtin_ctz(drawn);
             Record r = {};
-            if (!sh_color(direction(in.means + 3 * i, center.xyz), view.sh_degree,
-                          in.sh + 3 * in.sh_coefficients * i, kShMax, r.rgb)) {
-                dropped++;
-                continue;
-            }
             r.x = b.x[lane];
             r.y = b.y[lane];
             r.uu = float(b.uu[lane]);
             r.uw = float(b.uw[lane]);
             r.ww = float(b.ww[lane]);
             r.log2_opacity = float(b.log2_opacity[lane]);
+            for (int c = 0; c < 3; c++) r.rgb[c] = channels[c][lane];
             r.depth = float(b.depth[lane]);
             r.extent_x = float(b.extent_x[lane]);
             r.extent_y = float(b.extent_y[lane]);
-            records[i] = r;
-            radii[i] = float(b.radius[lane]);
-            visible++;
+            records[first + lane] = r;
+            radii[first + lane] = float(b.radius[lane]);
         }
     }
     return {visible, dropped};
@@ -166,7 +192,6 @@ Sums sum_slots(const Slots& slots, const float* slot_gradients) {
     Lanes low = {}, high = {};
     for (uint32_t s = 0; s < slots.count; s++) {
         const float* from = slot_gradients + int64_t(slots.first + s) * kSlotFloats;
-        typedef float f32x8 __attribute__((vector_size(32)));
         low += __builtin_convertvector(load<f32x8>(from), Lanes);
         high += __builtin_convertvector(load<f32x8>(from + 8), Lanes);
     }
@@ -180,16 +205,18 @@ Sums sum_slots(const Slots& slots, const float* slot_gradients) {
 
 // From the moments of y = (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2) and
 // y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
-ImageGradients image_gradients(const double (*m)[kProjectLanes], const Record* const* records) {
+// Of eight Gaussians from lane `at` on.
+ImageGradients image_gradients(const double (*m)[kBlockSize], const Record* const* records,
+                               int at) {
     double uu[8], uw[8], ww[8];
     for (int lane = 0; lane < kProjectLanes; lane++) {
-        const Record* r = records[lane];
+        const Record* r = records[at + lane];
         uu[lane] = r ? r->uu : 0;
         uw[lane] = r ? r->uw : 0;
         ww[lane] = r ? r->ww : 0;
     }
     const Lanes l00 = load<Lanes>(uu), l10 = load<Lanes>(uw), l11 = load<Lanes>(ww);
-    const auto get = [&](Moment k) { return load<Lanes>(m[k]); };
+    const auto get = [&](Moment k) { return load<Lanes>(m[k] + at); };
     const double ln2 = 0.69314718055994530942;
     ImageGradients g;
     g.x = 2.0 * ln2 * l00 * get(kVU);
@@ -227,65 +254,76 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
     const Center center = camera_center(view);
     const int active = 3 * sh_count(view.sh_degree);
     const int64_t sh_width = 3 * in.sh_coefficients;
-    const int64_t blocks = (in.count + kProjectLanes - 1) / kProjectLanes;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 64)
+    const int64_t blocks = (in.count + kBlockSize - 1) / kBlockSize;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 32)
     for (int64_t block = 0; block < blocks; block++) {
-        const int64_t first = block * kProjectLanes;
-        const int lanes = int(in.count - first < kProjectLanes ? in.count - first : kProjectLanes);
-        double moments[12][kProjectLanes] = {};
-        const Record* record[kProjectLanes] = {};
-        bool any_drawn = false;
+        const int64_t first = block * kBlockSize;
+        const int lanes = int(in.count - first < kBlockSize ? in.count - first : kBlockSize);
+        double moments[12][kBlockSize] = {};
+        const Record* record[kBlockSize] = {};
+        uint32_t drawn = 0;
         for (int lane = 0; lane < lanes; lane++) {
             const int64_t i = first + lane;
-            if (!(radii[i] > 0) || slots[i].count == 0) continue;
-            any_drawn = true;
+            if (!(radii[i] > 0) || slots[i].count == 0) {
+                zero_gradients(in, i, out);
+                continue;
+            }
+            drawn |= 1u << lane;
             record[lane] = records + i;
             const Sums sums = sum_slots(slots[i], slot_gradients);
             for (int m = 0; m < 12; m++) moments[m][lane] = sums.moment[m];
         }
-        double field[11][kProjectLanes], xy[2][kProjectLanes];
-        if (any_drawn) {
-            const Projected p = project(load_inputs(in, first), view);
-            const ImageGradients image = image_gradients(moments, record);
-            const InputGradients g = project_backward(p, image, view);
+        if (!drawn) continue;
+        double field[11][kBlockSize], xy[2][kBlockSize];
+        DirectionLanes directions;
+        for (int at = 0; at < lanes; at += kProjectLanes) {
+            const Inputs inputs = load_inputs(in, first + at);
+            const ImageGradients image = image_gradients(moments, record, at);
+            const InputGradients g = project_backward(project(inputs, view), image, view);
             const Lanes all[11] = {g.mean.x,      g.mean.y,      g.mean.z,       g.log_scale.x,
                                    g.log_scale.y, g.log_scale.z, g.quat[0],      g.quat[1],
                                    g.quat[2],     g.quat[3],     g.opacity_logit};
-            for (int k = 0; k < 11; k++) store(field[k], all[k]);
-            store(xy[0], image.x);
-            store(xy[1], image.y);
+            for (int k = 0; k < 11; k++) store(field[k] + at, all[k]);
+            store(xy[0] + at, image.x);
+            store(xy[1] + at, image.y);
+            directions.set(inputs.mean, center, at);
         }
-        for (int lane = 0; lane < lanes; lane++) {
-            const int64_t i = first + lane;
-            const Record* r = record[lane];
-            if (!r) {
-                zero_gradients(in, i, out);
-                continue;
-            }
-            bool finite = true;
-            float d_rgb[3];
+        uint32_t sound = drawn;  // of which every gradient fits into float32
+        const auto fits = [&](double v, int lane) {
+            if (!(std::fabs(v) <= 1e37)) sound &= ~(1u << lane);
+            return float(v);
+        };
+        alignas(64) float d_rgb[3][kBlockSize] = {}, d_mean[3][kBlockSize];
+        for (uint32_t left = drawn; left; left &= left - 1) {
+            const int lane = __builtin_ctz(left);
             for (int c = 0; c < 3; c++)
-                d_rgb[c] = r->rgb[c] > 0 ? finite_float(moments[kRed + c][lane], finite) : 0;
-            double d_mean[3] = {field[0][lane], field[1][lane], field[2][lane]};
-            float* d_sh = out.sh + sh_width * i;
-            sh_backward(direction(in.means + 3 * i, center.xyz), view.sh_degree,
-                        in.sh + sh_width * i, d_rgb, d_sh, d_mean);
-            for (int64_t k = active; k < sh_width; k++) d_sh[k] = 0;
+                if (record[lane]->rgb[c] > 0) d_rgb[c][lane] = fits(moments[kRed + c][lane], lane);
+        }
+        ShBlock sh;
+        sh.read(view.sh_degree, in.sh + sh_width * first, sh_width, drawn);
+        f32x16 toward[3];
+        sh_backward(directions.get(), view.sh_degree,
+                    {load<f32x16>(d_rgb[0]), load<f32x16>(d_rgb[1]), load<f32x16>(d_rgb[2])}, sh,
+                    toward);
+        for (int k = 0; k < 3; k++) store(d_mean[k], toward[k]);
+        sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, drawn);
+        for (uint32_t left = drawn; left; left &= left - 1) {
+            const int lane = __builtin_ctz(left);
+            const int64_t i = first + lane;
+            for (int64_t k = active; k < sh_width; k++) out.sh[sh_width * i + k] = 0;
             for (int k = 0; k < 3; k++) {
-                out.means[3 * i + k] = finite_float(d_mean[k], finite);
-                out.log_scales[3 * i + k] = finite_float(field[3 + k][lane], finite);
+                out.means[3 * i + k] = fits(field[k][lane] + d_mean[k][lane], lane);
+                out.log_scales[3 * i + k] = fits(field[3 + k][lane], lane);
             }
-            for (int k = 0; k < 4; k++)
-                out.quats[4 * i + k] = finite_float(field[6 + k][lane], finite);
-            out.opacity_logits[i] = finite_float(field[10][lane], finite);
+            for (int k = 0; k < 4; k++) out.quats[4 * i + k] = fits(field[6 + k][lane], lane);
+            out.opacity_logits[i] = fits(field[10][lane], lane);
             const double ln2 = 0.69314718055994530942;
             for (int k = 0; k < 2; k++) {
-                out.means2d[2 * i + k] = finite_float(xy[k][lane], finite);
+                out.means2d[2 * i + k] = fits(xy[k][lane], lane);
                 if (out.means2d_abs)
-                    out.means2d_abs[2 * i + k] =
-                        finite_float(2.0 * ln2 * moments[kAbsX + k][lane], finite);
+                    out.means2d_abs[2 * i + k] = fits(2.0 * ln2 * moments[kAbsX + k][lane], lane);
             }
-            if (!finite) zero_gradients(in, i, out);
+            if (!(sound >> lane & 1)) zero_gradients(in, i, out);
         }
     }
 }

@@ -19,6 +19,7 @@ namespace splat {
 
 typedef float f32x16 __attribute__((vector_size(64)));
 typedef int32_t i32x16 __attribute__((vector_size(64)));
+typedef float f32x8 __attribute__((vector_size(32)));
 typedef double f64x8 __attribute__((vector_size(64)));
 typedef int64_t i64x8 __attribute__((vector_size(64)));
 // Where bits are put together, or lanes may hold junk: these wrap around by definition.
@@ -58,6 +59,8 @@ SPLAT_INLINE f32x16 keep(Mask16 m, f32x16 v) { return _mm512_maskz_mov_ps(m.bits
 SPLAT_INLINE uint32_t bits(Mask16 m) { return m.bits; }
 SPLAT_INLINE f32x16 min(f32x16 a, f32x16 b) { return _mm512_min_ps(a, b); }
 SPLAT_INLINE f32x16 max(f32x16 a, f32x16 b) { return _mm512_max_ps(a, b); }
+SPLAT_INLINE f32x16 floor(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_NEG_INF); }
+SPLAT_INLINE f32x16 ceil(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_POS_INF); }
 SPLAT_INLINE f32x16 sqrt(f32x16 v) { return _mm512_sqrt_ps(v); }
 SPLAT_INLINE f64x8 sqrt(f64x8 v) { return _mm512_sqrt_pd(v); }
 #else
@@ -79,6 +82,14 @@ SPLAT_INLINE uint32_t bits(Mask16 m) {
 }
 SPLAT_INLINE f32x16 min(f32x16 a, f32x16 b) { return select(lt(a, b), a, b); }
 SPLAT_INLINE f32x16 max(f32x16 a, f32x16 b) { return select(lt(a, b), b, a); }
+SPLAT_INLINE f32x16 floor(f32x16 v) {
+    for (int i = 0; i < 16; i++) v[i] = __builtin_floorf(v[i]);
+    return v;
+}
+SPLAT_INLINE f32x16 ceil(f32x16 v) {
+    for (int i = 0; i < 16; i++) v[i] = __builtin_ceilf(v[i]);
+    return v;
+}
 SPLAT_INLINE f32x16 sqrt(f32x16 v) {
     for (int i = 0; i < 16; i++) v[i] = __builtin_sqrtf(v[i]);
     return v;
@@ -113,6 +124,12 @@ SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
     for (; bits; bits &= bits - 1) to[n++] = base + uint32_t(__builtin_ctz(bits));
     return n;
 #endif
+}
+
+// In lanes 0, 4, 8 and 12: the bits set in any of the four lanes from there on.
+SPLAT_INLINE u32x16 any_of_four(u32x16 v) {
+    v |= __builtin_shuffle(v, u32x16{1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14});
+    return v | __builtin_shuffle(v, u32x16{2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13});
 }
 
 // The sign bit alone turns: -x where m.

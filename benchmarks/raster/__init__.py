@@ -1,0 +1,1 @@
+"""How fast the rasterizer is, and how right: ``python -m benchmarks.raster --help``."""

@@ -1,0 +1,94 @@
+"""The kernels against the float64 twin, inside a window in the middle of the image."""
+
+from __future__ import annotations
+
+import time
+from dataclasses import dataclass, replace
+
+import torch
+
+from benchmarks.raster.measure import BACKGROUND, Step
+from benchmarks.raster.scenes import synthetic
+from pipeline.raster import RasterOptions, backward, forward, twin
+
+WINDOW = 32  # pixels
+NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """``colour``: largest error, of pixels that hang on no cut-off; ``gradient``: the largest
+    relative L2 error of the five parameters' gradients."""
+
+    colour: float
+    gradient: float
+
+
+def accuracy(step: Step) -> Accuracy:
+    """Of a random scalar of the window's colours. Gaussians that miss the window are left out of
+    the twin, which could not hold them all."""
+    scene, camera = step.scene, step.scene.camera
+    w, h = min(WINDOW, camera.width), min(WINDOW, camera.height)
+    left, top = (camera.width - w) // 2, (camera.height - h) // 2
+    options = RasterOptions(background=BACKGROUND)
+    centres = step.state.records[:, :4].view(torch.float64)
+    middle = torch.tensor([left + w / 2, top + h / 2])
+    extent = torch.tensor([w / 2, h / 2])
+    near = ((centres - middle).abs() < extent + step.drawn.radii[:, None] + 1).all(1)
+    rows = torch.nonzero(near & (step.drawn.radii > 0)).squeeze(1)
+
+    inputs = [g[rows].double().requires_grad_() for g in scene.gaussians]
+    means, log_scales, quats, logits, sh = inputs
+    projection = twin.project(means, log_scales, quats, logits, sh, camera, options)
+    colors = twin.sh_colors(means[projection.index], sh[projection.index], camera, 3)
+    moved = replace(projection, means2d=projection.means2d - torch.tensor([left, top]))
+    image = twin.blend(moved, colors, replace(camera, width=w, height=h), options)
+    window = (slice(top, top + h), slice(left, left + w))
+    sure = image.margin > 1e-5
+    error = (step.drawn.color[window] - image.color.detach()).abs().amax(-1)[sure]
+    d_window = torch.randn(h, w, 3, generator=torch.Generator().manual_seed(2)) * sure[..., None]
+    d_color = torch.zeros(camera.height, camera.width, 3)
+    d_color[window] = d_window
+    found = backward(step.drawn, d_color)
+    wanted = torch.autograd.grad((image.color * d_window).sum(), inputs)
+    relative = [
+        float((getattr(found, name)[rows] - want).norm() / want.norm().clamp(min=1e-30))
+        for name, want in zip(NAMES, wanted, strict=True)
+    ]
+    return Accuracy(float(error.max()), max(relative))
+
+
+@dataclass(frozen=True)
+class TwinRatio:
+    """Forward and backward on a scene small enough for the twin, milliseconds."""
+
+    scene: str
+    twin: float
+    kernels: float
+
+
+def twin_ratio(threads: int) -> TwinRatio:
+    scene = synthetic(1000, 96, 54, 5.0)
+    options = RasterOptions(background=BACKGROUND, threads=threads)
+    weight = torch.rand(54, 96, 3, generator=torch.Generator().manual_seed(3))
+
+    def in_torch() -> None:
+        means, scales, quats, logits, sh = (g.clone().requires_grad_() for g in scene.gaussians)
+        out = twin.render(means, scales, quats, logits, sh, scene.camera, options)
+        (out.color * weight).sum().backward()
+
+    def in_kernels() -> None:
+        backward(forward(*scene.gaussians, scene.camera, options), weight, means2d_abs=False)
+
+    before = torch.get_num_threads()
+    torch.set_num_threads(threads)
+    best = []
+    for run, repeats in ((in_torch, 1), (in_kernels, 9)):
+        times = []
+        for _ in range(repeats):
+            start = time.perf_counter()
+            run()
+            times.append(1e3 * (time.perf_counter() - start))
+        best.append(min(times))
+    torch.set_num_threads(before)
+    return TwinRatio(scene.name, *best)

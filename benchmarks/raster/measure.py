@@ -1,0 +1,202 @@
+"""Times of the operators of a training step, and what the machine could do at most."""
+
+from __future__ import annotations
+
+import ctypes
+import statistics
+import subprocess
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from benchmarks.raster.scenes import Scene
+from pipeline.raster import RasterOptions, build, forward
+
+BACKGROUND = (0.1, 0.2, 0.3)
+SSIM_WEIGHT = 0.2
+
+
+@dataclass(frozen=True)
+class Peak:
+    """Of ``threads`` threads: float32 operations and bytes moved, a second."""
+
+    threads: int
+    flops: float
+    bytes: float
+
+
+@dataclass(frozen=True)
+class Cost:
+    """The least an operator has to do on a scene: float32 operations and bytes."""
+
+    flops: float
+    bytes: float
+
+    def seconds(self, peak: Peak) -> float:
+        """At the machine's peak, whichever of the two binds."""
+        return max(self.flops / peak.flops, self.bytes / peak.bytes)
+
+
+@dataclass(frozen=True)
+class Timing:
+    """Milliseconds: on the clock, and CPU time over threads, which other work on the machine
+    disturbs less."""
+
+    wall: float
+    cpu: float
+
+
+def measured_peak(threads: int) -> Peak:
+    """Runs the calibration loops of peak.cpp, compiled with the kernels' flags."""
+    with tempfile.TemporaryDirectory() as folder:
+        library = Path(folder) / "peak.so"
+        source = Path(__file__).with_name("peak.cpp")
+        command = [*build.compiler(), *build.FLAGS, "-I", str(build.SOURCES), "-shared"]
+        subprocess.run([*command, str(source), "-o", str(library)], check=True)
+        loaded = ctypes.CDLL(str(library))
+    for function in (loaded.peak_flops, loaded.peak_bytes):
+        function.restype = ctypes.c_double
+    return Peak(threads, loaded.peak_flops(threads), loaded.peak_bytes(threads))
+
+
+class Step:
+    """A training step on a scene, taken apart. ``operators`` run in this order."""
+
+    def __init__(self, scene: Scene, threads: int):
+        build.load()
+        kernels: Any = torch.ops.splatmake
+        options = RasterOptions(background=BACKGROUND, threads=threads)
+        self.scene, self.threads = scene, threads
+        self.drawn = forward(*scene.gaussians, scene.camera, options)
+        self.state = s = self.drawn.state
+        size, view = s.size, s.view
+        gen = torch.Generator().manual_seed(1)
+        target = torch.rand(size[1], size[0], 3, generator=gen)
+        params = [g.clone() for g in s.inputs]
+        moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
+        # Rates of 0, so that every repeat draws the same.
+        rate = torch.zeros(1, dtype=torch.float64)
+        self.d_color = kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)[3]
+        kept: dict[str, Any] = {}
+
+        def project() -> None:
+            kernels.project(*s.inputs, view, *size, 3, False, threads)
+
+        def bin_() -> None:
+            kernels.bin(s.records, self.drawn.radii, view, *size, threads)
+
+        def blend() -> None:
+            kernels.blend(s.records, s.entries, s.tile_begin, view, *size, s.background, threads)
+
+        def loss() -> None:
+            kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)
+
+        def blend_backward() -> None:
+            kept["slots"] = kernels.blend_backward(
+                s.records, s.entries, s.tile_begin, s.tile_end, view, *size, s.background,
+                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, False, threads,
+            )  # fmt: skip
+
+        def project_backward() -> None:
+            kept["gradients"] = kernels.project_backward(
+                *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
+                kept["slots"], False, threads,
+            )  # fmt: skip
+
+        def adam() -> None:
+            for p, g, (m, v) in zip(params, kept["gradients"][:5], moments, strict=True):
+                kernels.adam_step(p, g, m, v, rate, 1, 0.9, 0.999, 1e-15, threads)
+
+        self.operators: dict[str, Callable[[], None]] = {
+            "projection, SH": project,
+            "bin": bin_,
+            "blend": blend,
+            "loss": loss,
+            "blend backward": blend_backward,
+            "projection, SH backward": project_backward,
+            "Adam": adam,
+        }
+
+    def costs(self, pairs: int) -> dict[str, Cost]:
+        """What the method asks for at least, given its contributing (pixel, Gaussian) pairs: the
+        operations of useful lanes (a multiply-add is two), and every array read or written once."""
+        n, pixels = self.scene.count, self.state.size[0] * self.state.size[1]
+        visible, tiles = int((self.drawn.radii > 0).sum()), self.drawn.num_intersections
+        row = 4 * sum(g[0].numel() for g in self.state.inputs) if n else 0
+        record, entry, slot = 64, 12, 64
+        # 8 blurs (5 forward, 3 of the gradient) of 6 taps, twice: 17 operations; some 30 beside
+        loss = 3 * pixels * (8 * 2 * 17 + 30)
+        return {
+            "projection, SH": Cost(n * 400, n * row + visible * record),
+            "bin": Cost(0, visible * (record + 3 * 16 + 8) + tiles * entry),
+            "blend": Cost(28 * pairs, visible * record + tiles * entry + 16 * pixels),
+            "loss": Cost(loss, 36 * pixels),
+            "blend backward": Cost(56 * pairs, tiles * (entry + slot) + 28 * pixels),
+            "projection, SH backward": Cost(n * 800, 2 * n * row + tiles * slot),
+            "Adam": Cost(0, 7 * n * row),
+        }
+
+    def once(self) -> dict[str, Timing]:
+        """Every operator's time in one step, and the whole "step"'s."""
+        times = {}
+        for name, run in self.operators.items():
+            wall, cpu = time.perf_counter(), time.process_time()
+            run()
+            cpu = (time.process_time() - cpu) / self.threads
+            times[name] = Timing(1e3 * (time.perf_counter() - wall), 1e3 * cpu)
+        times["step"] = Timing(
+            sum(t.wall for t in times.values()), sum(t.cpu for t in times.values())
+        )
+        return times
+
+    def time(self, seconds: float) -> dict[str, Timing]:
+        """Medians over steps that take ``seconds`` in all."""
+        self.once()  # touches fresh memory
+        samples: list[dict[str, Timing]] = []
+        end = time.monotonic() + seconds
+        while time.monotonic() < end or len(samples) < 3:
+            samples.append(self.once())
+        return {
+            name: Timing(
+                statistics.median(s[name].wall for s in samples),
+                statistics.median(s[name].cpu for s in samples),
+            )
+            for name in samples[0]
+        }
+
+
+def contributing_pairs(step: Step) -> int:
+    """How many (pixel, Gaussian) pairs the image is made of, found in torch tile by tile."""
+    state = step.state
+    width, height = state.size
+    tiles_x, tiles_y = -(-width // 16), -(-height // 16)
+    begin = state.tile_begin
+    counts = begin.diff()
+    order = torch.argsort(counts, descending=True, stable=True)
+    x = (order % tiles_x * 16).float()[:, None] + torch.arange(256).remainder(16) + 0.5
+    y = (order // tiles_x * 16).float()[:, None] + torch.arange(256).div(16).floor() + 0.5
+    left = ((x < width) & (y < height)).float()
+    counts, first = counts[order], begin[:-1][order]
+    assert len(order) == tiles_x * tiles_y
+    centres, fields = state.records[:, :4].view(torch.float64), state.records[:, 4:8]
+    pairs = 0
+    for rank in range(int(counts[0]) if len(counts) else 0):
+        tiles = int((counts > rank).sum())
+        gaussian = state.entries[first[:tiles] + rank, 0].long()
+        dx = x[:tiles] - centres[gaussian, :1].float()
+        dy = y[:tiles] - centres[gaussian, 1:].float()
+        uu, uw, ww, log2_opacity = fields[gaussian].unsqueeze(-1).unbind(1)
+        power = log2_opacity - (uu * dx + uw * dy) ** 2 - (ww * dy) ** 2
+        alpha = power.exp2().clamp(max=0.999)
+        after = left[:tiles] * (1 - alpha)
+        seen = alpha >= 1 / 255
+        drawn = seen & (after >= 1e-4)
+        pairs += int(drawn.sum())
+        # A pixel that stops draws no more.
+        left[:tiles] = torch.where(drawn, after, torch.where(seen, 0.0, left[:tiles]))
+    return pairs

@@ -2,6 +2,7 @@
 
 import json
 import multiprocessing
+import tempfile
 import time
 from dataclasses import replace
 
@@ -11,6 +12,13 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job, Request, content_digest, run_stage
 
 KEY = {"stage": "work", "seed": 0, "config": {}}
+
+
+@pytest.fixture(autouse=True)
+def _temporary_files_stay_where_they_were(monkeypatch):
+    """A stage has a process to itself, and a temporary folder; tests after these have not."""
+    monkeypatch.setenv("TMPDIR", tempfile.gettempdir())
+    monkeypatch.setattr(tempfile, "tempdir", None)
 
 
 def request(tmp_path, key=KEY, **kwargs):

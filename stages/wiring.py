@@ -45,7 +45,7 @@ ROLES: dict[str, dict[str, tuple[str, ...]]] = {
         "poses": _POSES,
         "train": ("train",),
         "evaluate": ("evaluate",),
-        "export": ("export", "views", "split", "train"),
+        "export": ("export",),
     },
 }
 
@@ -60,7 +60,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "init": ("init", "views", "split", "features", "matches"),
     "train": ("train", "views", "split"),
     "evaluate": ("evaluate", "views", "split", "train"),
-    "export": ("export", "split", "train"),
+    "export": ("export", "views", "split", "train"),
     "report": ("report", "views", "split", "train"),
 }
 

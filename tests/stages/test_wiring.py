@@ -1,13 +1,14 @@
 """Keys of stages: what a run shares with another one."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
 
 from pipeline.config.schema import Config
 from pipeline.scene.plan import STAGES, Plan, StagePlan
-from stages.wiring import SEEDED, public_plan, stage_key, upstream
+from stages.wiring import ROLES, SECTIONS, SEEDED, public_plan, stage_key, upstream
 
 
 def plan(config: Config, scene: str = "fox") -> Plan:
@@ -27,6 +28,20 @@ def test_a_stage_that_asks_for_the_seed_has_it_in_its_key(stage):
     assert "job.seed" not in source or stage in SEEDED
     key = json.loads(stage_key(stage, plan(Config(seed=7)), "f", "p"))
     assert key["seed"] == (7 if stage in SEEDED else None)
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_a_stage_has_the_sections_it_asks_for_and_no_others(stage):
+    """One too few is a failure, one too many reruns what does not depend on it."""
+    source = Path(f"stages/{stage}.py").read_text()
+    asked = re.findall(r"job\.section\((?:schema\.)?([A-Z]\w+)\)", source)
+    assert {name.lower() for name in asked} == set(SECTIONS[stage])
+
+
+@pytest.mark.parametrize("stage", STAGES)
+def test_what_fills_a_role_is_a_stage(stage):
+    for candidates in ROLES[stage].values():
+        assert set(candidates) <= set(STAGES)
 
 
 def test_seeds_share_what_draws_nothing():

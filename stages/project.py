@@ -202,8 +202,8 @@ class SnakemakeProject:
         """The message of a stage that ended in this run with a user's error; else empty."""
         if not self._began(log):
             return ""
-        _, _, message = f"\n{log.read_text()}".rpartition("\nerror in ")
-        return message.partition(": ")[2].rstrip()
+        _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
+        return message.partition(": ")[2].rstrip() if found else ""
 
 
 def _outcome(

@@ -146,11 +146,13 @@ def trade_off_chart(dots: Sequence[Dot], *, title: str, x_title: str, y_label: L
     across = _scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT, log=True)
     up = _scale(y_low, y_high, _HEIGHT - _BOTTOM, _TOP, log=True)
     steps = (1, 2, 5, 10, 20, 30, 60, 120, 300, 600, 1200, 1800, 3600, 7200, 18_000, 36_000, 86_400)
-    x_ticks = [t for t in steps if x_low <= t <= x_high]
+    x_ticks: list[float] = [t for t in steps if x_low <= t <= x_high]
+    if len(x_ticks) < 2:
+        x_ticks = time_ticks(x_low, x_high)
     y_ticks = log_ticks(y_low, y_high)
     if len(y_ticks) < 3:
         y_ticks = [t for t in linear_ticks(y_low, y_high, 5) if t > 0]
-    step = math.ceil(len(x_ticks) / 7)
+    step = max(1, math.ceil(len(x_ticks) / 7))
     axes = _axes(
         [(across(t), clock(t)) for t in x_ticks[::step]], [(up(t), y_label(t)) for t in y_ticks]
     )

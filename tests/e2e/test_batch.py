@@ -36,6 +36,8 @@ def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path
     failed = snakemake(project, TABLE, config=CONFIG, check=False)
     assert failed.returncode != 0
     assert "Traceback" not in failed.stdout, failed.stdout
+    blamed = set(re.findall(r"^error in \w+ of (\S+):", failed.stdout, re.M))
+    assert blamed == {"broken@plain", "broken@sh0"}
     found = rows(project)
     assert {name: row["status"] for name, row in found.items()} == {
         "broken@plain": "failed",

@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.reporting.charts import (
+    Dot,
     clock,
     histogram,
     line_chart,
@@ -14,6 +15,7 @@ from pipeline.reporting.charts import (
     log_ticks,
     short,
     time_ticks,
+    trade_off_chart,
 )
 
 spread = st.tuples(st.floats(-1e6, 1e6), st.floats(1e-4, 1e7))
@@ -74,3 +76,16 @@ def test_whole_numbers_have_a_bar_each_and_the_tail_is_named() -> None:
     svg = histogram(lengths, title="t", x_title="x", whole=True)
     assert "<title>2: 60</title>" in svg and "<title>3: 30</title>" in svg
     assert "<title>4 or more: 21</title>" in svg
+
+
+positive = st.floats(1e-3, 1e6)
+
+
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(st.lists(st.tuples(positive, positive), min_size=1, max_size=12))
+def test_any_time_and_error_make_a_trade_off(pairs) -> None:
+    """One run that took a time between two round ones, too."""
+    dots = [Dot(seconds, error, "a", "tip") for seconds, error in pairs]
+    svg = trade_off_chart(dots, title="t", x_title="x", y_label=str)
+    assert "nan" not in svg
+    assert trade_off_chart([Dot(196.0, 0.3, "a", "")], title="t", x_title="x", y_label=str)

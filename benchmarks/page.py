@@ -1,0 +1,99 @@
+"""``python -m benchmarks.page``: a scene's page in a browser against the program's own renders.
+
+make demo && python -m benchmarks.page results/demo
+
+Needs a Chromium on PATH, and playwright (in the development extras).
+"""
+
+from __future__ import annotations
+
+import argparse
+import base64
+import io
+import re
+import shutil
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from PIL import Image
+
+from pipeline.metrics.evaluate import choose_protocol, to_bytes
+from pipeline.metrics.image import psnr
+from pipeline.reporting.space import upright_camera
+from pipeline.scene.cameras import posed_scene
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.render import render_view
+
+FLAGS = [
+    "--headless=new",
+    "--no-sandbox",
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+    "--no-first-run",
+]
+MILLISECONDS = 600_000  # the processor draws every pixel
+CAMERAS = 3
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
+    parser.add_argument("results", type=Path, help="a finished scene, for example results/demo")
+    results = parser.parse_args().results
+    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
+    if chromium is None:
+        print("error: no Chromium on PATH", file=sys.stderr)
+        return 2
+    scene = posed_scene(results, None, None)
+    gaussians = Gaussians.load(results / "train" / "gaussians.npz")
+    protocol = choose_protocol(scene.views, scene.split, scene.train)
+    picks = np.linspace(0, len(scene.views) - 1, CAMERAS + 2).round().astype(int)[1:-1]
+    views = [scene.views[i] for i in picks]
+    ours = [
+        to_bytes(
+            render_view(
+                gaussians,
+                view,
+                background=protocol.background,
+                antialias=scene.train.antialias,
+                near=protocol.near,
+            ).rgb
+        )
+        for view in views
+    ]
+    page = results / "report.html"
+    print(f"{page}: {page.stat().st_size / 1e6:.1f} MB, {len(gaussians)} Gaussians")
+    with TemporaryDirectory() as folder:
+        swapped = Path(folder) / "ply.html"
+        ply = base64.b64encode((results / "export" / "point_cloud.ply").read_bytes()).decode()
+        text = page.read_text("utf-8")
+        swapped.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, text), "utf-8")
+        for what, file in (("the page's SPZ", page.resolve()), ("the PLY", swapped)):
+            for view, own, theirs in zip(views, ours, drawn(chromium, file, views), strict=True):
+                print(f"{what} {view.name}: {psnr(theirs / 255, own / 255):.2f} dB")
+    return 0
+
+
+def drawn(chromium: str, page: Path, views: list[View]) -> Iterator[Any]:
+    """(H, W, 3) uint8 of each view, as the page's viewer draws it."""
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
+        browser = driver.chromium.launch(executable_path=chromium, args=FLAGS, timeout=MILLISECONDS)
+        opened = browser.new_page(viewport={"width": 480, "height": 400})
+        opened.set_default_timeout(MILLISECONDS)
+        opened.goto(page.as_uri())
+        opened.evaluate("viewer.ready")
+        for view in views:
+            url = opened.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
+            png = base64.b64decode(url.partition(",")[2])
+            yield np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
+        browser.close()
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -15,7 +15,6 @@ def run(job: Job) -> None:
         job.section(Matches),
         job.section(Sfm),
         job.out,
-        threads=job.threads,
         seed=job.seed,
     )
     job.record(report)

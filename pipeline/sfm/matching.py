@@ -58,12 +58,11 @@ def match_features(
     sharing: schema.Sfm,
     out: Path,
     *,
-    threads: int,
     seed: int,
 ) -> MatchReport:
     """Write ``out/database.db`` (COLMAP's: cameras with their priors, images with ids from 1 in
     order of names, keypoints, matches, verified geometries) and ``out/keypoint_colors.npz``
-    (image id -> (F, 3) uint8). The bytes of both do not depend on ``threads``.
+    (image id -> (F, 3) uint8).
 
     Args:
         features: the folder ``extract_features`` wrote.
@@ -80,7 +79,7 @@ def match_features(
     cameras, camera_of = plan_cameras(manifest, sharing)
     images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
     pairs, decision = resolve_pairs(manifest, features, config)
-    settings = MatchingSettings(config.max_ratio, config.min_inliers, threads, seed)
+    settings = MatchingSettings(config.max_ratio, config.min_inliers, seed)
     database = out / "database.db"
     build_database(database, cameras, images, features, pairs, settings)
     _write_colors(out / "keypoint_colors.npz", features, names)

@@ -67,7 +67,7 @@ def triangulate(
         cache = cache or Path(folder) / "cache"
         feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
         facts: dict[str, Any] = run_isolated(
-            _triangulate, manifest, sparse, out, found, matches, threads, seed
+            _triangulate, manifest, sparse, out, found, matches, seed
         )
     return TriangulationReport(
         **facts,
@@ -93,7 +93,6 @@ def _triangulate(
     out: Path,
     features: Path,
     config: schema.Matches,
-    threads: int,
     seed: int,
 ) -> dict[str, Any]:
     import pycolmap
@@ -132,7 +131,7 @@ def _triangulate(
             images,
             features,
             pairs,
-            MatchingSettings(config.max_ratio, config.min_inliers, threads, seed),
+            MatchingSettings(config.max_ratio, config.min_inliers, seed),
         )
         verified = verified_inliers(database)
         points = posed_model(list(cameras.values()), images, poses)

@@ -24,15 +24,12 @@ def match(
     features: Path,
     out: Path,
     pairs: str = "exhaustive",
-    threads: int = 2,
     sfm: schema.Sfm | None = None,
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import match_features
 
     config = schema.Matches.model_validate({"pairs": pairs})
-    report = match_features(
-        manifest, features, config, sfm or schema.Sfm(), out, threads=threads, seed=0
-    )
+    report = match_features(manifest, features, config, sfm or schema.Sfm(), out, seed=0)
     return asdict(report)
 
 
@@ -47,7 +44,7 @@ def reconstruct(
 def match_and_reconstruct(
     manifest: Manifest, features: Path, out: Path, config: schema.Sfm, threads: int = 2
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    matched = match(manifest, features, out / "matches", threads=threads, sfm=config)
+    matched = match(manifest, features, out / "matches", sfm=config)
     database = out / "matches" / "database.db"
     return matched, reconstruct(manifest, database, config, out / "sfm", threads)
 

@@ -17,6 +17,7 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
+from benchmarks.page import FLAGS
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
 from pipeline.splats.ply import write_splat_ply
@@ -24,13 +25,6 @@ from pipeline.training.render import render_view
 from tests.reporting.made import gaussians, report, trained
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
-FLAGS = [
-    "--headless=new",
-    "--no-sandbox",
-    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
-    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
-    "--no-first-run",
-]
 SECONDS = 180.0  # a browser on a busy machine; a page is there within one or two on an idle one
 
 Pixels = NDArray[np.uint8]

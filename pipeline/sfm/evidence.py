@@ -12,17 +12,18 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.sfm.consistency import Pairs, check
-from pipeline.sfm.judge import Evidence
+from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
 
 # Enough pairs and matches to tell turning from moving, few enough to take no time.
-PARALLAX_PAIRS = 60
-PARALLAX_MATCHES = 100
+PARALLAX_PAIRS = 40
+PARALLAX_MATCHES = 64
 # A camera that only turned can have any focal length (over the longer side) and any distortion.
-PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 16))
+PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 14))
+PARALLAX_STEP = float(np.log(PARALLAX_FOCALS[1] / PARALLAX_FOCALS[0]))
 PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
 # How the focal length is tried: changed by this factor, on this many images, spread evenly.
-FOCAL_STEP, FOCAL_IMAGES = 1.2, 40
+FOCAL_STEP, FOCAL_IMAGES, FOCAL_ITERATIONS = 1.2, 30, 8
 
 
 def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Evidence:
@@ -45,6 +46,7 @@ def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Eviden
     side = {i: max(model.camera(i).width, model.camera(i).height) for i in used}
     off = {i: max(focal[i] / prior, prior / max(focal[i], 1e-9)) for i, prior in priors.items()}
     offs = [off[camera_id] for camera_id in camera_of.values() if camera_id in off]
+    focal_off = float(np.median(offs)) if offs else None
     return Evidence(
         registered=len(registered),
         total=total,
@@ -60,8 +62,9 @@ def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Eviden
         behind_camera=behind,
         parallax=parallax,
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
-        focal_off=float(np.median(offs)) if offs else None,
-        focal_certainty=_focal_certainty(model),
+        focal_off=focal_off,
+        # Where EXIF agrees nobody asks.
+        focal_certainty=None if _agrees(focal_off) else _focal_certainty(model),
         focal_relative=float(np.median([focal[c] / side[c] for c in camera_of.values()])),
         focal_prior_px=priors,
     )
@@ -139,32 +142,56 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
     if not pairs:
         return 0.0
     chosen = list(pairs)[:: max(1, len(pairs) // PARALLAX_PAIRS)]
-    sides = []
-    for first, second in chosen:
-        matches = pairs[first, second]
-        matches = matches[:: max(1, len(matches) // PARALLAX_MATCHES)]
-        both = []
-        for image_id, column in ((first, 0), (second, 1)):
+    found: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
+    for pair in chosen:
+        matches = pairs[pair]
+        # As many of each pair, so that all pairs make one array; of a small one some twice.
+        spread = np.linspace(0, len(matches) - 1, PARALLAX_MATCHES).round().astype(np.intp)
+        for image_id, column, side in zip(pair, matches[spread].T, found, strict=True):
             camera = model.camera(model.image(image_id).camera_id)
-            xy = database.read_keypoints(image_id)[matches[:, column], :2].astype(np.float64)
+            xy = database.read_keypoints(image_id)[column, :2].astype(np.float64)
             middle = np.array([camera.width, camera.height]) / 2
-            both.append((xy - middle) / max(camera.width, camera.height))
-        sides.append(both)
-    best = np.inf
-    for focal in PARALLAX_FOCALS:
-        for radial in PARALLAX_RADIALS:
-            residuals = []
-            for a, b in sides:
-                plane_a, plane_b = (_undistorted(p / focal, radial) for p in (a, b))
-                misses = np.linalg.norm(_turn(plane_a, plane_b) - plane_b, axis=1) * focal
-                residuals.append(float(np.median(np.nan_to_num(misses, nan=1.0))))
-            best = min(best, float(np.percentile(residuals, 75)))
+            side.append((xy - middle) / max(camera.width, camera.height))
+    a, b = (np.stack(side) for side in found)
+
+    def missed(focal: float, radial: float) -> float:
+        plane_a, plane_b = (_undistorted(p / focal, radial) for p in (a, b))
+        misses = np.linalg.norm(_turn(plane_a, plane_b) - plane_b, axis=-1) * focal
+        medians = np.median(np.nan_to_num(misses, nan=1.0), axis=1)
+        return float(np.percentile(medians, 75))
+
+    best, focal, radial = min(
+        (missed(f, k), f, k) for f in PARALLAX_FOCALS for k in PARALLAX_RADIALS
+    )
+    for finer in (0.5, 0.25):
+        near = [
+            (focal * float(np.exp(sf * finer * PARALLAX_STEP)), radial + sk * finer * 0.15)
+            for sf in (-1, 0, 1)
+            for sk in (-1, 0, 1)
+        ]
+        best, focal, radial = min([(missed(f, k), f, k) for f, k in near])
     return best
 
 
 def _undistorted(plane: NDArray[np.float64], radial: float) -> NDArray[np.float64]:
-    """(M, 2) without a radial term, to first order: this is to be near, not exact."""
-    return plane * (1 - radial * (plane**2).sum(1, keepdims=True))
+    """(..., 2) without a radial term, to first order: this is to be near, not exact."""
+    return plane * (1 - radial * (plane**2).sum(-1, keepdims=True))
+
+
+def _turn(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, M, 2) where points ``a`` of the plane z = 1 go by the rotation, one for each of P, that
+    best takes them to ``b``; NaN where that is behind."""
+    rays_a, rays_b = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (a, b))
+    rays_a /= np.linalg.norm(rays_a, axis=-1, keepdims=True)
+    rays_b /= np.linalg.norm(rays_b, axis=-1, keepdims=True)
+    u, _, vt = np.linalg.svd(np.swapaxes(rays_b, -1, -2) @ rays_a)
+    vt[:, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[:, None]
+    turned = rays_a @ np.swapaxes(u @ vt, -1, -2)
+    return np.asarray(turned[..., :2] / np.where(turned[..., 2:] > 1e-6, turned[..., 2:], np.nan))
+
+
+def _agrees(focal_off: float | None) -> bool:
+    return focal_off is not None and focal_off <= MAX_FOCAL_OFF
 
 
 def _focal_certainty(model: pycolmap.Reconstruction) -> float:
@@ -191,7 +218,7 @@ def _adjusted_cost(model: pycolmap.Reconstruction, *, refine_focal: bool) -> flo
     )
     options.ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     options.ceres.solver_options.num_threads = 1
-    options.ceres.solver_options.max_num_iterations = 15
+    options.ceres.solver_options.max_num_iterations = FOCAL_ITERATIONS
     options.ceres.solver_options.function_tolerance = 1e-4
     config = pycolmap.BundleAdjustmentConfig()
     images = sorted(model.reg_image_ids())
@@ -201,15 +228,3 @@ def _adjusted_cost(model: pycolmap.Reconstruction, *, refine_focal: bool) -> flo
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     summary = cast(pycolmap.CeresBundleAdjustmentSummary, adjuster.solve())
     return float(summary.ceres_summary.final_cost)
-
-
-def _turn(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(M, 2) where points ``a`` of the plane z = 1 go by the rotation that best takes them to
-    ``b``; NaN where that is behind."""
-    rays_a, rays_b = (np.column_stack([p, np.ones(len(p))]) for p in (a, b))
-    rays_a /= np.linalg.norm(rays_a, axis=1, keepdims=True)
-    rays_b /= np.linalg.norm(rays_b, axis=1, keepdims=True)
-    u, _, vt = np.linalg.svd(rays_b.T @ rays_a)
-    rotation = u @ np.diag([1.0, 1.0, np.linalg.det(u) * np.linalg.det(vt)]) @ vt
-    turned = rays_a @ rotation.T
-    return turned[:, :2] / np.where(turned[:, 2:] > 1e-6, turned[:, 2:], np.nan)

@@ -31,7 +31,7 @@ MIN_SPREAD = 3.0
 # A tilt that the positions leave uncertain by more than this is left to the cameras.
 MAX_TILT_RAD = float(np.radians(4.0))
 MIN_POSITIONS = 3
-HYPOTHESES = 500
+HYPOTHESES = 200
 # Beyond so many deviations a position counts as wrong (GPS in a street canyon, a stale fix).
 OUTLIER = 3.5
 # Cameras of a scene without a place lie within this distance of their mean, all but the farthest.

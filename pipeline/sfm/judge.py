@@ -23,7 +23,7 @@ MAX_STRANGERS = (0.35, 0.15)
 # Both signs of a folded model together, each of which alone would pass as weak.
 FOLDED_AGREEING, FOLDED_STRANGERS = 0.95, 0.15
 # Matches that a camera which only turns would see as well, but for noise (half a pixel).
-MIN_PARALLAX = (0.0015, 0.004)
+MIN_PARALLAX = (0.0018, 0.004)
 MAX_BEHIND = 0.01
 # A lens from 8 mm to 600 mm on 35 mm film: focal length over the longer side.
 FOCAL_RANGE = (0.22, 17.0)
@@ -73,7 +73,8 @@ class Evidence:
         median_angle_deg: of the points, the largest angle between two of their rays, the median.
         focal_off: ratio of the focal length to its EXIF prior, either way up, of the median image
             with a prior; None without any (pictures cropped after they were taken have wrong ones).
-        focal_certainty: share by which the cost rises for a focal length 20% off.
+        focal_certainty: share by which the cost rises for a focal length 20% off; None, not asked,
+            where EXIF agrees.
         focal_relative: focal length over the longer side, of the median image.
         focal_prior_px: camera id -> EXIF prior.
     """
@@ -93,7 +94,7 @@ class Evidence:
     parallax: float
     median_angle_deg: float
     focal_off: float | None
-    focal_certainty: float
+    focal_certainty: float | None
     focal_relative: float
     focal_prior_px: dict[int, float]
 
@@ -150,7 +151,7 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
     share = e.registered / e.total
     folded = e.agreeing_pairs < FOLDED_AGREEING and e.strangers > FOLDED_STRANGERS
     off = e.focal_off or 1.0
-    told = e.focal_certainty >= MIN_FOCAL_CERTAINTY
+    told = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
     findings = [
         _Finding(
             share < (min_registered_share if failed else MIN_SHARE_GOOD),

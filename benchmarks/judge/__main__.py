@@ -109,7 +109,7 @@ def _row(
 
 
 def rows(args: argparse.Namespace) -> Iterator[Row]:
-    names = args.cases or [*CASES, *PICTURES]
+    names = [*CASES, *PICTURES] if args.cases is None else args.cases
     for seed in args.seeds:
         for name in names:
             with tempfile.TemporaryDirectory(prefix="judge-") as temporary:
@@ -160,7 +160,9 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="benchmarks.judge", description=__doc__)
     parser.add_argument("--cases", nargs="*", help=f"of {', '.join([*CASES, *PICTURES])}")
     parser.add_argument("--seeds", type=_seeds, default=[0], help="one, or first-last")
-    parser.add_argument("--data", nargs="*", type=Path, default=[], help="scenes' folders")
+    parser.add_argument(
+        "--data", nargs="*", type=Path, default=[], help="scenes' folders, or results/NAME"
+    )
     parser.add_argument("--mapper", choices=["incremental", "global"], default="incremental")
     parser.add_argument("--budget", type=int, default=Sfm().max_attempts, help="attempts at most")
     parser.add_argument("--json", type=Path, help="write all of it here")

@@ -4,11 +4,14 @@ pipeline would."""
 from __future__ import annotations
 
 import contextlib
+import shutil
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
 from pipeline.config.schema import Config, Matches, Sfm
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.job import read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.plan import make_plan
 from pipeline.scene.posefiles import truth_folder
@@ -76,7 +79,10 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
 
 
 def match_folder(folder: Path, work: Path, seed: int) -> Matched:
-    """Features and matches of a scene's photographs, by its plan; given poses are ignored."""
+    """Features and matches of a scene's photographs, by its plan, given poses ignored; or those of
+    a finished scene (``results/NAME``)."""
+    if (folder / "plan.json").is_file():
+        return _finished(folder, work)
     config = Config(poses="ignore", seed=seed)
     found = scan(folder, folder.name, config, cache=None)
     plan = make_plan(found, config)
@@ -97,10 +103,23 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
     )
 
 
+def _finished(folder: Path, work: Path) -> Matched:
+    config = read_stage(folder / "sfm")["key"]["config"]["sfm"]
+    database = work / "database.db"
+    shutil.copyfile(folder / "matches" / "database.db", database)
+    truth = folder / "inspect" / "truth"
+    return Matched(
+        database,
+        len(Manifest.read(folder / "inspect" / "images.json").photos),
+        config["mapper"],
+        config["min_registered_share"],
+        truth if truth.is_dir() else None,
+    )
+
+
 def _match(
     manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, out: Path, seed: int
 ) -> None:
-    from pipeline.runtime.errors import UserError
     from pipeline.sfm.matching import match_features
 
     # No verified pair: this stage already says so. Mapping then finds no model.

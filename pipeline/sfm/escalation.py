@@ -105,8 +105,16 @@ def _alternatives(
         return share_cameras_by_size(database, path)
 
     yield first, "one camera for all photographs of a size, EXIF ignored", one_camera
+
+    def fisheye(path: Path) -> bool:
+        return _set_cameras(database, path, "OPENCV_FISHEYE", FISHEYE_FOCAL)
+
     tried = _believed_focals(database)
-    for focal in (_view_graph_focal(database), *SWEPT_FOCALS):
+    seen = _view_graph_focal(database)
+    wide = min(seen, *tried) < FISHEYE_BELOW
+    if wide:
+        yield first, "fisheye cameras", fisheye
+    for focal in (seen, *SWEPT_FOCALS):
         if any(max(focal / t, t / focal) < SAME_FOCAL for t in tried):
             continue
         tried.append(focal)
@@ -115,11 +123,7 @@ def _alternatives(
             return _set_cameras(database, path, None, focal)
 
         yield first, f"EXIF ignored, a focal length of {focal:.2f} times the longer side", believed
-    if min(tried) < FISHEYE_BELOW:
-
-        def fisheye(path: Path) -> bool:
-            return _set_cameras(database, path, "OPENCV_FISHEYE", FISHEYE_FOCAL)
-
+    if not wide:
         yield first, "fisheye cameras", fisheye
 
 

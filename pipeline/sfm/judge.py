@@ -212,8 +212,8 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
         ),
         _Finding(
             e.focal_off is None and not told,
-            "the photographs do not tell the focal length: they show a plane from the front, or "
-            "the camera went straight ahead",
+            "the photographs hardly tell the focal length: they show a plane from the front, the "
+            "camera went straight ahead, or they are not sharp",
             _FOCAL,
             False,
         ),

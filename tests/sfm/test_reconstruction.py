@@ -289,7 +289,7 @@ GOOD = Evidence(
         ({"observations_per_image": 40}, "weak", "only 40 points"),
         ({"focal_off": 2.5}, "good", None),
         ({"focal_off": 1.5, "focal_certainty": 0.02}, "weak", "1.5 times off"),
-        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "do not tell the focal length"),
+        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "hardly tell the focal length"),
         ({"agreeing_pairs": 0.8}, "failed", "20% of the pairs"),
         ({"agreeing_pairs": 0.93}, "weak", "7% of the pairs"),
         ({"strangers": 0.5}, "failed", "50% of neighbouring"),

@@ -24,9 +24,11 @@ Pairs = dict[tuple[int, int], NDArray[np.uint32]]
 
 # A match agrees within this share of the picture's longer side (pycolmap verifies within 4 px).
 AGREEMENT = 0.006
-# A pair of which fewer matches agree contradicts the model; one with fewer matches than that may
-# be there by chance, and is asked only where no other is.
-PAIR_SHARE, PAIR_MATCHES = 0.5, 30
+# A pair of which fewer matches agree contradicts the model.
+PAIR_SHARE = 0.5
+# Asked are the pairs with this share, at least, of the matches of the strongest pair of one of
+# their photographs: parts that look alike verify weaker ones, which right models contradict.
+STRONG_SHARE = 0.3
 
 # Neighbours for the second question: of each photograph as many, whose rays to a point are within
 # that angle, at distances within that ratio, and which should share as many points at least.
@@ -45,7 +47,7 @@ class Consistency:
     """Attributes:
     agreeing_matches: share of the verified matches between registered images that lie on the
         epipolar lines which the model gives their pair, in front of both cameras.
-    agreeing_pairs: share of the pairs most of whose matches do.
+    agreeing_pairs: share of the strong pairs most of whose matches do.
     strangers: share of neighbouring views that hardly see one another's points again.
     """
 
@@ -89,13 +91,17 @@ def check(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs: Pa
             focal=float(camera.mean_focal_length()),
         )
     agreeing, matches = 0, 0
-    votes: dict[bool, list[bool]] = {True: [], False: []}
+    strongest: dict[int, int] = {}
+    for pair, inliers in pairs.items():
+        for image_id in pair:
+            strongest[image_id] = max(strongest.get(image_id, 0), len(inliers))
+    asked = []
     for (first, second), inliers in pairs.items():
         agree = _agree(posed[first], posed[second], inliers)
         agreeing += int(agree.sum())
         matches += len(agree)
-        votes[len(agree) >= PAIR_MATCHES].append(bool(agree.mean() >= PAIR_SHARE))
-    asked = votes[True] or votes[False]
+        if len(agree) >= STRONG_SHARE * min(strongest[first], strongest[second]):
+            asked.append(bool(agree.mean() >= PAIR_SHARE))
     return Consistency(
         agreeing_matches=agreeing / max(matches, 1),
         agreeing_pairs=sum(asked) / max(len(asked), 1),

@@ -18,10 +18,10 @@ Grade = Literal["good", "weak", "failed"]
 # each lies between what right models and what wrong ones show there, nearer to the wrong ones.
 MIN_EXPLAINED = (0.15, 0.40)
 MIN_OBSERVATIONS = (15, 60)
-MIN_AGREEING_PAIRS = (0.88, 0.95)
+MIN_AGREEING_PAIRS = (0.93, 0.98)
 MAX_STRANGERS = (0.35, 0.15)
 # Both signs of a folded model together, each of which alone would pass as weak.
-FOLDED_AGREEING, FOLDED_STRANGERS = 0.95, 0.15
+FOLDED_AGREEING, FOLDED_STRANGERS = 0.97, 0.15
 # Matches that a camera which only turns would see as well, but for noise (half a pixel).
 MIN_PARALLAX = (0.0018, 0.004)
 MAX_BEHIND = 0.01
@@ -42,6 +42,7 @@ REACHED = 0.9
 _MORE = (
     "take more photographs around the subject, each sharing at least two thirds with the one before"
 )
+_OPTIONS = "raise features.max_features and matches.neighbours, or set matches.pairs: exhaustive"
 _MOVE = "move sideways around the subject between photographs instead of turning on the spot"
 _TEXTURE = "photograph something with texture, sharply and in unchanging light"
 _FOCAL = (
@@ -64,8 +65,8 @@ class Evidence:
         points, observations_per_image, mean_track_length, reprojection_px: of the model.
         explained_matches: share of verified matches between registered images whose two keypoints
             are seen as one point.
-        agreeing_matches, agreeing_pairs: shares of the verified matches, and of the pairs, that
-            agree with the epipolar geometry which the model gives them.
+        agreeing_matches, agreeing_pairs: shares of the verified matches, and of the strong pairs,
+            that agree with the epipolar geometry which the model gives them.
         strangers: share of neighbouring views that hardly see one another's points again.
         behind_camera: share of observations behind the camera that made them.
         parallax: how far matches are from what a camera that only turns would see, over the
@@ -156,7 +157,7 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
         _Finding(
             share < (min_registered_share if failed else MIN_SHARE_GOOD),
             f"{e.registered} of {e.total} photographs got a pose",
-            _MORE + "; leave out those that show something else",
+            _MORE + f"; leave out those that show something else; or {_OPTIONS}",
             e.registered < REACHED * e.reachable,
         ),
         _Finding(
@@ -167,12 +168,12 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
         _Finding(
             e.observations_per_image < MIN_OBSERVATIONS[which],
             f"a photograph sees only {e.observations_per_image:.0f} points",
-            _TEXTURE + "; or raise features.max_features",
+            _TEXTURE + f"; or {_OPTIONS}",
         ),
         _Finding(
             e.agreeing_pairs < MIN_AGREEING_PAIRS[which] or (failed and folded),
-            f"{1 - e.agreeing_pairs:.0%} of the pairs of photographs contradict the model: parts "
-            "that look alike may have been taken for one another",
+            f"{1 - e.agreeing_pairs:.0%} of the strongest pairs of photographs contradict the "
+            "model: parts that look alike may have been taken for one another",
             _ALIKE,
         ),
         _Finding(

@@ -16,7 +16,7 @@ Grade = Literal["good", "weak", "failed"]
 
 # Bounds on the evidence, (failed, weak), from the corpus of ``benchmarks.judge`` (docs/judge.md):
 # each lies between what right models and what wrong ones show there, nearer to the wrong ones.
-MIN_EXPLAINED = (0.15, 0.40)
+MIN_EXPLAINED = (0.20, 0.40)
 MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
 MAX_STRANGERS = (0.35, 0.15)
@@ -116,12 +116,14 @@ class Verdict:
 
 @dataclass(frozen=True)
 class _Finding:
-    """One thing that speaks against a model, where ``hit``."""
+    """One thing that speaks against a model, where ``hit``. ``curable``: mapping again may take it
+    away; ``final``: whatever else it takes away is not worth it."""
 
     hit: bool
     reason: str
     remedy: str
     curable: bool = True
+    final: bool = False
 
 
 def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
@@ -140,8 +142,7 @@ def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
                 grade,  # type: ignore[arg-type]
                 [f.reason for f in found],
                 list(dict.fromkeys(f.remedy for f in found)),
-                # What cannot be cured makes everything else not worth curing.
-                all(f.curable for f in found),
+                any(f.curable for f in found) and not any(f.final for f in found),
             )
     return Verdict("good", [], [], False)
 
@@ -186,7 +187,8 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
             e.parallax < MIN_PARALLAX[which],
             "the camera only turned, or hardly moved: nothing shows how far away things are",
             _MOVE,
-            False,
+            curable=False,
+            final=True,
         ),
     ]
     if failed:

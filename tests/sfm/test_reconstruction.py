@@ -321,3 +321,5 @@ def test_a_failure_says_what_to_change_and_whether_mapping_again_may_help():
     apart = judge(replace(GOOD, registered=12, reachable=12), 0.5)
     assert apart.grade == "weak" and not apart.curable
     assert judge(replace(GOOD, registered=12), 0.5).curable
+    both = judge(replace(GOOD, registered=12, parallax=0.003), 0.5)
+    assert both.grade == "weak" and not both.curable

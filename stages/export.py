@@ -6,6 +6,7 @@ Outputs: of the Gaussians ``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``; t
 ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
 """
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,9 @@ def run(job: Job) -> None:
         "near": protocol.near,
         "antialias": train.antialias,
     }
-    frame = describe_frame(scene.gaussians, scene.views, up, render, files)
+    placed = job.inputs["poses"] / "georeference.json"
+    georeference = json.loads(placed.read_text()) if placed.is_file() else None
+    frame = describe_frame(scene.gaussians, scene.views, up, render, files, georeference)
     write_json(job.out / "frame.json", frame)
     job.counters["exported_gaussians"] = len(scene.gaussians)
     if not set(config.formats) <= WRITERS.keys():

@@ -1,14 +1,16 @@
 """Look at the scene folder thoroughly once: which photographs are whole, which poses came along.
 
 Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses were given and
-``truth`` where the scene has ``sparse_gt``.
+``truth`` where the scene has ``sparse_gt``, ``gcp_list.txt`` where it has that.
 """
 
 from pathlib import Path
 
 from pipeline.config.schema import Config, Inspect, Views
+from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.gcp import GCP_FILE, read_ground_control
 from pipeline.scene.given import load_given
 from pipeline.scene.scan import scan
 from pipeline.scene.verify import verify_photos
@@ -36,6 +38,10 @@ def run(job: Job) -> None:
         given = load_given(found.model_copy(update={"manifest": manifest}))
         write_model(job.out / "sparse" / "0", given)
         job.counters |= {"given_poses": len(given.images), "given_points": len(given.points)}
+    if found.ground_control is not None and found.poses is None:
+        # Malformed, it is told now and not after hours.
+        read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])
+        write_bytes(job.out / GCP_FILE, found.ground_control.read_bytes())
     if found.truth is not None:
         write_model(job.out / "truth", read_model(found.truth))
 

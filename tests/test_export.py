@@ -63,7 +63,7 @@ def export(scene: Path, **options) -> tuple[Path, Job]:
         stage="export",
         scene="NAME",
         key={"seed": 0, "config": config},
-        inputs={"views": scene / "undistort", "model": scene / "undistort"}
+        inputs={role: scene / "undistort" for role in ("views", "model", "poses")}
         | {"train": scene / "train"},
         out=out,
         scratch=out.parent,

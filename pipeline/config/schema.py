@@ -130,6 +130,18 @@ class Sfm(Section):
     min_registered_share: Share = Field(
         0.5, description="A model with fewer of the photographs registered is a failure."
     )
+    max_attempts: Positive = Field(
+        4,
+        description="While the model is not good, map again at most so many times in all: by the "
+        "other mapper, with one camera a size, with other focal lengths, as a fisheye.",
+    )
+    georeference: Literal["auto", "gps", "gcp", "none"] = Field(
+        "auto",
+        description="The model's frame. gcp: metres in the projection of gcp_list.txt "
+        "(OpenDroneMap's ground control points); gps: metres east, north and up of the EXIF "
+        "positions; none: level, y down, of unit size; auto: the first that there is. Origin and "
+        "residuals are in sfm/georeference.json.",
+    )
 
 
 class Undistort(Section):

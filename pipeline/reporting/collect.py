@@ -61,6 +61,8 @@ def collect_metrics(
         "registered_images": sfm.get("registered", counters["inspect"].get("given_poses")),
         "total_images": photos + counters["inspect"]["left_out"],
         "reprojection_error_px": sfm.get("mean_reprojection_error_px"),
+        "sfm_verdict": sfm.get("verdict"),
+        "georeference": sfm.get("georeference"),
         "pose_error": evaluation["pose_error"],
         "stages": stages,
         "versions": own_run["versions"],

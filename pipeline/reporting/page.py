@@ -19,7 +19,12 @@ from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradie
 from pipeline.reporting.script import JS
 from pipeline.reporting.space import space_section, viewer_script
 from pipeline.reporting.style import CSS
-from pipeline.reporting.tables import definitions, per_view_table, stages_table
+from pipeline.reporting.tables import (
+    definitions,
+    georeference,
+    per_view_table,
+    stages_table,
+)
 from pipeline.reporting.text import count, duration, escape, fixed
 from pipeline.runtime.atomic import write_text
 
@@ -247,6 +252,9 @@ def _reconstruction(data: ReportData) -> str:
     pose = data.metrics.get("pose_error")
     if pose:
         out += "<h3>Poses against the truth</h3>" + definitions(pose)
+    placed = data.metrics.get("georeference")
+    if placed and placed.get("origin"):
+        out += f"<h3>Place on the ground</h3>{georeference(placed)}"
     return out or _nothing("Nothing is known of points and tracks, and there is no true pose.")
 
 

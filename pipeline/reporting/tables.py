@@ -36,6 +36,26 @@ def definitions(values: Mapping[str, Any]) -> str:
     return f"<dl>{rows}</dl>"
 
 
+def georeference(placed: Mapping[str, Any]) -> str:
+    """What the model's frame rests on, where its zero is, and how far off the rest is."""
+    left = placed.get("residuals_m") or {}
+    values = {
+        "rests on": {"gps": "GPS", "gcp": "ground control points"}.get(placed["method"]),
+        **(placed.get("origin") or {}),
+        "positions used": left.get("used"),
+        "left out as wrong": left.get("left_out"),
+        "residual on the ground, median and largest, m": _pair(left, "horizontal"),
+        "residual in height, median and largest, m": _pair(left, "vertical"),
+    }
+    return definitions({name: value for name, value in values.items() if value is not None})
+
+
+def _pair(left: Mapping[str, Any], axis: str) -> str | None:
+    if f"{axis}_median" not in left:
+        return None
+    return f"{left[f'{axis}_median']:.3f}, {left[f'{axis}_max']:.3f}"
+
+
 def per_view_table(per_view: Sequence[Mapping[str, Any]]) -> str:
     """Sortable; a measure that no view has is left out."""
     if not per_view:

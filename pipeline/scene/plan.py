@@ -111,7 +111,11 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             poses, "keypoints to find the poses by", [_keypoints(scan, config)]
         ),
         "matches": _pose_stage(poses, "pairs to find poses by", [pairs_reason]),
-        "sfm": _pose_stage(poses, _why_sfm(config), [mapper_reason, model_reason, sharing_reason]),
+        "sfm": _pose_stage(
+            poses,
+            _why_sfm(config),
+            [mapper_reason, model_reason, sharing_reason, _frame(scan, config)],
+        ),
         "undistort": _undistort(scan, settled),
         "init": _init(scan, settled),
         "train": StagePlan(
@@ -210,6 +214,16 @@ def _camera_model(scan: Scan, config: Config) -> Choice:
     if any("fisheye" in photo.camera_group.casefold() for photo in scan.photos):
         return "OPENCV_FISHEYE", f"OPENCV_FISHEYE cameras: EXIF names a fisheye lens; {priors}"
     return "SIMPLE_RADIAL", f"SIMPLE_RADIAL cameras; {priors}"
+
+
+def _frame(scan: Scan, config: Config) -> str:
+    wanted, control = config.sfm.georeference, scan.ground_control is not None
+    if wanted in ("auto", "gcp") and control:
+        return "the scene's frame from the ground control points in gcp_list.txt"
+    if wanted in ("auto", "gps") and scan.num_gps:
+        return f"the scene's frame from GPS in {scan.num_gps} photographs, if it says enough"
+    ignored = ", as configured" if wanted == "none" else ": neither GPS nor ground control points"
+    return f"the scene's frame level and of unit size{ignored}"
 
 
 def _share_cameras(scan: Scan, config: Config) -> Choice:
@@ -363,6 +377,7 @@ def _facts(scan: Scan, config: Config) -> dict[str, Any]:
         "masks": scan.num_masks,
         "depths": scan.num_depths,
         "gps": scan.num_gps,
+        "ground_control": scan.ground_control is not None,
         "gps_extent_m": round(_gps_extent(scan), 1),
         "focal_priors": scan.num_focal,
         "turned_by_exif": sum(photo.orientation != 1 for photo in photos),

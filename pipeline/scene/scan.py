@@ -20,6 +20,7 @@ from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
 from pipeline.scene.cache import FactCache
 from pipeline.scene.folders import PhotoFolder, companions, pictures_in, relative_folders
+from pipeline.scene.gcp import GCP_FILE
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.names import (
     RAW_SUFFIXES,
@@ -51,9 +52,10 @@ class Scan(BaseModel):
     given poses name photographs in (images for images_4). ``listed`` holds the names of all
     picture files found, those left out of the manifest among them. ``poses`` is None where no
     poses are given or ``poses: ignore`` is set. ``ordered`` says why the photographs count as
-    a sequence. ``truth`` and ``truth_digest`` are ground truth poses, never an input.
-    ``fingerprint`` changes with names and contents of photographs, masks, depth maps and pose
-    files; not with times or places.
+    a sequence. ``ground_control`` is the scene's ``gcp_list.txt``. ``truth`` and
+    ``truth_digest`` are ground truth poses, never an input.
+    ``fingerprint`` changes with names and contents of photographs, masks, depth maps, pose files
+    and ground control points; not with times or places.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -66,6 +68,7 @@ class Scan(BaseModel):
     listed: tuple[str, ...]
     poses: GivenPoses | None
     ordered: str | None
+    ground_control: Path | None
     truth: Path | None
     truth_digest: str | None
     fingerprint: str
@@ -158,6 +161,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         for name in sorted(facts)
     ]
     truth = truth_folder(folder)
+    control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
     result = Scan(
         folder=folder,
         manifest=Manifest(scene=scene, photos=tuple(photos), warnings=tuple(warnings)),
@@ -167,9 +171,10 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         listed=tuple(chosen.names),
         poses=poses,
         ordered=why_ordered(photos),
+        ground_control=control,
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
-        fingerprint=_fingerprint(folder, photos, sorted(chosen.names), poses, facts_cache),
+        fingerprint=_fingerprint(folder, photos, sorted(chosen.names), poses, control, facts_cache),
     )
     facts_cache.save()
     return result
@@ -477,11 +482,14 @@ def _fingerprint(
     photos: Sequence[Photo],
     listed: Sequence[str],
     poses: GivenPoses | None,
+    control: Path | None,
     cache: FactCache,
 ) -> str:
     others = [Path(p) for photo in photos for p in (photo.mask, photo.depth) if p is not None]
     if poses is not None:
         others += pose_files(folder / poses.path)
+    if control is not None:
+        others.append(control)
     lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in photos]
     # Files that could not be read count by name: a warning names them.
     lines += [*listed, _digest_files(folder, others, cache)]

@@ -11,6 +11,9 @@ from pipeline.config import schema
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View, is_held_out
 
+# How much columns of pictures count beside their rows, where up is sought.
+COLUMN_WEIGHT = 0.02
+
 
 def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
     """Width and height in pixels, reduced so that neither exceeds ``max_long_side``; the shape
@@ -69,6 +72,10 @@ def up_direction(
 ) -> NDArray[np.float64]:
     """(3,) unit vector of the world that the cameras together hold up.
 
+    People tilt cameras up and down and roll them little, so up is what is perpendicular to the
+    rows of all pictures; as far as these leave it open (a camera that does not turn), what the
+    pictures' columns point to on average.
+
     Args:
         rotations: (N, 3, 3) world to camera.
         orientations: the photographs' EXIF orientations, 1 to 8: a camera held upright has its
@@ -78,12 +85,22 @@ def up_direction(
     """
     # Where the picture's top is on the sensor. Source: EXIF 2.3, tag Orientation.
     top = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-    total = np.zeros(3)
+    total, rows, ahead = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
     for rotation, orientation in zip(rotations, orientations, strict=True):
         right, down = top.get(orientation, (0, -1))
-        total += right * rotation[0] + down * rotation[1]
+        column = right * rotation[0] + down * rotation[1]
+        row = np.cross(column, rotation[2])
+        total += column
+        rows += np.outer(row, row) / len(rotations)
+        ahead += rotation[2]
     length = float(np.linalg.norm(total))
-    return total / length if length > 1e-6 else np.array([0.0, -1.0, 0.0])
+    # Cameras that look straight down hold nothing up, but from above.
+    upwards = total - 0.5 * ahead
+    if length < 1e-6 or np.linalg.norm(upwards) < 1e-6:
+        return np.array([0.0, -1.0, 0.0])
+    mean = total / length
+    _, axes = np.linalg.eigh(rows + COLUMN_WEIGHT * (np.eye(3) - np.outer(mean, mean)))
+    return np.asarray(axes[:, 0] * np.sign(axes[:, 0] @ upwards))
 
 
 def scene_extent(views: list[View]) -> float:

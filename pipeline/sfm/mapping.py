@@ -9,36 +9,26 @@ import shutil
 import tempfile
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Any
 
 import numpy as np
 import pycolmap
 
 from pipeline.config import schema
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.database import share_cameras_by_size
+from pipeline.sfm.escalation import Attempt, AttemptRecord, map_until_good
 from pipeline.sfm.evidence import gather
-from pipeline.sfm.judge import Evidence, Verdict, judge
+from pipeline.sfm.georeference import summary
+from pipeline.sfm.judge import Evidence
 from pipeline.sfm.matching import shown
 from pipeline.sfm.models import Colors, color_points, write_model
+from pipeline.sfm.placement import place
 from pipeline.sfm.quiet import quiet_colmap
 from pipeline.sfm.refine import refine
 
-Mapper = Literal["incremental", "global"]
-
-# A smaller model is no reconstruction; of two photographs, two must do.
-MIN_MODEL_SIZE = 3
-
-# Global mapping on the longest tracks alone: three times as fast, as accurate.
-GLOBAL_TRACKS_PER_VIEW = 300
-
-REMEDY = (
-    "take more photographs around the subject, each sharing at least two thirds with the one "
-    "before and from another place (do not only turn the camera); sharp, in unchanging light, of "
-    "a textured, unmoving scene; or give known poses (sparse/0, transforms.json)"
-)
+GIVEN_POSES = "or give known poses (sparse/0, transforms.json)"
 
 
 @dataclass(frozen=True)
@@ -65,6 +55,8 @@ class SfmReport:
     cameras: their summaries.
     verdict: "good" or "weak" (a failed one raises).
     evidence: what the verdict stands on (see ``judge.Evidence``).
+    attempts: what was tried, in order (see ``escalation``).
+    georeference: the frame's method, origin and residuals (see ``georeference.Frame``).
     decisions, warnings: for people.
     """
 
@@ -79,23 +71,24 @@ class SfmReport:
     cameras: list[CameraSummary]
     verdict: str
     evidence: dict[str, float | int | None]
+    attempts: list[AttemptRecord]
+    georeference: dict[str, Any]
     decisions: list[str]
     warnings: list[str]
 
 
-@dataclass(frozen=True)
-class _Attempt:
-    mapper: Mapper
-    models: list[pycolmap.Reconstruction]  # largest first
-    evidence: Evidence | None
-    verdict: Verdict
-    database: Path
-
-
 def reconstruct(
-    manifest: Manifest, database: Path, config: schema.Sfm, out: Path, *, threads: int, seed: int
+    manifest: Manifest,
+    database: Path,
+    config: schema.Sfm,
+    out: Path,
+    *,
+    threads: int,
+    seed: int,
+    ground_control: Path | None = None,
 ) -> SfmReport:
-    """Write the largest model to ``out/sparse/0`` and the others to ``out/other_models/<n>``.
+    """Write the largest model to ``out/sparse/0``, where its frame is to ``out/georeference.json``
+    and the other models to ``out/other_models/<n>``.
 
     The same bytes for any number of ``threads``: the libraries sum in the order their threads
     finish, so mapping runs on one (which on real scenes is no slower).
@@ -117,11 +110,17 @@ def reconstruct(
         work = Path(folder) / "database.db"
         shutil.copyfile(database, work)
         warnings = _check_complete(manifest, work)
-        attempt, decisions = _map_with_fallback(
-            work, config.mapper, total, config.min_registered_share, seed
+        attempt, attempts = map_until_good(
+            work,
+            config.mapper,
+            total,
+            config.min_registered_share,
+            seed,
+            config.max_attempts,
         )
+        decisions = [_told(record, total) for record in attempts]
         if attempt.verdict.grade == "failed" or attempt.evidence is None:
-            raise UserError("no reconstruction: " + "; ".join(attempt.verdict.reasons), fix=REMEDY)
+            raise _failure(attempt, attempts)
         model, evidence = attempt.models[0], attempt.evidence
         if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
             model, refined = refine(
@@ -134,6 +133,9 @@ def reconstruct(
             evidence = gather(model, attempt.database, total)
         else:
             decisions.append("cameras not refined further: weak geometry bends to what is freed")
+    frame = place(model, manifest, config.georeference, ground_control)
+    decisions += frame.decisions
+    warnings += frame.warnings
     others = attempt.models[1:]
     folders = [out / "sparse" / "0"]
     folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]
@@ -142,6 +144,7 @@ def reconstruct(
         if colors is not None:
             color_points(each, colors)
         write_model(each, folder_of)
+    write_json(out / "georeference.json", frame.sidecar())
 
     registered = {model.image(i).name for i in model.reg_image_ids()}
     missing = [photo.name for photo in manifest.photos if photo.name not in registered]
@@ -154,7 +157,10 @@ def reconstruct(
             f"({len(registered)} photographs) is used; the others ({sizes}) are in other_models"
         )
     if attempt.verdict.grade == "weak":
-        warnings.append("the reconstruction is weak: " + "; ".join(attempt.verdict.reasons))
+        warnings.append(
+            f"the reconstruction is weak: {'; '.join(attempt.verdict.reasons)} (what would help: "
+            f"{'; '.join(attempt.verdict.remedies)})"
+        )
     return SfmReport(
         mapper=attempt.mapper,
         registered=len(registered),
@@ -167,108 +173,31 @@ def reconstruct(
         cameras=_camera_summaries(model, evidence),
         verdict=attempt.verdict.grade,
         evidence={k: v for k, v in asdict(evidence).items() if k != "focal_prior_px"},
+        attempts=attempts,
+        georeference={
+            "method": frame.method,
+            "origin": frame.origin,
+            "residuals_m": summary(frame.residuals),
+        },
         decisions=decisions,
         warnings=warnings,
     )
 
 
-def _map_with_fallback(
-    database: Path, first: Mapper, total: int, min_share: float, seed: int
-) -> tuple[_Attempt, list[str]]:
-    """The first mapper's attempt; where that is not good the best of it, of the other mapper's,
-    and of the first one's with one camera for all photographs of a size (EXIF of pictures that
-    were cropped or collected misleads), each tried only if nothing before was good."""
-    other: Mapper = "global" if first == "incremental" else "incremental"
-    shared = database.with_name("shared.db")
-    best = _attempt(database, first, total, min_share, seed)
-    decisions = [_told(best, total)]
-    for mapper, path in ((other, database), (first, shared)):
-        if best.verdict.grade == "good":
-            break
-        if path == shared and not share_cameras_by_size(database, shared):
-            break
-        attempt = _attempt(path, mapper, total, min_share, seed)
-        note = " with one camera for each size" if path == shared else ""
-        decisions.append(_told(attempt, total) + note)
-        if _rank(attempt) > _rank(best):
-            decisions.append(f"{mapper} mapping{note} is taken: it explains more")
-            best = attempt
-    return best, decisions
+def _told(record: AttemptRecord, total: int) -> str:
+    how = f" ({record.change})" if record.change else ""
+    found = f"{record.registered} of {total} photographs" if record.registered else "no model"
+    why = f": {'; '.join(record.reasons)}" if record.reasons and record.registered else ""
+    taken = "; taken" if record.taken else ""
+    return f"{record.mapper} mapping{how}: {found}, {record.verdict}{why}{taken}"
 
 
-def _attempt(database: Path, mapper: Mapper, total: int, min_share: float, seed: int) -> _Attempt:
-    with tempfile.TemporaryDirectory(dir=database.parent) as folder:
-        run = _map_incremental if mapper == "incremental" else _map_global
-        models = run(database, Path(folder), total, seed)
-    smallest = min(MIN_MODEL_SIZE, total)
-    models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
-    # Ties go to the model with more points, then to the first found.
-    models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
-    evidence = gather(models[0], database, total) if models else None
-    return _Attempt(mapper, models, evidence, judge(evidence, min_share), database)
-
-
-def _rank(attempt: _Attempt) -> tuple[int, float]:
-    if attempt.evidence is None:
-        return -1, 0.0
-    grade = ["failed", "weak", "good"].index(attempt.verdict.grade)
-    return grade, attempt.evidence.registered * attempt.evidence.explained_matches
-
-
-def _told(attempt: _Attempt, total: int) -> str:
-    if not attempt.models:
-        return f"{attempt.mapper} mapping: no model"
-    model = attempt.models[0]
-    return (
-        f"{attempt.mapper} mapping: {model.num_reg_images()} of {total} photographs, "
-        f"{model.num_points3D()} points, {attempt.verdict.grade}"
+def _failure(attempt: Attempt, attempts: list[AttemptRecord]) -> UserError:
+    ways = f" ({len(attempts)} ways were tried)" if len(attempts) > 1 else ""
+    return UserError(
+        f"no reconstruction{ways}: {'; '.join(attempt.verdict.reasons)}",
+        fix="; ".join([*attempt.verdict.remedies, GIVEN_POSES]),
     )
-
-
-def _map_incremental(
-    database: Path, out: Path, total: int, seed: int
-) -> list[pycolmap.Reconstruction]:
-    options = pycolmap.IncrementalPipelineOptions(
-        num_threads=1,
-        random_seed=seed,
-        min_model_size=min(MIN_MODEL_SIZE, total),
-        extract_colors=False,
-        # Fewer global adjustments: a third faster, as accurate.
-        ba_local_max_refinements=1,
-        ba_global_frames_ratio=1.5,
-        ba_global_points_ratio=1.5,
-    )
-    # 1.8 times the points at the same accuracy, and points are what Gaussians start from.
-    options.triangulation.ignore_two_view_tracks = False
-    progress = Progress("mapping", total, "photographs")
-
-    def registered() -> None:
-        # Photographs tried again, or in a second model, count once more: stop at the total.
-        if progress.done < progress.total:
-            progress.advance()
-
-    models = pycolmap.incremental_mapping(
-        database, out, out, options, next_image_callback=registered
-    )
-    return [models[key] for key in sorted(models)]
-
-
-def _map_global(database: Path, out: Path, total: int, seed: int) -> list[pycolmap.Reconstruction]:
-    calibrated = out / "calibrated.db"
-    shutil.copyfile(database, calibrated)
-    # Global mapping trusts the focal lengths it is given: estimate those without a prior first.
-    pycolmap.calibrate_view_graph(
-        calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=seed)
-    )
-    options = pycolmap.GlobalPipelineOptions(
-        num_threads=1, random_seed=seed, min_model_size=min(MIN_MODEL_SIZE, total)
-    )
-    options.mapper.num_threads = 1
-    options.mapper.random_seed = seed
-    options.mapper.track_required_tracks_per_view = GLOBAL_TRACKS_PER_VIEW
-    options.mapper.retriangulation.ignore_two_view_tracks = False
-    models = pycolmap.global_mapping(calibrated, out, out, options)
-    return [models[key] for key in sorted(models)]
 
 
 def _check_complete(manifest: Manifest, database: Path) -> list[str]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,7 +16,7 @@ AXES = (
     "right-handed; the world of the cameras as COLMAP has it: a camera at the identity has x to "
     "the right and y down in its picture, and looks along z"
 )
-UNIT = "that of the camera poses: arbitrary where they were reconstructed, else as they were given"
+UNIT = "that of the camera poses, as they were given"
 OTHER_AXES = {
     "point_cloud.glb": "turned by 180 degrees about z (x and y negated): glTF is y up",
     "transforms.json": "this world; the cameras' own axes are OpenGL's (x right, y up, z backward)",
@@ -29,6 +29,7 @@ def describe_frame(
     up: NDArray[np.float64],
     render: dict[str, Any],
     files: Sequence[str],
+    georeference: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """The content of ``frame.json``.
 
@@ -38,13 +39,17 @@ def describe_frame(
         render: background (RGB in [0, 1]), near plane (world unit), antialias: those that the
             Gaussians are to be rendered with.
         files: names of the exported files; those with other axes are named with them.
+        georeference: the content of the reconstruction's ``georeference.json``, None where the
+            poses were given.
     """
+    placed = georeference or {}
     centres = np.stack([view.centre for view in views])
     return {
-        "axes": AXES,
+        "axes": f"{AXES}; {placed['axes']}" if placed else AXES,
         "axes_of": {name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
         "up": _rounded(up),
-        "unit": UNIT,
+        "unit": placed.get("unit", UNIT),
+        "georeference": {k: placed[k] for k in ("method", "origin", "projection") if k in placed},
         "cameras": {
             "count": len(views),
             "centre": _rounded(centres.mean(0)),

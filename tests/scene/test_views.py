@@ -89,5 +89,27 @@ def test_up_knows_cameras_that_were_turned(orientation, quarter_turns):
     np.testing.assert_allclose(found, [0, -1, 0], atol=1e-9)
 
 
+def test_up_is_level_where_all_cameras_look_up():
+    """A facade from below: every camera is tilted the same way, and up is still up."""
+    rotations = []
+    for angle in np.radians([-30, -10, 10, 30]):
+        forward = np.array([np.sin(angle), -0.5, np.cos(angle)]) / np.sqrt(1.25)
+        right = np.cross([0, 1.0, 0], forward)
+        right /= np.linalg.norm(right)
+        rotations.append([right, np.cross(forward, right), forward])
+    found = up_direction(np.array(rotations), [1] * 4)
+    assert np.degrees(np.arccos(found @ [0, -1, 0])) < 4, found
+
+
+def test_up_is_above_cameras_that_look_down():
+    """A drone that flies to and fro: its pictures' tops point all ways along the ground."""
+    down, rotations = np.array([0.0, 1.0, 0.0]), []
+    for angle in np.radians([0, 0, 180, 180, 175, 5, 90]):
+        right = np.array([np.cos(angle), 0.0, np.sin(angle)])
+        rotations.append([right, np.cross(down, right), down])
+    found = up_direction(np.array(rotations), [1] * 7)
+    np.testing.assert_allclose(found, [0, -1, 0], atol=0.1)
+
+
 def test_up_without_cameras_is_against_y():
     assert up_direction(np.zeros((0, 3, 3)), []).tolist() == [0, -1, 0]

@@ -248,8 +248,8 @@ def test_sharing_cameras_by_size_saves_photographs_with_wrong_priors(room, tmp_p
         jobs.match_and_reconstruct, corner.manifest(wrong), found, tmp_path, INCREMENTAL
     )
     assert report["verdict"] == "good", report
-    assert any("one camera for each size is taken" in text for text in report["decisions"])
-    assert len(report["cameras"]) == 1 and report["cameras"][0]["num_images"] == 8
+    taken = [attempt for attempt in report["attempts"] if attempt["taken"]]
+    assert len(taken) == 1 and taken[0]["verdict"] == "good"
     error = pose_error(read_model(tmp_path / "sfm" / "sparse" / "0"), truth)
     assert error.rotation_median_deg < 0.5
 
@@ -257,15 +257,20 @@ def test_sharing_cameras_by_size_saves_photographs_with_wrong_priors(room, tmp_p
 GOOD = Evidence(
     registered=20,
     total=20,
+    reachable=20,
     points=4000,
     observations_per_image=800,
     mean_track_length=4.0,
     reprojection_px=0.5,
     explained_matches=0.9,
+    agreeing_matches=0.99,
+    agreeing_pairs=1.0,
+    strangers=0.02,
     behind_camera=0.0,
     parallax=0.05,
     median_angle_deg=12.0,
     focal_off=1.05,
+    focal_certainty=0.8,
     focal_relative=0.9,
     focal_prior_px={},
 )
@@ -280,9 +285,16 @@ GOOD = Evidence(
         ({"registered": 9}, "failed", "9 of 20 photographs"),
         ({"explained_matches": 0.3}, "weak", "30% of the verified matches"),
         ({"explained_matches": 0.1}, "failed", "10% of the verified matches"),
-        ({"points": 100}, "failed", "5 points for each photograph"),
-        ({"focal_off": 1.5}, "weak", "1.5 times off"),
-        ({"focal_off": 2.5}, "failed", "2.5 times off"),
+        ({"observations_per_image": 8}, "failed", "only 8 points"),
+        ({"observations_per_image": 40}, "weak", "only 40 points"),
+        ({"focal_off": 2.5}, "good", None),
+        ({"focal_off": 1.5, "focal_certainty": 0.02}, "weak", "1.5 times off"),
+        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "hardly tell the focal length"),
+        ({"agreeing_pairs": 0.8}, "failed", "20% of the strongest pairs"),
+        ({"agreeing_pairs": 0.95}, "weak", "5% of the strongest pairs"),
+        ({"strangers": 0.5}, "failed", "50% of neighbouring"),
+        ({"strangers": 0.25}, "weak", "25% of neighbouring"),
+        ({"agreeing_pairs": 0.96, "strangers": 0.2}, "failed", "look alike"),
         ({"focal_relative": 0.1}, "failed", "0.10 times the picture"),
         ({"behind_camera": 0.2}, "failed", "20% of the points are behind"),
         ({"parallax": 0.003}, "weak", "only turned"),
@@ -298,3 +310,16 @@ def test_the_judge_by_its_evidence(change, grade, reason):
 
 def test_no_model_is_a_failure():
     assert judge(None, 0.5).grade == "failed"
+
+
+def test_a_failure_says_what_to_change_and_whether_mapping_again_may_help():
+    turned = judge(replace(GOOD, parallax=0.001), 0.5)
+    assert "move sideways" in turned.remedies[0] and not turned.curable
+    alike = judge(replace(GOOD, agreeing_pairs=0.5), 0.5)
+    assert "look alike" in alike.remedies[0] and alike.curable
+    # All that pairs link have a pose: no mapper can add those of another place.
+    apart = judge(replace(GOOD, registered=12, reachable=12), 0.5)
+    assert apart.grade == "weak" and not apart.curable
+    assert judge(replace(GOOD, registered=12), 0.5).curable
+    both = judge(replace(GOOD, registered=12, parallax=0.003), 0.5)
+    assert both.grade == "weak" and not both.curable

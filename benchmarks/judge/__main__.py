@@ -1,0 +1,194 @@
+"""Every case's truth, verdict and evidence, and how often they agree."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+import tempfile
+import time
+from collections import Counter
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from benchmarks.judge.cases import CASES, make
+from benchmarks.judge.pictures import PICTURES, Matched, match_folder, write_pictures
+from benchmarks.judge.truth import Grade, Truth, grade
+from benchmarks.judge.world import write
+from pipeline.config.schema import Sfm
+from pipeline.scene.colmap import read_model
+from pipeline.sfm.escalation import Attempt, map_until_good
+from pipeline.sfm.isolate import run_isolated
+from pipeline.sfm.mappers import Mapper
+from pipeline.sfm.models import write_model
+from pipeline.sfm.quiet import quiet_colmap
+
+GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
+# What is printed of the evidence.
+SHOWN = (
+    ("explained_matches", "expl", "{:.2f}"),
+    ("agreeing_pairs", "agree", "{:.2f}"),
+    ("strangers", "stra", "{:.2f}"),
+    ("observations_per_image", "obs", "{:.0f}"),
+    ("parallax", "parlx", "{:.4f}"),
+    ("median_angle_deg", "angle", "{:.1f}"),
+    ("focal_certainty", "fcert", "{:.2f}"),
+    ("focal_off", "foff", "{:.2f}"),
+)
+
+
+@dataclass(frozen=True)
+class Row:
+    """One case; ``truth`` is None where there is no truth to measure against."""
+
+    case: str
+    seed: int
+    truth: Truth | None
+    verdict: Grade
+    reasons: list[str]
+    registered: int
+    total: int
+    attempts: int
+    cpu_s: float
+    evidence: dict[str, Any]
+
+
+def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) -> Row:
+    """A case of ``cases.CASES``."""
+    made = write(make(name, seed), folder / "database.db", seed)
+    start = time.process_time()
+    total = len(made.manifest.photos)
+    best, records = map_until_good(
+        folder / "database.db", mapper, total, Sfm().min_registered_share, seed, budget
+    )
+    truth = grade(_model(best, folder), made.truths, total, made.depth)
+    return _row(name, seed, truth, best, total, len(records), time.process_time() - start)
+
+
+def run_folder(name: str, seed: int, found: Matched, mapper: Mapper | None, budget: int) -> Row:
+    """Photographs, as the pipeline's plan would have them matched and mapped."""
+    start = time.process_time()
+    best, records = map_until_good(
+        found.database, mapper or found.mapper, found.total, found.min_share, seed, budget
+    )
+    truth = None
+    if found.truth is not None:
+        model = _model(best, found.database.parent)
+        truth = grade(model, [read_model(found.truth)], found.total, None)
+    return _row(name, seed, truth, best, found.total, len(records), time.process_time() - start)
+
+
+def _model(best: Attempt, folder: Path) -> Any:
+    if not best.models:
+        return None
+    write_model(best.models[0], folder / "model")
+    return read_model(folder / "model")
+
+
+def _row(
+    name: str, seed: int, truth: Truth | None, best: Attempt, total: int, tried: int, cpu: float
+) -> Row:
+    evidence = asdict(best.evidence) if best.evidence else {}
+    evidence.pop("focal_prior_px", None)
+    return Row(
+        name,
+        seed,
+        truth,
+        best.verdict.grade,
+        best.verdict.reasons,
+        evidence.get("registered", 0),
+        total,
+        tried,
+        round(cpu, 1),
+        evidence,
+    )
+
+
+def rows(args: argparse.Namespace) -> Iterator[Row]:
+    names = [*CASES, *PICTURES] if args.cases is None else args.cases
+    for seed in args.seeds:
+        for name in names:
+            with tempfile.TemporaryDirectory(prefix="judge-") as temporary:
+                folder = Path(temporary)
+                if name in CASES:
+                    yield run_made(name, seed, args.mapper, args.budget, folder)
+                elif name in PICTURES:
+                    run_isolated(write_pictures, name, seed, folder / name)
+                    found = match_folder(folder / name, folder, seed)
+                    yield run_folder(name, seed, found, args.mapper, args.budget)
+    for photographs in args.data:
+        with tempfile.TemporaryDirectory(prefix="judge-") as temporary:
+            found = match_folder(photographs, Path(temporary), args.seeds[0])
+            yield run_folder(photographs.name, args.seeds[0], found, None, args.budget)
+
+
+def show(row: Row) -> str:
+    told = "?" if row.truth is None else row.truth.grade
+    facts = " ".join(
+        f"{short} {form.format(row.evidence[key])}"
+        for key, short, form in SHOWN
+        if row.evidence.get(key) is not None
+    )
+    wrong = "  <-- WRONG" if {told, row.verdict} == {"good", "failed"} else ""
+    share = "" if row.truth is None else f" {row.truth.share:.2f}"
+    return (
+        f"{row.case:<22} {row.seed:>2}  truth {told:<6}{share}  verdict {row.verdict:<6} "
+        f"{row.registered:>3}/{row.total:<3} {row.attempts} tried {row.cpu_s:>6.1f} s  {facts}"
+        f"{'  | ' + '; '.join(row.reasons) if row.reasons else ''}{wrong}"
+    )
+
+
+def table(found: list[Row]) -> str:
+    """The confusion table, as Markdown."""
+    counts = Counter((row.truth.grade, row.verdict) for row in found if row.truth is not None)
+    lines = ["| truth | " + " | ".join(f"called {g}" for g in GRADES) + " |", "|---|---|---|---|"]
+    for true in GRADES:
+        lines.append(f"| {true} | " + " | ".join(str(counts[true, g]) for g in GRADES) + " |")
+    return "\n".join(lines)
+
+
+def _seeds(text: str) -> list[int]:
+    first, _, last = text.partition("-")
+    return list(range(int(first), int(last or first) + 1))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="benchmarks.judge", description=__doc__)
+    parser.add_argument("--cases", nargs="*", help=f"of {', '.join([*CASES, *PICTURES])}")
+    parser.add_argument("--seeds", type=_seeds, default=[0], help="one, or first-last")
+    parser.add_argument(
+        "--data", nargs="*", type=Path, default=[], help="scenes' folders, or results/NAME"
+    )
+    parser.add_argument("--mapper", choices=["incremental", "global"], default="incremental")
+    parser.add_argument("--budget", type=int, default=Sfm().max_attempts, help="attempts at most")
+    parser.add_argument("--json", type=Path, help="write all of it here")
+    args = parser.parse_args()
+    unknown = set(args.cases or []) - {*CASES, *PICTURES}
+    if unknown:
+        parser.error(f"no such case: {', '.join(sorted(unknown))}")
+    quiet_colmap()
+    found = []
+    for row in rows(args):
+        found.append(row)
+        print(show(row), flush=True)
+        if args.json:
+            text = json.dumps([asdict(r) for r in found], indent=1, default=_plain)
+            args.json.write_text(text)
+    print("\n" + table(found))
+    wrong = sum(
+        r.truth is not None and {r.truth.grade, r.verdict} == {"good", "failed"} for r in found
+    )
+    print(f"\n{len(found)} cases, {wrong} wrong")
+    return 1 if wrong else 0
+
+
+def _plain(value: Any) -> Any:
+    return value.item() if isinstance(value, np.generic) else str(value)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

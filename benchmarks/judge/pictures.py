@@ -1,0 +1,127 @@
+"""Cases that need pictures: rendered ones, and photographs from a folder; both matched as the
+pipeline would."""
+
+from __future__ import annotations
+
+import contextlib
+import shutil
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Literal
+
+from pipeline.config.schema import Config, Matches, Sfm
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.job import read_stage
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.plan import make_plan
+from pipeline.scene.posefiles import truth_folder
+from pipeline.scene.scan import scan
+from pipeline.sfm.features import extract_features
+from pipeline.sfm.isolate import run_isolated
+from pipeline.sfm.mappers import Mapper
+
+Look = Literal["as_it_is", "bare", "blurred"]
+PICTURES: dict[str, Look] = {
+    "pictures": "as_it_is",
+    "pictures_bare": "bare",
+    "pictures_blurred": "blurred",
+}
+VIEWS, WIDTH, HEIGHT = 14, 320, 240
+STEP_DEGREES = 12.0
+# Heavy blur: sigma in pixels of 320.
+BLUR = 5.0
+
+
+@dataclass(frozen=True)
+class Matched:
+    """A scene's database, and what its plan says of mapping it."""
+
+    database: Path
+    total: int
+    mapper: Mapper
+    min_share: float
+    truth: Path | None
+
+
+def write_pictures(name: str, seed: int, folder: Path) -> None:
+    """Render a case of ``PICTURES``: the demo's room, as it is, without texture, or blurred."""
+    # In a process of its own: cv2 and pycolmap do not go together.
+    import cv2
+    import numpy as np
+    from PIL import Image
+
+    from pipeline.demo.cameras import lens, orbit
+    from pipeline.demo.render import rays, render
+    from pipeline.demo.scene import OBJECTS
+    from pipeline.demo.sensor import srgb, to_bytes
+    from pipeline.scene.colmap import write_model
+    from pipeline.scene.model import Reconstruction
+
+    look = PICTURES[name]
+    names = [f"view_{i:03d}.png" for i in range(VIEWS)]
+    # An arc: as many views of a whole ring would be too far from each other.
+    views = orbit(names, seed)
+    camera = lens("simple_radial", WIDTH, HEIGHT)
+    through = rays(camera)
+    (folder / "images").mkdir(parents=True)
+    rng = np.random.default_rng([seed, 5])
+    for posed in views:
+        light = render(posed, camera, through, OBJECTS).light
+        if look == "blurred":
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), BLUR), np.float64)
+        if look == "bare":
+            # Painted over: shading and edges stay, texture goes.
+            light = np.asarray(cv2.GaussianBlur(light, (0, 0), 12.0), np.float64) * 0.2 + 0.3
+        noisy = srgb(light) + rng.normal(0, 0.004, light.shape)
+        Image.fromarray(to_bytes(noisy)).save(folder / "images" / posed.name)
+    truth = Reconstruction({1: camera}, {i + 1: posed for i, posed in enumerate(views)})
+    write_model(folder / "sparse_gt", truth, text=True)
+
+
+def match_folder(folder: Path, work: Path, seed: int) -> Matched:
+    """Features and matches of a scene's photographs, by its plan, given poses ignored; or those of
+    a finished scene (``results/NAME``)."""
+    if (folder / "plan.json").is_file():
+        return _finished(folder, work)
+    config = Config(poses="ignore", seed=seed)
+    found = scan(folder, folder.name, config, cache=None)
+    plan = make_plan(found, config)
+    manifest = found.manifest
+    features = work / "features"
+    extract_features(manifest, plan.config.features, features, cache=work / "cache", threads=1)
+    run_isolated(
+        _match, manifest, features, plan.config.matches, plan.config.sfm, work / "matches", seed
+    )
+    mapper = plan.config.sfm.mapper
+    assert mapper != "auto"
+    return Matched(
+        work / "matches" / "database.db",
+        len(manifest.photos),
+        mapper,
+        plan.config.sfm.min_registered_share,
+        truth_folder(folder),
+    )
+
+
+def _finished(folder: Path, work: Path) -> Matched:
+    config = read_stage(folder / "sfm")["key"]["config"]["sfm"]
+    database = work / "database.db"
+    shutil.copyfile(folder / "matches" / "database.db", database)
+    truth = folder / "inspect" / "truth"
+    return Matched(
+        database,
+        len(Manifest.read(folder / "inspect" / "images.json").photos),
+        config["mapper"],
+        config["min_registered_share"],
+        truth if truth.is_dir() else None,
+    )
+
+
+def _match(
+    manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, out: Path, seed: int
+) -> None:
+    from pipeline.sfm.matching import match_features
+
+    # No verified pair: this stage already says so. Mapping then finds no model.
+    with contextlib.suppress(UserError):
+        match_features(manifest, features, matches, sfm, out, seed=seed)

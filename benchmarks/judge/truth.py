@@ -1,0 +1,139 @@
+"""What a model is worth, by its poses against the truth: the same for every case."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.metrics.pose import umeyama
+from pipeline.scene.model import Reconstruction
+from pipeline.scene.names import NameIndex
+
+Array = NDArray[np.float64]
+Grade = Literal["good", "weak", "failed"]
+
+# A view is right within these, after the similarity that makes most views right.
+ROTATION_DEG, CENTRE_SHARE = 5.0, 0.05
+# Of the views with a pose (and a true one): as many right is a good model, fewer than that failed.
+GOOD_SHARE, FAILED_SHARE = 0.9, 0.6
+# A model of less than this share of the photographs is no model of the scene.
+LEAST_REGISTERED = 0.5
+# Cameras that moved less than this share of the distance to what they saw saw no depth.
+MIN_TRUE_MOTION = 0.01
+HYPOTHESES = 600
+
+
+@dataclass(frozen=True)
+class Truth:
+    """Attributes:
+    grade: by ``share``; failed too where there is no model or one of too few photographs, and
+        where the true cameras never moved.
+    share: of the views that have a pose and a true one, how many are right.
+    common: their number.
+    rotation_deg, centre: medians over all of these, after the robust similarity; the centre over
+        the true radius.
+    """
+
+    grade: Grade
+    share: float
+    common: int
+    rotation_deg: float
+    centre: float
+
+
+def grade(
+    estimated: Reconstruction | None,
+    truths: Sequence[Reconstruction],
+    total: int,
+    depth: float | None = None,
+) -> Truth:
+    """Grade a model.
+
+    Args:
+        truths: of the scenes that were photographed; the model is of the one it has most views of,
+            and its views of the others are wrong.
+        total: photographs.
+        depth: typical distance of what the cameras saw, in the truth's unit; None where unknown.
+    """
+    if estimated is None:
+        return Truth("failed", 0.0, 0, np.inf, np.inf)
+    posed = estimated.by_name()
+    index = NameIndex(posed)
+    found = [
+        [
+            (posed[match], true)
+            for name, true in sorted(truth.by_name().items())
+            if (match := index.find(name)) is not None
+        ]
+        for truth in truths
+    ]
+    pairs = max(found, key=len)
+    common = sum(len(each) for each in found)
+    if len(pairs) < 2:
+        return Truth("failed", 0.0, common, np.inf, np.inf)
+    r_found, r_true = (np.stack([p[k].rotation for p in pairs]) for k in (0, 1))
+    c_found, c_true = (np.stack([p[k].centre for p in pairs]) for k in (0, 1))
+    radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))
+    rotation, centre = _residuals(r_found, c_found, r_true, c_true)
+    relative = centre / max(radius, 1e-12)
+    right = (rotation <= ROTATION_DEG) & (relative <= CENTRE_SHARE)
+    share = float(right.sum()) / common
+    still = depth is not None and radius < MIN_TRUE_MOTION * depth
+    verdict: Grade = "good" if share >= GOOD_SHARE else "weak"
+    few = len(estimated.images) < LEAST_REGISTERED * total
+    if share < FAILED_SHARE or still or few:
+        verdict = "failed"
+    return Truth(verdict, share, common, float(np.median(rotation)), float(np.median(relative)))
+
+
+def _residuals(r_found: Array, c_found: Array, r_true: Array, c_true: Array) -> tuple[Array, Array]:
+    """Degrees and distances left by the similarity, of those that one view's rotation and two
+    views' distance propose and of the least-squares ones on what these explain, that makes most
+    views right."""
+    rng = np.random.default_rng(0)
+    count = len(c_true)
+    radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))
+    best: tuple[tuple[int, float], Array, Array] | None = None
+
+    def consider(scale: float, world: Array, shift: Array) -> NDArray[np.bool_]:
+        nonlocal best
+        rotation = _angles(r_found @ world.T, r_true)
+        centre = np.linalg.norm(scale * c_found @ world.T + shift - c_true, axis=1)
+        right = (rotation <= ROTATION_DEG) & (centre <= CENTRE_SHARE * radius)
+        miss = np.minimum(rotation / ROTATION_DEG, 1) + np.minimum(
+            centre / max(CENTRE_SHARE * radius, 1e-12), 1
+        )
+        score = (int(right.sum()), -float(miss.sum()))
+        if best is None or score > best[0]:
+            best = (score, rotation, centre)
+        return np.asarray(right)
+
+    for _ in range(HYPOTHESES if count > 2 else 4):
+        i, j = rng.choice(count, 2, replace=False)
+        span = float(np.linalg.norm(c_found[i] - c_found[j]))
+        if span < 1e-12:
+            continue
+        scale = float(np.linalg.norm(c_true[i] - c_true[j])) / span
+        world = r_true[i].T @ r_found[i]
+        shift = c_true[i] - scale * world @ c_found[i]
+        right = consider(scale, world, shift)
+        if right.sum() >= 3:
+            # On a line the centres leave a turn about it open: the rotations settle it.
+            u, _, vt = np.linalg.svd(np.einsum("nij,nik->jk", r_true[right], r_found[right]))
+            world = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
+            scale, _, _ = umeyama(c_found[right] @ world.T, c_true[right])
+            shift = c_true[right].mean(0) - scale * world @ c_found[right].mean(0)
+            consider(scale, world, shift)
+            consider(*umeyama(c_found[right], c_true[right]))
+    if best is None:
+        return np.full(count, np.inf), np.full(count, np.inf)
+    return best[1], best[2]
+
+
+def _angles(first: Array, second: Array) -> Array:
+    cosine = (np.einsum("nij,nij->n", first, second) - 1) / 2
+    return np.asarray(np.degrees(np.arccos(np.clip(cosine, -1, 1))))

@@ -1,0 +1,320 @@
+"""Made scenes: points on surfaces that cameras see, match and mistake, as a database of matches.
+
+No pictures: a keypoint is where a surface point falls, half a pixel off. Which points are found
+again in which pictures follows what SIFT does: not from the back, not at a grazing angle, less
+with every degree between the views, not at another scale, and never all of them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pycolmap
+from numpy.typing import NDArray
+
+from pipeline.demo.cameras import look_at
+from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.model import Camera, Posed, Reconstruction
+
+Array = NDArray[np.float64]
+Triple = Array | tuple[float, float, float]
+Ints = NDArray[np.int64]
+
+WIDTH, HEIGHT = 640, 480
+FOCAL, RADIAL = 560.0, -0.06
+NOISE_PX = 0.5
+# Of the points in view a detector finds this share, and of those in two pictures the matcher this.
+DETECTED, MATCHED = 0.75, 0.85
+# Matching falls off with the angle between two views (SIFT: half is gone at 30 degrees).
+HALF_ANGLE_DEG = 30.0
+MAX_GRAZING_DEG = 72.0
+MAX_SCALE_RATIO = 2.5
+# Of a pair's matches, wrong ones that passed the ratio test; and those by chance between any two.
+WRONG_SHARE, WRONG_MATCHES = 0.08, 4
+MIN_INLIERS = 15
+
+
+@dataclass(frozen=True)
+class Surface:
+    """Points that can be seen and what they look like.
+
+    Attributes:
+        xyz, normal: (P, 3).
+        look: (P,) points of one number look the same.
+    """
+
+    xyz: Array
+    normal: Array
+    look: Ints
+
+    def __add__(self, other: Surface) -> Surface:
+        first = int(self.look.max()) + 1 if len(self.look) else 0
+        return Surface(
+            np.concatenate([self.xyz, other.xyz]),
+            np.concatenate([self.normal, other.normal]),
+            np.concatenate([self.look, other.look + first]),
+        )
+
+
+@dataclass(frozen=True)
+class Shot:
+    """One photograph.
+
+    Attributes:
+        rotation, centre: where the camera truly was, world to camera.
+        scene: surfaces of other scenes are not seen.
+        mirrored: turned left to right after it was taken.
+        prior: focal length that EXIF claims over the true one; None where it claims none.
+        blur: keypoints' noise, pixels, on top.
+        copy_of: index of the photograph that this is a copy of.
+        camera: photographs of one number share a camera.
+    """
+
+    rotation: Array
+    centre: Array
+    scene: int = 0
+    mirrored: bool = False
+    prior: float | None = None
+    blur: float = 0.0
+    copy_of: int | None = None
+    camera: int = 0
+
+
+@dataclass(frozen=True)
+class Made:
+    """A made scene: what was photographed, and how."""
+
+    scenes: Sequence[Surface]
+    shots: Sequence[Shot]
+    radial: float = RADIAL
+    solid: Sequence[tuple[Triple, float]] = field(default_factory=tuple)
+    """Spheres (centre, radius) that hide what is behind them."""
+
+
+def plane(
+    rng: np.random.Generator, origin: Triple, u: Triple, v: Triple, count: int, relief: float = 0.0
+) -> Surface:
+    """A parallelogram's points; its normal is u x v, along which they rise up to ``relief``."""
+    first, second, corner = (np.asarray(a, np.float64) for a in (u, v, origin))
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal)
+    s, t, h = rng.uniform(0, 1, (3, count, 1))
+    xyz = corner + s * first + t * second + h * relief * normal
+    tilted = normal + rng.normal(0, 0.15, (count, 3))
+    tilted /= np.linalg.norm(tilted, axis=1, keepdims=True)
+    return Surface(xyz, tilted, np.arange(count))
+
+
+def ball(rng: np.random.Generator, centre: Triple, radius: float, count: int) -> Surface:
+    normal = rng.normal(size=(count, 3))
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    return Surface(np.asarray(centre) + radius * normal, normal, np.arange(count))
+
+
+def room(rng: np.random.Generator, side: float, count: int) -> Surface:
+    """Floor (z = 0) and four walls, seen from inside."""
+    h, tall = side / 2, 0.5 * side
+    each = count // 5
+    walls = plane(rng, (-h, -h, 0), (side, 0, 0), (0, side, 0), each)
+    for corner, along in (
+        ((-h, h, 0), (side, 0, 0)),
+        ((h, -h, 0), (-side, 0, 0)),
+        ((-h, -h, 0), (0, side, 0)),
+        ((h, h, 0), (0, -side, 0)),
+    ):
+        walls = walls + plane(rng, corner, along, (0, 0, tall), each)
+    return walls
+
+
+def looking(centre: Triple, target: Triple, roll: float = 0.0, **facts: Any) -> Shot:
+    at = np.asarray(centre, np.float64)
+    return Shot(look_at(at, np.asarray(target, np.float64), roll), at, **facts)
+
+
+@dataclass(frozen=True)
+class Written:
+    """A made scene's photographs and truth.
+
+    Attributes:
+        truths: cameras of each scene, and of each scene's mirror image: no model can hold more
+            than one of them.
+        depth: median distance of what they saw.
+    """
+
+    manifest: Manifest
+    truths: tuple[Reconstruction, ...]
+    depth: float
+
+
+def write(made: Made, path: Path, seed: int) -> Written:
+    """Write the database of matches and verified pairs."""
+    rng = np.random.default_rng([seed, 77])
+    seen = [_see(made, shot, rng) for shot in made.shots]
+    for index, shot in enumerate(made.shots):
+        if shot.copy_of is not None:
+            seen[index] = seen[shot.copy_of]
+    names = [f"{index:03d}.jpg" for index in range(len(made.shots))]
+    path.unlink(missing_ok=True)
+    camera_ids: dict[tuple[int, float | None], int] = {}
+    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+        for index, (shot, view) in enumerate(zip(made.shots, seen, strict=True), start=1):
+            key = (shot.camera, shot.prior)
+            if key not in camera_ids:
+                camera_ids[key] = len(camera_ids) + 1
+                _write_camera(database, camera_ids[key], shot.prior)
+            _write_image(database, index, names[index - 1], camera_ids[key], view.xy)
+        for i in range(len(seen)):
+            for j in range(i + 1, len(seen)):
+                matches = _match(made, i, j, seen, rng)
+                # Fewer can't be verified, and are what takes longest to try.
+                if len(matches) >= MIN_INLIERS:
+                    database.write_matches(i + 1, j + 1, matches.astype(np.uint32))
+    options = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
+    options.ransac.random_seed = seed
+    verifier = pycolmap.GeometricVerifierOptions(num_threads=1)
+    pycolmap.geometric_verification(path, verifier, two_view_geometry_options=options)
+    photos = tuple(
+        Photo(name=name, path=name, width=WIDTH, height=HEIGHT, digest="") for name in names
+    )
+    truths = {(shot.scene, shot.mirrored): _truth(made, names, shot) for shot in made.shots}
+    depth = float(np.median(np.concatenate([view.depth for view in seen])))
+    return Written(Manifest(scene="made", photos=photos), tuple(truths.values()), depth)
+
+
+def _truth(made: Made, names: Sequence[str], like: Shot) -> Reconstruction:
+    """The cameras that show what ``like`` shows. A photograph turned left to right is what a
+    camera sees that was mirrored together with the world, both in x."""
+    params = np.array([FOCAL, WIDTH / 2, HEIGHT / 2, made.radial])
+    mirror = np.diag([-1.0, 1.0, 1.0]) if like.mirrored else np.eye(3)
+    images = {}
+    for i, shot in enumerate(made.shots, start=1):
+        if (shot.scene, shot.mirrored) == (like.scene, like.mirrored):
+            rotation = mirror @ shot.rotation @ mirror
+            images[i] = Posed(names[i - 1], 1, rotation, -rotation @ mirror @ shot.centre)
+    return Reconstruction({1: Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, params)}, images)
+
+
+@dataclass(frozen=True)
+class _Seen:
+    """Keypoints of a photograph: (F, 2) xy and what each shows, sorted by point."""
+
+    xy: Array
+    point: Ints
+    look: Ints
+    ray: Array
+    depth: Array
+
+
+def _see(made: Made, shot: Shot, rng: np.random.Generator) -> _Seen:
+    surface = made.scenes[shot.scene]
+    local = (surface.xyz - shot.centre) @ shot.rotation.T
+    ahead = local[:, 2] > 0.1
+    flat = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
+    r2 = (flat**2).sum(1, keepdims=True)
+    # Beyond the distortion's turning point rays would come back into the picture.
+    ahead &= (r2 < 1.0)[:, 0]
+    xy = FOCAL * flat * (1 + made.radial * r2) + (WIDTH / 2, HEIGHT / 2)
+    to_camera = shot.centre - surface.xyz
+    depth = np.linalg.norm(to_camera, axis=1)
+    ray = to_camera / depth[:, None]
+    facing = (ray * surface.normal).sum(1) > np.cos(np.radians(MAX_GRAZING_DEG))
+    inside = ((xy > 2) & (xy < (WIDTH - 2, HEIGHT - 2))).all(1)
+    kept = ahead & facing & inside & (rng.uniform(size=len(xy)) < DETECTED)
+    for centre, radius in made.solid:
+        kept &= ~_hidden(surface.xyz, shot.centre, np.asarray(centre), radius)
+    index = np.flatnonzero(kept)
+    found = xy[index] + rng.normal(0, np.hypot(NOISE_PX, shot.blur), (len(index), 2))
+    if shot.mirrored:
+        found[:, 0] = WIDTH - found[:, 0]
+    return _Seen(found, index, surface.look[index], ray[index], depth[index])
+
+
+def _hidden(points: Array, eye: Array, centre: Array, radius: float) -> NDArray[np.bool_]:
+    """Whether a sphere stands between the eye and each point (the sphere's own are not hidden)."""
+    way = points - eye
+    along = np.clip(((centre - eye) * way).sum(1) / (way**2).sum(1), 0, 1)
+    nearest = eye + along[:, None] * way
+    return np.asarray(np.linalg.norm(nearest - centre, axis=1) < 0.97 * radius)
+
+
+def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generator) -> Ints:
+    a, b = seen[i], seen[j]
+    first, second = made.shots[i], made.shots[j]
+    if len(a.xy) == 0 or len(b.xy) == 0:
+        return np.zeros((0, 2), np.int64)
+    right = np.zeros((0, 2), np.int64)
+    if first.scene == second.scene and first.mirrored == second.mirrored:
+        # Of several that look the same the ratio test lets none through.
+        ua, ca = np.unique(a.look, return_counts=True)
+        ub, cb = np.unique(b.look, return_counts=True)
+        alone = np.intersect1d(ua[ca == 1], ub[cb == 1])
+        row = np.flatnonzero(np.isin(a.look, alone))
+        row = row[np.argsort(a.look[row])]
+        column = np.flatnonzero(np.isin(b.look, alone))
+        column = column[np.argsort(b.look[column])]
+        if first.copy_of is not None or second.copy_of is not None:
+            same = (first.copy_of if first.copy_of is not None else i) == (
+                second.copy_of if second.copy_of is not None else j
+            )
+        else:
+            same = False
+        likely = np.full(len(row), MATCHED)
+        if not same and len(row):
+            normal = made.scenes[first.scene].normal
+            # Each copy of a look is compared as it presents itself to its camera.
+            angle = _presented_angle(
+                a.ray[row], normal[a.point[row]], b.ray[column], normal[b.point[column]]
+            )
+            ratio = np.maximum(a.depth[row] / b.depth[column], b.depth[column] / a.depth[row])
+            likely *= np.exp(-np.log(2) * (angle / HALF_ANGLE_DEG) ** 2)
+            likely[ratio > MAX_SCALE_RATIO] = 0.0
+        kept = rng.uniform(size=len(row)) < likely
+        right = np.column_stack([row[kept], column[kept]])
+    wrong = rng.poisson(WRONG_MATCHES + WRONG_SHARE * len(right))
+    noise = np.column_stack([rng.integers(0, len(a.xy), wrong), rng.integers(0, len(b.xy), wrong)])
+    both = np.concatenate([right, noise])
+    # A keypoint is matched once; the right ones come first.
+    _, keep = np.unique(both[:, 0], return_index=True)
+    both = both[np.sort(keep)]
+    _, keep = np.unique(both[:, 1], return_index=True)
+    return np.asarray(both[np.sort(keep)])
+
+
+def _presented_angle(ray_a: Array, normal_a: Array, ray_b: Array, normal_b: Array) -> Array:
+    """Degrees between the ways in which two points present themselves: of one point, the angle
+    between its rays; of two that look the same, the difference of their slants."""
+    same = (np.abs(normal_a - normal_b) < 1e-9).all(1)
+    rays = np.degrees(np.arccos(np.clip((ray_a * ray_b).sum(1), -1, 1)))
+    slant_a, slant_b = (
+        np.degrees(np.arccos(np.clip((r * n).sum(1), -1, 1)))
+        for r, n in ((ray_a, normal_a), (ray_b, normal_b))
+    )
+    return np.asarray(np.where(same, rays, np.abs(slant_a - slant_b)))
+
+
+def _write_camera(database: pycolmap.Database, camera_id: int, prior: float | None) -> None:
+    focal = 1.2 * max(WIDTH, HEIGHT) if prior is None else prior * FOCAL
+    camera = pycolmap.Camera.create_from_model_name(
+        camera_id, "SIMPLE_RADIAL", focal, WIDTH, HEIGHT
+    )
+    camera.has_prior_focal_length = prior is not None
+    database.write_camera(camera, use_camera_id=True)
+    rig = pycolmap.Rig(rig_id=camera_id)
+    rig.add_ref_sensor(camera.sensor_id)
+    database.write_rig(rig, use_rig_id=True)
+
+
+def _write_image(
+    database: pycolmap.Database, image_id: int, name: str, camera_id: int, xy: Array
+) -> None:
+    image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+    database.write_image(image, use_image_id=True)
+    frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+    frame.add_data_id(image.data_id)
+    database.write_frame(frame, use_frame_id=True)
+    table = np.column_stack([xy, np.ones(len(xy)), np.zeros(len(xy))]).astype(np.float32)
+    database.write_keypoints(image_id, table.reshape(-1, 4))

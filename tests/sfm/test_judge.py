@@ -1,0 +1,96 @@
+"""The judge on captures made by code: nothing wrong is called good, nothing right failed."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.sfm.isolate import run_isolated
+
+# Cases that cost a second or two; all of them: python -m benchmarks.judge (docs/judge.md).
+GOOD = ("three_views", "prior_x3.0", "duplicates")
+WEAK = ("outliers_30",)
+FAILED = ("turning", "one_photo_8_times")
+# Both are bent or folded, and both register every photograph at a third of a pixel.
+SEEMING = ("tower_4_bare", "windows")
+
+
+def judged(case: str, seed: int, folder: Path) -> dict:
+    """The first attempt of a case: its truth, its verdict, what speaks against it."""
+    from benchmarks.judge.__main__ import run_made
+    from pipeline.sfm.quiet import quiet_colmap
+
+    quiet_colmap()
+    row = run_made(case, seed, "incremental", 1, folder)
+    assert row.truth is not None
+    return {
+        "truth": row.truth.grade,
+        "share": row.truth.share,
+        "verdict": row.verdict,
+        "reasons": "; ".join(row.reasons),
+        "evidence": row.evidence,
+    }
+
+
+@pytest.mark.parametrize("case", GOOD)
+def test_right_models_are_called_good(case, tmp_path):
+    row = run_isolated(judged, case, 0, tmp_path)
+    assert row["truth"] == "good" and row["verdict"] == "good", row
+
+
+@pytest.mark.parametrize("case", WEAK)
+def test_right_models_of_a_part_are_called_weak(case, tmp_path):
+    row = run_isolated(judged, case, 0, tmp_path)
+    assert row["truth"] == "good" and row["verdict"] == "weak", row
+
+
+@pytest.mark.parametrize("case", FAILED)
+def test_failures_are_called_failed(case, tmp_path):
+    row = run_isolated(judged, case, 0, tmp_path)
+    assert row["truth"] == "failed" and row["verdict"] == "failed", row
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("case", SEEMING)
+def test_models_that_register_all_and_are_wrong_are_called_failed(case, tmp_path):
+    row = run_isolated(judged, case, 0, tmp_path)
+    evidence = row["evidence"]
+    assert evidence["registered"] == evidence["total"] and evidence["reprojection_px"] < 0.6, row
+    assert row["truth"] == "failed" and row["verdict"] == "failed", row
+    assert "look alike" in row["reasons"]
+
+
+def test_the_truth_finds_the_similarity_that_most_views_share():
+    """Half of the views right and half folded by half a turn: a mean would blame all of them."""
+    from benchmarks.judge.truth import grade
+    from pipeline.scene.model import Camera, Posed, Reconstruction
+
+    rng = np.random.default_rng(0)
+    camera = Camera("SIMPLE_PINHOLE", 100, 100, np.array([90.0, 50, 50]))
+
+    def model(poses: list[tuple[np.ndarray, np.ndarray]]) -> Reconstruction:
+        images = {
+            i: Posed(f"{i}.jpg", 1, rotation, -rotation @ centre)
+            for i, (rotation, centre) in enumerate(poses, start=1)
+        }
+        return Reconstruction({1: camera}, images)
+
+    true = []
+    for angle in np.linspace(0, 2 * np.pi, 20, endpoint=False):
+        c, s = np.cos(angle), np.sin(angle)
+        rotation = np.array([[-s, c, 0], [0, 0, -1], [-c, -s, 0]])
+        true.append((rotation, np.array([3 * c, 3 * s, rng.uniform(-0.3, 0.3)])))
+    half_turn = np.diag([-1.0, -1.0, 1.0])
+    folded = [
+        (r @ half_turn, half_turn @ c) if i >= 14 else (r, c) for i, (r, c) in enumerate(true)
+    ]
+    # Another frame: a turn, a scale and a shift.
+    turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
+    moved = [(r @ turn.T, 0.2 * turn @ c + 7) for r, c in folded]
+    found = grade(model(moved), [model(true)], 20)
+    assert found.share == pytest.approx(0.7) and found.grade == "weak"
+    assert grade(model(moved[:14]), [model(true)], 20).grade == "good"
+    assert grade(model(moved[:9]), [model(true)], 20).grade == "failed"
+    assert grade(None, [model(true)], 20).grade == "failed"

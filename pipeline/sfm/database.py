@@ -42,8 +42,6 @@ KEYPOINTS_HELD = 200
 # Pairs that go into the cache together; a run that is stopped loses no more than these.
 BATCH_PAIRS = 256
 _PAIR_TABLES = ("matches", "two_view_geometries")
-# The cache may hold pairs that this run has no use for, up to so many times its own.
-CACHE_SHARE = 1
 
 
 @dataclass(frozen=True)
@@ -114,7 +112,7 @@ def build_database(
         found = _Photographs(cameras, images, features)
         wanted = [(images[i][0], images[j][0]) for i, j in pairs]
         keys = {pair: found.key(pair, settings) for pair in wanted}
-        with closing(_PairCache(store / "pairs.db")) as kept:
+        with closing(_PairCache(store)) as kept:
             missing = [pair for pair in wanted if not kept.has(keys[pair])]
             _match_missing(found, missing, keys, settings, kept, Path(folder), threads)
             path.unlink(missing_ok=True)
@@ -207,10 +205,11 @@ class _Photographs:
 
     def key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
         """Names the pair's result by all that it depends on: 63 bits, as SQLite's keys have."""
-        facts = [ALGORITHM_VERSION, MAX_TRIALS, asdict(settings)]
+        facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, asdict(settings)]
         for image_id in pair:
-            camera = self.camera(image_id)
-            facts += [self._digest[image_id], camera.todict() | {"camera_id": 0}]
+            c = self.camera(image_id)
+            facts += [self._digest[image_id], c.model_name, c.width, c.height]
+            facts += [c.params.tolist(), c.has_prior_focal_length]
         digest = hashlib.sha256(repr(facts).encode()).digest()
         return int.from_bytes(digest[:8], "big") >> 1
 
@@ -285,18 +284,22 @@ def _match_pair(
 class _PairCache:
     """Results of pairs by their keys, as COLMAP's rows with the key in the place of the pair."""
 
-    def __init__(self, path: Path):
+    def __init__(self, folder: Path):
+        # COLMAP's tables may change with its version.
+        path = folder / f"pairs-{pycolmap.__version__}.db"
+        for file in folder.glob("pairs-*.db"):
+            if file != path:
+                file.unlink()
         try:
             self._open(path)
         except sqlite3.DatabaseError:
-            # Damaged, or of another version: it holds nothing that cannot be made again.
+            # Damaged: it holds nothing that cannot be made again.
             self._connection.close()
             path.unlink()
             self._open(path)
 
     def _open(self, path: Path) -> None:
         self._connection = sqlite3.connect(path)
-        self._connection.execute("PRAGMA synchronous = OFF")
         if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             pycolmap.Database.open(path).close()
         self._columns = {
@@ -323,9 +326,9 @@ class _PairCache:
         self._copy(path, [(key, pair_id) for pair_id, key in _by_pair_id(keys)], "main", "other")
 
     def prune(self, used: set[int]) -> None:
-        """Drop what was not used, once there is more of that than is worth its place."""
+        """Drop what this run did not use, once that is more than what it did."""
         others = self._keys - used
-        if len(others) > CACHE_SHARE * len(used):
+        if len(others) > len(used):
             for table in _PAIR_TABLES:
                 self._connection.executemany(
                     f"DELETE FROM {table} WHERE pair_id = ?", [(key,) for key in others]

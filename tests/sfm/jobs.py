@@ -26,10 +26,11 @@ def match(
     pairs: str = "exhaustive",
     sfm: schema.Sfm | None = None,
     threads: int = 2,
+    min_inliers: int = 15,
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import match_features
 
-    config = schema.Matches.model_validate({"pairs": pairs})
+    config = schema.Matches.model_validate({"pairs": pairs, "min_inliers": min_inliers})
     report = match_features(
         manifest,
         features,

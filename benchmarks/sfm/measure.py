@@ -98,7 +98,7 @@ def run_once(scene: Scene, configuration: Configuration | None, threads: int) ->
         costs, failure = {}, ""
         for step, (function, arguments) in zip(STEPS, calls, strict=True):
             try:
-                costs[step] = run_isolated(_measured, function, arguments)
+                costs[step] = run_isolated(measured, function, arguments)
             except UserError as refusal:
                 failure = refusal.what
                 break
@@ -155,7 +155,8 @@ def _error(run: Run) -> PoseError:
 # --- the steps, each in a process of its own ------------------------------------------------
 
 
-def _measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
+def measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
+    """Run ``step`` in this process, which does nothing else, and say what it cost."""
     # Libraries load once, whatever the number of photographs. cv2 comes first (see isolate).
     if step is our_features:
         import pipeline.sfm.sift

@@ -1,4 +1,7 @@
-"""Exact matching of descriptors: the Python face of csrc/nearest.cpp."""
+"""Exact matching of descriptors: the Python face of csrc/nearest.cpp.
+
+``python -m pipeline.sfm.nearest`` compiles it beforehand; otherwise its first use does.
+"""
 
 from __future__ import annotations
 
@@ -90,3 +93,7 @@ def _library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(LIBRARY.build()))
     library.nearest.restype = None
     return library
+
+
+if __name__ == "__main__":
+    print(LIBRARY.build())

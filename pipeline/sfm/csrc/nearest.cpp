@@ -83,7 +83,8 @@ int32_t norm(const uint8_t* d) {
 }  // namespace
 
 // a (n, 128), b (m, 128). Of each row: the nearest one's index in the other (the lowest of equals;
-// -1 where there is none), its squared distance, and the second nearest's (FAR where there is none).
+// -1 where there is none), its squared distance, and the second nearest's (FAR where there is
+// none).
 extern "C" void nearest(const uint8_t* a, int32_t n, const uint8_t* b, int32_t m, int32_t* a_index,
                         int32_t* a_first, int32_t* a_second, int32_t* b_index, int32_t* b_first,
                         int32_t* b_second) {
@@ -134,8 +135,8 @@ extern "C" void nearest(const uint8_t* a, int32_t n, const uint8_t* b, int32_t m
                     std::memcpy(&some, &spread[size_t(row + r) * SIZE + k * STEP], sizeof some);
 #pragma GCC unroll 16
                     for (int c = 0; c < COLUMNS; ++c)
-                        sum[r][c] = add_products(
-                            sum[r][c], some, panel + (size_t(c) * STEPS + k) * LANES * STEP);
+                        sum[r][c] = add_products(sum[r][c], some,
+                                                 panel + (size_t(c) * STEPS + k) * LANES * STEP);
                 }
 #pragma GCC unroll 16
             for (int r = 0; r < ROWS; ++r)

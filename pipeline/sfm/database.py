@@ -343,7 +343,8 @@ class _PairCache:
         """Copy the rows of (id in the source, id in the target), in order of the target's."""
         run = self._connection.execute
         run("ATTACH DATABASE ? AS other", (str(path),))
-        run("CREATE TEMP TABLE renamed (old INTEGER PRIMARY KEY, new INTEGER)")
+        # Copies of a photograph share their keys: neither column is unique.
+        run("CREATE TEMP TABLE renamed (old INTEGER, new INTEGER)")
         self._connection.executemany("INSERT INTO renamed VALUES (?, ?)", ids)
         for table in _PAIR_TABLES:
             columns = ", ".join(self._columns[table])

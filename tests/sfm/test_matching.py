@@ -116,6 +116,17 @@ def test_one_more_photograph_matches_its_own_pairs_alone(room, tmp_path):
     assert jobs.digests(tmp_path / "matches") == jobs.digests(tmp_path / "afresh" / "matches")
 
 
+def test_copies_of_a_photograph_share_their_results(room, tmp_path):
+    folder, photos = room
+    for name in ("a copy.png", "view 99.png"):
+        shutil.copy(photos[1].path, tmp_path / name)
+    copies = [corner.photo(tmp_path / name) for name in ("a copy.png", "view 99.png")]
+    manifest = corner.manifest([*photos[:2], *copies])
+    extract_features(manifest, FEATURES, tmp_path / "f", cache=folder / "cache", threads=1)
+    report = run_isolated(jobs.match, manifest, tmp_path / "f", tmp_path / "matches")
+    assert report["num_pairs"] == report["num_verified"] == 6
+
+
 def pairs_kept(cache: Path) -> int:
     (file,) = cache.glob("pairs-*.db")
     connection = sqlite3.connect(file)

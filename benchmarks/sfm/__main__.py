@@ -8,15 +8,17 @@ import os
 import platform
 import sys
 from collections.abc import Sequence
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 
 from benchmarks.sfm.measure import STEPS, Run, Summary, as_data, run_once, summarise
 from benchmarks.sfm.plot import pareto_svg
 from benchmarks.sfm.scenes import REFERENCE, configurations, load_scene
-from pipeline.reporting.charts import Dot
+from pipeline.reporting.charts import Dot, pareto_front
 from pipeline.runtime.atomic import write_json, write_text
 from pipeline.runtime.errors import UserError
+
+_OTHER = 2  # colour of what is neither the plan's choice nor the reference
 
 
 def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -77,17 +79,29 @@ def table(summaries: Sequence[Summary]) -> str:
 
 
 def plot(summaries: Sequence[Summary]) -> str:
-    """Time against centre error, one chart a scene, with the Pareto front."""
+    """Time against centre error, one chart a scene, with the Pareto front. Named are the dots on
+    it, the plan's choices and pycolmap's defaults; all have tooltips."""
     charts = {}
     for scene in dict.fromkeys(s.scene for s in summaries):
+        shown = [s for s in summaries if s.scene == scene and s.centre_permille]
         dots = [
-            Dot(s.total_s, s.centre_permille, s.configuration, _tip(s), colour=_colour(s))
-            for s in summaries
-            if s.scene == scene and s.centre_permille
+            Dot(s.total_s, s.centre_permille or 0.0, _label(s), _tip(s), colour=_colour(s))
+            for s in shown
+        ]
+        front = pareto_front(dots)
+        dots = [
+            dot if dot in front or _colour(s) != _OTHER else replace(dot, name="")
+            for dot, s in zip(dots, shown, strict=True)
         ]
         if dots:
-            charts[f"{scene}: centre error, thousandths of the cameras' radius"] = dots
+            charts[f"{scene}: centre error, permille of the radius"] = dots
     return pareto_svg(charts)
+
+
+def _label(s: Summary) -> str:
+    """Short enough to stand beside a dot."""
+    preset, _, rest = s.configuration.partition("/")
+    return " ".join([preset, *(part[:3] for part in rest.split("/") if part)])
 
 
 def _tip(s: Summary) -> str:
@@ -96,7 +110,7 @@ def _tip(s: Summary) -> str:
 
 def _colour(s: Summary) -> int:
     """The page's accent for what the plan chooses, another for pycolmap's defaults."""
-    return 0 if s.planned else 3 if s.configuration == REFERENCE else 2
+    return 0 if s.planned else 3 if s.configuration == REFERENCE else _OTHER
 
 
 def _cell(value: float | None, form: str) -> str:

@@ -46,7 +46,10 @@ def test_the_table_compares_with_pycolmap_and_the_plot_shows_both():
     assert len({line.count("|") for line in lines}) == 1
     assert "| 6.0 | 0.20 | 0.1000 |" in lines[-1]
     drawn = plot(rows)
-    assert drawn.count("<circle") == 2 and "fast/global/retrieval" in drawn
+    assert drawn.count("<circle") == 2 and ">fast glo ret</text>" in drawn
+    worse = replace(rows[0], configuration="high/global/retrieval", planned=False)
+    drawn = plot([*rows, worse])
+    assert drawn.count("<circle") == 3 and ">high glo ret</text>" not in drawn
 
 
 @pytest.fixture(scope="module")

@@ -60,9 +60,9 @@ def match_features(
     sharing: schema.Sfm,
     out: Path,
     *,
-    cache: Path,
-    threads: int,
     seed: int,
+    cache: Path | None = None,
+    threads: int = 1,
 ) -> MatchReport:
     """Write ``out/database.db`` (COLMAP's: cameras with their priors, images with ids from 1 in
     order of names, keypoints, matches, verified geometries) and ``out/keypoint_colors.npz``
@@ -72,7 +72,7 @@ def match_features(
         features: the folder ``extract_features`` wrote.
         config: ``pairs`` is settled, not "auto".
         sharing: its camera model and sharing.
-        cache: folder for pairs' results; it may outlive this scene's results.
+        cache: folder for pairs' results that outlives the call.
 
     Raises:
         UserError: no pair of photographs could be verified.

@@ -33,6 +33,7 @@ $(VENV)/installed: pyproject.toml
 
 setup: $(VENV)/installed
 	@$(BIN)/python -m pipeline.raster.build
+	@$(BIN)/python -m pipeline.sfm.nearest
 
 data/demo/demo.json: | setup
 	@$(BIN)/python -m pipeline.demo data/demo
@@ -50,11 +51,11 @@ lint: $(VENV)/installed
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/snakefmt --check Snakefile
-	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/raster/csrc/*')
+	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
 
 format: $(VENV)/installed
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile
-	@$(BIN)/clang-format -i $$(git ls-files 'pipeline/raster/csrc/*')
+	@$(BIN)/clang-format -i $$(git ls-files 'pipeline/*/csrc/*')
 
 docs: $(VENV)/installed
 	@$(BIN)/python -m pipeline.config.docs

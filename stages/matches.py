@@ -15,9 +15,13 @@ def run(job: Job) -> None:
         job.section(Matches),
         job.section(Sfm),
         job.out,
+        cache=job.shared_cache,
+        threads=job.threads,
         seed=job.seed,
     )
     job.record(report)
+    # How the run went, not what came of it.
+    job.timings["num_cached"] = job.counters.pop("num_cached")
 
 
 if __name__ == "__main__":

@@ -14,6 +14,9 @@ ROOT = Path(__file__).resolve().parents[2]
 # options themselves stand in the stage's key.
 NEUTRAL = ("pipeline.runtime", "pipeline.config")
 
+# Modules whose C++ is compiled where it runs, and its folder.
+NATIVE = {"pipeline.raster": "pipeline/raster/csrc", "pipeline.sfm.nearest": "pipeline/sfm/csrc"}
+
 _COMMENT = re.compile(r'//[^\n]*|/\*.*?\*/|("(?:\\.|[^"\\])*")', re.S)
 
 
@@ -80,8 +83,8 @@ def _module_hash(module: str) -> str:
     digest = hashlib.sha256()
     if tree is not None:
         digest.update(ast.dump(_without_docstrings(tree)).encode())
-    if module == "pipeline.raster":
-        for file in sorted((ROOT / "pipeline/raster/csrc").glob("*")):
+    if module in NATIVE:
+        for file in sorted((ROOT / NATIVE[module]).glob("*")):
             if file.suffix in (".cpp", ".h"):
                 text = _COMMENT.sub(lambda m: m.group(1) or " ", file.read_text())
                 digest.update(f"{file.name}={' '.join(text.split())}\n".encode())

@@ -2,28 +2,46 @@
 
 from __future__ import annotations
 
+import hashlib
 import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import closing
+from dataclasses import asdict, dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 import pycolmap
+from numpy.typing import NDArray
 
 from pipeline.config import schema
+from pipeline.runtime.job import file_digest
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
+from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pairs import Pair
 
 # COLMAP's guess where there is no prior: a 45 degree view, about.
 DEFAULT_FOCAL_FACTOR = 1.2
 
-# Pairs matched between two lines of progress; each batch reads its descriptors anew.
-BATCH_PAIRS = 200
+# Part of a pair's key in the cache: raise it whenever the same two photographs would match
+# differently.
+ALGORITHM_VERSION = 1
+
+# Two-view geometries are drawn from random samples. At most so many: enough for a fundamental
+# matrix where 40% of the matches are right, and pairs that share nothing cost a fifth of COLMAP's.
+MAX_TRIALS = 2000
+
+# Photographs whose keypoints are held at a time, some 700 KB each.
+KEYPOINTS_HELD = 200
+# Pairs that go into the cache together; a run that is stopped loses no more than these.
+BATCH_PAIRS = 256
+_PAIR_TABLES = ("matches", "two_view_geometries")
 
 
 @dataclass(frozen=True)
@@ -69,24 +87,39 @@ def build_database(
     features: Path,
     pairs: Sequence[Pair],
     settings: MatchingSettings,
-) -> None:
+    *,
+    cache: Path | None = None,
+    threads: int = 1,
+) -> int:
     """Write a database of matched and verified pairs to ``path``.
 
-    The file's bytes depend on the arguments alone: what pycolmap's threads wrote in the order
-    they finished is copied into a fresh file in order of its keys.
+    The file's bytes depend neither on ``threads`` nor on what the cache holds: each pair is
+    computed by itself, and all go into the file in their order.
 
     Args:
         images: (image id, name, camera id) in order of their ids.
         features: folder of keypoint files.
-        pairs: indices into ``images``.
+        pairs: indices into ``images``, the smaller one first.
+        cache: folder for pairs' results that outlives the call.
+
+    Returns:
+        How many pairs the cache had.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="matching-", dir=path.parent) as folder:
-        work = Path(folder) / "work.db"
-        _write_images(work, cameras, images, features)
-        _match(work, [(images[i][0], images[j][0]) for i, j in pairs], settings)
-        path.unlink(missing_ok=True)
-        _copy_sorted(work, path, {image_id: name for image_id, name, _ in images})
+        store = Path(folder) if cache is None else cache
+        store.mkdir(parents=True, exist_ok=True)
+        found = _Photographs(cameras, images, features)
+        wanted = [(images[i][0], images[j][0]) for i, j in pairs]
+        keys = {pair: found.key(pair, settings) for pair in wanted}
+        with closing(_PairCache(store)) as kept:
+            missing = [pair for pair in wanted if not kept.has(keys[pair])]
+            _match_missing(found, missing, keys, settings, kept, Path(folder), threads)
+            path.unlink(missing_ok=True)
+            found.write(path)
+            kept.copy_to(path, keys)
+            kept.prune(set(keys.values()))
+    return len(wanted) - len(missing)
 
 
 def verified_inliers(path: Path) -> dict[tuple[str, str], int]:
@@ -145,75 +178,185 @@ def share_cameras_by_size(source: Path, target: Path) -> bool:
     return True
 
 
-def _write_images(
-    path: Path,
-    cameras: Sequence[pycolmap.Camera],
-    images: Sequence[tuple[int, str, int]],
-    features: Path,
+class _Photographs:
+    """What matching needs to know of each photograph; keypoints are read as they are needed."""
+
+    def __init__(
+        self,
+        cameras: Sequence[pycolmap.Camera],
+        images: Sequence[tuple[int, str, int]],
+        features: Path,
+    ):
+        self._cameras, self._images = cameras, images
+        self._camera = {camera.camera_id: camera for camera in cameras}
+        self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
+        self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
+        self._digest = {image_id: file_digest(file) for image_id, file in self._file.items()}
+        # Two for each thread are in use at a time; the rest spares reading.
+        self.keypoints = lru_cache(maxsize=KEYPOINTS_HELD)(self._read)
+
+    def camera(self, image_id: int) -> pycolmap.Camera:
+        return self._camera[self._camera_of[image_id]]
+
+    def _read(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
+        """(F, 2) places and (F, 128) descriptors."""
+        found = Keypoints.read(self._file[image_id])
+        return found.xy.astype(np.float64), found.descriptors
+
+    def key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
+        """Names the pair's result by all that it depends on: 63 bits, as SQLite's keys have."""
+        facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, asdict(settings)]
+        for image_id in pair:
+            c = self.camera(image_id)
+            facts += [self._digest[image_id], c.model_name, c.width, c.height]
+            facts += [c.params.tolist(), c.has_prior_focal_length]
+        digest = hashlib.sha256(repr(facts).encode()).digest()
+        return int.from_bytes(digest[:8], "big") >> 1
+
+    def write(self, path: Path) -> None:
+        """A database of the cameras, images and keypoints."""
+        with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+            for camera in self._cameras:
+                database.write_camera(camera, use_camera_id=True)
+                rig = pycolmap.Rig(rig_id=camera.camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            for image_id, name, camera_id in self._images:
+                image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+                database.write_image(image, use_image_id=True)
+                frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame, use_frame_id=True)
+                found = Keypoints.read(self._file[image_id])
+                table = np.column_stack([found.xy, found.scale, found.orientation])
+                database.write_keypoints(image_id, table.astype(np.float32).reshape(-1, 4))
+
+
+def _match_missing(
+    found: _Photographs,
+    missing: Sequence[tuple[int, int]],
+    keys: Mapping[tuple[int, int], int],
+    settings: MatchingSettings,
+    kept: _PairCache,
+    folder: Path,
+    threads: int,
 ) -> None:
-    """Images are named by their ids: pycolmap's pair lists cannot say a name with a space."""
-    with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-        for camera in cameras:
-            database.write_camera(camera, use_camera_id=True)
-            rig = pycolmap.Rig(rig_id=camera.camera_id)
-            rig.add_ref_sensor(camera.sensor_id)
-            database.write_rig(rig, use_rig_id=True)
-        for image_id, name, camera_id in images:
-            image = pycolmap.Image(name=str(image_id), camera_id=camera_id, image_id=image_id)
-            database.write_image(image, use_image_id=True)
-            frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
-            frame.add_data_id(image.data_id)
-            database.write_frame(frame, use_frame_id=True)
-            found = Keypoints.read(keypoint_file(features, name))
-            table = np.column_stack([found.xy, found.scale, found.orientation])
-            database.write_keypoints(image_id, table.astype(np.float32).reshape(-1, 4))
-            database.write_descriptors(
-                image_id,
-                pycolmap.FeatureDescriptors(
-                    pycolmap.FeatureExtractorType.SIFT, found.descriptors.reshape(-1, 128)
-                ),
+    """Match and verify those pairs, and keep what comes of them."""
+    if not missing:
+        return
+    progress = Progress("matching", len(missing), "pairs")
+    # Threads suffice: matching and pycolmap's verification both let go of the interpreter.
+    with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+        for start in range(0, len(missing), BATCH_PAIRS):
+            batch = missing[start : start + BATCH_PAIRS]
+            path = folder / "batch.db"
+            path.unlink(missing_ok=True)
+            with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+                results = pool.map(lambda pair: _match_pair(found, pair, settings), batch)
+                for (first, second), (matches, geometry) in zip(batch, results, strict=True):
+                    database.write_matches(first, second, matches)
+                    database.write_two_view_geometry(first, second, geometry)
+                    progress.advance()
+            kept.take(path, {pair: keys[pair] for pair in batch})
+
+
+def _match_pair(
+    found: _Photographs, pair: tuple[int, int], settings: MatchingSettings
+) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
+    """(M, 2) matches, and the geometry that verifies some of them, empty where none does."""
+    (xy_a, descriptors_a), (xy_b, descriptors_b) = (found.keypoints(i) for i in pair)
+    matches = match_descriptors(descriptors_a, descriptors_b, settings.max_ratio)
+    if len(matches) < settings.min_inliers:
+        return matches, pycolmap.TwoViewGeometry()
+    options = pycolmap.TwoViewGeometryOptions(min_num_inliers=settings.min_inliers)
+    options.ransac.random_seed = settings.seed
+    options.ransac.max_num_trials = MAX_TRIALS
+    # A geometry with fewer inliers is dropped anyway, so none with a smaller share is looked for.
+    options.ransac.min_inlier_ratio = settings.min_inliers / len(matches)
+    geometry = pycolmap.estimate_two_view_geometry(
+        found.camera(pair[0]), xy_a, found.camera(pair[1]), xy_b, matches, options
+    )
+    if len(geometry.inlier_matches) < settings.min_inliers:
+        return matches, pycolmap.TwoViewGeometry()
+    return matches, geometry
+
+
+class _PairCache:
+    """Results of pairs by their keys, as COLMAP's rows with the key in the place of the pair."""
+
+    def __init__(self, folder: Path):
+        # COLMAP's tables may change with its version.
+        path = folder / f"pairs-{pycolmap.__version__}.db"
+        for file in folder.glob("pairs-*.db"):
+            if file != path:
+                file.unlink()
+        try:
+            self._open(path)
+        except sqlite3.DatabaseError:
+            # Damaged: it holds nothing that cannot be made again.
+            self._connection.close()
+            path.unlink()
+            self._open(path)
+
+    def _open(self, path: Path) -> None:
+        self._connection = sqlite3.connect(path)
+        if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
+            pycolmap.Database.open(path).close()
+        self._columns = {
+            table: [
+                row[1]
+                for row in self._connection.execute(f"PRAGMA table_info({table})")
+                if row[1] != "pair_id"
+            ]
+            for table in _PAIR_TABLES
+        }
+        rows = self._connection.execute("SELECT pair_id FROM two_view_geometries")
+        self._keys = {key for (key,) in rows}
+
+    def has(self, key: int) -> bool:
+        return key in self._keys
+
+    def take(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
+        """Keep the pairs of the database at ``path`` (image ids -> key)."""
+        self._copy(path, [(pair_id, key) for pair_id, key in _by_pair_id(keys)], "other", "main")
+        self._keys |= set(keys.values())
+
+    def copy_to(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
+        """Add pairs to the database at ``path``, in their order (image ids -> key)."""
+        self._copy(path, [(key, pair_id) for pair_id, key in _by_pair_id(keys)], "main", "other")
+
+    def prune(self, used: set[int]) -> None:
+        """Drop what this run did not use, once that is more than what it did."""
+        others = self._keys - used
+        if len(others) > len(used):
+            for table in _PAIR_TABLES:
+                self._connection.executemany(
+                    f"DELETE FROM {table} WHERE pair_id = ?", [(key,) for key in others]
+                )
+            self._connection.commit()
+            self._connection.execute("VACUUM")
+
+    def close(self) -> None:
+        self._connection.close()
+
+    def _copy(self, path: Path, ids: list[tuple[int, int]], source: str, target: str) -> None:
+        """Copy the rows of (id in the source, id in the target), in order of the target's."""
+        run = self._connection.execute
+        run("ATTACH DATABASE ? AS other", (str(path),))
+        # Copies of a photograph share their keys: neither column is unique.
+        run("CREATE TEMP TABLE renamed (old INTEGER, new INTEGER)")
+        self._connection.executemany("INSERT INTO renamed VALUES (?, ?)", ids)
+        for table in _PAIR_TABLES:
+            columns = ", ".join(self._columns[table])
+            run(
+                f"INSERT OR REPLACE INTO {target}.{table} (pair_id, {columns}) "
+                f"SELECT new, {columns} FROM renamed JOIN {source}.{table} ON pair_id = old "
+                "ORDER BY new"
             )
+        run("DROP TABLE renamed")
+        self._connection.commit()
+        run("DETACH DATABASE other")
 
 
-def _match(path: Path, pairs: Sequence[tuple[int, int]], settings: MatchingSettings) -> None:
-    # Not more: with two threads pycolmap 4.2 loses the matches of some pairs once in many runs.
-    matching = pycolmap.FeatureMatchingOptions(num_threads=1, use_gpu=False)
-    matching.sift.max_ratio = settings.max_ratio
-    verification = pycolmap.TwoViewGeometryOptions(min_num_inliers=settings.min_inliers)
-    verification.ransac.random_seed = settings.seed
-    progress = Progress("matching", len(pairs), "pairs")
-    pairing = pycolmap.ImportedPairingOptions(match_list_path=path.with_name("pairs.txt"))
-    for start in range(0, len(pairs), BATCH_PAIRS):
-        batch = pairs[start : start + BATCH_PAIRS]
-        lines = "".join(f"{first} {second}\n" for first, second in batch)
-        path.with_name("pairs.txt").write_text(lines)
-        pycolmap.match_image_pairs(path, matching, pairing, verification, pycolmap.Device.cpu)
-        progress.advance(len(batch))
-
-
-def _copy_sorted(source: Path, target: Path, names: dict[int, str]) -> None:
-    """Copy all tables but the descriptors, each in order of its first columns, and give the
-    images their names."""
-    pycolmap.Database.open(target).close()
-    connection = sqlite3.connect(target)
-    try:
-        connection.execute("ATTACH DATABASE ? AS work", (str(source),))
-        tables = connection.execute(
-            "SELECT name FROM main.sqlite_master WHERE type = 'table' "
-            "AND name NOT LIKE 'sqlite%' AND name != 'descriptors' ORDER BY name"
-        ).fetchall()
-        for (table,) in tables:
-            columns = connection.execute(f"PRAGMA main.table_info({table})").fetchall()
-            keys = ", ".join(str(i + 1) for i in range(min(2, len(columns))))
-            connection.execute(
-                f"INSERT INTO main.{table} SELECT * FROM work.{table} ORDER BY {keys}"
-            )
-        connection.executemany(
-            "UPDATE main.images SET name = ? WHERE image_id = ?",
-            [(name, image_id) for image_id, name in names.items()],
-        )
-        connection.commit()
-        connection.execute("DETACH DATABASE work")
-        connection.execute("VACUUM")
-    finally:
-        connection.close()
+def _by_pair_id(keys: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:
+    return sorted((pycolmap.image_pair_to_pair_id(*pair), key) for pair, key in keys.items())

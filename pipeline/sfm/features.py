@@ -47,7 +47,8 @@ def extract_features(
     The bits do not depend on ``threads``, nor on what the cache holds.
 
     Args:
-        cache: folder that may outlive this scene's results; filled, never emptied.
+        cache: folder that may outlive this scene's results. What this call did not use is dropped
+            from it once that is more than what it did.
 
     Raises:
         UserError: a photograph or mask cannot be read, or changed since it was inspected.
@@ -75,6 +76,7 @@ def extract_features(
         # A copy: damage to a stage's output must not reach the cache.
         shutil.copyfile(source, target)
         counts[photo.name] = len(Keypoints.read(target))
+    _prune(cache, {f"{key}.npz" for key in keys.values()})
     num_cached = len(manifest.photos) - len(absent)
     median = int(np.median(list(counts.values()))) if counts else 0
     return FeatureReport(
@@ -100,6 +102,13 @@ def _cache_key(photo: Photo, config: schema.Features) -> str:
         "version": ALGORITHM_VERSION,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
+
+
+def _prune(cache: Path, used: set[str]) -> None:
+    others = [file for file in cache.glob("*.npz") if file.name not in used]
+    if len(others) > len(used):
+        for file in others:
+            file.unlink()
 
 
 def _digest(path: Path) -> str | None:

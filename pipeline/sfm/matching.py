@@ -38,6 +38,7 @@ class MatchReport:
     components: sizes of the sets of photographs that verified pairs hold together, largest first.
     isolated: names of the photographs outside the largest set.
     num_cameras: cameras shared out among the photographs.
+    num_cached: pairs whose result was found in the cache.
     decisions, warnings: for people.
     """
 
@@ -47,6 +48,7 @@ class MatchReport:
     components: list[int]
     isolated: list[str]
     num_cameras: int
+    num_cached: int
     decisions: list[str]
     warnings: list[str]
 
@@ -59,15 +61,18 @@ def match_features(
     out: Path,
     *,
     seed: int,
+    cache: Path | None = None,
+    threads: int = 1,
 ) -> MatchReport:
     """Write ``out/database.db`` (COLMAP's: cameras with their priors, images with ids from 1 in
     order of names, keypoints, matches, verified geometries) and ``out/keypoint_colors.npz``
-    (image id -> (F, 3) uint8).
+    (image id -> (F, 3) uint8). The bits depend neither on ``threads`` nor on the cache.
 
     Args:
         features: the folder ``extract_features`` wrote.
         config: ``pairs`` is settled, not "auto".
         sharing: its camera model and sharing.
+        cache: folder for pairs' results that outlives the call.
 
     Raises:
         UserError: no pair of photographs could be verified.
@@ -81,7 +86,9 @@ def match_features(
     pairs, decision = resolve_pairs(manifest, features, config)
     settings = MatchingSettings(config.max_ratio, config.min_inliers, seed)
     database = out / "database.db"
-    build_database(database, cameras, images, features, pairs, settings)
+    num_cached = build_database(
+        database, cameras, images, features, pairs, settings, cache=cache, threads=threads
+    )
     _write_colors(out / "keypoint_colors.npz", features, names)
 
     verified = verified_inliers(database)
@@ -108,6 +115,7 @@ def match_features(
         components=components,
         isolated=isolated,
         num_cameras=len(cameras),
+        num_cached=num_cached,
         decisions=[
             decision,
             f"{len(verified)} of {len(pairs)} pairs verified, {median} matches in the median one",

@@ -47,7 +47,7 @@ def environment(project: Path) -> dict[str, str]:
     return os.environ | {
         "PYTHONPATH": str(project),
         # The compiled extension of the project under test: same sources, same key.
-        "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "raster")),
+        "SPLATMAKE_CACHE": os.environ.get("SPLATMAKE_CACHE", str(ROOT / "build" / "native")),
         "NO_COLOR": "1",
         # LPIPS weights of this machine would change what is expected.
         "TORCH_HOME": str(ROOT / "build" / "no-weights"),

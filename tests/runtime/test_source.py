@@ -67,6 +67,16 @@ def test_kernels_count_without_their_comments(project):
     assert hash_of("work") == hash_of("work")
 
 
+def test_the_matchers_sources_count_for_what_matches(project):
+    root, hash_of = project
+    (root / "pipeline/sfm/csrc").mkdir(parents=True)
+    (root / "pipeline/sfm/nearest.py").write_text("")
+    (root / "stages/match.py").write_text("import pipeline.sfm.nearest\n")
+    before = hash_of("match"), hash_of("draw")
+    (root / "pipeline/sfm/csrc/kernel.cpp").write_text("int f() { return 3; }\n")
+    assert hash_of("match") != before[0] and hash_of("draw") == before[1]
+
+
 def test_the_viewer_counts_for_what_makes_pages(project):
     root, hash_of = project
     viewer = root / "pipeline/reporting/viewer/viewer.min.js"

@@ -25,11 +25,22 @@ def match(
     out: Path,
     pairs: str = "exhaustive",
     sfm: schema.Sfm | None = None,
+    threads: int = 2,
+    min_inliers: int = 15,
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import match_features
 
-    config = schema.Matches.model_validate({"pairs": pairs})
-    report = match_features(manifest, features, config, sfm or schema.Sfm(), out, seed=0)
+    config = schema.Matches.model_validate({"pairs": pairs, "min_inliers": min_inliers})
+    report = match_features(
+        manifest,
+        features,
+        config,
+        sfm or schema.Sfm(),
+        out,
+        cache=out.with_name("cache"),
+        threads=threads,
+        seed=0,
+    )
     return asdict(report)
 
 
@@ -44,7 +55,7 @@ def reconstruct(
 def match_and_reconstruct(
     manifest: Manifest, features: Path, out: Path, config: schema.Sfm, threads: int = 2
 ) -> tuple[dict[str, Any], dict[str, Any]]:
-    matched = match(manifest, features, out / "matches", sfm=config)
+    matched = match(manifest, features, out / "matches", sfm=config, threads=threads)
     database = out / "matches" / "database.db"
     return matched, reconstruct(manifest, database, config, out / "sfm", threads)
 

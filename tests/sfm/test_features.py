@@ -149,6 +149,13 @@ def test_what_changes_the_keypoints_misses_the_cache(tmp_path, pixels):
     assert extract(tmp_path, [photo])[1].num_cached == 0
 
 
+def test_the_cache_keeps_two_settings_and_does_not_grow_for_ever(tmp_path, pixels):
+    photo = saved(tmp_path, "a.png", pixels)
+    for limit, cached, kept in ((400, 0, 1), (300, 0, 2), (400, 1, 2), (200, 0, 1)):
+        _, report = extract(tmp_path, [photo], schema.Features(max_features=limit))
+        assert (report.num_cached, len(list((tmp_path / "cache").iterdir()))) == (cached, kept)
+
+
 def test_bytes_do_not_depend_on_threads_or_cache(tmp_path):
     photos, _ = corner.write_scene(tmp_path / "photos", 3)
     for threads in (1, 2):

@@ -1,0 +1,252 @@
+"""One run of one configuration, in processes of its own, and what comes of several."""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import sys
+import tempfile
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from benchmarks.sfm.scenes import REFERENCE, Configuration, Scene
+from pipeline.config.schema import Config
+from pipeline.metrics.pose import PoseError, pose_error
+from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import read_model
+from pipeline.scene.manifest import Manifest
+from pipeline.sfm.isolate import run_isolated
+
+STEPS = ("features", "matches", "mapping")
+
+
+@dataclass(frozen=True)
+class Cost:
+    """CPU seconds of a step without the imports, and the most memory it held, MiB."""
+
+    cpu_s: float
+    peak_mb: float
+
+
+@dataclass(frozen=True)
+class Run:
+    """Attributes:
+    costs: of each step.
+    registered: photographs with a pose.
+    error: against the scene's poses; None where there is no model.
+    failure: why not.
+    """
+
+    scene: str
+    configuration: str
+    planned: bool
+    costs: dict[str, Cost]
+    registered: int
+    error: PoseError | None
+    failure: str = ""
+
+    @property
+    def cpu_s(self) -> float:
+        return sum(cost.cpu_s for cost in self.costs.values())
+
+
+@dataclass(frozen=True)
+class Summary:
+    """Medians over the runs of a configuration on a scene that gave a model.
+
+    Attributes:
+        cpu_s: of each step; ``total_s`` their sum.
+        rotation_deg, centre, centre_permille, auc1: median errors over the images in degrees,
+            the world's unit and thousandths of the cameras' radius; area under the curve of
+            relative pose errors up to one degree. None without any model.
+        runs, failed: how many, and how many of them without a model.
+    """
+
+    scene: str
+    configuration: str
+    planned: bool
+    cpu_s: dict[str, float]
+    total_s: float
+    peak_mb: float
+    registered: int
+    rotation_deg: float | None
+    centre: float | None
+    centre_permille: float | None
+    auc1: float | None
+    runs: int
+    failed: int
+
+
+def run_once(scene: Scene, configuration: Configuration | None, threads: int) -> Run:
+    """One run from photographs to poses; None for pycolmap's defaults."""
+    with tempfile.TemporaryDirectory(prefix="benchmark-sfm-") as name:
+        folder = Path(name)
+        if configuration is None:
+            title, planned = REFERENCE, False
+            calls: list[tuple[Callable[..., None], tuple[Any, ...]]] = [
+                (step, (scene.manifest, folder, threads))
+                for step in (reference_features, reference_matches, reference_mapping)
+            ]
+        else:
+            title, planned = configuration.name, configuration.planned
+            calls = [
+                (step, (scene.manifest, configuration.config, folder, threads))
+                for step in (our_features, our_matches, our_mapping)
+            ]
+        costs, failure = {}, ""
+        for step, (function, arguments) in zip(STEPS, calls, strict=True):
+            try:
+                costs[step] = run_isolated(measured, function, arguments)
+            except UserError as refusal:
+                failure = refusal.what
+                break
+        model = folder / "sparse" / "0"
+        if failure or not model.is_dir():
+            return Run(scene.name, title, planned, costs, 0, None, failure or "no model")
+        error = pose_error(read_model(model), scene.truth)
+        registered = len(read_model(model).images)
+        return Run(scene.name, title, planned, costs, registered, error)
+
+
+def summarise(runs: Sequence[Run]) -> Summary:
+    """Of runs of one configuration on one scene; at least one."""
+    done = [run for run in runs if run.error is not None]
+    timed = done or list(runs)
+
+    def middle(of: Callable[[PoseError], float | None]) -> float | None:
+        values = [value for run in done if (value := of(_error(run))) is not None]
+        return statistics.median(values) if values else None
+
+    steps = {
+        step: statistics.median(run.costs[step].cpu_s for run in timed if step in run.costs)
+        for step in STEPS
+        if any(step in run.costs for run in timed)
+    }
+    relative = middle(lambda error: error.centre_relative_median)
+    return Summary(
+        scene=runs[0].scene,
+        configuration=runs[0].configuration,
+        planned=runs[0].planned,
+        cpu_s=steps,
+        total_s=statistics.median(run.cpu_s for run in timed),
+        peak_mb=max((c.peak_mb for run in runs for c in run.costs.values()), default=0.0),
+        registered=int(statistics.median(run.registered for run in timed)),
+        rotation_deg=middle(lambda error: error.rotation_median_deg),
+        centre=middle(lambda error: error.centre_median),
+        centre_permille=None if relative is None else 1000 * relative,
+        auc1=middle(lambda error: None if error.auc is None else error.auc[1.0]),
+        runs=len(runs),
+        failed=len(runs) - len(done),
+    )
+
+
+def as_data(run: Run) -> dict[str, Any]:
+    """The run as JSON holds it."""
+    return asdict(run) | {"cpu_s": run.cpu_s}
+
+
+def _error(run: Run) -> PoseError:
+    assert run.error is not None
+    return run.error
+
+
+# --- the steps, each in a process of its own ------------------------------------------------
+
+
+def measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
+    """Run ``step`` in this process, which does nothing else, and say what it cost."""
+    # Libraries load once, whatever the number of photographs. cv2 comes first (see isolate).
+    if step is our_features:
+        import pipeline.sfm.sift
+    else:
+        import pipeline.sfm.mapping
+
+        pipeline.sfm.mapping.quiet_colmap()
+    before = _used()
+    step(*arguments)
+    after = _used()
+    unit = 2**20 if sys.platform == "darwin" else 2**10
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    peak = max(resource.getrusage(kind).ru_maxrss for kind in kinds) / unit
+    return Cost(after - before, peak)
+
+
+def _used() -> float:
+    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
+    return sum(u.ru_utime + u.ru_stime for u in map(resource.getrusage, kinds))
+
+
+def our_features(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
+    """What stages/features.py calls."""
+    from pipeline.sfm.features import extract_features
+
+    extract_features(
+        manifest, config.features, folder / "features", cache=folder / "cache", threads=threads
+    )
+
+
+def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
+    """What stages/matches.py calls."""
+    from pipeline.sfm.matching import match_features
+
+    match_features(
+        manifest,
+        folder / "features",
+        config.matches,
+        config.sfm,
+        folder / "matches",
+        cache=folder / "cache",
+        threads=threads,
+        seed=config.seed,
+    )
+
+
+def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
+    """What stages/sfm.py calls."""
+    from pipeline.sfm.mapping import reconstruct
+
+    database = folder / "matches" / "database.db"
+    reconstruct(manifest, database, config.sfm, folder, threads=threads, seed=config.seed)
+
+
+def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:
+    """pycolmap's defaults but for the threads, and for one camera where our scan finds one."""
+    import pycolmap
+
+    photo = manifest.photos[0]
+    kinds = {(p.camera_group, p.width, p.height) for p in manifest.photos}
+    pycolmap.extract_features(
+        folder / "database.db",
+        photo.path.removesuffix(photo.name),
+        image_names=[p.name for p in manifest.photos],
+        camera_mode=pycolmap.CameraMode.SINGLE if len(kinds) == 1 else pycolmap.CameraMode.AUTO,
+        extraction_options=pycolmap.FeatureExtractionOptions(num_threads=threads, use_gpu=False),
+        device=pycolmap.Device.cpu,
+    )
+
+
+def reference_matches(manifest: Manifest, folder: Path, threads: int) -> None:
+    """Exhaustive, verified."""
+    import pycolmap
+
+    options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
+    pycolmap.match_exhaustive(
+        folder / "database.db", matching_options=options, device=pycolmap.Device.cpu
+    )
+
+
+def reference_mapping(manifest: Manifest, folder: Path, threads: int) -> None:
+    """Incremental; the model with the most images is written."""
+    import pycolmap
+
+    photo = manifest.photos[0]
+    options = pycolmap.IncrementalPipelineOptions(num_threads=threads)
+    models = pycolmap.incremental_mapping(
+        folder / "database.db", photo.path.removesuffix(photo.name), folder / "models", options
+    )
+    if models:
+        target = folder / "sparse" / "0"
+        target.mkdir(parents=True)
+        max(models.values(), key=lambda m: m.num_reg_images()).write_binary(target)

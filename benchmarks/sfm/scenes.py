@@ -1,0 +1,108 @@
+"""What is measured: scenes with known poses, and the configurations that the plan can choose."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from fnmatch import fnmatchcase
+from itertools import product
+from pathlib import Path
+
+from pipeline.config.load import scene_config
+from pipeline.config.presets import PRESETS
+from pipeline.config.schema import Config
+from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import read_model
+from pipeline.scene.given import load_given
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction
+from pipeline.scene.names import NameIndex
+from pipeline.scene.plan import make_plan
+from pipeline.scene.scan import Scan, scan
+from pipeline.scene.verify import verify_photos
+
+REFERENCE = "pycolmap"
+MAPPERS = ("incremental", "global")
+PAIRS = ("exhaustive", "sequential", "spatial", "retrieval")
+
+
+@dataclass(frozen=True)
+class Scene:
+    """Photographs and their true poses.
+
+    Attributes:
+        scan: of the photographs to be used, as if no poses were given.
+        truth: poses of these photographs alone.
+        truth_kind: "truth" from ``sparse_gt``, or "given poses", themselves a reconstruction.
+    """
+
+    name: str
+    scan: Scan
+    truth: Reconstruction
+    truth_kind: str
+
+    @property
+    def manifest(self) -> Manifest:
+        return self.scan.manifest
+
+
+@dataclass(frozen=True)
+class Configuration:
+    """``name`` is preset/mapper/pairs. ``planned``: the plan's own choice for the scene."""
+
+    name: str
+    config: Config
+    planned: bool
+
+
+def load_scene(folder: Path, every: int = 1) -> Scene:
+    """The scene in ``folder``, with one in ``every`` photographs in order of their names.
+
+    Raises:
+        UserError: the folder brings no poses to measure against.
+    """
+    name = folder.resolve().name
+    found = scan(folder, name, Config(poses="ignore"), cache=None)
+    if found.truth is not None:
+        truth, kind = read_model(found.truth), "truth"
+    else:
+        given = scan(folder, name, Config(), cache=None)
+        if given.poses is None:
+            raise UserError(
+                "has no poses to measure against",
+                file=folder,
+                fix="bring them as sparse_gt/, sparse/0 or transforms.json",
+            )
+        truth, kind = load_given(given), "given poses"
+    manifest, _ = verify_photos(found.manifest, threads=1, min_photos=2)
+    photos = sorted(manifest.photos, key=lambda photo: photo.name)[::every]
+    manifest = manifest.model_copy(update={"photos": tuple(photos)})
+    used = NameIndex({photo.name: photo for photo in photos})
+    images = {i: v for i, v in truth.images.items() if used.find(v.name) is not None}
+    scanned = found.model_copy(update={"manifest": manifest})
+    return Scene(name, scanned, replace(truth, images=images), kind)
+
+
+def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]:
+    """Those whose names match one of the ``patterns`` (``*`` stands for anything), "plan" meaning
+    what the plan chooses under each preset."""
+    possible = [
+        pairs
+        for pairs in PAIRS
+        if not (pairs == "sequential" and scene.scan.ordered is None)
+        and not (pairs == "spatial" and scene.scan.num_gps < len(scene.manifest.photos))
+    ]
+    found = []
+    for preset in PRESETS:
+        chosen = _settled(scene, preset, "auto", "auto")
+        for mapper, pairs in product(MAPPERS, possible):
+            planned = (chosen.sfm.mapper, chosen.matches.pairs) == (mapper, pairs)
+            name = f"{preset}/{mapper}/{pairs}"
+            if any(fnmatchcase(name, p) or (p == "plan" and planned) for p in patterns):
+                found.append(Configuration(name, _settled(scene, preset, mapper, pairs), planned))
+    return found
+
+
+def _settled(scene: Scene, preset: str, mapper: str, pairs: str) -> Config:
+    raw = {"preset": preset, "matches": {"pairs": pairs}, "sfm": {"mapper": mapper}}
+    return make_plan(scene.scan, scene_config({**raw, "poses": "ignore"}, scene.name)).config

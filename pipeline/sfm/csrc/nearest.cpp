@@ -1,0 +1,176 @@
+// For each descriptor of one photograph the nearest and second nearest of another, and the other
+// way round, exactly: squared distances of bytes are whole numbers. One pass over all pairs gives
+// both directions.
+//
+// |a - b|^2 = |a|^2 + |b|^2 - 2 a.b. The products a.b take nearly all of the time. B is packed so
+// that one vector holds 4 bytes (VNNI) or 2 (elsewhere) of 16 descriptors, and A's bytes are
+// spread over the lanes: a lane is a descriptor of B, and no sum goes across lanes. ROWS x COLUMNS
+// vectors of sums stay in registers.
+
+#include <algorithm>
+#include <cstdint>
+#include <cstring>
+#include <type_traits>
+#include <vector>
+#if defined(__SSE2__)
+#include <immintrin.h>
+#endif
+
+namespace {
+
+constexpr int SIZE = 128;
+// No two descriptors are this far apart (128 * 255^2 = 8.3M).
+constexpr int32_t FAR = 1 << 28;
+// The norm of what fills up the last block: however much a product takes off, it stays beyond FAR.
+constexpr int32_t FILLER = 1 << 29;
+
+// LANES is a vector register's; ROWS * COLUMNS sums leave some of the registers to the operands.
+#if defined(__AVX512VNNI__)
+// Unsigned bytes of A times signed bytes of B, which are therefore stored as b - 128.
+constexpr int LANES = 16, STEP = 4, OFFSET = 128, ROWS = 4, COLUMNS = 4;
+typedef int8_t Packed;
+#elif defined(__AVX512BW__)
+constexpr int LANES = 16, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 4;
+typedef int16_t Packed;
+#elif defined(__AVX2__)
+constexpr int LANES = 8, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 2;
+typedef int16_t Packed;
+#else
+constexpr int LANES = 4, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 2;
+typedef int16_t Packed;
+#endif
+typedef int32_t Ints __attribute__((vector_size(4 * LANES)));
+
+// Of each lane the sum plus the products of STEP elements.
+inline Ints add_products(Ints sum, int32_t a, const Packed* b) {
+#if defined(__AVX512VNNI__)
+    return (Ints)_mm512_dpbusd_epi32((__m512i)sum, _mm512_set1_epi32(a), _mm512_loadu_si512(b));
+#elif defined(__AVX512BW__)
+    return sum + (Ints)_mm512_madd_epi16(_mm512_set1_epi32(a), _mm512_loadu_si512(b));
+#elif defined(__AVX2__)
+    const __m256i some = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(b));
+    return sum + (Ints)_mm256_madd_epi16(_mm256_set1_epi32(a), some);
+#elif defined(__SSE2__)
+    const __m128i some = _mm_loadu_si128(reinterpret_cast<const __m128i*>(b));
+    return sum + (Ints)_mm_madd_epi16(_mm_set1_epi32(a), some);
+#else
+    const int16_t low = int16_t(a & 0xffff), high = int16_t(a >> 16);
+    for (int l = 0; l < LANES; ++l) sum[l] += low * b[2 * l] + high * b[2 * l + 1];
+    return sum;
+#endif
+}
+
+// Element type of A as it is spread: STEP of them make 32 bits.
+typedef std::conditional_t<STEP == 4, uint8_t, int16_t> Spread;
+
+struct Best {
+    Ints first, second, index;
+    void take(Ints distance, Ints at) {
+        const Ints nearer = distance < first;
+        const Ints loser = nearer ? first : distance;
+        second = loser < second ? loser : second;
+        index = nearer ? at : index;
+        first = nearer ? distance : first;
+    }
+};
+
+int32_t norm(const uint8_t* d) {
+    int32_t sum = 0;
+    for (int k = 0; k < SIZE; ++k) sum += int32_t(d[k]) * d[k];
+    return sum;
+}
+
+}  // namespace
+
+// a (n, 128), b (m, 128). Of each row: the nearest one's index in the other (the lowest of equals;
+// -1 where there is none), its squared distance, and the second nearest's (FAR where there is
+// none).
+extern "C" void nearest(const uint8_t* a, int32_t n, const uint8_t* b, int32_t m, int32_t* a_index,
+                        int32_t* a_first, int32_t* a_second, int32_t* b_index, int32_t* b_first,
+                        int32_t* b_second) {
+    const int groups = (m + LANES - 1) / LANES;
+    const int blocks = (groups + COLUMNS - 1) / COLUMNS;
+    const int rows = (n + ROWS - 1) / ROWS * ROWS;
+    constexpr int STEPS = SIZE / STEP;
+
+    std::vector<Packed> packed(size_t(blocks) * COLUMNS * LANES * SIZE);
+    std::vector<int32_t> b_norm(size_t(blocks) * COLUMNS * LANES, FILLER);
+    for (int j = 0; j < m; ++j) {
+        Packed* group = &packed[size_t(j / LANES) * LANES * SIZE];
+        for (int k = 0; k < SIZE; ++k)
+            group[(k / STEP * LANES + j % LANES) * STEP + k % STEP] =
+                Packed(int(b[size_t(j) * SIZE + k]) - OFFSET);
+        b_norm[j] = norm(b + size_t(j) * SIZE);
+    }
+    std::vector<Spread> spread(size_t(rows) * SIZE);
+    std::vector<int32_t> a_norm(rows, FILLER);
+    for (int i = 0; i < n; ++i) {
+        int32_t sum = 0;
+        for (int k = 0; k < SIZE; ++k) {
+            spread[size_t(i) * SIZE + k] = a[size_t(i) * SIZE + k];
+            sum += a[size_t(i) * SIZE + k];
+        }
+        // -2 a.b = -2 a.(b - OFFSET) - 2 OFFSET |a|_1.
+        a_norm[i] = norm(a + size_t(i) * SIZE) - 2 * OFFSET * sum;
+    }
+
+    const Ints far = Ints{} + FAR, none = Ints{} - 1;
+    Ints lane;
+    for (int l = 0; l < LANES; ++l) lane[l] = l;
+    std::vector<Best> of_a(rows, Best{far, far, none});
+    for (int block = 0; block < blocks; ++block) {
+        Best of_b[COLUMNS];
+        Ints norms[COLUMNS];
+        for (int c = 0; c < COLUMNS; ++c) {
+            of_b[c] = {far, far, none};
+            std::memcpy(&norms[c], &b_norm[(block * COLUMNS + c) * LANES], sizeof norms[c]);
+        }
+        const Packed* panel = &packed[size_t(block) * COLUMNS * LANES * SIZE];
+        for (int row = 0; row < rows; row += ROWS) {
+            Ints sum[ROWS][COLUMNS] = {};
+            for (int k = 0; k < STEPS; ++k)
+#pragma GCC unroll 16
+                for (int r = 0; r < ROWS; ++r) {
+                    int32_t some;
+                    std::memcpy(&some, &spread[size_t(row + r) * SIZE + k * STEP], sizeof some);
+#pragma GCC unroll 16
+                    for (int c = 0; c < COLUMNS; ++c)
+                        sum[r][c] = add_products(sum[r][c], some,
+                                                 panel + (size_t(c) * STEPS + k) * LANES * STEP);
+                }
+#pragma GCC unroll 16
+            for (int r = 0; r < ROWS; ++r)
+#pragma GCC unroll 16
+                for (int c = 0; c < COLUMNS; ++c) {
+                    const Ints distance = a_norm[row + r] + norms[c] - 2 * sum[r][c];
+                    of_a[row + r].take(distance, (block * COLUMNS + c) * LANES + lane);
+                    of_b[c].take(distance, Ints{} + (row + r));
+                }
+        }
+        for (int c = 0; c < COLUMNS; ++c)
+            for (int l = 0; l < LANES; ++l) {
+                const int j = (block * COLUMNS + c) * LANES + l;
+                if (j >= m) break;
+                b_index[j] = of_b[c].index[l];
+                b_first[j] = of_b[c].first[l];
+                b_second[j] = of_b[c].second[l];
+            }
+    }
+    for (int i = 0; i < n; ++i) {
+        int32_t first = FAR, second = FAR, index = -1;
+        for (int l = 0; l < LANES; ++l) {
+            const int32_t d = of_a[i].first[l], at = of_a[i].index[l];
+            if (d < first || (d == first && at >= 0 && at < index)) {
+                second = std::min(second, first);
+                first = d;
+                index = at;
+            } else {
+                second = std::min(second, d);
+            }
+            second = std::min(second, of_a[i].second[l]);
+        }
+        a_index[i] = index;
+        a_first[i] = first;
+        a_second[i] = second;
+    }
+}

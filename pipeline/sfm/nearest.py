@@ -1,0 +1,99 @@
+"""Exact matching of descriptors: the Python face of csrc/nearest.cpp.
+
+``python -m pipeline.sfm.nearest`` compiles it beforehand; otherwise its first use does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.runtime.native import NativeLibrary
+
+LIBRARY = NativeLibrary(
+    name="matcher",
+    file="libmatcher.so",
+    sources=Path(__file__).parent / "csrc",
+    # -march=native: the vector width of this machine.
+    flags=("-std=c++17", "-O3", "-march=native", "-fPIC", "-Wall", "-Wno-psabi"),
+)
+SIZE = 128
+# COLMAP's: descriptors (unit vectors times 512) more than 0.7 radians apart are no match.
+MAX_DISTANCE = 2 * 512**2 * (1 - float(np.cos(0.7)))
+
+
+@dataclass(frozen=True)
+class Neighbours:
+    """Of each descriptor of one photograph among those of another.
+
+    Attributes:
+        index: (F,) int32, the nearest, the lowest index of equals; -1 where there is none.
+        first, second: (F,) int32, squared distances of the two nearest; 2^28 where there is none.
+    """
+
+    index: NDArray[np.int32]
+    first: NDArray[np.int32]
+    second: NDArray[np.int32]
+
+
+def nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Neighbours, Neighbours]:
+    """The two nearest of ``b`` to each of ``a``, and the other way round.
+
+    Whole numbers throughout: the same on every machine. Other Python threads run meanwhile.
+
+    Args:
+        a, b: (F, 128) and (G, 128) uint8.
+
+    Raises:
+        UserError: it is not compiled yet and cannot be.
+    """
+    tables = [np.ascontiguousarray(table, np.uint8) for table in (a, b)]
+    if any(table.ndim != 2 or table.shape[1] != SIZE for table in tables):
+        raise ValueError(f"expected (F, {SIZE}) and (G, {SIZE}), found {a.shape} and {b.shape}")
+    found = [Neighbours(*(np.empty(len(t), np.int32) for _ in range(3))) for t in tables]
+    results = [array for n in found for array in (n.index, n.first, n.second)]
+    arguments: list[object] = []
+    for table in tables:
+        arguments += [table.ctypes.data_as(ctypes.c_void_p), ctypes.c_int32(len(table))]
+    arguments += [array.ctypes.data_as(ctypes.c_void_p) for array in results]
+    _library().nearest(*arguments)
+    return found[0], found[1]
+
+
+def match_descriptors(
+    a: NDArray[np.uint8], b: NDArray[np.uint8], max_ratio: float
+) -> NDArray[np.uint32]:
+    """(M, 2) indices into ``a`` and ``b``, by the first: mutual nearest neighbours that pass
+    Lowe's ratio test both ways, as COLMAP asks for.
+
+    Args:
+        a, b: (F, 128), (G, 128) uint8, unit vectors times 512.
+        max_ratio: of the distances to the nearest and to the second nearest.
+    """
+    of_a, of_b = nearest(a, b)
+    if len(a) == 0 or len(b) == 0:
+        return np.zeros((0, 2), np.uint32)
+    index = of_a.index
+    limit = max_ratio**2
+    keep = of_b.index[index] == np.arange(len(a))
+    keep &= of_a.first < limit * of_a.second
+    keep &= of_b.first[index] < limit * of_b.second[index]
+    keep &= of_a.first <= MAX_DISTANCE
+    rows = np.flatnonzero(keep)
+    return np.column_stack([rows, index[rows]]).astype(np.uint32)
+
+
+@cache
+def _library() -> ctypes.CDLL:
+    library = ctypes.CDLL(str(LIBRARY.build()))
+    library.nearest.restype = None
+    return library
+
+
+if __name__ == "__main__":
+    print(LIBRARY.build())

@@ -1,0 +1,97 @@
+"""benchmarks.sfm: what it chooses, how it sums up, and that it runs."""
+
+from __future__ import annotations
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+
+from benchmarks.sfm.__main__ import main, plot, table
+from benchmarks.sfm.measure import Cost, Run, summarise
+from benchmarks.sfm.scenes import configurations, load_scene
+from pipeline.demo.write import DemoSpec, write_demo
+from pipeline.metrics.pose import PoseError
+from pipeline.runtime.errors import UserError
+
+ERROR = PoseError(0.1, 0.1, 0.02, 0.02, 0.004, 5.0, 1.0, {1.0: 0.9, 5.0: 1.0, 10.0: 1.0}, 8, 8)
+
+
+def run(cpu: float, rotation: float | None, name: str = "fast/global/retrieval") -> Run:
+    costs = {step: Cost(cpu, 100 + cpu) for step in ("features", "matches", "mapping")}
+    error = None if rotation is None else replace(ERROR, rotation_median_deg=rotation)
+    return Run("s", name, True, costs, 8 if error else 0, error, "" if error else "no model")
+
+
+def test_a_summary_is_the_median_of_runs_with_a_model():
+    summary = summarise([run(1, 0.3), run(9, None), run(3, 0.1), run(2, 0.2)])
+    assert (summary.total_s, summary.cpu_s["matches"]) == (6, 2)
+    assert summary.rotation_deg == 0.2 and summary.centre_permille == pytest.approx(4)
+    assert (summary.runs, summary.failed, summary.registered) == (4, 1, 8)
+    assert summary.peak_mb == 109
+
+
+def test_runs_without_any_model_have_times_and_no_errors():
+    summary = summarise([run(4, None)])
+    assert summary.total_s == 12 and summary.rotation_deg is None and summary.failed == 1
+    line = table([summary]).splitlines()[-1]
+    assert "1 of 1 runs failed" in line and "| - |" in line
+    assert plot([summary]).startswith("<svg")
+
+
+def test_the_table_compares_with_pycolmap_and_the_plot_shows_both():
+    rows = [summarise([run(10, 0.5, "pycolmap")]), summarise([run(2, 0.1)])]
+    lines = table(rows).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert "| 6.0 | 0.20 | 0.1000 |" in lines[-1]
+    drawn = plot(rows)
+    assert drawn.count("<circle") == 2 and ">fast glo ret</text>" in drawn
+    worse = replace(rows[0], configuration="high/global/retrieval", planned=False)
+    drawn = plot([*rows, worse])
+    assert drawn.count("<circle") == 3 and ">high glo ret</text>" not in drawn
+
+
+@pytest.fixture(scope="module")
+def demo(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("scenes") / "demo"
+    write_demo(folder, DemoSpec(views=6, width=320, height=240), None)
+    return folder
+
+
+def test_patterns_choose_what_the_plan_can(demo):
+    scene = load_scene(demo)
+    assert len(scene.manifest.photos) == len(scene.truth.images) == 6
+    names = {c.name: c.planned for c in configurations(scene, ["balanced/*", "plan"])}
+    # No GPS; the plan's choice under the other presets comes on top.
+    assert not any("spatial" in name for name in names)
+    assert {n for n, planned in names.items() if planned} == {
+        f"{preset}/incremental/exhaustive" for preset in ("fast", "balanced", "high")
+    }
+    assert {n.split("/")[1] for n in names} == {"incremental", "global"}
+    fast = configurations(scene, ["fast/*/exhaustive"])
+    assert {c.config.features.max_features for c in fast} == {3000}
+
+
+def test_every_takes_photographs_and_truth_together(demo):
+    scene = load_scene(demo, every=3)
+    assert len(scene.manifest.photos) == len(scene.truth.images) == 2
+
+
+def test_a_folder_without_poses_is_refused(demo, tmp_path):
+    (tmp_path / "images").symlink_to(demo / "images")
+    with pytest.raises(UserError, match="no poses to measure against"):
+        load_scene(tmp_path)
+
+
+def test_it_measures_ours_and_pycolmaps(demo, tmp_path, capsys):
+    arguments = [str(demo), "--configs", "pycolmap", "fast/incremental/exhaustive"]
+    main([*arguments, "--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg")])
+    found = json.loads((tmp_path / "a.json").read_text())
+    reference, ours = found["summaries"]
+    assert (reference["configuration"], reference["planned"]) == ("pycolmap", False)
+    assert ours["planned"] and ours["registered"] == reference["registered"] == 6
+    assert ours["rotation_deg"] < 0.3 and ours["centre_permille"] < 20
+    assert all(cost["cpu_s"] > 0 for run in found["runs"] for cost in run["costs"].values())
+    assert re.search(r"\| demo \| \*\*fast/incremental/exhaustive\*\* \|", capsys.readouterr().out)
+    assert "<circle" in (tmp_path / "a.svg").read_text()

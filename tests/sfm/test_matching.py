@@ -1,0 +1,194 @@
+"""Matching: exact on any processor, kept pair by pair, the same bytes whatever was kept."""
+
+from __future__ import annotations
+
+import ctypes
+import json
+import platform
+import shutil
+import sqlite3
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import example, given, settings
+from hypothesis import strategies as st
+
+from pipeline.config import schema
+from pipeline.runtime.native import compiler
+from pipeline.scene.plan import make_plan
+from pipeline.scene.scan import scan
+from pipeline.sfm import nearest as near
+from pipeline.sfm.features import extract_features
+from pipeline.sfm.isolate import run_isolated
+from stages.wiring import ROLES, stage_key
+from tests.sfm import corner, jobs
+
+FEATURES = schema.Features(max_features=500)
+
+
+def plainly(a: np.ndarray, b: np.ndarray) -> near.Neighbours:
+    far = 1 << 28
+    whole = np.full((len(a), len(b) + 2), far, np.int64)
+    whole[:, : len(b)] = ((a[:, None].astype(np.int64) - b[None]) ** 2).sum(-1)
+    index = whole.argmin(1) if len(a) else np.zeros(0, int)
+    ordered = np.sort(whole, axis=1)
+    return near.Neighbours(np.where(index < len(b), index, -1), ordered[:, 0], ordered[:, 1])
+
+
+def same(one: near.Neighbours, two: near.Neighbours) -> None:
+    for name in ("index", "first", "second"):
+        np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
+
+
+def wild(seed: int, count: int, kind: str) -> np.ndarray:
+    rng = np.random.default_rng(seed)
+    values = {"bytes": 256, "extremes": 2, "alike": 2}[kind]
+    table = rng.integers(0, values, (count, 128))
+    if kind == "alike":  # a few kinds of descriptors only: ties everywhere
+        table = table[rng.integers(0, min(3, count), count)] if count else table
+    return (table * (255 if kind == "extremes" else 1)).astype(np.uint8)
+
+
+@settings(max_examples=60, derandomize=True, deadline=None)
+@given(
+    counts=st.tuples(st.integers(0, 90), st.integers(0, 90)),
+    kind=st.sampled_from(["bytes", "extremes", "alike"]),
+    seed=st.integers(0, 99),
+)
+@example(counts=(1, 1), kind="extremes", seed=0)
+@example(counts=(64, 64), kind="bytes", seed=0)
+def test_the_two_nearest_are_the_two_nearest(counts, kind, seed):
+    a, b = wild(seed, counts[0], kind), wild(seed + 1, counts[1], kind)
+    of_a, of_b = near.nearest(a, b)
+    same(of_a, plainly(a, b))
+    same(of_b, plainly(b, a))
+
+
+@pytest.mark.slow
+def test_other_instruction_sets_find_the_same(tmp_path, monkeypatch):
+    flags = {"x86_64": ["-march=native -mno-avx512vnni", "-march=haswell", "-march=x86-64"]}
+    a, b = wild(1, 301, "bytes"), wild(2, 277, "extremes")
+    expected = near.nearest(a, b)
+    for index, march in enumerate(flags.get(platform.machine(), ["-O1"])):
+        library = tmp_path / f"{index}.so"
+        source = near.LIBRARY.sources / "nearest.cpp"
+        options = [*near.LIBRARY.flags, *march.split(), "-Werror", "-shared"]
+        subprocess.run([*compiler(), *options, str(source), "-o", str(library)], check=True)
+        monkeypatch.setattr(near, "_library", lambda path=library: ctypes.CDLL(str(path)))
+        for one, two in zip(near.nearest(a, b), expected, strict=True):
+            same(one, two)
+
+
+def test_matches_are_mutual_distinct_and_near():
+    rng = np.random.default_rng(0)
+    a = rng.integers(30, 60, (6, 128)).astype(np.uint8)
+    b = a[[3, 0, 1, 2, 4]].copy()
+    b[4] = np.clip(rng.integers(0, 90, 128), 0, 255)  # the fifth looks like nothing
+    b = np.vstack([b, b[1], np.zeros((1, 128), np.uint8)])  # the first has a twin in b
+    found = near.match_descriptors(a, b, 0.8)
+    assert found.dtype == np.uint32 and found.tolist() == [[1, 2], [2, 3], [3, 0]]
+    assert near.match_descriptors(a[:0], b, 0.8).shape == (0, 2)
+
+
+@pytest.fixture(scope="module")
+def room(tmp_path_factory):
+    """Folder, seven photographs of a room's corner, and their features."""
+    folder = tmp_path_factory.mktemp("room")
+    photos, _ = corner.write_scene(folder / "photos", 7, camera_group="a")
+    manifest = corner.manifest(photos)
+    extract_features(manifest, FEATURES, folder / "features", cache=folder / "cache", threads=2)
+    return folder, photos
+
+
+def test_one_more_photograph_matches_its_own_pairs_alone(room, tmp_path):
+    folder, photos = room
+    # The new one stands in the middle: ids of the others move.
+    fewer = corner.manifest([p for p in photos if p.name != photos[3].name])
+    first = run_isolated(jobs.match, fewer, folder / "features", tmp_path / "matches", threads=1)
+    whole = corner.manifest(photos)
+    second = run_isolated(jobs.match, whole, folder / "features", tmp_path / "matches")
+    assert (first["num_pairs"], first["num_cached"]) == (15, 0)
+    assert (second["num_pairs"], second["num_cached"]) == (21, 15)
+    run_isolated(jobs.match, whole, folder / "features", tmp_path / "afresh" / "matches")
+    assert jobs.digests(tmp_path / "matches") == jobs.digests(tmp_path / "afresh" / "matches")
+
+
+def test_copies_of_a_photograph_share_their_results(room, tmp_path):
+    folder, photos = room
+    for name in ("a copy.png", "view 99.png"):
+        shutil.copy(photos[1].path, tmp_path / name)
+    copies = [corner.photo(tmp_path / name) for name in ("a copy.png", "view 99.png")]
+    manifest = corner.manifest([*photos[:2], *copies])
+    extract_features(manifest, FEATURES, tmp_path / "f", cache=folder / "cache", threads=1)
+    report = run_isolated(jobs.match, manifest, tmp_path / "f", tmp_path / "matches")
+    assert report["num_pairs"] == report["num_verified"] == 6
+
+
+def pairs_kept(cache: Path) -> int:
+    (file,) = cache.glob("pairs-*.db")
+    connection = sqlite3.connect(file)
+    try:
+        return connection.execute("SELECT count(*) FROM two_view_geometries").fetchone()[0]
+    finally:
+        connection.close()
+
+
+def test_the_cache_knows_other_settings_and_does_not_grow_for_ever(room, tmp_path):
+    folder, photos = room
+    for inliers, cached, kept in ((15, 0, 3), (16, 0, 6), (15, 3, 6), (17, 0, 3)):
+        report = run_isolated(
+            jobs.match,
+            corner.manifest(photos[:3]),
+            folder / "features",
+            tmp_path / "matches",
+            min_inliers=inliers,
+        )
+        assert (report["num_cached"], pairs_kept(tmp_path / "cache")) == (cached, kept), inliers
+
+
+def test_a_damaged_cache_is_made_again(room, tmp_path):
+    folder, photos = room
+    manifest = corner.manifest(photos[:3])
+    run_isolated(jobs.match, manifest, folder / "features", tmp_path / "matches")
+    (file,) = (tmp_path / "cache").glob("pairs-*.db")
+    file.write_bytes(b"not a database" * 1000)
+    before = jobs.digests(tmp_path / "matches")
+    report = run_isolated(jobs.match, manifest, folder / "features", tmp_path / "matches")
+    assert report["num_cached"] == 0 and jobs.digests(tmp_path / "matches") == before
+
+
+def run_stages(scene: Path, results: Path) -> dict[str, dict]:
+    """run.json of the stages up to matches, run as Snakemake runs them."""
+    config = schema.Config(features=FEATURES)
+    found = scan(scene, "corner", config, cache=None)
+    plan = make_plan(found, config)
+    for stage in ("inspect", "features", "matches"):
+        inputs = {
+            role: next(name for name in fillers if plan.runs(name))
+            for role, fillers in ROLES[stage].items()
+        }
+        command = [sys.executable, "-m", f"stages.{stage}", "--out", str(results / stage)]
+        command += ["--key", stage_key(stage, plan, str(scene), found.fingerprint)]
+        command += ["--threads", "2"]
+        command += ["--input", *(f"{role}={results / name}" for role, name in inputs.items())]
+        subprocess.run(command, check=True, capture_output=True, cwd=Path(__file__).parents[2])
+    stages = ("features", "matches")
+    return {name: json.loads((results / name / "run.json").read_text()) for name in stages}
+
+
+def test_the_stages_record_that_one_photograph_was_added(room, tmp_path):
+    _, photos = room
+    scene, results = tmp_path / "scene", tmp_path / "results" / "corner"
+    (scene / "images").mkdir(parents=True)
+    for photo in photos[:5]:
+        shutil.copy(photo.path, scene / "images")
+    first = run_stages(scene, results)
+    assert first["features"]["num_cached"] == first["matches"]["num_cached"] == 0
+    shutil.copy(photos[5].path, scene / "images")
+    second = run_stages(scene, results)
+    # Six photographs and 15 pairs now: one is extracted, its five pairs are matched.
+    assert second["features"]["num_cached"] == 5
+    assert second["matches"]["num_cached"] == 10

@@ -130,7 +130,7 @@ class TileSorter {
 void Binner::Part::make_room(int64_t spans_more) {
     if (used + spans_more <= capacity) return;
     capacity = 2 * capacity + spans_more;
-    std::unique_ptr<Span[]> grown(new Span[capacity]);
+    Scratch<Span> grown(capacity);
     std::memcpy(grown.get(), spans.get(), used * sizeof(Span));
     spans = std::move(grown);
 }
@@ -139,7 +139,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                   int threads) {
     threads_ = threads;
     tiles_ = view.tiles();
-    touched_.reset(new uint32_t[count]);
+    touched_ = Scratch<uint32_t>(count);
     const int64_t tiles_x = view.tiles_x(), tiles_y = view.tiles_y();
     const int parts = threads * kPartsPerThread;
     parts_ = std::vector<Part>(parts);
@@ -150,7 +150,8 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
         part.begin = count * number / parts;
         part.end = count * (number + 1) / parts;
         part.tile_count.assign(tiles_, 0);
-        part.spans.reset(new Span[part.capacity = 2 * (part.end - part.begin) + tiles_]);
+        part.capacity = 2 * (part.end - part.begin) + tiles_;
+        part.spans = Scratch<Span>(part.capacity);
         std::vector<Window> windows;
         alignas(64) uint32_t hit[kWindows][16];
         // Step by step for many windows, because a Gaussian's numbers of windows and tiles are
@@ -209,7 +210,7 @@ void Binner::write(const Record* records, Entry* entries, int64_t* tile_begin, S
         }
     }
     tile_begin[tiles_] = total;
-    const std::unique_ptr<uint32_t[]> depths(new uint32_t[intersections_]);
+    const Scratch<uint32_t> depths(intersections_);
     const int parts = int(parts_.size());
     std::vector<uint32_t> first(parts, 0);
     for (int number = 1; number < parts; number++)

@@ -1,9 +1,9 @@
 // Stage 2: which Gaussians touch which tile, front to back.
 #pragma once
 
-#include <memory>
 #include <vector>
 
+#include "memory.h"
 #include "types.h"
 
 namespace splat {
@@ -32,7 +32,7 @@ class Binner {
     // A run of the Gaussians.
     struct Part {
         int64_t begin, end;
-        std::unique_ptr<Span[]> spans;  // not a vector, which would write zeros first
+        Scratch<Span> spans;
         int64_t used = 0, capacity = 0;
         std::vector<uint32_t> tile_count;
 
@@ -41,7 +41,7 @@ class Binner {
 
     int threads_ = 1;
     int64_t tiles_ = 0, intersections_ = 0;
-    std::unique_ptr<uint32_t[]> touched_;  // tiles, by Gaussian
+    Scratch<uint32_t> touched_;  // tiles, by Gaussian
     std::vector<Part> parts_;
 };
 

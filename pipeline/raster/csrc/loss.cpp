@@ -11,9 +11,9 @@
 #include "loss.h"
 
 #include <cmath>
-#include <memory>
 #include <vector>
 
+#include "memory.h"
 #include "simd.h"
 
 namespace splat {
@@ -34,19 +34,6 @@ struct Window {
         for (int i = 0; i <= kRadius; i++) tap[i] = float(weight[i] / sum);
     }
 };
-
-// Memory kept by the calling thread from one loss to the next: touching new pages each time would
-// cost as much as the arithmetic.
-float* scratch(size_t floats) {
-    thread_local std::unique_ptr<float[]> kept;
-    thread_local size_t size = 0;
-    if (size < floats) {
-        kept.reset();
-        kept.reset(new float[floats]);
-        size = floats;
-    }
-    return kept.get();
-}
 
 // Rows of floats with the frame around them; row 0 is the image's first.
 struct Plane {
@@ -76,7 +63,8 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
     const int64_t stride = (kFrame + 16 * vectors + kFrame + 15) / 16 * 16;
     const bool masked = in.mask != nullptr;
     const int64_t plane = (height + 2 * kRadius) * stride;
-    float* memory = scratch(size_t((masked ? 6 : 5) * plane + stride)) + kRadius * stride;
+    const Scratch<float> scratch(size_t((masked ? 6 : 5) * plane + stride));
+    float* const memory = scratch.get() + kRadius * stride;
     const Plane x = {memory, stride}, y = {memory + plane, stride};
     const Plane d_m = {memory + 2 * plane, stride}, d_xx = {memory + 3 * plane, stride};
     const Plane d_xy = {memory + 4 * plane, stride};

@@ -94,18 +94,16 @@ std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor
                                              const Tensor& view, int64_t width, int64_t height,
                                              int64_t threads) {
     const splat::View v = view_from(view, width, height, 0, false);
+    Tensor slots = new_ints({records.size(0), 2});
     splat::Binner binner;
     const bool fits =
-        binner.find(records_from(records), floats(radii), records.size(0), v, int(threads));
-    const int64_t pairs = fits ? binner.intersections() : 0;
-    Tensor entries = new_ints({pairs, 3});
+        binner.find(records_from(records), floats(radii), records.size(0), v, int(threads),
+                    reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
+    Tensor entries = new_ints({fits ? binner.intersections() : 0, 3});
     Tensor tile_begin = new_longs({v.tiles() + 1});
-    Tensor slots = new_ints({records.size(0), 2});
     if (fits)
-        binner.write(records_from(records),
-                     reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
-                     tile_begin.mutable_data_ptr<int64_t>(),
-                     reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
+        binner.write(reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
+                     tile_begin.mutable_data_ptr<int64_t>());
     return {entries, tile_begin, slots, fits};
 }
 

@@ -175,7 +175,8 @@ class Strip {
                 l1 += weight * abs(a - b);
                 ssim += weight * value;
             }
-            store(to_m + i, weight * 2.0f * (m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1)));
+            const f32x16 d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
+            store(to_m + i, weight * 2.0f * d_m);
             store(to_2 + i, -weight * over_b2);
             store(to_xy + i, weight * 2.0f * a1 * inverse);
         }

@@ -199,7 +199,8 @@ SPLAT_INLINE f64x8 widen(f32x16 v, int half) {
 }
 SPLAT_INLINE f32x16 narrow(f64x8 low, f64x8 high) {
 #if SPLAT_AVX512
-    return _mm512_insertf32x8(_mm512_castps256_ps512(_mm512_cvtpd_ps(low)), _mm512_cvtpd_ps(high), 1);
+    const __m512 lower = _mm512_castps256_ps512(_mm512_cvtpd_ps(low));
+    return _mm512_insertf32x8(lower, _mm512_cvtpd_ps(high), 1);
 #else
     const f32x8 parts[2] = {__builtin_convertvector(low, f32x8),
                             __builtin_convertvector(high, f32x8)};

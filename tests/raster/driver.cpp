@@ -91,12 +91,12 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     Array<Record> records(n);
     Array<float> radii(n);
     project_view(in, view, threads, records.get(), radii.get());
+    Array<Slots> slots(n);
     Binner binner;
-    if (!binner.find(records.get(), radii.get(), s.count, view, threads)) return;
+    if (!binner.find(records.get(), radii.get(), s.count, view, threads, slots.get())) return;
     Array<Entry> entries(size_t(binner.intersections()));
     Array<int64_t> begin(size_t(view.tiles() + 1)), end(size_t(view.tiles()));
-    Array<Slots> slots(n);
-    binner.write(records.get(), entries.get(), begin.get(), slots.get());
+    binner.write(entries.get(), begin.get());
     const Pairs pairs = {entries.get(), begin.get()};
     const float background[3] = {0.1f, 0.5f, 0.9f};
     Array<float> color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);

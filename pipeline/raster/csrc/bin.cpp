@@ -1,5 +1,6 @@
 #include "bin.h"
 
+#include <algorithm>
 #include <atomic>
 #include <cstring>
 
@@ -12,20 +13,10 @@ namespace {
 constexpr int kPartsPerThread = 4;
 
 // Columns of blocks that are tested at once: a bit each.
-constexpr int kColumns = 32, kTilesAcross = kColumns * kBlock / kTile;
+constexpr int kColumns = 32;
 
 // Windows that are worked on at once.
 constexpr int kWindows = 64;
-
-// Tiles [first, last] that hold pixel centres in [center - extent, center + extent], one axis.
-struct TileRange {
-    int64_t first, last;
-};
-SPLAT_INLINE TileRange tile_range(double center, double extent, int64_t tiles) {
-    const double first = (center - extent - 0.5) / kTile, last = (center + extent - 0.5) / kTile;
-    return {first > 0 ? int64_t(first < tiles ? first : tiles) : 0,
-            last < 0 ? -1 : (last < tiles - 1 ? int64_t(last) : tiles - 1)};
-}
 
 // Bits [first, last] of each lane that is `inside`, whole numbers; those of [0, kColumns).
 SPLAT_INLINE u32x16 bit_range(Mask16 inside, f32x16 first, f32x16 last) {
@@ -39,24 +30,30 @@ SPLAT_INLINE u32x16 bit_range(Mask16 inside, f32x16 first, f32x16 last) {
     return u32x16(keep(some, f32x16(range)));
 }
 
-// A Gaussian over a row of tiles, at most kTilesAcross of them.
+// Four rows of blocks of a Gaussian's box, and kColumns columns from a tile's first one on.
 struct Window {
     const Record* record;
-    uint32_t gaussian, tile, tiles;  // tile: the first
-    float left, top;                 // the first pixel's centre, from the Gaussian's
+    uint32_t gaussian, tile;        // tile: of the first block
+    uint32_t rows_down, row_count;  // of blocks, from the tile's first row; 1 to 4
+    uint32_t columns;               // of blocks
+    float left, top;                // the first pixel's centre, from the Gaussian's
 };
 
-// Lists the windows of a Gaussian's bounding box.
-SPLAT_INLINE void list_windows(const Record& r, uint32_t gaussian, int64_t tiles_x, int64_t tiles_y,
+SPLAT_INLINE void list_windows(const Record& r, uint32_t gaussian, uint32_t tiles_x,
                                std::vector<Window>& windows) {
-    const TileRange columns = tile_range(r.x, r.extent_x + 0.01, tiles_x);
-    const TileRange rows = tile_range(r.y, r.extent_y + 0.01, tiles_y);
-    for (int64_t ty = rows.first; ty <= rows.last; ty++)
-        for (int64_t tx = columns.first; tx <= columns.last; tx += kTilesAcross) {
-            const int64_t left = columns.last - tx + 1;
-            windows.push_back({&r, gaussian, uint32_t(ty * tiles_x + tx),
-                               uint32_t(left < kTilesAcross ? left : kTilesAcross),
-                               float(tx * kTile + 0.5 - r.x), float(ty * kTile + 0.5 - r.y)});
+    constexpr uint32_t kAcross = kTile / kBlock;  // blocks of a tile
+    const uint32_t left = r.block_left / kAcross * kAcross;
+    // A low box takes one window wherever it begins, a high one begins with a row of tiles: so no
+    // two windows share a tile.
+    const bool low = uint32_t(r.block_bottom - r.block_top) < kAcross;
+    const uint32_t top = low ? r.block_top : r.block_top / kAcross * kAcross;
+    for (uint32_t y = top; y <= r.block_bottom; y += kAcross)
+        for (uint32_t x = left; x <= r.block_right; x += kColumns) {
+            const uint32_t rows = r.block_bottom - y + 1, columns = r.block_right - x + 1;
+            windows.push_back({&r, gaussian, y / kAcross * tiles_x + x / kAcross, y % kAcross,
+                               std::min(rows, kAcross), std::min(columns, uint32_t(kColumns)),
+                               float(double(kBlock) * x + 0.5 - r.x),
+                               float(double(kBlock) * y + 0.5 - r.y)});
         }
 }
 
@@ -86,119 +83,164 @@ SPLAT_INLINE uint32_t depth_bits(float depth) {
     return bits;
 }
 
-// Sorts lists by depth: least significant digit first, which is stable.
+// An entry on its way into order.
+struct TilePair {
+    Entry entry;
+    uint32_t depth;
+};
+
+// Sorts a tile's list by depth, and by place in the list where depths are equal.
 class TileSorter {
   public:
-    void sort(const uint32_t* depths, Entry* entries, int64_t count) {
-        uint32_t low = UINT32_MAX, high = 0;
-        for (int64_t i = 0; i < count; i++) {
-            low = depths[i] < low ? depths[i] : low;
-            high = depths[i] > high ? depths[i] : high;
+    void sort(const TilePair* pairs, int64_t count, Entry* to) {
+        if (int64_t(keys_.size()) < count) {
+            keys_.resize(count + count / 2);
+            other_.resize(keys_.size());
         }
-        if (low >= high) return;  // none, or all alike
-        keys_.resize(count);
-        other_.resize(count);
-        for (int64_t i = 0; i < count; i++) keys_[i] = {depths[i] - low, uint32_t(i)};
-        constexpr int kPasses = 3;
-        const int bits = (32 - __builtin_clz(high - low) + kPasses - 1) / kPasses;
-        for (int pass = 0; pass < kPasses; pass++) {
-            const auto digit = [=](const Key& k) {
-                return (k.depth >> (pass * bits)) & ((1u << bits) - 1);
-            };
-            uint32_t place[(1 << 11) + 1];
-            std::memset(place, 0, ((size_t(1) << bits) + 1) * sizeof(uint32_t));
-            for (const Key& k : keys_) place[digit(k) + 1]++;
-            for (uint32_t bucket = 0; bucket < 1u << bits; bucket++)
-                place[bucket + 1] += place[bucket];
-            for (const Key& k : keys_) other_[place[digit(k)]++] = k;
-            keys_.swap(other_);
-        }
-        unsorted_.assign(entries, entries + count);
-        for (int64_t i = 0; i < count; i++) entries[i] = unsorted_[keys_[i].number];
+        sort_keys(pairs, count);
+        for (int64_t i = 0; i < count; i++) to[i] = pairs[uint32_t(keys_[i])].entry;
     }
 
   private:
-    struct Key {
-        uint32_t depth, number;
-    };
+    using Key = uint64_t;  // depth, place
+    static constexpr int kPlaceBits = 32, kMostBits = 11;
+
+    void sort_keys(const TilePair* pairs, int64_t count) {
+        uint32_t low = UINT32_MAX, high = 0;
+        for (int64_t i = 0; i < count; i++) {
+            low = std::min(low, pairs[i].depth);
+            high = std::max(high, pairs[i].depth);
+        }
+        for (int64_t i = 0; i < count; i++)
+            keys_[i] = Key(pairs[i].depth - low) << kPlaceBits | uint32_t(i);
+        if (low >= high) return;  // none, or all alike
+        // Two passes by the leading bits of the depth, twice as many as number the list: few agree
+        // in them. The least significant first, which is stable.
+        const int depth_bits = 32 - __builtin_clz(high - low);
+        const int wanted = 32 - __builtin_clz(uint32_t(count));
+        const int bits = std::min({wanted, kMostBits, (depth_bits + 1) / 2});
+        const int shift = kPlaceBits + std::max(depth_bits - 2 * bits, 0);
+        const uint32_t buckets = 1u << bits;
+        uint32_t place[2][1 << kMostBits];
+        for (auto& p : place) std::memset(p, 0, buckets * sizeof(uint32_t));
+        const auto digit = [=](Key key, int pass) {
+            return uint32_t(key >> (shift + pass * bits)) & (buckets - 1);
+        };
+        for (int64_t i = 0; i < count; i++) {
+            place[0][digit(keys_[i], 0)]++;
+            place[1][digit(keys_[i], 1)]++;
+        }
+        uint32_t sum[2] = {};
+        for (uint32_t bucket = 0; bucket < buckets; bucket++)
+            for (int pass = 0; pass < 2; pass++) {
+                const uint32_t here = place[pass][bucket];
+                place[pass][bucket] = sum[pass];
+                sum[pass] += here;
+            }
+        for (int64_t i = 0; i < count; i++) other_[place[0][digit(keys_[i], 0)]++] = keys_[i];
+        for (int64_t i = 0; i < count; i++) keys_[place[1][digit(other_[i], 1)]++] = other_[i];
+        // What agrees in the leading bits by the rest.
+        for (int64_t i = 1; i < count; i++) {
+            if (keys_[i - 1] < keys_[i]) continue;
+            int64_t begin = i - 1, end = i + 1;
+            while (begin > 0 && keys_[begin - 1] >> shift == keys_[i] >> shift) begin--;
+            while (end < count && keys_[end] >> shift == keys_[i] >> shift) end++;
+            std::sort(keys_.begin() + begin, keys_.begin() + end);
+            i = end;
+        }
+    }
+
     std::vector<Key> keys_, other_;
-    std::vector<Entry> unsorted_;
 };
 
 }  // namespace
 
-void Binner::Part::make_room(int64_t spans_more) {
-    if (used + spans_more <= capacity) return;
-    capacity = 2 * capacity + spans_more;
-    std::unique_ptr<Span[]> grown(new Span[capacity]);
-    std::memcpy(grown.get(), spans.get(), used * sizeof(Span));
-    spans = std::move(grown);
+void Binner::Part::make_room(int64_t pairs_more) {
+    if (used + pairs_more <= capacity) return;
+    capacity = 2 * capacity + pairs_more;
+    Scratch<Found> grown(capacity);
+    if (used) std::memcpy(grown.get(), found.get(), used * sizeof(Found));
+    found = std::move(grown);
 }
 
 bool Binner::find(const Record* records, const float* radii, int64_t count, const View& view,
-                  int threads) {
+                  int threads, Slots* slots) {
     threads_ = threads;
     tiles_ = view.tiles();
-    touched_.reset(new uint32_t[count]);
-    const int64_t tiles_x = view.tiles_x(), tiles_y = view.tiles_y();
+    slots_ = slots;
+    const uint32_t tiles_x = uint32_t(view.tiles_x());
     const int parts = threads * kPartsPerThread;
     parts_ = std::vector<Part>(parts);
-    std::atomic<int64_t> found{0};
+    std::atomic<int64_t> total{0};
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
     for (int number = 0; number < parts; number++) {
         Part& part = parts_[number];
         part.begin = count * number / parts;
         part.end = count * (number + 1) / parts;
-        part.tile_count.assign(tiles_, 0);
-        part.spans.reset(new Span[part.capacity = 2 * (part.end - part.begin) + tiles_]);
+        // Blocks that are not hit are counted too, as nothing, and there may be some beyond.
+        part.tile_count.assign(tiles_ + tiles_x + 2, 0);
+        part.make_room(2 * (part.end - part.begin));
         std::vector<Window> windows;
         alignas(64) uint32_t hit[kWindows][16];
         // Step by step for many windows, because a Gaussian's numbers of windows and tiles are
         // mispredicted: the processor loses no more than the one step's work.
-        const auto list_spans = [&] {
+        const auto list_pairs = [&] {
             for (size_t begin = 0; begin < windows.size(); begin += kWindows) {
-                const size_t left = windows.size() - begin;
-                const int count = int(left < kWindows ? left : kWindows);
-                for (int i = 0; i < count; i++) store(hit[i], blocks_hit(windows[begin + i]));
-                part.make_room(count * kTilesAcross);
-                for (int i = 0; i < count; i++) {
+                const int here = int(std::min(windows.size() - begin, size_t(kWindows)));
+                for (int i = 0; i < here; i++) store(hit[i], blocks_hit(windows[begin + i]));
+                part.make_room(here * (kColumns / 4 + 1) * 2);
+                for (int i = 0; i < here; i++) {
                     const Window& window = windows[begin + i];
-                    Span* const first = part.spans.get() + part.used;
-                    Span* next = first;
-                    for (uint32_t tile = 0; tile < window.tiles; tile++) {
-                        uint32_t blocks = 0;
-                        for (int row = 0; row < 4; row++)
-                            blocks |= (hit[i][4 * row] >> 4 * tile & 15) << 4 * row;
-                        *next = {window.tile + tile, blocks};
+                    const uint32_t depth = depth_bits(window.record->depth);
+                    const uint32_t rows = (1u << 4 * window.row_count) - 1;
+                    Found* const first = part.found.get() + part.used;
+                    Found* next = first;
+                    const auto list = [&](uint32_t tile, uint32_t blocks) {
+                        *next = {tile, depth, window.gaussian, blocks};
                         next += blocks != 0;
-                        part.tile_count[window.tile + tile] += blocks != 0;
+                        part.tile_count[tile] += blocks != 0;
+                    };
+                    uint32_t row[4];
+                    const uint32_t beyond = kColumns - (window.columns + 3) / 4 * 4;
+                    for (int r = 0; r < 4; r++) row[r] = hit[i][4 * r] & (~0u >> beyond);
+                    // Two tiles at once: most windows have no more.
+                    for (uint32_t column = 0; column < window.columns; column += 8) {
+                        for (uint32_t k = 0; k < 2; k++) {
+                            const uint32_t tile = window.tile + column / 4 + k;
+                            uint32_t blocks = 0;
+                            for (int r = 0; r < 4; r++)
+                                blocks |= (row[r] >> (column + 4 * k) & 15) << 4 * r;
+                            blocks = (blocks & rows) << 4 * window.rows_down;
+                            list(tile, blocks & 0xffff);
+                            list(tile + tiles_x, blocks >> 16);
+                        }
                     }
-                    touched_[window.gaussian] += uint32_t(next - first);
+                    slots[window.gaussian].count += uint32_t(next - first);
                     part.used += next - first;
                 }
             }
             windows.clear();
         };
         int64_t reported = 0;
-        for (int64_t i = part.begin; i < part.end && found <= kMaxIntersections; i++) {
-            touched_[i] = 0;
+        for (int64_t i = part.begin; i < part.end && total <= kMaxIntersections; i++) {
+            slots[i].count = 0;
             if (!(radii[i] > 0)) continue;
-            list_windows(records[i], uint32_t(i), tiles_x, tiles_y, windows);
+            list_windows(records[i], uint32_t(i), tiles_x, windows);
             if (windows.size() < kWindows) continue;
-            list_spans();
+            list_pairs();
             if (part.used - reported > 65536) {
-                found += part.used - reported;
+                total += part.used - reported;
                 reported = part.used;
             }
         }
-        list_spans();
+        list_pairs();
     }
     intersections_ = 0;
     for (const Part& part : parts_) intersections_ += part.used;
     return intersections_ <= kMaxIntersections;
 }
 
-void Binner::write(const Record* records, Entry* entries, int64_t* tile_begin, Slots* slots) {
+void Binner::write(Entry* entries, int64_t* tile_begin) {
     int64_t total = 0;
     for (int64_t tile = 0; tile < tiles_; tile++) {
         tile_begin[tile] = total;
@@ -209,7 +251,7 @@ void Binner::write(const Record* records, Entry* entries, int64_t* tile_begin, S
         }
     }
     tile_begin[tiles_] = total;
-    const std::unique_ptr<uint32_t[]> depths(new uint32_t[intersections_]);
+    const Scratch<TilePair> by_tile(intersections_);
     const int parts = int(parts_.size());
     std::vector<uint32_t> first(parts, 0);
     for (int number = 1; number < parts; number++)
@@ -219,24 +261,22 @@ void Binner::write(const Record* records, Entry* entries, int64_t* tile_begin, S
 #pragma omp for schedule(dynamic, 1)
         for (int number = 0; number < parts; number++) {
             Part& part = parts_[number];
-            const Span* span = part.spans.get();
             uint32_t slot = first[number];
             for (int64_t i = part.begin; i < part.end; i++) {
-                slots[i] = {slot, touched_[i]};
-                if (touched_[i] == 0) continue;
-                const uint32_t depth = depth_bits(records[i].depth);
-                for (uint32_t k = 0; k < touched_[i]; k++, span++) {
-                    const uint32_t to = part.tile_count[span->tile]++;
-                    entries[to] = {uint32_t(i), slot++, span->blocks};
-                    depths[to] = depth;
-                }
+                slots_[i].first = slot;
+                slot += slots_[i].count;
+            }
+            slot = first[number];
+            for (int64_t k = 0; k < part.used; k++) {
+                const Found& f = part.found[k];
+                by_tile[part.tile_count[f.tile]++] = {{f.gaussian, slot++, f.blocks}, f.depth};
             }
         }
         TileSorter sorter;
 #pragma omp for schedule(dynamic, 16)
         for (int64_t tile = 0; tile < tiles_; tile++)
-            sorter.sort(depths.get() + tile_begin[tile], entries + tile_begin[tile],
-                        tile_begin[tile + 1] - tile_begin[tile]);
+            sorter.sort(by_tile.get() + tile_begin[tile], tile_begin[tile + 1] - tile_begin[tile],
+                        entries + tile_begin[tile]);
     }
 }
 

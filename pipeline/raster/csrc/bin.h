@@ -1,9 +1,9 @@
 // Stage 2: which Gaussians touch which tile, front to back.
 #pragma once
 
-#include <memory>
 #include <vector>
 
+#include "memory.h"
 #include "types.h"
 
 namespace splat {
@@ -14,34 +14,34 @@ namespace splat {
 // of threads: every part of the Gaussians writes where the parts before it end.
 class Binner {
   public:
-    // Finds the pairs. False when there would be more than kMaxIntersections.
+    // Finds the pairs. False when there would be more than kMaxIntersections. `slots` (N): zeros
+    // where a Gaussian touches nothing; whole after `write`.
     bool find(const Record* records, const float* radii, int64_t count, const View& view,
-              int threads);
+              int threads, Slots* slots);
 
     int64_t intersections() const { return intersections_; }
 
-    // Writes entries (intersections), tile_begin (tiles + 1) and slots (N; zeros where a Gaussian
-    // touches nothing), after find and with its records.
-    void write(const Record* records, Entry* entries, int64_t* tile_begin, Slots* slots);
+    // Writes entries (intersections) and tile_begin (tiles + 1), after `find`.
+    void write(Entry* entries, int64_t* tile_begin);
 
   private:
     // One Gaussian in one tile.
-    struct Span {
-        uint32_t tile, blocks;
+    struct Found {
+        uint32_t tile, depth, gaussian, blocks;
     };
     // A run of the Gaussians.
     struct Part {
         int64_t begin, end;
-        std::unique_ptr<Span[]> spans;  // not a vector, which would write zeros first
+        Scratch<Found> found;
         int64_t used = 0, capacity = 0;
         std::vector<uint32_t> tile_count;
 
-        void make_room(int64_t spans_more);
+        void make_room(int64_t pairs_more);
     };
 
     int threads_ = 1;
     int64_t tiles_ = 0, intersections_ = 0;
-    std::unique_ptr<uint32_t[]> touched_;  // tiles, by Gaussian
+    Slots* slots_ = nullptr;
     std::vector<Part> parts_;
 };
 

@@ -5,27 +5,18 @@
 #include <torch/csrc/stable/ops.h>
 #include <torch/csrc/stable/tensor.h>
 
-#include <cstdlib>  // defines __GLIBC__
 #include <optional>
 #include <tuple>
-#ifdef __GLIBC__
-#include <malloc.h>
-#endif
+#include <vector>
 
 #include "adam.h"
 #include "bin.h"
 #include "blend.h"
 #include "loss.h"
+#include "memory.h"
 #include "project.h"
 
 namespace {
-
-#ifdef __GLIBC__
-// A training step frees what the next one asks for. By default glibc hands it back to the system
-// in between, and touching fresh pages costs a fifth of the step. 32 MB is the most glibc allows.
-[[maybe_unused]] const bool keeps_freed_memory =
-    mallopt(M_MMAP_THRESHOLD, 32 << 20) && mallopt(M_TRIM_THRESHOLD, 1 << 30);
-#endif
 
 using torch::headeronly::ScalarType;
 using torch::stable::Tensor;
@@ -35,8 +26,24 @@ const float* floats(const Tensor& t) { return t.const_data_ptr<float>(); }
 const float* floats(const OptionalTensor& t) { return t ? floats(*t) : nullptr; }
 float* mutable_floats(const Tensor& t) { return t.mutable_data_ptr<float>(); }
 
-Tensor new_floats(std::initializer_list<int64_t> shape) {
-    return torch::stable::empty(shape, ScalarType::Float);
+// A tensor of junk, in memory that goes back to be used again.
+template <class T>
+Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type) {
+    std::vector<int64_t> strides(shape.size());
+    int64_t count = 1;
+    for (size_t i = shape.size(); i-- > 0; count *= shape[i]) strides[i] = count;
+    return torch::stable::from_blob(splat::take_memory(size_t(count) * sizeof(T)), shape, strides,
+                                    {torch::headeronly::DeviceType::CPU}, type,
+                                    splat::give_back_memory);
+}
+Tensor new_floats(const std::vector<int64_t>& shape) {
+    return new_tensor<float>(shape, ScalarType::Float);
+}
+Tensor new_ints(const std::vector<int64_t>& shape) {
+    return new_tensor<int32_t>(shape, ScalarType::Int);
+}
+Tensor new_longs(const std::vector<int64_t>& shape) {
+    return new_tensor<int64_t>(shape, ScalarType::Long);
 }
 
 // view: 17 float64, fx fy cx cy, rotation, translation, near.
@@ -87,18 +94,16 @@ std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor
                                              const Tensor& view, int64_t width, int64_t height,
                                              int64_t threads) {
     const splat::View v = view_from(view, width, height, 0, false);
+    Tensor slots = new_ints({records.size(0), 2});
     splat::Binner binner;
     const bool fits =
-        binner.find(records_from(records), floats(radii), records.size(0), v, int(threads));
-    const int64_t pairs = fits ? binner.intersections() : 0;
-    Tensor entries = torch::stable::empty({pairs, 3}, ScalarType::Int);
-    Tensor tile_begin = torch::stable::empty({v.tiles() + 1}, ScalarType::Long);
-    Tensor slots = torch::stable::empty({records.size(0), 2}, ScalarType::Int);
+        binner.find(records_from(records), floats(radii), records.size(0), v, int(threads),
+                    reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
+    Tensor entries = new_ints({fits ? binner.intersections() : 0, 3});
+    Tensor tile_begin = new_longs({v.tiles() + 1});
     if (fits)
-        binner.write(records_from(records),
-                     reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
-                     tile_begin.mutable_data_ptr<int64_t>(),
-                     reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
+        binner.write(reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
+                     tile_begin.mutable_data_ptr<int64_t>());
     return {entries, tile_begin, slots, fits};
 }
 
@@ -110,7 +115,7 @@ std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& en
     const splat::View v = view_from(view, width, height, 0, false);
     Tensor color = new_floats({height, width, 3});
     Tensor alpha = new_floats({height, width});
-    Tensor tile_end = torch::stable::empty({v.tiles()}, ScalarType::Long);
+    Tensor tile_end = new_longs({v.tiles()});
     splat::blend(records_from(records), pairs_from(entries, tile_begin), v, floats(background),
                  int(threads), mutable_floats(color), mutable_floats(alpha),
                  tile_end.mutable_data_ptr<int64_t>());

@@ -59,11 +59,11 @@ void blend(const Record* records, const Pairs& pairs, const View& view, const fl
         tile_end[index] = composite(records, pairs, index, tile, transmittance, sum);
         for (int block = 0; block < kBlocks; block++) {
             const f32x16 left = abs(transmittance[block]);
+            const f32x16 rgb[3] = {sum.red[block] + left * background[0],
+                                   sum.green[block] + left * background[1],
+                                   sum.blue[block] + left * background[2]};
             alignas(64) float pixels[3 * 16];
-            interleave(
-                {sum.red[block] + left * background[0], sum.green[block] + left * background[1],
-                 sum.blue[block] + left * background[2]},
-                pixels);
+            interleave(rgb, pixels);
             tile.write<3>(block, pixels, view.width, color);
             store(pixels, 1.0f - left);
             tile.write<1>(block, pixels, view.width, alpha);

@@ -26,21 +26,23 @@ struct TileTargets {
             tile.read<1>(block, image, view.width, pixels);
             return load<f32x16>(pixels);
         };
-        const auto rgb = [&](int block, const float* image) {
+        const auto rgb = [&](int block, const float* image, f32x16 (&to)[3]) {
             tile.read<3>(block, image, view.width, pixels);
-            return deinterleave(pixels);
+            deinterleave(pixels, to);
         };
         const float* background = in.background;
         for (int block = 0; block < kBlocks; block++) {
-            const Rgb c = rgb(block, in.color), d = rgb(block, in.d_color);
+            f32x16 c[3], d[3];
+            rgb(block, in.color, c);
+            rgb(block, in.d_color, d);
             // The background shows through 1 - alpha.
             const f32x16 under =
-                d.red * background[0] + d.green * background[1] + d.blue * background[2];
-            red[block] = d.red;
-            green[block] = d.green;
-            blue[block] = d.blue;
+                d[0] * background[0] + d[1] * background[1] + d[2] * background[2];
+            red[block] = d[0];
+            green[block] = d[1];
+            blue[block] = d[2];
             alpha[block] = -under;
-            behind[block] = c.red * d.red + c.green * d.green + c.blue * d.blue - under;
+            behind[block] = c[0] * d[0] + c[1] * d[1] + c[2] * d[2] - under;
             if (in.d_alpha) {
                 const f32x16 d_alpha = plane(block, in.d_alpha);
                 alpha[block] += d_alpha;

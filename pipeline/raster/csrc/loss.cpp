@@ -1,27 +1,35 @@
-// The window is a product of two rows of 11 taps, and a row of an (H, W, 3) image is a flat
-// array whose taps lie 3 apart: all is done on flat rows of vectors. Images are copied into a
-// frame of zeros 5 pixels wide and padded to whole vectors, so that no row has a tail.
+// The window is a product of two rows of 11 taps, and a row of an (H, W, 3) image is a flat array
+// whose taps lie 3 apart: all is done on flat rows of vectors.
 //
-// With m_x, m_y, m_xx, m_yy, m_xy the blurred x, y, x^2, y^2, xy,
-//     SSIM = (2 m_x m_y + C1)(2 (m_xy - m_x m_y) + C2) / ((m_x^2 + m_y^2 + C1)(v_x + v_y + C2)),
-//     dL/dx = blur(dL/dm_x) + 2 x blur(dL/dm_xx) + y blur(dL/dm_xy),
-// as the window is even. First loop: blur vertically, then the row horizontally, then the three
-// derivatives; second loop: the same blur of those.
+// With m_x, m_y, m_2, m_xy the blurred x, y, x^2 + y^2, x y,
+//     SSIM = (2 m_x m_y + C1)(2 (m_xy - m_x m_y) + C2)
+//            / ((m_x^2 + m_y^2 + C1)(m_2 - m_x^2 - m_y^2 + C2)),
+//     dL/dx = blur(dL/dm_x) + 2 x blur(dL/dm_2) + y blur(dL/dm_xy),
+// as the window is even. A strip of the image is walked from top to bottom once, with the last 11
+// rows of the two images and of the three derivatives at hand, so that they stay in the cache: the
+// derivatives follow the images 5 rows behind, and the gradient follows those.
 
 #include "loss.h"
 
+#include <algorithm>
 #include <cmath>
-#include <memory>
 #include <vector>
 
+#include "memory.h"
 #include "simd.h"
 
 namespace splat {
 namespace {
 
-constexpr int kRadius = 5;           // of the window, pixels
-constexpr int kFrame = 3 * kRadius;  // the frame's left edge, floats
+constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;  // of the window, pixels
+constexpr int kReach = 16;  // how far a blur looks to each side, floats: 3 kRadius in vectors
 constexpr float kC1 = 1e-4f, kC2 = 9e-4f;
+
+// Floats of a strip's row, at most: the rows at hand take some 200 KB, less than half an L2 cache.
+constexpr int64_t kStripFloats = 1024;
+
+// Fewest rows for a thread to begin in the middle of a strip: it goes through 10 more on each side.
+constexpr int64_t kBandRows = 32;
 
 struct Window {
     float tap[kRadius + 1];  // from the centre outwards
@@ -35,30 +43,6 @@ struct Window {
     }
 };
 
-// Memory kept by the calling thread from one loss to the next: touching new pages each time would
-// cost as much as the arithmetic.
-float* scratch(size_t floats) {
-    thread_local std::unique_ptr<float[]> kept;
-    thread_local size_t size = 0;
-    if (size < floats) {
-        kept.reset();
-        kept.reset(new float[floats]);
-        size = floats;
-    }
-    return kept.get();
-}
-
-// Rows of floats with the frame around them; row 0 is the image's first.
-struct Plane {
-    float* first;
-    int64_t stride;
-
-    float* row(int64_t y) const { return first + y * stride; }
-    void clear(int64_t y, int64_t from, int64_t to) const {
-        std::memset(row(y) + from, 0, (to - from) * sizeof(float));
-    }
-};
-
 SPLAT_INLINE f32x16 blur_across(const float* centre, const Window& k) {
     f32x16 sum = load<f32x16>(centre) * k.tap[0];
     for (int t = 1; t <= kRadius; t++)
@@ -66,152 +50,218 @@ SPLAT_INLINE f32x16 blur_across(const float* centre, const Window& k) {
     return sum;
 }
 
+// The last kTaps rows of something.
+struct Ring {
+    float* memory;
+    int64_t stride;
+
+    float* row(int64_t y) const { return memory + (y + kTaps) % kTaps * stride; }
+};
+
+// The columns [begin, end) of an image's rows of `values` floats. Its buffers hold 2 kReach floats
+// more on each side: what the blur of a blur looks at.
+class Strip {
+  public:
+    Strip(const LossImages& in, const Window& window, double l1_scale, double ssim_scale,
+          int64_t begin, int64_t end)
+        : in_(in),
+          window_(window),
+          l1_scale_(float(l1_scale)),
+          ssim_scale_(float(ssim_scale)),
+          begin_(begin),
+          end_(end),
+          values_(3 * in.width),
+          own_((end - begin + 15) / 16 * 16),
+          stride_(own_ + 4 * kReach),
+          memory_(size_t((6 * kTaps + 4) * stride_)) {
+        float* next = memory_.get();
+        for (Ring* ring : {&x_, &y_, &keep_, &d_m_, &d_2_, &d_xy_}) {
+            *ring = {next, stride_};
+            next += kTaps * stride_;
+        }
+        for (float*& line : line_) line = next, next += stride_;
+    }
+
+    // Rows [first, last) of the gradient, and their sums.
+    void walk(int64_t first, int64_t last, float* grad, double* row_l1, double* row_ssim) {
+        for (int64_t y = first - 2 * kRadius; y < last + 2 * kRadius; y++) {
+            read(y);
+            const int64_t middle = y - kRadius, done = y - 2 * kRadius;
+            if (middle >= first - kRadius) {
+                const Sums sums = differentiate(middle);
+                if (middle >= first && middle < last)
+                    row_l1[middle] = sums.l1, row_ssim[middle] = sums.ssim;
+            }
+            if (done >= first) write(done, grad);
+        }
+    }
+
+  private:
+    struct Sums {
+        double l1, ssim;
+    };
+
+    // Row y of the images, zeros beyond them and, in both, nothing to tell where a mask hides them.
+    void read(int64_t y) {
+        float *x = x_.row(y), *target = y_.row(y), *keep = keep_.row(y);
+        for (float* row : {x, target, keep}) std::memset(row, 0, stride_ * sizeof(float));
+        if (y < 0 || y >= in_.height) return;
+        const int64_t origin = begin_ - 2 * kReach;  // column of a buffer's first float
+        const int64_t from = std::max(origin, int64_t(0));
+        const int64_t to = std::min(origin + stride_, values_);
+        const int64_t offset = y * values_;
+        std::memcpy(x + from - origin, in_.rendered + offset + from, (to - from) * sizeof(float));
+        if (in_.target_float)
+            std::memcpy(target + from - origin, in_.target_float + offset + from,
+                        (to - from) * sizeof(float));
+        else
+            for (int64_t i = from; i < to; i++)
+                target[i - origin] = float(in_.target_bytes[offset + i]) / 255.0f;
+        for (int64_t i = from; i < to; i++) keep[i - origin] = 1;
+        if (!in_.mask) return;
+        for (int64_t i = from; i < to; i++)
+            if (in_.mask[y * in_.width + i / 3])
+                x[i - origin] = target[i - origin], keep[i - origin] = 0;
+    }
+
+    // Row y of the three derivatives; its own sums of |x - y| and SSIM.
+    Sums differentiate(int64_t y) {
+        if (y < 0 || y >= in_.height) {
+            for (const Ring& ring : {d_m_, d_2_, d_xy_})
+                std::memset(ring.row(y), 0, stride_ * sizeof(float));
+            return {0, 0};
+        }
+        const float *xs[kTaps], *ys[kTaps];
+        for (int t = 0; t < kTaps; t++)
+            xs[t] = x_.row(y + t - kRadius), ys[t] = y_.row(y + t - kRadius);
+        for (int64_t i = 0; i < stride_; i += 16) {
+            const f32x16 a = load<f32x16>(xs[kRadius] + i), b = load<f32x16>(ys[kRadius] + i);
+            f32x16 m_x = a * window_.tap[0], m_y = b * window_.tap[0];
+            f32x16 m_2 = a * m_x + b * m_y, m_xy = a * m_y;
+            for (int t = 1; t <= kRadius; t++) {
+                const f32x16 a0 = load<f32x16>(xs[kRadius - t] + i);
+                const f32x16 a1 = load<f32x16>(xs[kRadius + t] + i);
+                const f32x16 b0 = load<f32x16>(ys[kRadius - t] + i);
+                const f32x16 b1 = load<f32x16>(ys[kRadius + t] + i);
+                m_x += (a0 + a1) * window_.tap[t];
+                m_y += (b0 + b1) * window_.tap[t];
+                m_2 += (a0 * a0 + a1 * a1 + b0 * b0 + b1 * b1) * window_.tap[t];
+                m_xy += (a0 * b0 + a1 * b1) * window_.tap[t];
+            }
+            store(line_[0] + i, m_x);
+            store(line_[1] + i, m_y);
+            store(line_[2] + i, m_2);
+            store(line_[3] + i, m_xy);
+        }
+        float *to_m = d_m_.row(y), *to_2 = d_2_.row(y), *to_xy = d_xy_.row(y);
+        const float* keep = keep_.row(y);
+        f32x16 l1 = {}, ssim = {};
+        for (int64_t i = kReach; i < stride_ - kReach; i += 16) {
+            const f32x16 m_x = blur_across(line_[0] + i, window_);
+            const f32x16 m_y = blur_across(line_[1] + i, window_);
+            const f32x16 squares = m_x * m_x + m_y * m_y, product = m_x * m_y;
+            const f32x16 a1 = 2.0f * product + kC1;
+            const f32x16 a2 = 2.0f * (blur_across(line_[3] + i, window_) - product) + kC2;
+            const f32x16 b1 = squares + kC1;
+            // No variance is negative, whatever rounding says.
+            const f32x16 variance = max(blur_across(line_[2] + i, window_) - squares, f32x16{});
+            const f32x16 b2 = variance + kC2;
+            const f32x16 inverse = reciprocal(b1 * b2);
+            const f32x16 value = a1 * a2 * inverse;
+            const f32x16 over_b1 = value * b2 * inverse, over_b2 = value * b1 * inverse;
+            const f32x16 weight = load<f32x16>(keep + i);
+            if (i >= 2 * kReach && i < 2 * kReach + own_) {
+                const f32x16 a = load<f32x16>(xs[kRadius] + i), b = load<f32x16>(ys[kRadius] + i);
+                l1 += weight * abs(a - b);
+                ssim += weight * value;
+            }
+            const f32x16 d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
+            store(to_m + i, weight * 2.0f * d_m);
+            store(to_2 + i, -weight * over_b2);
+            store(to_xy + i, weight * 2.0f * a1 * inverse);
+        }
+        Sums sums = {};
+        for (int lane = 0; lane < 16; lane++) sums.l1 += l1[lane], sums.ssim += ssim[lane];
+        return sums;
+    }
+
+    // Row y of the gradient.
+    void write(int64_t y, float* grad) {
+        const Ring rings[3] = {d_m_, d_2_, d_xy_};
+        for (int k = 0; k < 3; k++) {
+            const float* rows[kTaps];
+            for (int t = 0; t < kTaps; t++) rows[t] = rings[k].row(y + t - kRadius);
+            for (int64_t i = kReach; i < stride_ - kReach; i += 16) {
+                f32x16 sum = load<f32x16>(rows[kRadius] + i) * window_.tap[0];
+                for (int t = 1; t <= kRadius; t++)
+                    sum += (load<f32x16>(rows[kRadius - t] + i) +
+                            load<f32x16>(rows[kRadius + t] + i)) *
+                           window_.tap[t];
+                store(line_[k] + i, sum);
+            }
+        }
+        for (int64_t i = 2 * kReach; i < 2 * kReach + own_; i += 16) {
+            const f32x16 a = load<f32x16>(x_.row(y) + i), b = load<f32x16>(y_.row(y) + i);
+            const f32x16 ssim = blur_across(line_[0] + i, window_) +
+                                2.0f * a * blur_across(line_[1] + i, window_) +
+                                b * blur_across(line_[2] + i, window_);
+            const f32x16 sign = select(lt(b, a), splat16(1), splat16(0)) -
+                                select(lt(a, b), splat16(1), splat16(0));
+            const f32x16 out =
+                load<f32x16>(keep_.row(y) + i) * (l1_scale_ * sign + ssim_scale_ * ssim);
+            const int64_t column = begin_ + i - 2 * kReach;
+            std::memcpy(grad + y * values_ + column, &out,
+                        std::min(end_ - column, int64_t(16)) * sizeof(float));
+        }
+    }
+
+    const LossImages& in_;
+    const Window& window_;
+    const float l1_scale_, ssim_scale_;
+    const int64_t begin_, end_, values_;
+    const int64_t own_, stride_;  // floats of the strip in whole vectors; of a buffer's row
+    const Scratch<float> memory_;
+    Ring x_, y_, keep_, d_m_, d_2_, d_xy_;
+    float* line_[4];
+};
+
+// Values that no mask hides.
+int64_t count_values(const LossImages& in) {
+    const int64_t pixels = in.width * in.height;
+    if (!in.mask) return 3 * pixels;
+    int64_t counted = 0;
+    for (int64_t i = 0; i < pixels; i++) counted += in.mask[i] == 0;
+    return 3 * counted;
+}
+
 }  // namespace
 
 LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float* grad) {
     const Window window;
-    const int64_t width = in.width, height = in.height, values = 3 * width;
-    // Vectors of a row start at kFrame; the last one, and its taps, must end inside the stride.
-    const int64_t vectors = (values + 15) / 16;
-    const int64_t stride = (kFrame + 16 * vectors + kFrame + 15) / 16 * 16;
-    const bool masked = in.mask != nullptr;
-    const int64_t plane = (height + 2 * kRadius) * stride;
-    float* memory = scratch(size_t((masked ? 6 : 5) * plane + stride)) + kRadius * stride;
-    const Plane x = {memory, stride}, y = {memory + plane, stride};
-    const Plane d_m = {memory + 2 * plane, stride}, d_xx = {memory + 3 * plane, stride};
-    const Plane d_xy = {memory + 4 * plane, stride};
-    // 1 where a value counts: a plane with a mask, one row for all without.
-    const Plane keep = {memory + 5 * plane - (masked ? 0 : kRadius * stride), stride};
-    const auto keep_row = [&](int64_t r) { return keep.row(masked ? r : 0); };
-    std::vector<int64_t> counted(height);
-    std::vector<double> row_l1(height), row_ssim(height);
-
-    for (int64_t r : {-5, -4, -3, -2, -1})
-        for (const Plane& p : {x, y, d_m, d_xx, d_xy})
-            p.clear(r, 0, stride), p.clear(height - 1 - r, 0, stride);
-    if (!masked) {
-        keep.clear(0, 0, stride);
-        for (int64_t i = 0; i < values; i++) keep.row(0)[kFrame + i] = 1;
-    }
-
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t r = 0; r < height; r++) {
-        for (const Plane& p : {x, y}) p.clear(r, 0, kFrame), p.clear(r, kFrame + values, stride);
-        float *to_x = x.row(r) + kFrame, *to_y = y.row(r) + kFrame;
-        const float* rendered = in.rendered + r * values;
-        if (in.target_float)
-            std::memcpy(to_y, in.target_float + r * values, values * sizeof(float));
-        else
-            for (int64_t i = 0; i < values; i++)
-                to_y[i] = float(in.target_bytes[r * values + i]) / 255.0f;
-        std::memcpy(to_x, rendered, values * sizeof(float));
-        counted[r] = width;
-        if (masked) {
-            keep.clear(r, 0, stride);
-            for (int64_t i = 0; i < width; i++) {
-                const bool out = in.mask[r * width + i] != 0;
-                counted[r] -= out;
-                for (int64_t c = 3 * i; c < 3 * i + 3; c++) {
-                    keep.row(r)[kFrame + c] = out ? 0 : 1;
-                    if (out) to_x[c] = to_y[c];
-                }
-            }
-        }
-    }
-    int64_t count = 0;
-    for (int64_t n : counted) count += 3 * n;
+    const int64_t values = 3 * in.width, height = in.height, count = count_values(in);
     if (count == 0) {
         std::memset(grad, 0, height * values * sizeof(float));
         return {0, 0, 1};
     }
-
-#pragma omp parallel num_threads(threads)
-    {
-        std::vector<float> buffer(5 * stride);
-        float* line[5];
-        for (int k = 0; k < 5; k++) line[k] = buffer.data() + k * stride;
-
-#pragma omp for schedule(static)
-        for (int64_t r = 0; r < height; r++) {
-            for (int64_t i = 0; i < stride; i += 16) {
-                const f32x16 a = load<f32x16>(x.row(r) + i), b = load<f32x16>(y.row(r) + i);
-                f32x16 m_x = a * window.tap[0], m_y = b * window.tap[0];
-                f32x16 m_xx = a * m_x, m_yy = b * m_y, m_xy = a * m_y;
-                for (int t = 1; t <= kRadius; t++) {
-                    const f32x16 a0 = load<f32x16>(x.row(r - t) + i);
-                    const f32x16 a1 = load<f32x16>(x.row(r + t) + i);
-                    const f32x16 b0 = load<f32x16>(y.row(r - t) + i);
-                    const f32x16 b1 = load<f32x16>(y.row(r + t) + i);
-                    m_x += (a0 + a1) * window.tap[t];
-                    m_y += (b0 + b1) * window.tap[t];
-                    m_xx += (a0 * a0 + a1 * a1) * window.tap[t];
-                    m_yy += (b0 * b0 + b1 * b1) * window.tap[t];
-                    m_xy += (a0 * b0 + a1 * b1) * window.tap[t];
-                }
-                store(line[0] + i, m_x);
-                store(line[1] + i, m_y);
-                store(line[2] + i, m_xx);
-                store(line[3] + i, m_yy);
-                store(line[4] + i, m_xy);
-            }
-            f32x16 l1 = {}, ssim = {};
-            for (const Plane& p : {d_m, d_xx, d_xy})
-                p.clear(r, 0, kFrame), p.clear(r, kFrame + values, stride);
-            for (int64_t i = kFrame; i < kFrame + values; i += 16) {
-                const f32x16 m_x = blur_across(line[0] + i, window);
-                const f32x16 m_y = blur_across(line[1] + i, window);
-                const f32x16 squares = m_x * m_x + m_y * m_y, product = m_x * m_y;
-                const f32x16 a1 = 2.0f * product + kC1;
-                const f32x16 a2 = 2.0f * (blur_across(line[4] + i, window) - product) + kC2;
-                const f32x16 b1 = squares + kC1;
-                const f32x16 b2 = blur_across(line[2] + i, window) +
-                                  blur_across(line[3] + i, window) - squares + kC2;
-                const f32x16 inverse = 1.0f / (b1 * b2);
-                const f32x16 value = a1 * a2 * inverse;
-                const f32x16 over_b1 = value * b2 * inverse, over_b2 = value * b1 * inverse;
-                const f32x16 weight = load<f32x16>(keep_row(r) + i);
-                l1 += weight * abs(load<f32x16>(x.row(r) + i) - load<f32x16>(y.row(r) + i));
-                ssim += weight * value;
-                store(d_m.row(r) + i,
-                      weight * 2.0f * (m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1)));
-                store(d_xx.row(r) + i, -weight * over_b2);
-                store(d_xy.row(r) + i, weight * 2.0f * a1 * inverse);
-            }
-            row_l1[r] = row_ssim[r] = 0;
-            for (int lane = 0; lane < 16; lane++) row_l1[r] += l1[lane], row_ssim[r] += ssim[lane];
-        }
-
-        const float l1_scale = float((1 - ssim_weight) / double(count));
-        const float ssim_scale = float(-ssim_weight / double(count));
-#pragma omp for schedule(static)
-        for (int64_t r = 0; r < height; r++) {
-            const Plane planes[3] = {d_m, d_xx, d_xy};
-            for (int k = 0; k < 3; k++)
-                for (int64_t i = 0; i < stride; i += 16) {
-                    f32x16 sum = load<f32x16>(planes[k].row(r) + i) * window.tap[0];
-                    for (int t = 1; t <= kRadius; t++)
-                        sum += (load<f32x16>(planes[k].row(r - t) + i) +
-                                load<f32x16>(planes[k].row(r + t) + i)) *
-                               window.tap[t];
-                    store(line[k] + i, sum);
-                }
-            for (int64_t i = kFrame; i < kFrame + values; i += 16) {
-                const f32x16 a = load<f32x16>(x.row(r) + i), b = load<f32x16>(y.row(r) + i);
-                const f32x16 ssim = blur_across(line[0] + i, window) +
-                                    2.0f * a * blur_across(line[1] + i, window) +
-                                    b * blur_across(line[2] + i, window);
-                const f32x16 sign = select(lt(b, a), splat16(1), splat16(0)) -
-                                    select(lt(a, b), splat16(1), splat16(0));
-                const f32x16 out =
-                    load<f32x16>(keep_row(r) + i) * (l1_scale * sign + ssim_scale * ssim);
-                const int64_t left = kFrame + values - i;
-                std::memcpy(grad + r * values + i - kFrame, &out,
-                            (left < 16 ? left : 16) * sizeof(float));
-            }
-        }
+    const double l1_scale = (1 - ssim_weight) / double(count);
+    const double ssim_scale = -ssim_weight / double(count);
+    // Strips follow from the image alone, so that sums do not depend on the threads; every row is
+    // found in the same way in whatever band it lies.
+    const int64_t strips = (values + kStripFloats - 1) / kStripFloats;
+    const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
+    const int64_t bands = std::max(std::min(int64_t(threads), height / kBandRows), int64_t(1));
+    std::vector<double> row_l1(strips * height), row_ssim(strips * height);
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
+    for (int64_t unit = 0; unit < strips * bands; unit++) {
+        const int64_t number = unit / bands, band = unit % bands, begin = number * across;
+        if (begin >= values) continue;
+        Strip strip(in, window, l1_scale, ssim_scale, begin, std::min(begin + across, values));
+        strip.walk(height * band / bands, height * (band + 1) / bands, grad,
+                   row_l1.data() + number * height, row_ssim.data() + number * height);
     }
     double l1 = 0, ssim = 0;
-    for (int64_t r = 0; r < height; r++) l1 += row_l1[r], ssim += row_ssim[r];
+    for (double sum : row_l1) l1 += sum;
+    for (double sum : row_ssim) ssim += sum;
     l1 /= double(count);
     ssim /= double(count);
     return {(1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim};

@@ -40,7 +40,7 @@ struct Projected {
     Lanes inv_z, u, v;       // 1/z; x/z and y/z, clamped
     Vec3 t[2];               // rows of T = J W
     Vec3 h[2];               // rows of H = T M; Sigma' = H H^T
-    Lanes plain_det, ratio;  // det of Sigma' undilated; to the dilated one
+    Lanes plain_det, ratio;  // det of Sigma' undilated; to the dilated one, with antialias only
     Lanes sigmoid;
     // Results
     Lanes x, y;        // pixels
@@ -52,7 +52,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     Projected p;
     p.norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] + in.quat[2] * in.quat[2] +
               in.quat[3] * in.quat[3];
-    p.inv_norm = 1.0 / sqrt(p.norm2);
+    p.inv_norm = inverse_sqrt(p.norm2);
     for (int i = 0; i < 4; i++) p.q[i] = in.quat[i] * p.inv_norm;
     const Lanes w = p.q[0], x = p.q[1], y = p.q[2], z = p.q[3];
     p.r[0] = {1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)};
@@ -67,7 +67,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     const double* t = view.translation;
     p.cam = {dot(row(view.rotation, 0), in.mean) + t[0], dot(row(view.rotation, 1), in.mean) + t[1],
              dot(row(view.rotation, 2), in.mean) + t[2]};
-    p.inv_z = 1.0 / p.cam.z;
+    p.inv_z = reciprocal(p.cam.z);
     const Lanes u = p.cam.x * p.inv_z, v = p.cam.y * p.inv_z;
     p.x = view.fx * u + view.cx;
     p.y = view.fy * v + view.cy;
@@ -90,11 +90,12 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     p.plain_det = dot(cross, cross);
     p.det = p.plain_det + kDilation * (xx + yy + kDilation);
 
-    p.sigmoid = 1.0 / (1.0 + exp(-in.opacity_logit));
+    p.sigmoid = reciprocal(1.0 + exp(-in.opacity_logit));
     p.opacity = p.sigmoid;
-    p.ratio = p.plain_det / p.det;
-    if (view.antialias)
+    if (view.antialias) {
+        p.ratio = p.plain_det / p.det;
         p.opacity *= sqrt(select(p.ratio > kCompensationMin, p.ratio, splat8(kCompensationMin)));
+    }
     return p;
 }
 

@@ -2,7 +2,7 @@
 // of Sloan 2013, ordered and signed as in 3DGS).
 #pragma once
 
-#include "simd.h"
+#include "shuffle.h"
 
 namespace splat {
 
@@ -52,26 +52,6 @@ struct Directions {
     f32x16 inv_length;
 };
 
-template <int kStep, int... kLanes>
-SPLAT_INLINE void swap_blocks(f32x16& a, f32x16& b, std::integer_sequence<int, kLanes...>) {
-    const i32x16 upper = {(kLanes & kStep ? 16 + kLanes - kStep : kLanes)...};
-    const i32x16 lower = {(kLanes & kStep ? 16 + kLanes : kLanes + kStep)...};
-    const f32x16 first = __builtin_shuffle(a, b, upper);
-    b = __builtin_shuffle(a, b, lower);
-    a = first;
-}
-template <int kStep>
-SPLAT_INLINE void transpose_step(f32x16* rows) {
-    for (int i = 0; i < 16; i++)
-        if (!(i & kStep)) swap_blocks<kStep>(rows[i], rows[i + kStep], SixteenLanes{});
-}
-SPLAT_INLINE void transpose(f32x16* rows) {  // 16 x 16
-    transpose_step<8>(rows);
-    transpose_step<4>(rows);
-    transpose_step<2>(rows);
-    transpose_step<1>(rows);
-}
-
 // The coefficients of 16 Gaussians, or their gradients: value[3 k + c] is coefficient k, channel c
 // of each.
 struct ShBlock {
@@ -93,19 +73,21 @@ struct ShBlock {
         }
         for (int j = 0; 16 * j < active; j++) transpose(value + 16 * j);
     }
-    // The way back: rows of the lanes in `lanes`, the active floats only.
-    SPLAT_INLINE void write(int degree, float* sh, int64_t width, uint32_t lanes) {
+    // The way back: `count` rows, zeros after the active floats.
+    SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) {
         const int active = 3 * sh_count(degree);
         for (int j = 0; 16 * j < active; j++) transpose(value + 16 * j);
-        for (int lane = 0; lane < 16; lane++)
-            if (lanes >> lane & 1)
-                for (int j = 0; 16 * j < active; j++) {
-                    float* const to = sh + width * lane + 16 * j;
-                    if (16 * j + 16 <= active)
-                        store(to, value[16 * j + lane]);
-                    else
-                        std::memcpy(to, &value[16 * j + lane], (active - 16 * j) * sizeof(float));
-                }
+        for (int lane = 0; lane < count; lane++) {
+            float* const row = sh + width * lane;
+            for (int j = 0; 16 * j < active; j++) {
+                if (16 * j + 16 <= active)
+                    store(row + 16 * j, value[16 * j + lane]);
+                else
+                    std::memcpy(row + 16 * j, &value[16 * j + lane],
+                                (active - 16 * j) * sizeof(float));
+            }
+            if (active < width) std::memset(row + active, 0, (width - active) * sizeof(float));
+        }
     }
 };
 

@@ -5,7 +5,6 @@
 
 #include <cstdint>
 #include <cstring>
-#include <utility>
 #if defined(__AVX512F__) && defined(__AVX512DQ__)
 #include <immintrin.h>
 #define SPLAT_AVX512 1
@@ -63,6 +62,10 @@ SPLAT_INLINE f32x16 floor(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_
 SPLAT_INLINE f32x16 ceil(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_POS_INF); }
 SPLAT_INLINE f32x16 sqrt(f32x16 v) { return _mm512_sqrt_ps(v); }
 SPLAT_INLINE f64x8 sqrt(f64x8 v) { return _mm512_sqrt_pd(v); }
+SPLAT_INLINE f64x8 floor(f64x8 v) { return _mm512_roundscale_pd(v, _MM_FROUND_TO_NEG_INF); }
+SPLAT_INLINE f64x8 ceil(f64x8 v) { return _mm512_roundscale_pd(v, _MM_FROUND_TO_POS_INF); }
+SPLAT_INLINE uint32_t bits(i64x8 m) { return _mm512_movepi64_mask(__m512i(m)); }
+SPLAT_INLINE Mask16 mask(uint32_t bits) { return {__mmask16(bits)}; }
 #else
 struct Mask16 {
     i32x16 lanes;
@@ -97,6 +100,24 @@ SPLAT_INLINE f32x16 sqrt(f32x16 v) {
 SPLAT_INLINE f64x8 sqrt(f64x8 v) {
     for (int i = 0; i < 8; i++) v[i] = __builtin_sqrt(v[i]);
     return v;
+}
+SPLAT_INLINE f64x8 floor(f64x8 v) {
+    for (int i = 0; i < 8; i++) v[i] = __builtin_floor(v[i]);
+    return v;
+}
+SPLAT_INLINE f64x8 ceil(f64x8 v) {
+    for (int i = 0; i < 8; i++) v[i] = __builtin_ceil(v[i]);
+    return v;
+}
+SPLAT_INLINE uint32_t bits(i64x8 m) {
+    uint32_t packed = 0;
+    for (int i = 0; i < 8; i++) packed |= uint32_t(m[i] & 1) << i;
+    return packed;
+}
+SPLAT_INLINE Mask16 mask(uint32_t bits) {
+    i32x16 lanes;
+    for (int i = 0; i < 16; i++) lanes[i] = -int32_t(bits >> i & 1);
+    return {lanes};
 }
 #endif
 
@@ -137,13 +158,53 @@ SPLAT_INLINE f32x16 negate_where(Mask16 m, f32x16 v) { return select(m, -v, v); 
 
 SPLAT_INLINE f32x16 abs(f32x16 v) { return f32x16(i32x16(v) & 0x7fffffff); }
 
-// 1 / x to about 2^-26, for x in [0.001, 1].
+// 1 / x to about 2^-26, for x in [1e-37, 1e37].
 SPLAT_INLINE f32x16 reciprocal(f32x16 x) {
 #if SPLAT_AVX512
     const f32x16 guess = _mm512_rcp14_ps(x);
     return guess * (2.0f - x * guess);
 #else
     return 1.0f / x;
+#endif
+}
+
+// 1 / x and 1 / sqrt(x) in float64 to about 2^-52, for x in [1e-300, 1e300]: Newton's steps from a
+// guess of 14 bits, where a division of eight lanes takes 16 to 24 cycles and a root more. 0 and
+// infinity may give NaN.
+SPLAT_INLINE f64x8 reciprocal(f64x8 x) {
+#if SPLAT_AVX512
+    f64x8 guess = _mm512_rcp14_pd(x);
+    for (int i = 0; i < 2; i++) guess += guess * (1.0 - x * guess);
+    return guess;
+#else
+    return 1.0 / x;
+#endif
+}
+SPLAT_INLINE f64x8 inverse_sqrt(f64x8 x) {
+#if SPLAT_AVX512
+    f64x8 guess = _mm512_rsqrt14_pd(x);
+    for (int i = 0; i < 2; i++) guess += 0.5 * guess * (1.0 - x * guess * guess);
+    return guess;
+#else
+    return 1.0 / sqrt(x);
+#endif
+}
+
+// ---- Two vectors of eight for one of sixteen ----
+
+SPLAT_INLINE f64x8 widen(f32x16 v, int half) {
+    f32x8 part;
+    std::memcpy(&part, reinterpret_cast<const char*>(&v) + half * sizeof(part), sizeof(part));
+    return __builtin_convertvector(part, f64x8);
+}
+SPLAT_INLINE f32x16 narrow(f64x8 low, f64x8 high) {
+#if SPLAT_AVX512
+    const __m512 lower = _mm512_castps256_ps512(_mm512_cvtpd_ps(low));
+    return _mm512_insertf32x8(lower, _mm512_cvtpd_ps(high), 1);
+#else
+    const f32x8 parts[2] = {__builtin_convertvector(low, f32x8),
+                            __builtin_convertvector(high, f32x8)};
+    return load<f32x16>(parts);
 #endif
 }
 
@@ -198,86 +259,10 @@ SPLAT_INLINE f64x8 exp(f64x8 x) {
 SPLAT_INLINE f64x8 log2(f64x8 x) {
     const i64x8 e = i64x8(u64x8(x) - 0x3fe6a09e667f3bcdULL) >> 52;  // less the bits of sqrt(0.5)
     const f64x8 m = f64x8(u64x8(x) - (u64x8(e) << 52));
-    const f64x8 s = (m - 1.0) / (m + 1.0), s2 = s * s;
+    const f64x8 s = (m - 1.0) * reciprocal(m + 1.0), s2 = s * s;
     f64x8 p = splat8(1.0 / 17);
     for (int n = 15; n > 0; n -= 2) p = p * s2 + 1.0 / n;
     return __builtin_convertvector(e, f64x8) + 2.8853900817779268 * s * p;
-}
-
-// ---- Pixels of three channels ----
-
-struct Rgb {
-    f32x16 red, green, blue;
-};
-
-template <int kPart, int... kLanes>
-SPLAT_INLINE f32x16 interleave_part(const Rgb& v, std::integer_sequence<int, kLanes...>) {
-    const auto lane = [](int i, int channel) { return (16 * kPart + i) % 3 == channel; };
-    const i32x16 two = {(lane(kLanes, 1) ? 16 : 0) + (16 * kPart + kLanes) / 3 ...};
-    const i32x16 three = {(lane(kLanes, 2) ? 16 + (16 * kPart + kLanes) / 3 : kLanes)...};
-    return __builtin_shuffle(__builtin_shuffle(v.red, v.green, two), v.blue, three);
-}
-template <int kChannel, int... kLanes>
-SPLAT_INLINE f32x16 channel(const float* pixels, std::integer_sequence<int, kLanes...>) {
-    const i32x16 two = {(3 * kLanes + kChannel) % 32 ...};
-    const i32x16 three = {(3 * kLanes + kChannel < 32 ? kLanes : 3 * kLanes + kChannel - 16)...};
-    return __builtin_shuffle(
-        __builtin_shuffle(load<f32x16>(pixels), load<f32x16>(pixels + 16), two),
-        load<f32x16>(pixels + 32), three);
-}
-using SixteenLanes = std::make_integer_sequence<int, 16>;
-
-// 16 pixels red, green, blue, red, ... to and from a vector per channel.
-SPLAT_INLINE void interleave(const Rgb& v, float* pixels) {
-    store(pixels, interleave_part<0>(v, SixteenLanes{}));
-    store(pixels + 16, interleave_part<1>(v, SixteenLanes{}));
-    store(pixels + 32, interleave_part<2>(v, SixteenLanes{}));
-}
-SPLAT_INLINE Rgb deinterleave(const float* pixels) {
-    return {channel<0>(pixels, SixteenLanes{}), channel<1>(pixels, SixteenLanes{}),
-            channel<2>(pixels, SixteenLanes{})};
-}
-
-// ---- Sums over lanes ----
-
-// Lane sums of 12 vectors in a fixed order: sum(v[i]) lands in lane sum_lane(i), the other lanes
-// are junk. Each step halves the lanes of two vectors into one.
-constexpr int sum_lane(int i) { return 4 * (i % 4) + i / 4; }
-
-template <int A, int B, int C, int D>
-SPLAT_INLINE f32x16 quarters(f32x16 a, f32x16 b) {  // 128-bit parts A, B of a, then C, D of b
-    const i32x16 order = {4 * A,      4 * A + 1,  4 * A + 2,  4 * A + 3,  4 * B,      4 * B + 1,
-                          4 * B + 2,  4 * B + 3,  4 * C + 16, 4 * C + 17, 4 * C + 18, 4 * C + 19,
-                          4 * D + 16, 4 * D + 17, 4 * D + 18, 4 * D + 19};
-    return __builtin_shuffle(a, b, order);
-}
-template <int A, int B>
-SPLAT_INLINE f32x16 within(f32x16 a, f32x16 b) {  // in each 128-bit part: A, B of a, A, B of b
-    const i32x16 order = {A,     B,     A + 16, B + 16, A + 4,  B + 4,  A + 20, B + 20,
-                          A + 8, B + 8, A + 24, B + 24, A + 12, B + 12, A + 28, B + 28};
-    return __builtin_shuffle(a, b, order);
-}
-
-SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[12]) {
-    f32x16 part[3];
-    for (int i = 0; i < 3; i++) {
-        const f32x16* u = v + 4 * i;
-        const f32x16 a = quarters<0, 1, 0, 1>(u[0], u[1]) + quarters<2, 3, 2, 3>(u[0], u[1]);
-        const f32x16 b = quarters<0, 1, 0, 1>(u[2], u[3]) + quarters<2, 3, 2, 3>(u[2], u[3]);
-        part[i] = quarters<0, 2, 0, 2>(a, b) + quarters<1, 3, 1, 3>(a, b);
-    }
-    const f32x16 a = within<0, 1>(part[0], part[1]) + within<2, 3>(part[0], part[1]);
-    const f32x16 b = within<0, 1>(part[2], part[2]) + within<2, 3>(part[2], part[2]);
-    return within<0, 2>(a, b) + within<1, 3>(a, b);
-}
-
-// The same for 4 vectors: sum(v[i]) lands in lane 4 i.
-SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[4]) {
-    const f32x16 a = quarters<0, 1, 0, 1>(v[0], v[1]) + quarters<2, 3, 2, 3>(v[0], v[1]);
-    const f32x16 b = quarters<0, 1, 0, 1>(v[2], v[3]) + quarters<2, 3, 2, 3>(v[2], v[3]);
-    const f32x16 part = quarters<0, 2, 0, 2>(a, b) + quarters<1, 3, 1, 3>(a, b);
-    const f32x16 pairs = within<0, 1>(part, part) + within<2, 3>(part, part);
-    return within<0, 2>(pairs, pairs) + within<1, 3>(pairs, pairs);
 }
 
 }  // namespace splat

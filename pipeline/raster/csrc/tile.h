@@ -2,7 +2,7 @@
 // from it.
 #pragma once
 
-#include "simd.h"
+#include "shuffle.h"
 #include "types.h"
 
 namespace splat {

@@ -39,7 +39,8 @@ struct alignas(64) Record {
     double x, y;
     float uu, uw, ww, log2_opacity;
     float rgb[3], depth;
-    float extent_x, extent_y;  // half the bounding box of {alpha >= 1/255}, pixels
+    // The box of {alpha >= 1/255} in blocks of 4 x 4 pixels, inside the image; all inclusive
+    uint16_t block_left, block_top, block_right, block_bottom;
     float unused[2];
 };
 static_assert(sizeof(Record) == 64);

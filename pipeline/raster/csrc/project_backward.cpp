@@ -1,0 +1,152 @@
+#include "group.h"
+#include "project.h"
+
+namespace splat {
+namespace {
+
+constexpr double kLn2 = 0.69314718055994530942;
+
+// The sums of one Gaussian's slots, lanes as in a slot.
+SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
+    Lanes low = {}, high = {};
+    for (uint32_t s = 0; s < slots.count; s++) {
+        const f32x16 slot =
+            load<f32x16>(slot_gradients + int64_t(slots.first + s) * kSlotFloats);
+        low += widen(slot, 0);
+        high += widen(slot, 1);
+    }
+    return narrow(low, high);
+}
+
+// What a group's image asks for: fields of the records, and sums of the slots by Moment.
+struct GroupMoments {
+    f32x16 uu, uw, ww, rgb[3];
+    f32x16 moment[12];
+
+    // Zeros for the lanes that are not in `drawn`.
+    GroupMoments(const Record* records, const Slots* slots, const float* slot_gradients,
+                 uint32_t drawn) {
+        f32x16 record[16], sums[16];
+        for (int lane = 0; lane < kGroup; lane++) {
+            const bool is_drawn = drawn >> lane & 1;
+            record[lane] = is_drawn ? load<f32x16>(records + lane) : f32x16{};
+            sums[lane] = is_drawn ? sum_slots(slots[lane], slot_gradients) : f32x16{};
+        }
+        transpose(record);
+        transpose(sums);
+        uu = record[4];
+        uw = record[5];
+        ww = record[6];
+        for (int c = 0; c < 3; c++) rgb[c] = record[8 + c];
+        for (int m = 0; m < 12; m++) moment[m] = sums[sum_lane(m)];
+    }
+
+    // From the moments of y = (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2)
+    // and y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
+    SPLAT_INLINE ImageGradients half(int h) const {
+        const auto get = [&](Moment m) { return widen(moment[m], h); };
+        const Lanes l00 = widen(uu, h), l10 = widen(uw, h), l11 = widen(ww, h);
+        ImageGradients g;
+        g.x = 2.0 * kLn2 * l00 * get(kVU);
+        g.y = 2.0 * kLn2 * (l10 * get(kVU) + l11 * get(kVW));
+        // inverse(cov) = 2 ln2 L L^T, d = L^-T y: 1/2 inverse(cov) (sum v d d^T) inverse(cov)
+        //   = 2 ln2^2 L (sum v y y^T) L^T
+        const double k = 2.0 * kLn2 * kLn2;
+        const Lanes a = get(kVUU), b = get(kVUW), c = get(kVWW);
+        g.xx = k * l00 * l00 * a;
+        g.xy = 2.0 * k * l00 * (l10 * a + l11 * b);
+        g.yy = k * (l10 * l10 * a + 2.0 * l10 * l11 * b + l11 * l11 * c);
+        g.depth = get(kDepth);
+        g.ln_opacity = get(kV);
+        return g;
+    }
+};
+
+// Gradients of a group, but for the spherical harmonics.
+struct GroupGradients {
+    f32x16 mean[3], log_scale[3], quat[4], opacity_logit, means2d[2];
+
+    GroupGradients(const InputGradients (&g)[2], const ImageGradients (&image)[2]) {
+        const auto three = [&](Vec3 InputGradients::*field, f32x16* to) {
+            to[0] = narrow((g[0].*field).x, (g[1].*field).x);
+            to[1] = narrow((g[0].*field).y, (g[1].*field).y);
+            to[2] = narrow((g[0].*field).z, (g[1].*field).z);
+        };
+        three(&InputGradients::mean, mean);
+        three(&InputGradients::log_scale, log_scale);
+        for (int k = 0; k < 4; k++) quat[k] = narrow(g[0].quat[k], g[1].quat[k]);
+        opacity_logit = narrow(g[0].opacity_logit, g[1].opacity_logit);
+        means2d[0] = narrow(image[0].x, image[1].x);
+        means2d[1] = narrow(image[0].y, image[1].y);
+    }
+    template <class Visit>
+    SPLAT_INLINE void each(const Visit& visit) {
+        for (f32x16& v : mean) visit(v);
+        for (f32x16& v : log_scale) visit(v);
+        for (f32x16& v : quat) visit(v);
+        visit(opacity_logit);
+        for (f32x16& v : means2d) visit(v);
+    }
+};
+
+}  // namespace
+
+void project_view_backward(const Gaussians& in, const View& view, int threads,
+                           const Record* records, const float* radii, const Slots* slots,
+                           const float* slot_gradients, const GaussianGradients& out) {
+    const CameraCenter center(view);
+    const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
+#pragma omp parallel for num_threads(threads) schedule(dynamic, 32)
+    for (int64_t number = 0; number < count; number++) {
+        const Group group(in, number);
+        const int64_t first = group.first;
+        uint32_t drawn = 0;
+        for (int lane = 0; lane < group.count; lane++)
+            drawn |= uint32_t(radii[first + lane] > 0 && slots[first + lane].count > 0) << lane;
+
+        const GroupMoments asked(records + first, slots + first, slot_gradients, drawn);
+        ImageGradients image[2];
+        InputGradients half[2];
+        CameraCenter::Toward toward[2];
+        for (int h = 0; h < 2; h++) {
+            const Inputs inputs = group.half(h);
+            image[h] = asked.half(h);
+            half[h] = project_backward(project(inputs, view), image[h], view);
+            toward[h] = center.toward(inputs.mean);
+        }
+        GroupGradients g(half, image);
+
+        // Colour: where it was clamped to zero it does not move.
+        Mask16 sound = mask(drawn);  // every gradient fits into float32
+        const f32x16 zero = {}, most = splat16(1e37f);
+        const auto check = [&](f32x16& v) { sound = sound & ge(most, abs(v)); };
+        f32x16 d_rgb[3], d_mean[3];
+        for (int c = 0; c < 3; c++) {
+            d_rgb[c] = keep(lt(zero, asked.rgb[c]), asked.moment[kRed + c]);
+            check(d_rgb[c]);
+        }
+        ShBlock sh;
+        sh.read(view.sh_degree, in.sh + sh_width * first, sh_width, drawn);
+        sh_backward(directions(toward), view.sh_degree, d_rgb, sh, d_mean);
+        for (int k = 0; k < 3; k++) g.mean[k] += d_mean[k];
+
+        f32x16 absolute[2];
+        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * asked.moment[kAbsX + k];
+        g.each(check);
+        for (f32x16& v : absolute) check(v);
+        const auto clear = [&](f32x16& v) { v = keep(sound, v); };
+        g.each(clear);
+        for (f32x16& v : absolute) clear(v);
+        for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
+
+        write_rows(g.mean, group.count, out.means + 3 * first);
+        write_rows(g.log_scale, group.count, out.log_scales + 3 * first);
+        write_rows(g.quat, group.count, out.quats + 4 * first);
+        write_column(g.opacity_logit, group.count, out.opacity_logits + first);
+        write_rows(g.means2d, group.count, out.means2d + 2 * first);
+        if (out.means2d_abs) write_rows(absolute, group.count, out.means2d_abs + 2 * first);
+        sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
+    }
+}
+
+}  // namespace splat

@@ -44,6 +44,12 @@ def run(job: Job) -> None:
     # After a kill: what earlier processes spent on the same training.
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
     job.warnings += result.warnings
+    minutes = job.section(Train).budget_minutes
+    if minutes is not None:
+        job.decide(
+            f"{result.steps} steps fitted into {minutes:g} minutes; how many do depends on the "
+            "machine and its load, so another run gives other bits"
+        )
     result.gaussians.save(job.out / "gaussians.npz")
     write_json(job.out / "curve.json", result.curve)
     write_json(job.out / "exposure.json", gains)

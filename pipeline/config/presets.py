@@ -10,7 +10,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {
         "views": {"max_long_side_px": 640},
         "features": {"max_features": 3000, "max_long_side_px": 1200},
-        "train": {"steps": 1500, "density": {"max_gaussians": 75_000}},
+        "train": {"steps": 1500, "density": {"pixels_per_gaussian": 4.0}},
     },
     "balanced": {},
     "high": {
@@ -19,7 +19,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train": {
             "steps": 30_000,
             "coarse_until": 0.2,
-            "density": {"max_gaussians": 1_000_000, "stop_share": 0.5},
+            "density": {"stop_share": 0.5},
         },
     },
 }

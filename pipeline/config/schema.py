@@ -166,13 +166,18 @@ class Init(Section):
     max_points: Positive = Field(
         200_000,
         description="More sparse points are thinned to this, or to "
-        "half of train.density.max_gaussians, so that room is left to densify.",
+        "half of the budget of Gaussians, so that room is left to densify.",
     )
 
 
 class Density(Section):
-    """Adaptive density control after Kerbl et al. 2023, section 5.2."""
+    """Density control: which Gaussians there are."""
 
+    strategy: Literal["gradient", "mcmc"] = Field(
+        "gradient",
+        description="gradient: clone, split and prune (Kerbl et al. 2023, section 5.2); mcmc: "
+        "relocate, grow and shake (Kheradmand et al. 2024).",
+    )
     start_step: int = Field(500, description="First densification.")
     stop_share: Share = Field(0.7, description="Densify until this share of the steps.")
     interval: Positive = Field(100, description="Steps between densifications.")
@@ -184,8 +189,15 @@ class Density(Section):
         description="Sum the absolute values of each pixel's gradient (AbsGS), so that pulls in "
         "opposite directions don't cancel; wants a larger grad_threshold.",
     )
+    clone: bool = Field(True, description="gradient: without, the small split, too.")
+    split: bool = Field(True, description="gradient: without, the large are cloned, too.")
     split_scale: Rate = Field(
         0.01, description="Gaussians larger than this share of the scene's extent split."
+    )
+    recycle: Share = Field(
+        0.02,
+        description="gradient: where the budget is used up, up to this share of it is taken each "
+        "time from the faintest Gaussians for those most wanted.",
     )
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
     prune_scale: Rate = Field(
@@ -197,7 +209,17 @@ class Density(Section):
         description="Steps between opacity resets; there is one only where as many steps of "
         "density control still follow, so that short runs have none.",
     )
-    max_gaussians: Positive = Field(150_000, description="Budget: never more Gaussians than this.")
+    growth: Rate = Field(0.05, description="mcmc: the set grows by this share each time.")
+    noise: bool = Field(True, description="mcmc: faint Gaussians move at random.")
+    opacity_cost: Rate = Field(0.01, description="mcmc: weight of the mean opacity in the loss.")
+    scale_cost: Rate = Field(0.01, description="mcmc: weight of the mean scale in the loss.")
+    pixels_per_gaussian: Annotated[float, Field(gt=0)] = Field(
+        2.0,
+        description="Budget: a view's pixels over this, or fewer where there are few photographs.",
+    )
+    max_gaussians: Positive = Field(
+        1_000_000, description="Budget: never more Gaussians than this, whatever the pixels."
+    )
 
 
 class Train(Section):
@@ -208,11 +230,16 @@ class Train(Section):
         description="Optimiser steps, one view each. Below 7000, the intervals that are counted in "
         "steps shrink in proportion.",
     )
+    budget_minutes: Annotated[float, Field(gt=0)] | None = Field(
+        None,
+        description="Instead of steps: train for so many minutes by the clock, as well as that "
+        "allows. How many steps fit depends on the machine and its load, so two runs differ.",
+    )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
     coarse_until: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.6, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
+        0.3, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."
@@ -223,10 +250,22 @@ class Train(Section):
         "points, are laid over the render before it is compared; auto: where they differ between "
         "photographs by over 0.2 stops (standard deviation).",
     )
+    isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
     lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")
     lr_means_final: Annotated[float, Field(gt=0)] = Field(
         1.6e-6, description="The same at the end (log-linear decay)."
+    )
+    lr_boost: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
+        "auto",
+        description="The rates below are multiplied by this; auto: by sqrt(30000 / steps) in runs "
+        "shorter than the papers' 30 000 steps.",
+    )
+    lr_decay_from: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.5, description="From this share of the run on, the rates below fall (log-linearly)"
+    )
+    lr_final_share: Annotated[float, Field(gt=0, le=1)] = Field(
+        0.1, description="to this share of themselves."
     )
     lr_scales: Rate = 5e-3
     lr_quats: Rate = 1e-3

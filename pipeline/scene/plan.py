@@ -43,6 +43,11 @@ SPATIAL_SHARE = 0.9
 MIXED_BODIES = 3
 MIXED_GROUP_SHARE = 0.5
 
+# Fewer Gaussians than this make no picture; and each wants to be seen in so many pixels of all
+# photographs together, or it learns single pictures by heart.
+MIN_GAUSSIANS = 20_000
+PIXELS_SEEN_PER_GAUSSIAN = 40
+
 # A plan is for people, and travels on a command line.
 FACTS_SHOWN = 20
 
@@ -84,6 +89,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
     camera_model, model_reason = _camera_model(scan, config)
     sharing, sharing_reason = _share_cameras(scan, config)
     background, background_reason = _background(scan, config)
+    budget, budget_reason = _budget(scan, config)
     settled = _settled(
         config,
         {
@@ -92,11 +98,12 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             "sfm": {"mapper": mapper, "camera_model": camera_model, "share_cameras": sharing},
             "init": {
                 "method": "points" if config.init.method == "auto" else config.init.method,
-                "max_points": min(
-                    config.init.max_points, max(1, config.train.density.max_gaussians // 2)
-                ),
+                "max_points": min(config.init.max_points, max(1, budget // 2)),
             },
-            "train": {"background": background},
+            "train": {
+                "background": background,
+                "density": config.train.density.model_copy(update={"max_gaussians": budget}),
+            },
         },
     )
     poses = scan.poses
@@ -120,8 +127,13 @@ def make_plan(scan: Scan, config: Config) -> Plan:
         "init": _init(scan, settled),
         "train": StagePlan(
             run=True,
-            reason=f"{settled.train.steps} steps",
-            decisions=[_resolution(scan, settled), background_reason, *_mask_lines(scan, config)],
+            reason=_length(settled),
+            decisions=[
+                _resolution(scan, settled),
+                budget_reason,
+                background_reason,
+                *_mask_lines(scan, config),
+            ],
         ),
         "evaluate": StagePlan(run=True, reason=_split(settled), decisions=_truth(scan)),
         "export": StagePlan(run=True, reason=", ".join(settled.export.formats) or "no format"),
@@ -251,6 +263,23 @@ def _background(scan: Scan, config: Config) -> Choice:
     return "black", f"black background: {few}"
 
 
+def _budget(scan: Scan, config: Config) -> tuple[int, str]:
+    """How many Gaussians the scene gets: as many as its pictures can tell apart."""
+    density = config.train.density
+    width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
+    by_view = width * height / density.pixels_per_gaussian
+    by_scene = width * height * len(scan.photos) / PIXELS_SEEN_PER_GAUSSIAN
+    wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene)))
+    if wanted >= density.max_gaussians:
+        return density.max_gaussians, f"at most {density.max_gaussians} Gaussians, as configured"
+    why = f"one for each {density.pixels_per_gaussian:g} pixels of a view"
+    if by_scene < by_view:
+        why = f"one for each {PIXELS_SEEN_PER_GAUSSIAN} pixels of these few photographs"
+    if wanted == MIN_GAUSSIANS:
+        why = "the least"
+    return wanted, f"at most {wanted} Gaussians: {why}"
+
+
 def _settled(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:
     sections = {
         name: getattr(config, name).model_copy(update=dict(values))
@@ -320,6 +349,11 @@ def _init(scan: Scan, config: Config) -> StagePlan:
         reason="Gaussians from points triangulated at the given poses, which came without any",
         decisions=["pairs of cameras that stand close and look alike"],
     )
+
+
+def _length(config: Config) -> str:
+    minutes = config.train.budget_minutes
+    return f"{config.train.steps} steps" if minutes is None else f"{minutes:g} minutes"
 
 
 def _resolution(scan: Scan, config: Config) -> str:

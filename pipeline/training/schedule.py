@@ -3,10 +3,14 @@
 Intervals in the config mean what they say for runs of ``NOMINAL_STEPS`` and more. Shorter runs
 have them all shrunk by ``steps / NOMINAL_STEPS``, so that 600 steps pass through the same phases
 as 7000. Steps count from 1: "after step t".
+
+A run that has minutes instead of steps goes through the schedule of ``NOMINAL_STEPS`` by the share
+of its time that has passed: its clock, not its steps, counts here.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 
 from pipeline.config.schema import Train
@@ -15,6 +19,10 @@ NOMINAL_STEPS = 7000
 # Fewer steps than this between two densifications say too little about a gradient's mean.
 MIN_REFINE_INTERVAL = 10
 COARSE_FACTORS = (4, 2)
+# The papers' length of a run, for which the configured learning rates are right. The noise of one
+# view a step asks that a run of fewer goes farther in each: by the root, as for batches (measured
+# between 1500 and 7000 steps).
+PAPER_STEPS = 30_000
 
 
 @dataclass(frozen=True)
@@ -27,7 +35,10 @@ class Schedule:
         coarse_steps: steps at reduced resolution, first half of them at 1/4, the rest at 1/2.
         refine_start, refine_stop, refine_interval: density control after steps of this range.
         reset_interval: steps between opacity resets.
+        max_gaussians: the budget.
         lr_means, lr_means_final: of the first and the last step, times the scene's extent.
+        lr_boost: all other rates are multiplied by this (None: see ``PAPER_STEPS``),
+        lr_decay_from, lr_final_share: and from this share of the run on fall to this share.
     """
 
     steps: int
@@ -38,26 +49,35 @@ class Schedule:
     refine_stop: int
     refine_interval: int
     reset_interval: int
+    max_gaussians: int
     lr_means: float
     lr_means_final: float
+    lr_boost: float | None
+    lr_decay_from: float
+    lr_final_share: float
 
     @staticmethod
     def of(config: Train) -> Schedule:
-        """The schedule of ``config.steps`` steps."""
-        shrink = min(1.0, config.steps / NOMINAL_STEPS)
+        """The schedule of ``config.steps`` steps, or of ``config.budget_minutes``."""
+        steps = config.steps if config.budget_minutes is None else NOMINAL_STEPS
+        shrink = min(1.0, steps / NOMINAL_STEPS)
         density = config.density
         interval = min(density.interval, MIN_REFINE_INTERVAL)
         return Schedule(
-            steps=config.steps,
+            steps=steps,
             sh_degree=config.sh_degree,
             sh_interval=max(1, round(config.sh_interval * shrink)),
-            coarse_steps=int(config.coarse_until * config.steps),
+            coarse_steps=int(config.coarse_until * steps),
             refine_start=round(density.start_step * shrink),
-            refine_stop=round(density.stop_share * config.steps),
+            refine_stop=round(density.stop_share * steps),
             refine_interval=max(interval, round(density.interval * shrink)),
             reset_interval=max(1, round(density.opacity_reset_interval * shrink)),
+            max_gaussians=density.max_gaussians,
             lr_means=config.lr_means,
             lr_means_final=config.lr_means_final,
+            lr_boost=None if config.lr_boost == "auto" else config.lr_boost,
+            lr_decay_from=config.lr_decay_from,
+            lr_final_share=config.lr_final_share,
         )
 
     def resolution_factor(self, step: int) -> int:
@@ -75,6 +95,19 @@ class Schedule:
             return self.lr_means
         t = (step - 1) / max(1, self.steps - 1)
         return self.lr_means ** (1 - t) * self.lr_means_final**t
+
+    def lr_factor_at(self, step: int, run: float | None = None) -> float:
+        """What the other rates are multiplied by: constant, then falling log-linearly. ``run`` is
+        the number of steps that the run will have, where that isn't the schedule's."""
+        boost = self.lr_boost or math.sqrt(max(1.0, PAPER_STEPS / (run or self.steps)))
+        begin = self.lr_decay_from * self.steps
+        t = max(0.0, step - begin) / max(1.0, self.steps - begin)
+        return float(boost * self.lr_final_share**t)
+
+    def budget_at(self, step: int) -> int:
+        """Most Gaussians after density control at this step: fewer while the pictures are coarse,
+        where more would cost as much as at full size and have no pixels to learn from."""
+        return round(self.max_gaussians / math.sqrt(self.resolution_factor(step)))
 
     def refines_after(self, step: int) -> bool:
         """Densify and prune after this step."""

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density import Changes, GradientDensity
+from pipeline.training.density import Changes, Strategy
 from pipeline.training.optimiser import Adam
 
 
@@ -48,6 +48,7 @@ class TrainState:
     """The state after ``step`` steps.
 
     Attributes:
+        clock: where the run is in its schedule: ``step``, unless it has minutes instead of steps.
         order: (V,) int64, this epoch's order of views; ``position`` of them are done.
         curve: records without times; ``curve_seconds`` has the time of each.
         seconds: training time before this process.
@@ -55,11 +56,12 @@ class TrainState:
 
     gaussians: Gaussians
     adam: Adam
-    density: GradientDensity
+    density: Strategy
     rng: np.random.Generator
     order: NDArray[np.int64]
     position: int = 0
     step: int = 0
+    clock: int = 0
     counters: Counters = field(default_factory=Counters)
     window: Window = field(default_factory=Window)
     curve: list[dict[str, float]] = field(default_factory=list)
@@ -80,15 +82,14 @@ class TrainState:
             result[f"parameter.{name}"] = tensor.numpy()
             result[f"first.{name}"] = self.adam.first[name].numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
-        result["gradient_sum"] = self.density.gradient_sum.numpy()
-        result["seen"] = self.density.seen.numpy()
-        return result
+        return result | self.density.arrays()
 
     def values(self) -> dict[str, Any]:
         """The rest, as JSON; floats survive exactly."""
         return {
             "rng": self.rng.bit_generator.state,
             "position": self.position,
+            "clock": self.clock,
             "counters": asdict(self.counters),
             "window": asdict(self.window),
             "curve": self.curve,
@@ -106,10 +107,9 @@ class TrainState:
         for name in self.gaussians.tensors():
             self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
             self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
-        self.density.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
-        self.density.seen = torch.from_numpy(arrays["seen"])
+        self.density.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
-        self.position = values["position"]
+        self.position, self.clock = values["position"], values["clock"]
         counters = dict(values["counters"])
         self.counters = Counters(changes=Changes(**counters.pop("changes")), **counters)
         self.window = Window(**values["window"])

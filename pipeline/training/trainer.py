@@ -28,7 +28,7 @@ from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
-from pipeline.training.density import GradientDensity
+from pipeline.training.density import make_strategy
 from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
@@ -36,7 +36,7 @@ from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 1
+STATE_VERSION = 2
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -158,7 +158,7 @@ class _Run:
             )
             chosen = np.sort(rng.permutation(len(gaussians))[:budget])
             gaussians = gaussians.select(torch.from_numpy(chosen))
-        density = GradientDensity(config.density, extent)
+        density = make_strategy(config.density, extent)
         density.start(len(gaussians))
         self.state = TrainState(
             gaussians, Adam(gaussians), density, rng, rng.permutation(len(self.views))
@@ -186,36 +186,50 @@ class _Run:
             self.on_log(message)
 
     def train(self) -> TrainResult:
-        state, steps = self.state, self.config.steps
+        state, steps = self.state, self.schedule.steps
         # What happened to checkpoints is told, but is no part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
         if found is not None:
             state.restore(found.step, found.arrays, found.values)
         started = saved = time.monotonic()
         seconds_before = state.seconds
-        progress = Progress("training", steps, unit="steps")
-        progress.start_at(state.step)
+        progress = Progress("training", steps, unit="steps" if self.counts_steps else "parts")
+        progress.start_at(state.clock)
         records = max(1, steps // CURVE_RECORDS)
-        while state.step < steps:
+        while state.clock < steps:
+            before = state.clock
             self.step()
             now = time.monotonic()
             state.seconds = seconds_before + now - started
-            if state.step % records == 0 or state.step == steps:
+            if state.clock // records > before // records or state.clock == steps:
                 self.record()
-            if now - saved >= CHECKPOINT_SECONDS and state.step < steps:
+            if now - saved >= CHECKPOINT_SECONDS and state.clock < steps:
                 self.save()
                 saved = time.monotonic()
-            progress.advance(note=self.note())
+            progress.advance(state.clock - before, note=self.note())
         return self.result()
+
+    @property
+    def counts_steps(self) -> bool:
+        return self.config.budget_minutes is None
+
+    def advance(self) -> range:
+        """Begin a step; the places in the schedule that it passes."""
+        state = self.state
+        state.step += 1
+        before, state.clock = state.clock, state.step
+        minutes, steps = self.config.budget_minutes, self.schedule.steps
+        if minutes is not None:
+            state.clock = max(1, before, min(steps, int(steps * state.seconds / (60 * minutes))))
+        return range(before + 1, state.clock + 1)
 
     def step(self) -> None:
         """One view: render, compare, differentiate, move; then density control when due."""
         state, config = self.state, self.config
-        state.step += 1
-        step = state.step
+        places, step = self.advance(), state.step
         self.raise_sh_degree()
         index = state.next_view()
-        factor = usable_factor(self.views, self.schedule.resolution_factor(step))
+        factor = usable_factor(self.views, self.schedule.resolution_factor(state.clock))
         target, camera = self.targets.get(index, factor), self.camera(index, factor)
         background = self.draw_background()
         options = RasterOptions(
@@ -232,36 +246,45 @@ class _Run:
         loss = l1_ssim(seen, wanted, config.ssim_weight, target.ignored, self.threads)
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
-        gradients = backward(rendered, d_color, means2d_abs=config.density.absolute_gradient)
+        gradients = backward(rendered, d_color, means2d_abs=self.config.density.absolute_gradient)
         state.density.observe(rendered, gradients, camera.width, camera.height)
-        state.adam.step(state.gaussians, gradients, self.rates(step), step, self.threads)
+        if config.isotropic:
+            gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
+        state.density.regularise(state.gaussians, gradients)
+        rates = self.rates()
+        state.adam.step(state.gaussians, gradients, rates, step, self.threads)
+        if state.clock <= self.schedule.refine_stop:
+            state.density.explore(state.gaussians, rates.means, state.rng)
 
         state.window.loss += float(loss.loss)
         state.window.steps += 1
-        if (step - 1) % min(PSNR_EVERY, max(1, config.steps // CURVE_RECORDS)) == 0:
+        if (step - 1) % min(PSNR_EVERY, max(1, self.schedule.steps // CURVE_RECORDS)) == 0:
             state.window.psnr += _psnr(seen, wanted, target)
             state.window.samples += 1
-        self.control_density(step)
+        self.control_density(places)
 
-    def control_density(self, step: int) -> None:
+    def control_density(self, places: range) -> None:
+        """Do what is due at these places of the schedule."""
         state, schedule = self.state, self.schedule
-        densify = schedule.refines_after(step)
-        if densify or schedule.prunes_after(step):
+        densify = any(map(schedule.refines_after, places))
+        if densify or any(map(schedule.prunes_after, places)):
             state.gaussians, changes = state.density.refine(
                 state.gaussians,
                 state.adam,
                 state.rng,
                 densify=densify,
-                prune_huge=schedule.prunes_huge_after(step),
+                prune_huge=any(map(schedule.prunes_huge_after, places)),
+                budget=schedule.budget_at(state.clock),
             )
             state.counters.changes.add(changes)
             if not len(state.gaussians):
                 raise UserError(
-                    f"every Gaussian has died by step {step}: none was of any use to the pictures",
+                    f"every Gaussian has died by step {state.step}: none was of any use to the "
+                    "pictures",
                     fix="check the poses and the masks; a lower train.density.prune_opacity or "
                     "init.method: points may help",
                 )
-        if schedule.resets_opacity_after(step):
+        if any(map(schedule.resets_opacity_after, places)):
             state.density.reset_opacity(state.gaussians, state.adam)
             state.counters.opacity_resets += 1
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
@@ -269,7 +292,7 @@ class _Run:
     def raise_sh_degree(self) -> None:
         """Bands that are not in use yet are not there at all: they would only cost time."""
         state = self.state
-        degree = self.schedule.sh_degree_at(state.step)
+        degree = self.schedule.sh_degree_at(state.clock)
         if degree > state.gaussians.sh_degree:
             state.gaussians = state.gaussians.with_sh_degree(degree)
             state.adam.resize_bands(degree)
@@ -280,15 +303,18 @@ class _Run:
             return red, green, blue
         return BACKGROUNDS[self.background]
 
-    def rates(self, step: int) -> Rates:
-        config = self.config
+    def rates(self) -> Rates:
+        config, schedule, state = self.config, self.schedule, self.state
+        # As many steps as the run will have if they go on as until now.
+        run = None if self.counts_steps else state.step * schedule.steps / state.clock
+        factor = schedule.lr_factor_at(state.clock, run)
         return Rates(
-            means=self.schedule.lr_means_at(step) * self.extent,
-            log_scales=config.lr_scales,
-            quats=config.lr_quats,
-            opacity_logits=config.lr_opacities,
-            sh0=config.lr_sh0,
-            shN=config.lr_shN,
+            means=schedule.lr_means_at(state.clock) * self.extent,
+            log_scales=config.lr_scales * factor,
+            quats=config.lr_quats * factor,
+            opacity_logits=config.lr_opacities * factor,
+            sh0=config.lr_sh0 * factor,
+            shN=config.lr_shN * factor,
         )
 
     def camera(self, index: int, factor: int) -> RasterCamera:

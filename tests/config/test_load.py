@@ -1,5 +1,7 @@
 """Configuration: what is validated, merged and documented."""
 
+from pathlib import Path
+
 import pytest
 import yaml
 
@@ -42,8 +44,8 @@ def test_scene_options_win_over_project_over_preset():
     fox, other = scene_config(raw, "fox"), scene_config(raw, "other")
     assert (fox.train.steps, other.train.steps) == (60, 50)
     assert fox.train.density.interval == 7
-    fast = PRESETS["fast"]["train"]["density"]["max_gaussians"]
-    assert fox.train.density.max_gaussians == fast
+    fast = PRESETS["fast"]["train"]["density"]["pixels_per_gaussian"]
+    assert fox.train.density.pixels_per_gaussian == fast
 
 
 def test_a_configuration_wins_over_the_scene_and_brings_its_preset():
@@ -96,3 +98,12 @@ def test_uncommented_defaults_are_the_defaults():
     for name in Project.model_fields.keys() - Config.model_fields.keys():
         values.pop(name)
     assert Config.model_validate(values) == Config()
+
+
+def test_every_ablation_is_a_configuration_that_differs_from_the_default():
+    path = Path(__file__).parents[2] / "config" / "ablations.yaml"
+    raw = yaml.safe_load(path.read_text())
+    found = {name: scene_config(raw, "fox", name) for name in raw["configs"]}
+    assert found.pop("balanced") == Config()
+    assert all(config != Config() for config in found.values())
+    assert len(set(map(Config.model_dump_json, found.values()))) == len(found)

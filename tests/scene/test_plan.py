@@ -252,3 +252,24 @@ def test_the_snakefile_can_afford_it():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
     assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize(
+    "count, options, budget",
+    [
+        (2000, {}, 20_000),  # tiny views: the least
+        (2000, {"pixels_per_gaussian": 0.1}, 48_000),
+        (100, {"pixels_per_gaussian": 0.1}, 20_000),  # few photographs
+        (100, {"pixels_per_gaussian": 0.1, "max_gaussians": 500}, 500),
+    ],
+)
+def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, budget):
+    size = {"width": lambda i: 80, "height": lambda i: 60}
+    config = Config.model_validate({"train": {"density": options}})
+    plan = make_plan(many(tmp_path, count, **size), config)
+    assert plan.config.train.density.max_gaussians == budget
+    assert plan.config.init.max_points == budget // 2
+    assert any(f"at most {budget} Gaussians" in text for text in plan.stages["train"].decisions)
+    # What was settled settles to the same.
+    again = make_plan(many(tmp_path, count, **size), plan.config)
+    assert again.config == plan.config

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,9 @@ from hypothesis import strategies as st
 
 from pipeline.config.schema import Density
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density import SPLIT_SHRINK, GradientDensity, rotations
+from pipeline.training.density.gradient import SPLIT_SHRINK, GradientDensity
+from pipeline.training.density.mcmc import McmcDensity, share_out
+from pipeline.training.density.strategy import rotations
 from pipeline.training.optimiser import Adam
 from tests.training.conftest import ball
 
@@ -38,7 +41,9 @@ def refine(
     density: GradientDensity, gaussians: Gaussians, adam: Adam, *, densify: bool = True
 ) -> Gaussians:
     rng = np.random.Generator(np.random.PCG64(0))
-    return density.refine(gaussians, adam, rng, densify=densify, prune_huge=False)[0]
+    return density.refine(
+        gaussians, adam, rng, densify=densify, prune_huge=False, budget=density.config.max_gaussians
+    )[0]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -52,7 +57,9 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
     rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
 
     rng2 = np.random.Generator(np.random.PCG64(seed))
-    result, changes = density.refine(gaussians, adam, rng2, densify=densify, prune_huge=False)
+    result, changes = density.refine(
+        gaussians, adam, rng2, densify=densify, prune_huge=False, budget=budget
+    )
 
     assert len(result) == count - changes.pruned + changes.cloned + changes.split
     assert len(result) <= max(budget, count - changes.pruned)
@@ -135,3 +142,84 @@ def test_opacity_reset_caps_and_forgets() -> None:
     assert torch.allclose(opacity[1:], torch.tensor(0.01))
     assert not adam.first["opacity_logits"].any()
     assert adam.first["means"].all()
+
+
+def test_without_split_or_clone_the_other_is_done_to_all() -> None:
+    for options, cloned, split in (({"split": False}, 5, 0), ({"clone": False}, 0, 5)):
+        gaussians, adam = marked(5)
+        density = strategy(5, split_scale=0.13, **options)
+        density.gradient_sum += 1.0
+        rng = np.random.Generator(np.random.PCG64(0))
+        _, changes = density.refine(
+            gaussians, adam, rng, densify=True, prune_huge=False, budget=100
+        )
+        assert (changes.cloned, changes.split) == (cloned, split)
+
+
+def mcmc(**options: object) -> McmcDensity:
+    return McmcDensity(Density(strategy="mcmc", **options))  # type: ignore[arg-type]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 60), st.integers(1, 80), st.integers(0, 2**31), st.booleans())
+def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
+    gaussians, adam = marked(count)
+    faint = np.random.default_rng(seed).random(count) < 0.3
+    gaussians.opacity_logits[torch.from_numpy(faint)] = -9.0
+    rng = np.random.Generator(np.random.PCG64(seed))
+    result, changes = mcmc(growth=0.2).refine(
+        gaussians, adam, rng, densify=densify, prune_huge=False, budget=budget
+    )
+    alive = count - int(faint.sum())
+    if densify and alive:
+        assert len(result) == max(count, min(budget, math.ceil(1.2 * count)))
+        assert changes.relocated == count - alive
+    else:
+        assert len(result) == alive
+        assert changes.pruned == count - alive
+    for name, tensor in result.tensors().items():
+        assert adam.first[name].shape == adam.second[name].shape == tensor.shape
+        assert torch.isfinite(tensor).all()
+    # Whoever stayed as it was has its own moments; whoever was shared out, and the new, have none.
+    had = {row.numpy().tobytes(): i + 1 for i, row in enumerate(gaussians.means)}
+    for row, moment in zip(result.means, adam.first["opacity_logits"], strict=True):
+        assert moment in (0, had[row.numpy().tobytes()])
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 10, 50])
+@pytest.mark.parametrize("opacity", [0.02, 0.5, 0.95])
+def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
+    """As many as ``parts`` in one place look as the one did: the same in the middle, and the same
+    light in all along a line (what equation 9 asks for)."""
+    logits = torch.logit(torch.tensor([opacity]))
+    new, shrink = share_out(logits, torch.tensor([parts]), 1e-6)
+    x = torch.linspace(-9, 9, 4001, dtype=torch.float64)
+    one = opacity * torch.exp(-0.5 * x**2)
+    part = torch.sigmoid(new.double()) * torch.exp(-0.5 * (x / shrink.double().exp()) ** 2)
+    many = 1 - (1 - part) ** parts
+    assert many.max() == pytest.approx(opacity, rel=1e-4)
+    assert many.sum() == pytest.approx(float(one.sum()), rel=1e-3)
+
+
+def test_noise_moves_the_faint_along_their_axes_alone() -> None:
+    gaussians = ball(2000, 0)
+    gaussians.opacity_logits[:1000] = -9.0
+    gaussians.opacity_logits[1000:] = 3.0
+    gaussians.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    gaussians.log_scales[:] = torch.tensor([-1.0, -9.0, -9.0])
+    before = gaussians.means.clone()
+    mcmc().explore(gaussians, 1e-6, np.random.Generator(np.random.PCG64(0)))
+    moved = (gaussians.means - before).abs()
+    assert not moved[1000:].any()
+    assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
+
+
+def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
+    gaussians = ball(5, 0)
+    logits = gaussians.opacity_logits.clone().requires_grad_()
+    scales = gaussians.log_scales.clone().requires_grad_()
+    (0.1 * torch.sigmoid(logits).mean() + 0.2 * scales.exp().mean()).backward()
+    gradients = SimpleNamespace(opacity_logits=torch.zeros(5), log_scales=torch.zeros(5, 3))
+    mcmc(opacity_cost=0.1, scale_cost=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
+    assert torch.allclose(gradients.opacity_logits, logits.grad)
+    assert torch.allclose(gradients.log_scales, scales.grad)

@@ -47,3 +47,20 @@ def test_short_runs_keep_their_large_backgrounds() -> None:
     """Without a reset, huge Gaussians are not yet split; pruning them cost 8 dB on a room."""
     schedule = Schedule.of(Train())
     assert not any(schedule.prunes_huge_after(step) for step in range(1, Train().steps + 1))
+
+
+def test_other_rates_are_boosted_in_short_runs_and_fall_at_the_end() -> None:
+    schedule = Schedule.of(Train(steps=3000, lr_decay_from=0.5, lr_final_share=0.1))
+    factors = [schedule.lr_factor_at(step) for step in range(1, 3001)]
+    assert factors[0] == factors[1499] == pytest.approx(10**0.5)
+    assert factors == sorted(factors, reverse=True)
+    assert factors[-1] == pytest.approx(0.1 * 10**0.5)
+    papers = Schedule.of(Train(steps=30_000, lr_final_share=1.0))
+    assert {papers.lr_factor_at(step) for step in (1, 15_000, 30_000)} == {1.0}
+
+
+def test_the_budget_grows_with_the_pictures() -> None:
+    schedule = Schedule.of(Train(coarse_until=0.5, density=Density(max_gaussians=1000)))
+    budgets = [schedule.budget_at(step) for step in range(1, Train().steps + 1)]
+    assert budgets == sorted(budgets)
+    assert set(budgets) == {500, 707, 1000}

@@ -98,6 +98,48 @@ def test_killed_and_resumed_gives_the_same_bits(
     assert not resumed.warnings
 
 
+@pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
+def test_killed_at_twenty_random_steps_and_resumed_gives_the_same_bytes(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str
+) -> None:
+    density = {"strategy": strategy, "max_gaussians": 90, "prune_opacity": 0.1}
+    config = tiny_config(60, density=density)
+    run(scene, tmp_path / "whole", config).gaussians.save(tmp_path / "whole.npz")
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    calls = np.random.default_rng(11).permutation(np.arange(1, 61))[:20]
+    for call in calls:
+        with monkeypatch.context() as patch:
+            interrupt_at(patch, int(call))
+            with pytest.raises(KeyboardInterrupt):
+                run(scene, tmp_path / f"{call}", config)
+        run(scene, tmp_path / f"{call}", config).gaussians.save(tmp_path / "resumed.npz")
+        assert (tmp_path / "resumed.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_minutes_pass_through_the_whole_schedule(scene: TinyScene, tmp_path: Path) -> None:
+    config = tiny_config(budget_minutes=2 / 60, coarse_until=0.5, density={"max_gaussians": 90})
+    result = run(scene, tmp_path, config)
+    assert 2.0 <= result.seconds < 20.0
+    assert len(result.curve) >= 20
+    assert result.gaussians.sh_degree == 1
+    assert len(result.gaussians) > 60, "density control took place"
+    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 3
+    steps = [record["step"] for record in result.curve]
+    assert steps == sorted(steps)
+    assert steps[-1] == result.steps
+
+
+def test_isotropic_gaussians_stay_spheres(scene: TinyScene, tmp_path: Path) -> None:
+    start = scene.initial.clone()
+    start.log_scales[:] = start.log_scales[:, :1]
+    common = {"seed": 0, "threads": 1, "extent": scene.extent, "checkpoint_dir": tmp_path}
+    scales = train(
+        scene.views, start, tiny_config(60, isotropic=True), **common
+    ).gaussians.log_scales
+    assert torch.equal(scales, scales[:, :1].expand(-1, 3))
+    assert (scales[:5] != start.log_scales[:5]).all()
+
+
 def test_resuming_from_an_older_step_gives_the_same_bits(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -1,40 +1,30 @@
 """Adaptive density control after Kerbl et al. 2023, section 5.2, under a budget.
 
-A strategy watches every step (``observe``) and now and then changes the set of Gaussians
-(``refine``, ``reset_opacity``); when, is the schedule's business.
+Gaussians whose image position the loss pulls at are cloned or split; faint and huge ones go.
 """
 
 from __future__ import annotations
 
 import math
 from dataclasses import dataclass, field
+from typing import Any
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Density
 from pipeline.raster import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density.strategy import Changes, not_finite, rotations
 from pipeline.training.optimiser import Adam
 
 # A split makes two, each this much smaller: 0.8 N with N = 2 (3DGS).
 SPLIT_SHRINK = 1.6
 RESET_OPACITY = 0.01
-
-
-@dataclass
-class Changes:
-    """Counts of one ``refine``."""
-
-    cloned: int = 0
-    split: int = 0
-    pruned: int = 0
-
-    def add(self, other: Changes) -> None:
-        self.cloned += other.cloned
-        self.split += other.split
-        self.pruned += other.pruned
+# What shows less than this may make room for others.
+RECYCLED_OPACITY = 0.1
 
 
 @dataclass
@@ -56,11 +46,12 @@ class GradientDensity:
     seen: Tensor = field(default_factory=lambda: torch.zeros(0))
 
     def start(self, count: int) -> None:
-        """Forget what was observed; ``count`` Gaussians from here on."""
         self.gradient_sum, self.seen = torch.zeros(count), torch.zeros(count)
 
+    def regularise(self, gaussians: Gaussians, gradients: Gradients) -> None:
+        """Nothing: the paper has no loss of this kind."""
+
     def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
-        """Take note of one step's view of ``width`` x ``height`` pixels."""
         pull = gradients.means2d
         if self.config.absolute_gradient:
             assert gradients.means2d_abs is not None
@@ -68,6 +59,9 @@ class GradientDensity:
         # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
         self.gradient_sum += torch.hypot(pull[:, 0] * (0.5 * width), pull[:, 1] * (0.5 * height))
         self.seen += forward.radii > 0
+
+    def explore(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+        """Nothing: chance has a part in splits alone."""
 
     def refine(
         self,
@@ -77,13 +71,19 @@ class GradientDensity:
         *,
         densify: bool,
         prune_huge: bool,
+        budget: int,
     ) -> tuple[Gaussians, Changes]:
-        """Prune, then (``densify``) clone and split; ``adam`` follows. What was observed is
-        forgotten. Never more than ``config.max_gaussians`` come out, unless more came in."""
+        """Prune, then (``densify``) clone the small and split the large."""
         kept = ~self._useless(gaussians, prune_huge)
+        grow = torch.zeros_like(kept)
+        if densify:
+            pull = self.gradient_sum / self.seen.clamp(min=1.0)
+            wanted = kept & (pull > self.config.grad_threshold)
+            kept = kept & ~self._recycled(gaussians, kept, wanted, budget)
+            # Each adds one Gaussian, cloned or split.
+            grow = most(pull, wanted, max(0, budget - int(kept.sum())))
         changes = Changes(pruned=len(gaussians) - int(kept.sum()))
-        grow = self._wanted(kept) if densify else torch.zeros_like(kept)
-        large = self._longest(gaussians) > self.config.split_scale * self.extent
+        large = self._large(gaussians)
         cloned = torch.nonzero(grow & ~large)[:, 0]
         split = torch.nonzero(grow & large)[:, 0]
         stay = torch.nonzero(kept & ~(grow & large))[:, 0]
@@ -105,30 +105,49 @@ class GradientDensity:
         gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         adam.forget("opacity_logits")
 
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return {"gradient_sum": self.gradient_sum.numpy(), "seen": self.seen.numpy()}
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
+        self.seen = torch.from_numpy(arrays["seen"])
+
     def _useless(self, gaussians: Gaussians, prune_huge: bool) -> Tensor:
         """(N,) bool: too faint, too large (``prune_huge``), or no longer a number."""
         useless = torch.sigmoid(gaussians.opacity_logits) < self.config.prune_opacity
         if prune_huge:
             useless |= self._longest(gaussians) > self.config.prune_scale * self.extent
-        for tensor in gaussians.tensors().values():
-            useless |= ~torch.isfinite(tensor).reshape(len(tensor), tensor[:1].numel()).all(1)
-        return useless
+        return useless | not_finite(gaussians)
 
-    def _wanted(self, kept: Tensor) -> Tensor:
-        """(N,) bool: those over the threshold, the most wanted ones first where the budget is
-        short. Each adds one Gaussian, cloned or split."""
-        gradient = self.gradient_sum / self.seen.clamp(min=1.0)
-        wanted = kept & (gradient > self.config.grad_threshold)
-        room = max(0, self.config.max_gaussians - int(kept.sum()))
-        if int(wanted.sum()) > room:
-            order = torch.argsort(gradient.where(wanted, -1.0), descending=True, stable=True)
-            wanted = torch.zeros_like(wanted)
-            wanted[order[:room]] = True
-        return wanted
+    def _large(self, gaussians: Gaussians) -> Tensor:
+        """(N,) bool: those that split rather than clone, where both are allowed."""
+        if not (self.config.clone and self.config.split):
+            return torch.full((len(gaussians),), self.config.split)
+        return self._longest(gaussians) > self.config.split_scale * self.extent
+
+    def _recycled(self, gaussians: Gaussians, kept: Tensor, wanted: Tensor, budget: int) -> Tensor:
+        """(N,) bool: the faintest, which make room where more are wanted than the budget has left.
+        Otherwise the first details would keep the budget, and what is bare would stay bare."""
+        short = int(wanted.sum()) - max(0, budget - int(kept.sum()))
+        limit = min(short, round(self.config.recycle * budget))
+        opacity = torch.sigmoid(gaussians.opacity_logits)
+        return most(-opacity, kept & ~wanted & (opacity < RECYCLED_OPACITY), limit)
 
     @staticmethod
     def _longest(gaussians: Gaussians) -> Tensor:
         return gaussians.log_scales.amax(1).exp()
+
+
+def most(score: Tensor, among: Tensor, count: int) -> Tensor:
+    """(N,) bool: the ``count`` highest scores ``among`` (N,) bool; the first of equal ones."""
+    if int(among.sum()) <= count:
+        return among
+    chosen = torch.zeros_like(among)
+    if count > 0:
+        lowest = torch.full_like(score, -math.inf)
+        order = torch.argsort(score.where(among, lowest), descending=True, stable=True)
+        chosen[order[:count]] = True
+    return chosen
 
 
 def _offsets(gaussians: Gaussians, rows: slice, rng: np.random.Generator) -> Tensor:
@@ -136,16 +155,3 @@ def _offsets(gaussians: Gaussians, rows: slice, rng: np.random.Generator) -> Ten
     scales = gaussians.log_scales[rows].exp()
     noise = torch.from_numpy(rng.standard_normal(scales.shape, np.float32))
     return torch.einsum("nij,nj->ni", rotations(gaussians.quats[rows]), scales * noise)
-
-
-def rotations(quats: Tensor) -> Tensor:
-    """(N, 3, 3) rotation matrices of quaternions (N, 4) wxyz of any length."""
-    w, x, y, z = torch.nn.functional.normalize(quats, dim=1).unbind(1)
-    return torch.stack(
-        [
-            *(1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)),
-            *(2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)),
-            *(2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)),
-        ],
-        1,
-    ).view(-1, 3, 3)

@@ -26,7 +26,7 @@ struct TileTargets {
             tile.read<1>(block, image, view.width, pixels);
             return load<f32x16>(pixels);
         };
-        const auto rgb = [&](int block, const float* image, f32x16 (&to)[3]) {
+        const auto rgb = [&](int block, const float* image, f32x16(&to)[3]) {
             tile.read<3>(block, image, view.width, pixels);
             deinterleave(pixels, to);
         };
@@ -36,8 +36,7 @@ struct TileTargets {
             rgb(block, in.color, c);
             rgb(block, in.d_color, d);
             // The background shows through 1 - alpha.
-            const f32x16 under =
-                d[0] * background[0] + d[1] * background[1] + d[2] * background[2];
+            const f32x16 under = d[0] * background[0] + d[1] * background[1] + d[2] * background[2];
             red[block] = d[0];
             green[block] = d[1];
             blue[block] = d[2];

@@ -67,9 +67,8 @@ struct CameraCenter {
 
     explicit CameraCenter(const View& v) {
         for (int i = 0; i < 3; i++)
-            xyz[i] =
-                -(v.rotation[i] * v.translation[0] + v.rotation[3 + i] * v.translation[1] +
-                  v.rotation[6 + i] * v.translation[2]);
+            xyz[i] = -(v.rotation[i] * v.translation[0] + v.rotation[3 + i] * v.translation[1] +
+                       v.rotation[6 + i] * v.translation[2]);
     }
     // Directions to eight Gaussians, and the inverse lengths.
     struct Toward {

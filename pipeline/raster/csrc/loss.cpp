@@ -205,8 +205,8 @@ class Strip {
             const f32x16 ssim = blur_across(line_[0] + i, window_) +
                                 2.0f * a * blur_across(line_[1] + i, window_) +
                                 b * blur_across(line_[2] + i, window_);
-            const f32x16 sign = select(lt(b, a), splat16(1), splat16(0)) -
-                                select(lt(a, b), splat16(1), splat16(0));
+            const f32x16 sign =
+                select(lt(b, a), splat16(1), splat16(0)) - select(lt(a, b), splat16(1), splat16(0));
             const f32x16 out =
                 load<f32x16>(keep_.row(y) + i) * (l1_scale_ * sign + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;

@@ -75,7 +75,7 @@ class Pool {
     }
 
     std::mutex mutex_;
-    std::vector<Block> free_;  // the one that has waited longest first
+    std::vector<Block> free_;                  // the one that has waited longest first
     std::unordered_map<void*, size_t> sizes_;  // of those in use
     size_t used_ = 0, unused_ = 0, most_used_ = 0;
 };

@@ -72,8 +72,8 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
 
 // The records of a group, one a vector.
 SPLAT_INLINE void make_records(const Seen (&s)[2], const f32x16 (&rgb)[3], f32x16 (&records)[16]) {
-    const auto both = [&](Lanes Seen::*field) { return narrow(s[0].*field, s[1].*field); };
-    const auto halves = [&](Lanes Seen::*field, f32x16* to) {  // of float64
+    const auto both = [&](Lanes Seen::* field) { return narrow(s[0].*field, s[1].*field); };
+    const auto halves = [&](Lanes Seen::* field, f32x16* to) {  // of float64
         alignas(64) float pairs[32];
         store(pairs, s[0].*field);
         store(pairs + 16, s[1].*field);
@@ -83,8 +83,8 @@ SPLAT_INLINE void make_records(const Seen (&s)[2], const f32x16 (&rgb)[3], f32x1
         to[1] = split[1];
     };
     // Two numbers of 16 bits
-    const auto corner = [&](Lanes PixelRange::*end) {
-        const auto blocks = [&](PixelRange Seen::*range) {
+    const auto corner = [&](Lanes PixelRange::* end) {
+        const auto blocks = [&](PixelRange Seen::* range) {
             const f32x16 pixel = narrow(s[0].*range.*end, s[1].*range.*end);
             return u32x16(__builtin_convertvector(pixel, i32x16)) / uint32_t(kBlock);
         };

@@ -10,8 +10,7 @@ constexpr double kLn2 = 0.69314718055994530942;
 SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
     Lanes low = {}, high = {};
     for (uint32_t s = 0; s < slots.count; s++) {
-        const f32x16 slot =
-            load<f32x16>(slot_gradients + int64_t(slots.first + s) * kSlotFloats);
+        const f32x16 slot = load<f32x16>(slot_gradients + int64_t(slots.first + s) * kSlotFloats);
         low += widen(slot, 0);
         high += widen(slot, 1);
     }
@@ -67,7 +66,7 @@ struct GroupGradients {
     f32x16 mean[3], log_scale[3], quat[4], opacity_logit, means2d[2];
 
     GroupGradients(const InputGradients (&g)[2], const ImageGradients (&image)[2]) {
-        const auto three = [&](Vec3 InputGradients::*field, f32x16* to) {
+        const auto three = [&](Vec3 InputGradients::* field, f32x16* to) {
             to[0] = narrow((g[0].*field).x, (g[1].*field).x);
             to[1] = narrow((g[0].*field).y, (g[1].*field).y);
             to[2] = narrow((g[0].*field).z, (g[1].*field).z);

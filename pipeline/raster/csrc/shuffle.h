@@ -14,28 +14,28 @@ using SixteenLanes = std::make_integer_sequence<int, 16>;
 template <int K, int kColumn, int... kLanes>
 SPLAT_INLINE f32x16 column_of(const f32x16* rows, std::integer_sequence<int, kLanes...>) {
     constexpr auto at = [](int lane) { return K * lane + kColumn; };
-    f32x16 v = __builtin_shuffle(rows[0], rows[1],
-                                 i32x16{(at(kLanes) < 32 ? at(kLanes) : kLanes)...});
+    f32x16 v =
+        __builtin_shuffle(rows[0], rows[1], i32x16{(at(kLanes) < 32 ? at(kLanes) : kLanes)...});
     if constexpr (K > 2)
-        v = __builtin_shuffle(
-            v, rows[2], i32x16{(at(kLanes) / 16 == 2 ? at(kLanes) - 16 : kLanes)...});
+        v = __builtin_shuffle(v, rows[2],
+                              i32x16{(at(kLanes) / 16 == 2 ? at(kLanes) - 16 : kLanes)...});
     if constexpr (K > 3)
-        v = __builtin_shuffle(
-            v, rows[3], i32x16{(at(kLanes) / 16 == 3 ? at(kLanes) - 32 : kLanes)...});
+        v = __builtin_shuffle(v, rows[3],
+                              i32x16{(at(kLanes) / 16 == 3 ? at(kLanes) - 32 : kLanes)...});
     return v;
 }
 template <int K, int kPart, int... kLanes>
 SPLAT_INLINE f32x16 rows_of(const f32x16* columns, std::integer_sequence<int, kLanes...>) {
     constexpr auto column = [](int lane) { return (16 * kPart + lane) % K; };
     constexpr auto row = [](int lane) { return (16 * kPart + lane) / K; };
-    f32x16 v = __builtin_shuffle(
-        columns[0], columns[1], i32x16{((column(kLanes) == 1 ? 16 : 0) + row(kLanes))...});
+    f32x16 v = __builtin_shuffle(columns[0], columns[1],
+                                 i32x16{((column(kLanes) == 1 ? 16 : 0) + row(kLanes))...});
     if constexpr (K > 2)
-        v = __builtin_shuffle(
-            v, columns[2], i32x16{(column(kLanes) == 2 ? 16 + row(kLanes) : kLanes)...});
+        v = __builtin_shuffle(v, columns[2],
+                              i32x16{(column(kLanes) == 2 ? 16 + row(kLanes) : kLanes)...});
     if constexpr (K > 3)
-        v = __builtin_shuffle(
-            v, columns[3], i32x16{(column(kLanes) == 3 ? 16 + row(kLanes) : kLanes)...});
+        v = __builtin_shuffle(v, columns[3],
+                              i32x16{(column(kLanes) == 3 ? 16 + row(kLanes) : kLanes)...});
     return v;
 }
 template <int K, int... kColumns>

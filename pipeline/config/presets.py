@@ -19,6 +19,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train": {
             "steps": 30_000,
             "coarse_until": 0.2,
+            "lr_shN": 1.25e-4,
             "density": {"stop_share": 0.5},
         },
     },

@@ -258,8 +258,8 @@ class Train(Section):
     )
     lr_boost: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
         "auto",
-        description="The rates below are multiplied by this; auto: by sqrt(30000 / steps) in runs "
-        "shorter than the papers' 30 000 steps.",
+        description="All rates are multiplied by this; auto: by sqrt(30000 / steps), at most "
+        "4, in runs shorter than the papers' 30 000 steps.",
     )
     lr_decay_from: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.5, description="From this share of the run on, the rates below fall (log-linearly)"
@@ -271,7 +271,7 @@ class Train(Section):
     lr_quats: Rate = 1e-3
     lr_opacities: Rate = 5e-2
     lr_sh0: Rate = 2.5e-3
-    lr_shN: Rate = Field(1.25e-4, description="Higher SH bands.")
+    lr_shN: Rate = Field(3e-4, description="Higher SH bands (3DGS: 1.25e-4).")
     density: Density = Field(default_factory=Density)
 
 

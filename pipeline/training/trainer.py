@@ -306,10 +306,11 @@ class _Run:
     def rates(self) -> Rates:
         config, schedule, state = self.config, self.schedule, self.state
         # As many steps as the run will have if they go on as until now.
-        run = None if self.counts_steps else state.step * schedule.steps / state.clock
-        factor = schedule.lr_factor_at(state.clock, run)
+        run = schedule.steps if self.counts_steps else state.step * schedule.steps / state.clock
+        boost = schedule.lr_boost_of(run)
+        factor = boost * schedule.lr_decay_at(state.clock)
         return Rates(
-            means=schedule.lr_means_at(state.clock) * self.extent,
+            means=schedule.lr_means_at(state.clock) * boost * self.extent,
             log_scales=config.lr_scales * factor,
             quats=config.lr_quats * factor,
             opacity_logits=config.lr_opacities * factor,

@@ -49,14 +49,18 @@ def test_short_runs_keep_their_large_backgrounds() -> None:
     assert not any(schedule.prunes_huge_after(step) for step in range(1, Train().steps + 1))
 
 
-def test_other_rates_are_boosted_in_short_runs_and_fall_at_the_end() -> None:
+def test_rates_are_boosted_in_short_runs_and_fall_at_the_end() -> None:
     schedule = Schedule.of(Train(steps=3000, lr_decay_from=0.5, lr_final_share=0.1))
-    factors = [schedule.lr_factor_at(step) for step in range(1, 3001)]
-    assert factors[0] == factors[1499] == pytest.approx(10**0.5)
-    assert factors == sorted(factors, reverse=True)
-    assert factors[-1] == pytest.approx(0.1 * 10**0.5)
+    assert schedule.lr_boost_of(3000) == pytest.approx(10**0.5)
+    decays = [schedule.lr_decay_at(step) for step in range(1, 3001)]
+    assert decays[0] == decays[1499] == 1.0
+    assert decays == sorted(decays, reverse=True)
+    assert decays[-1] == pytest.approx(0.1)
     papers = Schedule.of(Train(steps=30_000, lr_final_share=1.0))
-    assert {papers.lr_factor_at(step) for step in (1, 15_000, 30_000)} == {1.0}
+    assert papers.lr_boost_of(30_000) == papers.lr_boost_of(60_000) == 1.0
+    assert {papers.lr_decay_at(step) for step in (1, 15_000, 30_000)} == {1.0}
+    assert papers.lr_boost_of(10) == 4.0
+    assert Schedule.of(Train(lr_boost=1.5)).lr_boost_of(100) == 1.5
 
 
 def test_the_budget_grows_with_the_pictures() -> None:

@@ -212,7 +212,7 @@ rule train:
         "results/{scene}/logs/train.log",
     threads: THREADS
     resources:
-        mem_mb=6000,
+        mem_mb=project.training_memory,
     params:
         key=project.key("train"),
         inputs=project.folders("train"),

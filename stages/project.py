@@ -89,6 +89,10 @@ class SnakemakeProject:
         """Params function: the stage's key."""
         return lambda wildcards: stage_key(stage, *self._plan(wildcards.scene))
 
+    def training_memory(self, wildcards: Any) -> int:
+        """Resources function: MB to ask a cluster for, half more than the plan's rough estimate."""
+        return round(1.5 * self._plan(wildcards.scene)[0].facts["training_memory_mb"])
+
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
         return canonical(public_plan(self._plan(wildcards.scene)[0]))

@@ -273,3 +273,12 @@ def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, bu
     # What was settled settles to the same.
     again = make_plan(many(tmp_path, count, **size), plan.config)
     assert again.config == plan.config
+
+
+def test_training_says_what_memory_it_takes(tmp_path):
+    size = {"width": lambda i: 800, "height": lambda i: 500}
+    density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
+    config = Config.model_validate({"train": {"density": density}})
+    plan = make_plan(many(tmp_path, 200, **size), config)
+    assert plan.facts["training_memory_mb"] == 400 + 300 + 2500
+    assert "about 3.2 GB of memory" in plan.stages["train"].decisions

@@ -19,8 +19,9 @@ PRESETS: dict[str, dict[str, Any]] = {
         "train": {
             "steps": 30_000,
             "coarse_until": 0.2,
+            "lr_final_share": 1.0,
             "lr_shN": 1.25e-4,
-            "density": {"stop_share": 0.5},
+            "density": {"stop_share": 0.5, "recycle": 0.0},
         },
     },
 }

@@ -246,7 +246,7 @@ class _Run:
         loss = l1_ssim(seen, wanted, config.ssim_weight, target.ignored, self.threads)
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
-        gradients = backward(rendered, d_color, means2d_abs=self.config.density.absolute_gradient)
+        gradients = backward(rendered, d_color, means2d_abs=config.density.absolute_gradient)
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)

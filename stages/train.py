@@ -14,6 +14,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.depth import point_depths
 from pipeline.training.trainer import train
 from stages.command import main
 
@@ -29,6 +30,7 @@ def run(job: Job) -> None:
     has_alpha = any(photo.alpha for photo in manifest.photos)
     gains = {} if has_alpha else choose_gains(job, views, model)
     training = [view for view in views if not view.is_test]
+    known = point_depths(training, model) if job.section(Train).depth_weight else None
     start = time.perf_counter()
     result = train(
         training,
@@ -38,6 +40,7 @@ def run(job: Job) -> None:
         threads=job.threads,
         extent=scene_extent(views),
         gains=np.array([gains[view.name] for view in training]) if gains else None,
+        depths=known,
         checkpoint_dir=job.scratch / "checkpoints",
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
@@ -56,6 +59,7 @@ def run(job: Job) -> None:
     job.counters |= {
         "num_gaussians": len(result.gaussians),
         "steps": result.steps,
+        "known_depths": sum(map(len, known or ())),
         **result.counters,
     }
     job.timings = {"curve_seconds": result.curve_seconds, "earlier_s": round(earlier, 3)}

@@ -250,6 +250,11 @@ class Train(Section):
         "points, are laid over the render before it is compared; auto: where they differ between "
         "photographs by over 0.2 stops (standard deviation).",
     )
+    depth_weight: Rate = Field(
+        0.03,
+        description="Weight of the depths of the sparse points in the views that see them, mean "
+        "error of the logarithm; 0: colours alone.",
+    )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
     lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")

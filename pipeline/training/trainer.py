@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Train
-from pipeline.raster import RasterCamera, RasterOptions, backward, forward, l1_ssim
+from pipeline.raster import Forward, RasterCamera, RasterOptions, backward, forward, l1_ssim
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View
@@ -29,6 +29,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
+from pipeline.training.depth import KnownDepths, depth_gradients
 from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
@@ -36,11 +37,13 @@ from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 2
+STATE_VERSION = 3
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
 PSNR_EVERY = 10
+# Drawing depths and their gradients costs a step half as much again; depths change slowly.
+DEPTH_EVERY = 4
 
 Colour = tuple[float, float, float]
 BACKGROUNDS: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -84,6 +87,7 @@ def train(
     extent: float,
     checkpoint_dir: Path,
     gains: NDArray[np.float64] | None = None,
+    depths: Sequence[KnownDepths] | None = None,
     on_log: Callable[[str], None] | None = None,
 ) -> TrainResult:
     """Optimise ``initial`` until its renders look like ``views``.
@@ -98,6 +102,8 @@ def train(
         gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
             (``photos.exposure``): renders are multiplied before they are compared. Only for
             views without alpha.
+        depths: what is known beforehand of each view's depths (``training.depth``), to which
+            renders are held with ``Train.depth_weight``.
         on_log: called with one line for each warning.
 
     Raises:
@@ -113,7 +119,9 @@ def train(
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        run = _Run(views, initial, config, seed, threads, extent, gains, checkpoint_dir, on_log)
+        run = _Run(
+            views, initial, config, seed, threads, extent, gains, depths, checkpoint_dir, on_log
+        )
         return run.train()
     finally:
         torch.set_num_threads(torch_threads)
@@ -131,6 +139,7 @@ class _Run:
         threads: int,
         extent: float,
         gains: NDArray[np.float64] | None,
+        depths: Sequence[KnownDepths] | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
     ):
@@ -141,7 +150,8 @@ class _Run:
         self.schedule = Schedule.of(config)
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
         self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
-        self.identity = _identity(views, initial, config, seed, extent, gains)
+        self.depths = None if depths is None or not config.depth_weight else list(depths)
+        self.identity = _identity(views, initial, config, seed, extent, gains, self.depths)
         self.targets = Targets(views, threads)
         self.drop_hidden_views()
         self.background = config.background
@@ -176,6 +186,7 @@ class _Run:
             kept = [index for index in range(len(self.views)) if index not in hidden]
             self.views = [self.views[index] for index in kept]
             self.gains = None if self.gains is None else self.gains[kept]
+            self.depths = None if self.depths is None else [self.depths[i] for i in kept]
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)
@@ -246,7 +257,12 @@ class _Run:
         loss = l1_ssim(seen, wanted, config.ssim_weight, target.ignored, self.threads)
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
-        gradients = backward(rendered, d_color, means2d_abs=config.density.absolute_gradient)
+        gradients = backward(
+            rendered,
+            d_color,
+            *self.depth_gradients(rendered, index),
+            means2d_abs=config.density.absolute_gradient,
+        )
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
@@ -262,6 +278,13 @@ class _Run:
             state.window.psnr += _psnr(seen, wanted, target)
             state.window.samples += 1
         self.control_density(places)
+
+    def depth_gradients(self, rendered: Forward, index: int) -> tuple[Tensor | None, Tensor | None]:
+        """(d_alpha, d_depth) of the known depths; None in steps that don't look at them."""
+        if self.depths is None or self.state.step % DEPTH_EVERY or not len(self.depths[index]):
+            return None, None
+        weight = self.config.depth_weight * DEPTH_EVERY
+        return depth_gradients(rendered, self.depths[index], self.views[index], weight)
 
     def control_density(self, places: range) -> None:
         """Do what is due at these places of the schedule."""
@@ -394,6 +417,7 @@ def _identity(
     seed: int,
     extent: float,
     gains: NDArray[np.float64] | None,
+    depths: Sequence[KnownDepths] | None,
 ) -> str:
     """A digest of all that determines the result, apart from the pixels (whose stage's key names
     the folder of checkpoints)."""
@@ -405,7 +429,10 @@ def _identity(
     exposures = None if gains is None else gains.tolist()
     text = json.dumps([STATE_VERSION, config.model_dump(), seed, extent, described, exposures])
     digest.update(text.encode())
-    for array in initial.arrays().values():
+    arrays: list[NDArray[Any]] = list(initial.arrays().values())
+    for known in depths or ():
+        arrays += [known.xy, known.z, known.weight]
+    for array in arrays:
         digest.update(array.tobytes())
     return digest.hexdigest()
 

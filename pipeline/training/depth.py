@@ -1,0 +1,95 @@
+"""Depths that are known beforehand: of the sparse points, at the pixels where views see them.
+
+Where few photographs see a surface, colours alone leave its distance open, and Gaussians that hang
+in front of one camera explain its picture as well as the wall behind them would.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.raster import Forward
+from pipeline.scene.model import Reconstruction, View
+
+#: Where Huber's square ends, in the logarithm: beyond 1 % the pull is constant.
+TOLERANCE = 0.01
+#: Pixels more transparent than this have no depth yet.
+MIN_ALPHA = 0.1
+
+
+@dataclass(frozen=True)
+class KnownDepths:
+    """What is known of one view.
+
+    Attributes:
+        xy: (M, 2) float64 pixels of the view at its full size.
+        z: (M,) float32 camera z, world unit, positive.
+        weight: (M,) float32, of mean 1.
+    """
+
+    xy: NDArray[np.float64]
+    z: NDArray[np.float32]
+    weight: NDArray[np.float32]
+
+    def __len__(self) -> int:
+        return len(self.z)
+
+
+def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDepths]:
+    """The depths of the sparse points of ``model`` in each of ``views`` that sees them.
+
+    A point counts by the number of its views, at most eight: what two views made is often wrong.
+    """
+    points = model.points
+    owner = np.repeat(np.arange(len(points)), points.track_length)
+    order = np.argsort(points.track_image_id, kind="stable")
+    ids = points.track_image_id[order]
+    numbers = {image.name: number for number, image in model.images.items()}
+    found = []
+    for view in views:
+        number = numbers[view.name]
+        here = owner[order[np.searchsorted(ids, number) : np.searchsorted(ids, number, "right")]]
+        camera = points.xyz[here] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        z = camera[:, 2]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            xy = camera[:, :2] / z[:, None] * (view.fx, view.fy) + (view.cx, view.cy)
+        inside = (z > 0) & (xy >= 0).all(1) & (xy < (view.width, view.height)).all(1)
+        weight = np.minimum(points.track_length[here[inside]], 8).astype(np.float32)
+        weight /= max(float(weight.mean()), 1e-6) if len(weight) else 1.0
+        found.append(KnownDepths(xy[inside], z[inside].astype(np.float32), weight))
+    return found
+
+
+def depth_gradients(
+    rendered: Forward, known: KnownDepths, view: View, weight: float
+) -> tuple[Tensor, Tensor]:
+    """Gradients of ``weight`` times the mean Huber loss of log(D / z), D being the rendered depth
+    over alpha: in logarithms, so that near and far count alike.
+
+    Args:
+        rendered: of ``view`` at any of its sizes.
+
+    Returns:
+        d_alpha, d_depth: (H, W) float32, for ``raster.backward``.
+    """
+    height, width = rendered.alpha.shape
+    column = torch.from_numpy((known.xy[:, 0] * (width / view.width)).astype(np.int64))
+    row = torch.from_numpy((known.xy[:, 1] * (height / view.height)).astype(np.int64))
+    column, row = column.clamp_(max=width - 1), row.clamp_(max=height - 1)
+    alpha, depth = rendered.alpha[row, column], rendered.depth[row, column]
+    usable = ((alpha > MIN_ALPHA) & (depth > 0)).to(torch.float32)
+    alpha, depth = alpha.clamp(min=MIN_ALPHA), depth.where(usable > 0, torch.ones(()))
+    off = torch.log(depth / alpha / torch.from_numpy(known.z)) * usable
+    share = torch.from_numpy(known.weight) * (weight / max(1, len(known)))
+    # d log(depth / alpha): 1 / depth and -1 / alpha.
+    pull = (off / TOLERANCE).clamp(-1, 1) * share
+    d_alpha, d_depth = torch.zeros_like(rendered.alpha), torch.zeros_like(rendered.alpha)
+    d_alpha.index_put_((row, column), -pull / alpha, accumulate=True)
+    d_depth.index_put_((row, column), pull / depth, accumulate=True)
+    return d_alpha, d_depth

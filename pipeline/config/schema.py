@@ -250,10 +250,10 @@ class Train(Section):
         "points, are laid over the render before it is compared; auto: where they differ between "
         "photographs by over 0.2 stops (standard deviation).",
     )
-    depth_weight: Rate = Field(
-        0.03,
-        description="Weight of the depths of the sparse points in the views that see them, mean "
-        "error of the logarithm; 0: colours alone.",
+    depth_weight: Rate | Literal["auto"] = Field(
+        "auto",
+        description="Weight of the depths of the sparse points in the views that see them (mean "
+        "error of the logarithm); 0: colours alone; auto: 0.03 for up to 20 photographs, else 0.",
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")

@@ -47,6 +47,9 @@ MIXED_GROUP_SHARE = 0.5
 # photographs together, or it learns single pictures by heart.
 MIN_GAUSSIANS = 20_000
 PIXELS_SEEN_PER_GAUSSIAN = 40
+# Up to so many photographs, depths of sparse points are a help (docs/training.md): 7 training views
+# of a fountain gain 1.5 dB on views kept back, 8 of a door nothing, 38 of a fox lose 0.2 to 0.5 dB.
+FEW_PHOTOS, DEPTH_WEIGHT = 20, 0.03
 
 # Of training: the program with torch; a Gaussian.
 PROGRAM_MB = 400
@@ -94,6 +97,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
     sharing, sharing_reason = _share_cameras(scan, config)
     background, background_reason = _background(scan, config)
     budget, budget_reason = _budget(scan, config)
+    depth_weight, depth_reason = _depth_weight(scan, config)
     settled = _settled(
         config,
         {
@@ -106,6 +110,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             },
             "train": {
                 "background": background,
+                "depth_weight": depth_weight,
                 "density": config.train.density.model_copy(update={"max_gaussians": budget}),
             },
         },
@@ -136,6 +141,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
                 _resolution(scan, settled),
                 budget_reason,
                 background_reason,
+                *([depth_reason] if depth_reason else []),
                 *_mask_lines(scan, config),
                 f"about {training_memory_mb(scan, settled) / 1000:.1f} GB of memory",
             ],
@@ -283,6 +289,16 @@ def _budget(scan: Scan, config: Config) -> tuple[int, str]:
     if wanted == MIN_GAUSSIANS:
         why = "the least"
     return wanted, f"at most {wanted} Gaussians: {why}"
+
+
+def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:
+    """Whether renders are held to sparse points' depths: many photographs settle them alone."""
+    wanted = config.train.depth_weight
+    if wanted != "auto":
+        return wanted, f"sparse points' depths have weight {wanted:g}, as configured"
+    if len(scan.photos) > FEW_PHOTOS:
+        return 0.0, ""
+    return DEPTH_WEIGHT, f"few photographs: sparse points' depths have weight {DEPTH_WEIGHT:g}"
 
 
 def _settled(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:

@@ -150,7 +150,9 @@ class _Run:
         self.schedule = Schedule.of(config)
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
         self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
-        self.depths = None if depths is None or not config.depth_weight else list(depths)
+        # auto is the plan's to settle; without one, nothing is known to be needed.
+        self.depth_weight = 0.0 if config.depth_weight == "auto" else config.depth_weight
+        self.depths = list(depths) if depths is not None and self.depth_weight else None
         self.identity = _identity(views, initial, config, seed, extent, gains, self.depths)
         self.targets = Targets(views, threads)
         self.drop_hidden_views()
@@ -283,7 +285,7 @@ class _Run:
         """(d_alpha, d_depth) of the known depths; None in steps that don't look at them."""
         if self.depths is None or self.state.step % DEPTH_EVERY or not len(self.depths[index]):
             return None, None
-        weight = self.config.depth_weight * DEPTH_EVERY
+        weight = self.depth_weight * DEPTH_EVERY
         return depth_gradients(rendered, self.depths[index], self.views[index], weight)
 
     def control_density(self, places: range) -> None:

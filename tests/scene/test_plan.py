@@ -275,6 +275,18 @@ def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, bu
     assert again.config == plan.config
 
 
+@pytest.mark.parametrize(
+    "count, wanted, weight", [(20, "auto", 0.03), (21, "auto", 0.0), (21, 0.5, 0.5), (9, 0.0, 0.0)]
+)
+def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
+    config = Config.model_validate({"train": {"depth_weight": wanted}})
+    plan = make_plan(many(tmp_path, count), config)
+    assert plan.config.train.depth_weight == weight
+    assert any("depths" in text for text in plan.stages["train"].decisions) == (
+        count != 21 or wanted != "auto"
+    )
+
+
 def test_training_says_what_memory_it_takes(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}

@@ -14,13 +14,19 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.depth import point_depths
+from pipeline.training.depth import KnownDepths, point_depths
+from pipeline.training.depth_maps import add_maps
 from pipeline.training.trainer import train
 from stages.command import main
 
 # Standard deviation in stops from which photographs are taken for differently exposed: cameras that
 # hold their exposure show 0 to 0.1, collections from the internet 0.5.
 EXPOSURES_DIFFER = 0.2
+FITS = {
+    "factor": "depths in a unit of their own",
+    "depth": "depths up to factor and shift",
+    "inverse": "inverse depths up to factor and shift",
+}
 
 
 def run(job: Job) -> None:
@@ -30,7 +36,7 @@ def run(job: Job) -> None:
     has_alpha = any(photo.alpha for photo in manifest.photos)
     gains = {} if has_alpha else choose_gains(job, views, model)
     training = [view for view in views if not view.is_test]
-    known = point_depths(training, model) if job.section(Train).depth_weight else None
+    known = find_depths(job, training, manifest, model) if job.section(Train).depth_weight else None
     start = time.perf_counter()
     result = train(
         training,
@@ -63,6 +69,25 @@ def run(job: Job) -> None:
         **result.counters,
     }
     job.timings = {"curve_seconds": result.curve_seconds, "earlier_s": round(earlier, 3)}
+
+
+def find_depths(
+    job: Job, views: list[View], manifest: Manifest, model: Reconstruction
+) -> list[KnownDepths]:
+    """Depths of the sparse points and of the user's depth maps, by view."""
+    points = point_depths(views, model)
+    maps = {photo.name: photo.depth for photo in manifest.photos}
+    known, kinds, refused = add_maps(views, points, [maps[view.name] for view in views])
+    if kinds:
+        fits = ", ".join(f"{count} as {FITS[kind]}" for kind, count in kinds.items())
+        job.decide(f"depth maps fitted to the sparse points: {fits}")
+    if refused:
+        job.warn(
+            f"depth maps of {len(refused)} views do not fit the sparse points, or see too few of "
+            f"them, and are left out: {', '.join(refused[:5])}"
+        )
+    job.counters["depth_maps"] = sum(kinds.values())
+    return known
 
 
 def choose_gains(job: Job, views: list[View], model: Reconstruction) -> dict[str, list[float]]:

@@ -7,6 +7,7 @@ own framing is checked here instead.
 from __future__ import annotations
 
 import struct
+import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -65,6 +66,47 @@ def load_mask(path: str | Path) -> NDArray[np.bool_]:
         UserError: as ``load_rgb``.
     """
     return np.asarray(load_rgb(path).any(axis=2))
+
+
+def load_depth(path: str | Path, aspect: float) -> NDArray[np.float64]:
+    """Read a depth map (one-channel PNG, TIFF or .npy) as (H, W) float64, values as stored.
+
+    Args:
+        aspect: width over height that it must have.
+
+    Raises:
+        UserError: it cannot be read, has several channels, or another shape.
+    """
+    path = Path(path)
+    try:
+        if path.suffix in (".npy", ".npz"):
+            stored = np.load(path, allow_pickle=False)
+            depth: Picture | None = stored if path.suffix == ".npy" else stored[stored.files[0]]
+        else:
+            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
+    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, cv2.error):
+        depth = None
+    if depth is None:
+        raise UserError(
+            "the depth map cannot be read",
+            file=path,
+            fix="Save it as 16-bit grey PNG, float TIFF or .npy.",
+        )
+    if depth.ndim == 3 and depth.shape[2] == 1:
+        depth = depth[..., 0]
+    if depth.ndim != 2 or depth.dtype.kind not in "uif" or not depth.size:
+        raise UserError(
+            f"expected a depth map of one channel; found {depth.dtype} of shape {depth.shape}",
+            file=path,
+            fix="Save depths as 16-bit grey PNG, float TIFF or .npy.",
+        )
+    if abs(depth.shape[1] / depth.shape[0] / aspect - 1.0) > ASPECT_TOLERANCE:
+        raise UserError(
+            f"is {depth.shape[1]}x{depth.shape[0]} pixels, not of the photograph's shape",
+            file=path,
+            fix="Depth maps must cover the same picture as the photographs.",
+        )
+    return depth.astype(np.float64)
 
 
 def load_view(

@@ -296,6 +296,8 @@ def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:
     wanted = config.train.depth_weight
     if wanted != "auto":
         return wanted, f"sparse points' depths have weight {wanted:g}, as configured"
+    if scan.num_depths:
+        return DEPTH_WEIGHT, f"{scan.num_depths} depth maps and sparse points' depths are used"
     if len(scan.photos) > FEW_PHOTOS:
         return 0.0, ""
     return DEPTH_WEIGHT, f"few photographs: sparse points' depths have weight {DEPTH_WEIGHT:g}"

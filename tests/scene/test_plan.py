@@ -287,6 +287,13 @@ def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count
     )
 
 
+def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
+    some = many(tmp_path, 50, depth=lambda i: f"depths/{i}.png" if i < 30 else None)
+    plan = make_plan(some, Config())
+    assert plan.config.train.depth_weight == 0.03
+    assert any("30 depth maps" in text for text in plan.stages["train"].decisions)
+
+
 def test_training_says_what_memory_it_takes(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}

@@ -253,8 +253,8 @@ class Train(Section):
     depth_weight: Rate | Literal["auto"] = Field(
         "auto",
         description="Weight of the depths of the sparse points in the views that see them, and of "
-        "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.03 with "
-        "depth maps or up to 20 photographs, else 0.",
+        "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.3 with "
+        "depth maps, 0.03 for up to 20 photographs, else 0.",
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")

@@ -50,6 +50,7 @@ PIXELS_SEEN_PER_GAUSSIAN = 40
 # Up to so many photographs, depths of sparse points are a help (docs/training.md): 7 training views
 # of a fountain gain 1.5 dB on views kept back, 8 of a door nothing, 38 of a fox lose 0.2 to 0.5 dB.
 FEW_PHOTOS, DEPTH_WEIGHT = 20, 0.03
+MAP_WEIGHT = 0.3
 
 # Of training: the program with torch; a Gaussian.
 PROGRAM_MB = 400
@@ -297,7 +298,7 @@ def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:
     if wanted != "auto":
         return wanted, f"sparse points' depths have weight {wanted:g}, as configured"
     if scan.num_depths:
-        return DEPTH_WEIGHT, f"{scan.num_depths} depth maps and sparse points' depths are used"
+        return MAP_WEIGHT, f"{scan.num_depths} depth maps: depths have weight {MAP_WEIGHT:g}"
     if len(scan.photos) > FEW_PHOTOS:
         return 0.0, ""
     return DEPTH_WEIGHT, f"few photographs: sparse points' depths have weight {DEPTH_WEIGHT:g}"

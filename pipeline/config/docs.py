@@ -6,8 +6,10 @@ Both are made from the schemas, so that they can't disagree with the program.
 from __future__ import annotations
 
 import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, get_args, get_origin
+from types import NoneType, UnionType
+from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import yaml
 from pydantic import BaseModel
@@ -108,23 +110,32 @@ def yaml_value(value: Any) -> str:
 
 
 def _values(info: FieldInfo) -> str:
-    kind: Any = info.annotation
-    if get_origin(kind) is tuple:
-        kind = get_args(kind)[0]
-        return "list of " + ", ".join(f"`{v}`" for v in get_args(kind))
-    if get_origin(kind) is list:
+    return _words(info.annotation, info.metadata)
+
+
+def _words(kind: Any, metadata: Sequence[Any] = ()) -> str:
+    """What a value of this type may be, for a person."""
+    origin, inner = get_origin(kind), get_args(kind)
+    if origin is Annotated:
+        # A Field inside a union keeps its bounds in its own metadata.
+        bounds = [b for meta in kind.__metadata__ for b in getattr(meta, "metadata", [meta])]
+        return _words(inner[0], bounds)
+    if origin in (Union, UnionType):
+        return ", ".join(_words(each) for each in inner)
+    if origin is Literal:
+        return ", ".join(f"`{value}`" for value in inner)
+    if origin is tuple:
+        return f"list of {_words(inner[0])}"
+    if origin is list:
         return "list of whole numbers"
-    choices = get_args(kind)
-    if choices and not isinstance(choices[0], type):
-        return ", ".join(f"`{v}`" for v in choices)
     words = {int: "whole number", float: "number", bool: "true, false", str: "text"}
     bounds = [
         f"{sign} {getattr(meta, name):g}"
-        for meta in info.metadata
+        for meta in metadata
         for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
         if getattr(meta, name, None) is not None
     ]
-    return " ".join([words.get(kind, "mapping"), *bounds])
+    return " ".join([words.get(kind, "`null`" if kind is NoneType else "mapping"), *bounds])
 
 
 def main() -> int:

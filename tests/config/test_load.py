@@ -107,3 +107,10 @@ def test_every_ablation_is_a_configuration_that_differs_from_the_default():
     assert found.pop("balanced") == Config()
     assert all(config != Config() for config in found.values())
     assert len(set(map(Config.model_dump_json, found.values()))) == len(found)
+
+
+def test_the_option_page_speaks_of_values_not_of_types():
+    from pipeline.config.docs import page
+
+    assert "typing." not in page() and "<class" not in page() and "FieldInfo" not in page()
+    assert "| `budget_minutes` | number > 0, `null` | `null` |" in page()

@@ -256,6 +256,11 @@ class Train(Section):
         "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.3 with "
         "depth maps, 0.03 for up to 20 photographs, else 0.",
     )
+    salt_and_pepper: Share = Field(
+        0.0,
+        description="An experiment: this share of the training pixels is black or white at random. "
+        "Held-out views stay as they are.",
+    )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
     lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -45,11 +46,19 @@ class Target:
 
 class Targets:
     """All views' pixels in memory; those of a reduced resolution are made once, when first asked
-    for, and only one reduced resolution is kept."""
+    for, and only one reduced resolution is kept.
 
-    def __init__(self, views: Sequence[View], threads: int):
+    Args:
+        noise: share of the pixels that are made black or white, the same for the same ``seed``
+            and name.
+    """
+
+    def __init__(self, views: Sequence[View], threads: int, noise: float = 0.0, seed: int = 0):
         def load(view: View) -> Target:
-            return _target(load_view(view.image, view.mask, view.width, view.height))
+            pixels = load_view(view.image, view.mask, view.width, view.height)
+            if noise:
+                _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
+            return _target(pixels)
 
         with ThreadPoolExecutor(max(1, threads)) as pool:
             self._full = list(
@@ -98,6 +107,13 @@ def usable_factor(views: Sequence[View], factor: int) -> int:
     while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
         factor //= 2
     return factor
+
+
+def _salt_and_pepper(rgb: NDArray[np.uint8], share: float, seed: list[int]) -> None:
+    """Make this share of the pixels of (H, W, 3) black or white, in place."""
+    draw = np.random.Generator(np.random.PCG64(seed)).random(rgb.shape[:2])
+    rgb[draw < share / 2] = 0
+    rgb[draw > 1 - share / 2] = 255
 
 
 def _target(pixels: ViewPixels) -> Target:

@@ -154,7 +154,7 @@ class _Run:
         self.depth_weight = 0.0 if config.depth_weight == "auto" else config.depth_weight
         self.depths = list(depths) if depths is not None and self.depth_weight else None
         self.identity = _identity(views, initial, config, seed, extent, gains, self.depths)
-        self.targets = Targets(views, threads)
+        self.targets = Targets(views, threads, config.salt_and_pepper, seed)
         self.drop_hidden_views()
         self.background = config.background
         if self.background == "auto":

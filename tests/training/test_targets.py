@@ -86,3 +86,13 @@ def test_small_pictures_are_not_reduced() -> None:
     for width, height, wanted in sizes:
         view = View("", "", None, width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4), False)
         assert usable_factor([view], 4) == wanted
+
+
+def test_salt_and_pepper_is_the_share_asked_for_and_the_same_for_a_seed(tmp_path: Path) -> None:
+    views = [view_of(tmp_path / "a.png", np.full((80, 100, 3), 120, np.uint8))]
+    clean = Targets(views, threads=1).get(0, 1).rgb
+    assert (clean == 120).all()
+    noisy = [Targets(views, 1, 0.2, seed).get(0, 1).rgb.numpy() for seed in (0, 0, 1)]
+    assert (noisy[0] == noisy[1]).all() and (noisy[0] != noisy[2]).any()
+    assert abs((noisy[0] == 0).all(2).mean() - 0.1) < 0.015
+    assert abs((noisy[0] == 255).all(2).mean() - 0.1) < 0.015

@@ -138,7 +138,7 @@ def measure_coverage(
             "cameras": floaters.cameras,
         },
         "surroundings": {
-            "viewpoints": outlook.judged,
+            "viewpoints": len(outlook.judged),
             "trust": outlook.before,
             "trust_with_proposals": outlook.after,
         },

@@ -85,12 +85,12 @@ class Outlook:
 
     Attributes:
         proposals: what adds most, first.
-        judged: number of viewpoints around the photographs.
+        judged: all viewpoints around the photographs that were thought of.
         before, after: mean trust of what these show, now and with the proposals.
     """
 
     proposals: list[Proposal]
-    judged: int
+    judged: list[Viewpoint]
     before: float
     after: float
 
@@ -113,7 +113,7 @@ def propose(
     """
     viewpoints, opened = _with_sight(_around(views, eyes, up), draw)
     if not viewpoints:
-        return Outlook([], 0, 0.0, 0.0)
+        return Outlook([], [], 0.0, 0.0)
     points, owner = _surfaces(opened, beyond)
     evidence = gather(track(eyes, "judging viewpoints", len(eyes), unit="views"), points)
     sightings = [look_for(eye, points.xyz, points.open) for eye in opened]
@@ -135,7 +135,7 @@ def propose(
         left.remove(best)
         evidence.add(sightings[best], points)
         known = trust(evidence.information, evidence.support, points.towards)
-    return Outlook(proposals, len(opened), before, float(weight @ known))
+    return Outlook(proposals, viewpoints, before, float(weight @ known))
 
 
 def _surfaces(eyes: Sequence[Eye], beyond: float) -> tuple[Points, NDArray[np.intp]]:

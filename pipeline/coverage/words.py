@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.coverage.sight import Doubles, Eye, look_for
 from pipeline.coverage.viewpoints import STEEP, Viewpoint
 
 #: Steps shorter than this share of the distance to the subject are not worth words.
 _SMALL = 0.08
-#: Cameras on two sides of a place stand at least so many degrees apart, seen from there...
+#: Cameras on two sides of a place stand at least so many degrees apart, seen from above it...
 _BETWEEN = 120.0
 #: ...and no farther away than this many times the nearer one.
 _FARTHER = 4.0
@@ -31,7 +32,7 @@ def describe(viewpoint: Viewpoint, eyes: Sequence[Eye], up: Doubles, unit: str |
     distance = np.linalg.norm(centres - place, axis=1)
     order = np.argsort(distance, kind="stable")
     first = int(order[0])
-    second = _opposite(place, centres, order, distance)
+    second = _opposite(_level(centres - place, up), order)
     name = eyes[first].view.name
     start = centres[first]
     if second is None:
@@ -39,7 +40,8 @@ def describe(viewpoint: Viewpoint, eyes: Sequence[Eye], up: Doubles, unit: str |
     else:
         text = f"between {name} and {eyes[second].view.name}"
         along = centres[second] - start
-        start = start + along * float((place - start) @ along / (along @ along))
+        level = _level(along, up)
+        start = start + along * float((place - start) @ level / (level @ level))
     right, ahead = _heading(eyes[first], up)
     step = place - start
     steps = [
@@ -55,23 +57,32 @@ def describe(viewpoint: Viewpoint, eyes: Sequence[Eye], up: Doubles, unit: str |
     return f"{text}{', ' + moves if moves else ''}{looking}"
 
 
-def _opposite(place: Doubles, centres: Doubles, order: np.ndarray, distance: Doubles) -> int | None:
-    """The nearest camera on the other side of the place than the nearest one."""
-    first = int(order[0])
+def _opposite(offsets: Doubles, order: NDArray[np.intp]) -> int | None:
+    """The nearest camera on the other side of a place than the nearest one.
+
+    Args:
+        offsets: (N, 3) level, from the place to the cameras. order: the cameras, nearest first.
+    """
+    first = offsets[order[0]]
+    distance = np.linalg.norm(offsets, axis=1)
     for i in map(int, order[1:]):
-        if distance[i] > _FARTHER * max(distance[first], 1e-12):
-            break
-        cosine = (centres[first] - place) @ (centres[i] - place) / (distance[first] * distance[i])
-        if cosine < np.cos(np.radians(_BETWEEN)):
+        both = distance[order[0]] * distance[i]
+        if distance[i] > _FARTHER * distance[order[0]] or both == 0:
+            continue
+        if first @ offsets[i] / both < np.cos(np.radians(_BETWEEN)):
             return i
     return None
+
+
+def _level(vectors: Doubles, up: Doubles) -> Doubles:
+    return np.asarray(vectors - (vectors @ up)[..., None] * up)
 
 
 def _heading(eye: Eye, up: Doubles) -> tuple[Doubles, Doubles]:
     """Level unit vectors to the right and ahead of a camera."""
     rotation = eye.view.world_to_camera[:3, :3]
     ahead = rotation[2] if abs(float(rotation[2] @ up)) < STEEP else -rotation[1]
-    ahead = ahead - (ahead @ up) * up
+    ahead = _level(ahead, up)
     ahead = ahead / np.linalg.norm(ahead)
     return np.cross(ahead, up), ahead
 

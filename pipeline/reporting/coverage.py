@@ -77,7 +77,7 @@ def _facts(record: Mapping[str, Any]) -> str:
         rows.append(
             (
                 "trust and squared error",
-                f"rank correlation {fixed(error['rank_correlation'], 2)} over "
+                f"rank correlation {_signed(error['rank_correlation'])} over "
                 f"{count(error['squares'])} squares of held-out views (\u22121: trust tells the "
                 "error; 0: it tells nothing)",
             )
@@ -160,3 +160,7 @@ def _above(viewpoints: Sequence[Mapping[str, Any]], scene: TrainedScene | None) 
         f'<h3>From above</h3><svg class="above" viewBox="0 0 {_ABOVE} {height:.0f}" role="img" '
         f'aria-label="cameras and viewpoints from above">{"".join(marks)}</svg>'
     )
+
+
+def _signed(value: float) -> str:
+    return fixed(value, 2).replace("-", "\u2212")

@@ -24,13 +24,13 @@ NAMED = 5
 
 @dataclass(frozen=True)
 class Floaters:
-    """Opaque Gaussians close to cameras that stand in no surface.
+    """Opaque Gaussians that stand before cameras, nearer than any surface.
 
     Attributes:
         count: how many.
-        within: distance from a camera up to which they were sought, world unit; 0 where no surface
-            is agreed on.
-        cameras: names of the nearest cameras, those with most first, with their number.
+        within: distance from a camera up to which they were sought, world unit; 0 where
+            photographs agree on no surface.
+        cameras: names of the cameras that show them, those with most first, with their number.
     """
 
     count: int
@@ -39,8 +39,8 @@ class Floaters:
 
 
 def holes(eye: Eye, evidence: Evidence, opaque: Bools | None) -> Bools:
-    """(H, W) pixels whose rays meet no surface, though there is one, or though none of the
-    photographs says that there is none.
+    """(H, W) pixels whose rays meet no surface, though there is one, or though fewer than ``AGREE``
+    photographs say that there is none.
 
     Args:
         opaque: (H, W) where the photograph from here is, if it has alpha, else None.
@@ -49,35 +49,44 @@ def holes(eye: Eye, evidence: Evidence, opaque: Bools | None) -> Bools:
     return eye.counts & eye.open & (few if opaque is None else opaque)
 
 
-def floating(eye: Eye, evidence: Evidence) -> Bools:
-    """(H, W) pixels that show what photographs see past, and at most one sees."""
-    found = (evidence.passed >= AGREE) & (evidence.count < AGREE)
-    return eye.counts & ~eye.open & found.reshape(eye.open.shape)
-
-
-def near_floaters(gaussians: Gaussians, eyes: Sequence[Eye], nearest: float) -> Floaters:
-    """Opaque Gaussians nearer to a camera than any surface, past which photographs see.
+def floating(eye: Eye, evidence: Evidence, nearest: float) -> Bools:
+    """(H, W) pixels that show what fewer than ``AGREE`` photographs see, and what as many see past
+    or what is nearer than any surface.
 
     Args:
-        eyes: of the training views.
         nearest: distance of the nearest surfaces that photographs agree on, world unit.
+    """
+    shape = eye.open.shape
+    few, passed = (evidence.count < AGREE).reshape(shape), evidence.passed.reshape(shape) >= AGREE
+    return eye.counts & ~eye.open & few & (passed | (eye.depth < NEAR_SHARE * nearest))
+
+
+def near_floaters(
+    gaussians: Gaussians, training: Sequence[Eye], others: Sequence[Eye], nearest: float
+) -> Floaters:
+    """Opaque Gaussians that a camera shows nearer than any surface, and of the training views fewer
+    than ``AGREE``.
+
+    Args:
+        others: of held-out views.
+        nearest: as for ``floating``.
     """
     from scipy.spatial import cKDTree
 
     within = NEAR_SHARE * nearest
+    eyes = [*training, *others]
     means = gaussians.means.numpy().astype(np.float64)
-    centres = np.stack([eye.view.centre for eye in eyes])
     logit = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
-    opaque = np.flatnonzero(gaussians.opacity_logits.numpy() >= logit)
-    distance, camera = cKDTree(centres).query(means[opaque], distance_upper_bound=within)
-    close = np.isfinite(distance)
-    xyz, camera = means[opaque[close]], camera[close]
-    seen, passed = np.zeros((2, len(xyz)), int)
-    for eye in eyes:
-        sighting = look_for(eye, xyz, np.zeros(len(xyz), bool))
-        seen[sighting.seen] += 1
-        passed += sighting.passed
-    found = camera[(seen < AGREE) & (passed >= AGREE)]
-    names = Counter(eyes[i].view.name for i in found)
-    ranked = sorted(names.items(), key=lambda item: (-item[1], item[0]))
-    return Floaters(len(found), within, dict(ranked[:NAMED]))
+    opaque = means[gaussians.opacity_logits.numpy() >= logit]
+    centres = np.stack([eye.view.centre for eye in eyes])
+    reached, _ = cKDTree(centres).query(opaque, distance_upper_bound=within)
+    xyz = opaque[np.isfinite(reached)]
+    seen, shown = np.zeros(len(xyz), int), np.full(len(xyz), -1)
+    for i, eye in enumerate(eyes):
+        found = look_for(eye, xyz, np.zeros(len(xyz), bool)).seen
+        seen[found] += i < len(training)
+        close = np.linalg.norm(xyz[found] - eye.view.centre, axis=1) <= within
+        shown[found[close]] = i
+    named = Counter(eyes[i].view.name for i in shown[(seen < AGREE) & (shown >= 0)])
+    ranked = sorted(named.items(), key=lambda item: (-item[1], item[0]))
+    return Floaters(named.total(), within, dict(ranked[:NAMED]))

@@ -15,7 +15,7 @@ from PIL import Image
 
 from pipeline.config.schema import Train
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.sight import Bools, Doubles, Eye, Floats, open_eye, points_of
+from pipeline.coverage.sight import Bools, Doubles, Draw, Eye, Floats, open_eye, points_of
 from pipeline.coverage.trust import LITTLE, gather, trust_picture
 from pipeline.coverage.viewpoints import Outlook, propose
 from pipeline.coverage.words import describe
@@ -122,12 +122,12 @@ def measure_coverage(
         return _written(out, result | {"reason": "the scene shows no surface"})
     beyond = float(np.percentile(depths, 95))
     surface, nearest = _surface(_evenly(eyes, MAX_SAMPLED), eyes, beyond)
-    asked = _held_out(out, protocol, evaluation, eyes, draw, beyond)
+    asked = _held_out(out, protocol, evaluation, eyes, draw, beyond, nearest)
     # All photographs that there are: nobody need take a held-out one again.
     known = [*eyes, *(item.eye for item in asked)]
     cameras = [*training, *(_named(views, item.eye.view.name) for item in asked)]
     outlook = propose(cameras, known, draw, world.up, beyond)
-    floaters = near_floaters(gaussians, eyes, nearest)
+    floaters = near_floaters(gaussians, eyes, known[len(eyes) :], nearest)
     result |= {
         "surface": surface,
         "views": [item.record for item in asked],
@@ -201,8 +201,9 @@ def _held_out(
     protocol: Protocol,
     evaluation: Mapping[str, Any],
     eyes: Sequence[Eye],
-    draw: Any,
+    draw: Draw,
     beyond: float,
+    nearest: float,
 ) -> list[Asked]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
     measured = [item for item in evaluation["per_view"] if item["name"] in by_name]
@@ -227,7 +228,7 @@ def _held_out(
             "trust": _rounded(picture[counts].mean()) if counts.any() else None,
             "little_trust": _share(picture[counts] < LITTLE),
             "holes": _share(holes(eye, evidence, opaque)[counts]),
-            "floating": _share(floating(eye, evidence)[counts]),
+            "floating": _share(floating(eye, evidence, nearest)[counts]),
             "median_photographs": float(np.median(evidence.count)),
         }
         small = resize_area(error.astype(np.float32), width, height)

@@ -32,8 +32,8 @@ def coverage_section(data: ReportData) -> str:
         "direction of this view. It knows nothing of the photograph that the view is compared "
         "with.</p>"
         f'<div class="scale">trust 0<i style="background: {trust_gradient()}"></i>1</div>'
-        f'<div class="unseen"><div>{_views(shown, worst, orientations)}{_facts(record)}</div>'
-        f"<div>{_viewpoints(shown)}{_above(record['viewpoints'], data.trained)}</div></div>"
+        f'<div class="unseen"><div>{_views(shown, worst, orientations)}{_facts(record)}'
+        f"{_above(record['viewpoints'], data.trained)}</div><div>{_viewpoints(shown)}</div></div>"
     )
 
 

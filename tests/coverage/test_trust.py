@@ -127,11 +127,16 @@ def test_floaters_are_found_where_photographs_see_past_them() -> None:
     scene = concat([wall(), blobs([(0.25, 0.1, 1.6)])])
     # Only a has it before it; the others look past where it is.
     eyes = [open_eye(v, drawer(scene if v.name == "a" else wall())) for v in CAMERAS]
-    found = near_floaters(scene, eyes, 4.0)
+    found = near_floaters(scene, eyes, [], 4.0)
     assert (found.count, found.cameras) == (1, {"a": 1})
-    assert near_floaters(wall(), eyes, 4.0).count == 0
+    held_out = near_floaters(scene, eyes[1:], eyes[:1], 4.0)
+    assert (held_out.count, held_out.cameras) == (1, {"a": 1})
+    assert near_floaters(wall(), eyes, [], 4.0).count == 0
+    # Three that see it agree that it is there.
+    agreeing = [open_eye(view, drawer(scene)) for view in CAMERAS]
+    assert near_floaters(scene, agreeing, [], 4.0).count == 0
     picture, evidence = trust_picture(eyes[0], eyes[1:], 8.0)
-    shown = floating(eyes[0], evidence)
+    shown = floating(eyes[0], evidence, 4.0)
     assert 0 < shown.mean() < 0.3
     assert picture[shown].max() < 0.05 < np.median(picture[~shown])
 

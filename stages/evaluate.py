@@ -1,19 +1,24 @@
-"""Held-out views against their photographs, poses against the truth where it is known.
+"""Held-out views against their photographs, poses against the truth where it is known, and what
+the photographs did not see.
 
-Outputs: ``evaluation.json`` and ``renders/``.
+Outputs: ``evaluation.json`` with ``renders/``, ``coverage.json`` with ``coverage/``.
 """
 
 import json
 from dataclasses import asdict
 
+import numpy as np
+
 from pipeline.config.schema import Evaluate, Split, Train, Views
+from pipeline.coverage.measure import World, measure_coverage
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.views import load_views
+from pipeline.scene.model import View
+from pipeline.scene.views import load_views, up_direction
 from pipeline.splats.gaussians import Gaussians
 from stages.command import main
 
@@ -25,8 +30,9 @@ def run(job: Job) -> None:
     views = load_views(manifest, model, job.section(Views), split)
     train = job.section(Train)
     protocol = choose_protocol(views, split, train)
+    gaussians = Gaussians.load(job.inputs["train"] / "gaussians.npz")
     evaluation = evaluate_views(
-        Gaussians.load(job.inputs["train"] / "gaussians.npz"),
+        gaussians,
         protocol,
         job.section(Evaluate),
         train,
@@ -42,10 +48,25 @@ def run(job: Job) -> None:
         estimated = read_model(job.inputs["poses"] / "sparse" / "0")
         evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
+    world = world_of(job, manifest, views)
+    measure_coverage(
+        job.out, gaussians, views, protocol, train, evaluation, world, threads=job.threads
+    )
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
     if not protocol.every:
         job.warn("no view was held out: quality was measured on training views")
+
+
+def world_of(job: Job, manifest: Manifest, views: list[View]) -> World:
+    orientation = {photo.name: photo.orientation for photo in manifest.photos}
+    up = up_direction(
+        np.stack([view.world_to_camera[:3, :3] for view in views]),
+        [orientation[view.name] for view in views],
+    )
+    placed = job.inputs["poses"] / "georeference.json"
+    metric = placed.is_file() and json.loads(placed.read_text())["method"] != "level"
+    return World(up, "m" if metric else None)
 
 
 if __name__ == "__main__":

@@ -12,7 +12,7 @@ from pipeline.config.schema import Report, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol, reference
 from pipeline.photos.load import load_view
 from pipeline.reporting.collect import collect_metrics
-from pipeline.reporting.data import Comparison, ReportData, TrainedScene, ranked
+from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
 from pipeline.reporting.headline import headline
 from pipeline.reporting.page import write_report
 from pipeline.runtime.atomic import write_json
@@ -53,6 +53,7 @@ def run(job: Job) -> None:
             antialias=job.section(Train).antialias,
             near=protocol.near,
         ),
+        coverage=coverage_of(job.inputs["evaluate"]),
         **points_of(model),
     )
     write_report(data, job.out / "report.html")
@@ -87,6 +88,17 @@ def compare(
                 )
             )
     return shown
+
+
+def coverage_of(evaluate: Path) -> Coverage:
+    """What the photographs did not see, with the pictures of it."""
+    record = read_json(evaluate / "coverage.json")
+    pictures = {}
+    for shown in (*record.get("views", ()), *record.get("viewpoints", ())):
+        for name in (shown[key] for key in ("render", "trust_map") if key in shown):
+            with Image.open(evaluate / name) as picture:
+                pictures[name] = np.asarray(picture)
+    return Coverage(record, pictures)
 
 
 def curve_of(train: Path) -> list[dict[str, Any]]:

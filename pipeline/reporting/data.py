@@ -55,6 +55,20 @@ class TrainedScene:
     near: float
 
 
+@dataclass(frozen=True)
+class Coverage:
+    """What the photographs did not see.
+
+    Attributes:
+        record: the content of ``coverage.json``.
+        pictures: its pictures by the names it has for them; (H, W, 3) renders and (H, W) trust,
+            uint8.
+    """
+
+    record: Mapping[str, Any]
+    pictures: Mapping[str, NDArray[np.uint8]]
+
+
 def _empty(*shape: int) -> NDArray[np.float64]:
     return np.zeros(shape)
 
@@ -72,6 +86,7 @@ class ReportData:
             is known, ``seconds`` since the start of training; a missing or null value is a gap.
         comparisons: pictures to show, worst first.
         trained: the Gaussians and their views.
+        coverage: what the photographs did not see.
         points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
         reprojection_errors: pixels, one a sparse point. track_lengths: images, one a point.
     """
@@ -83,6 +98,7 @@ class ReportData:
     curve: Sequence[Mapping[str, float | None]] = ()
     comparisons: Sequence[Comparison] = ()
     trained: TrainedScene | None = None
+    coverage: Coverage | None = None
     points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
     points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
     reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))

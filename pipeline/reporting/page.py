@@ -14,6 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.reporting.charts import histogram, line_chart
+from pipeline.reporting.coverage import coverage_section
 from pipeline.reporting.data import Comparison, ReportData
 from pipeline.reporting.pictures import ERROR_SCALE, page_pictures, scale_gradient
 from pipeline.reporting.script import JS
@@ -48,6 +49,7 @@ def report_html(data: ReportData) -> str:
     viewer = "" if data.trained is None else f"<script>{viewer_script()}</script>"
     sections = [
         ("pictures", "Photograph and render", _pictures(data.comparisons)),
+        ("coverage", "What the photographs did not see", coverage_section(data)),
         ("training", "Training", _curves(data)),
         ("reconstruction", "Reconstruction", _reconstruction(data)),
         ("views", "Every view", per_view_table(data.metrics.get("per_view") or [])),

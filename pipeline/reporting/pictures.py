@@ -24,7 +24,7 @@ The scale is fixed, so that maps of different views and scenes can be compared."
 
 MASKED_GREY = 128
 
-_COLOURMAP = "inferno"
+_ERROR_COLOURS, _TRUST_COLOURS = "inferno", "viridis"
 _PAGE_SIDE = 900
 _JPEG_QUALITY = 86
 # Bytes of JPEG in one page; base64 makes a third more of them.
@@ -43,7 +43,7 @@ def error_map(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] |
     """
     top = 255.0 if image.dtype == np.uint8 else 1.0
     error = np.abs(image.astype(np.float64) - reference).mean(axis=2) / top
-    colours = _colours()
+    colours = _colours(_ERROR_COLOURS)
     index = np.rint(np.clip(error / ERROR_SCALE, 0, 1) * (len(colours) - 1)).astype(np.intp)
     picture = colours[index]
     if mask is not None:
@@ -51,16 +51,31 @@ def error_map(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] |
     return picture
 
 
+def trust_colours(trust: Picture) -> Picture:
+    """(H, W) uint8 trust, 255 is 1, as (H, W, 3) in a perceptually uniform colour map; yellow is
+    trusted."""
+    return _colours(_TRUST_COLOURS)[trust]
+
+
 @cache
-def _colours() -> Picture:
+def _colours(name: str) -> Picture:
     from matplotlib import colormaps
 
-    return np.rint(colormaps[_COLOURMAP](np.arange(256))[:, :3] * 255).astype(np.uint8)
+    return np.rint(colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
 
 
 def scale_gradient() -> str:
     """The error map's colours as a CSS gradient, left to right."""
-    stops = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _colours()[:: 255 // 15]]
+    return _gradient(_ERROR_COLOURS)
+
+
+def trust_gradient() -> str:
+    """The trust map's colours likewise."""
+    return _gradient(_TRUST_COLOURS)
+
+
+def _gradient(name: str) -> str:
+    stops = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _colours(name)[:: 255 // 15]]
     return f"linear-gradient(to right, {', '.join(stops)})"
 
 
@@ -121,6 +136,11 @@ def page_pictures(views: Sequence[Comparison]) -> list[list[tuple[str, int, int]
         ]
         for row, pictures in zip(encoded, small, strict=True)
     ]
+
+
+def data_uri(picture: Picture) -> str:
+    """The picture as JPEG, for an ``img``."""
+    return _data_uri(_jpeg(picture))
 
 
 def _jpeg(picture: Picture) -> bytes:

@@ -105,7 +105,7 @@ def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
     finite = np.isfinite(data.points_xyz).all(axis=1)
     xyz, rgb = data.points_xyz[finite], data.points_rgb[finite]
     middle, radius = _robust_box(xyz, centres)
-    rotation = _upright(poses[:, :, :3])
+    rotation = upright_frame(poses[:, :, :3])
     frame = np.eye(4)
     frame[:3, :3] = rotation / radius
     frame[:3, 3] = -rotation @ middle / radius
@@ -175,7 +175,7 @@ def _robust_box(xyz: Array, centres: Array) -> tuple[Array, float]:
     return middle, radius if radius > 0 else 1.0
 
 
-def _upright(rotations: Array) -> Array:
+def upright_frame(rotations: Array) -> Array:
     """(3, 3) world to a frame whose y is up: what the cameras agree to be so, or, where they do
     not, as from the air, what is behind them."""
     up = np.array([0.0, -1.0, 0.0])

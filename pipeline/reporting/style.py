@@ -97,6 +97,18 @@ nav + .cards { margin-top: 22px; }
   width: 34px; height: 34px; margin: -17px; border-radius: 50%; background: #fff; color: #222;
   text-align: center; font: 20px/32px sans-serif; box-shadow: 0 1px 5px rgb(0 0 0 / 50%); }
 .sliding input:focus-visible + .divider::after { outline: 3px solid var(--accent); }
+.unseen { display: grid; gap: 14px 28px; margin: 12px 0;
+  grid-template-columns: repeat(auto-fit, minmax(min(330px, 100%), 1fr)); }
+.unseen h3 { margin: 10px 0 4px; }
+.unseen ol { list-style: none; margin: 0; padding: 0; }
+.unseen li { margin: 0 0 16px; } .unseen li > p { margin: 0 0 5px; }
+.pair { display: grid; gap: 6px; grid-template-columns: repeat(2, minmax(0, 1fr)); }
+.pair img { display: block; width: 100%; height: auto; max-height: 240px; object-fit: contain;
+  border-radius: 9px; }
+.above { width: 100%; max-width: 480px; height: auto; }
+.above text { font-size: 12px; font-weight: 700; fill: var(--ink); text-anchor: middle; }
+.above .train { fill: var(--train); } .above .test { fill: var(--test); }
+.above .next { fill: none; stroke: var(--bad); stroke-width: 2; }
 .charts { display: grid; gap: 14px 22px;
   grid-template-columns: repeat(auto-fit, minmax(min(330px, 100%), 1fr)); }
 .chart { margin: 0; min-width: 0; }

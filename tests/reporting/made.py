@@ -7,7 +7,7 @@ import dataclasses
 import numpy as np
 import torch
 
-from pipeline.reporting.data import Comparison, ReportData, TrainedScene
+from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 
@@ -49,6 +49,59 @@ def gaussians(count: int = 400, *, degree: int = 3, seed: int = 0) -> Gaussians:
 def trained(**changes) -> TrainedScene:
     scene = TrainedScene(gaussians(), ring(), {}, (0.0, 0.0, 0.0), False, 0.03)
     return dataclasses.replace(scene, **changes)
+
+
+def coverage() -> Coverage:
+    rng = np.random.default_rng(1)
+    names = [f"coverage/{name}_{kind}.png" for name in ("view_1", "next_1") for kind in "rt"]
+    pictures = {
+        name: rng.integers(0, 256, (9, 12, 3) if name.endswith("r.png") else (9, 12), np.uint8)
+        for name in names
+    }
+    record = {
+        "photographs": 4,
+        "looked_at": 4,
+        "surface": {
+            "seen_by": {"1": 0.0123, "2": 0.0456, "3 or more": 0.9421},
+            "median_photographs": 5.0,
+            "median_parallax_deg": 41.3,
+        },
+        "views": [
+            {
+                "name": "0.jpg",
+                "psnr": 18.765,
+                "trust": 0.4321,
+                "little_trust": 0.6,
+                "holes": 0.0321,
+                "floating": 0.0077,
+                "median_photographs": 3.0,
+                "render": names[0],
+                "trust_map": names[1],
+            }
+        ],
+        "error": {
+            "squares": 1234,
+            "square_px": 8,
+            "rank_correlation": -0.567,
+            "by_trust": [{"trust": [0.0, 0.25], "share": 0.111, "rmse": 0.2222}],
+        },
+        "floaters": {"gaussians": 13, "within": 0.5, "cameras": {"3.jpg": 13}},
+        "surroundings": {"viewpoints": 40, "trust": 0.5, "trust_with_proposals": 0.7},
+        "viewpoints": [
+            {
+                "where": "between 1.jpg and 2.jpg, 0.4 m higher",
+                "position": [1.0, 2.0, 0.5],
+                "direction": [0.0, -1.0, 0.0],
+                "look_at": [0.0, 0.0, 0.0],
+                "world_to_camera": np.eye(4).tolist(),
+                "unknown_percent": 63.4,
+                "gain_percent": 17.2,
+                "render": names[2],
+                "trust_map": names[3],
+            }
+        ],
+    }
+    return Coverage(record, pictures)
 
 
 def metrics() -> dict:
@@ -104,6 +157,7 @@ def report(**changes) -> ReportData:
             Comparison("best", "b.jpg", photograph, render, None, 33.456, 0.9321),
         ],
         trained=trained(),
+        coverage=coverage(),
         points_xyz=rng.normal(size=(300, 3)),
         points_rgb=rng.integers(0, 256, (300, 3), dtype=np.uint8),
         reprojection_errors=rng.random(300),

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.reporting.data import ReportData
+from pipeline.reporting.data import Coverage, ReportData
 from pipeline.reporting.page import report_html, write_report
-from tests.reporting.made import metrics, report, ring, trained
+from tests.reporting.made import coverage, metrics, report, ring, trained
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
@@ -62,6 +62,10 @@ def test_every_number_is_on_the_page() -> None:
         *("12.5 s", "23.4 s", "345 MB", "14.5 s", "347 MB", "27.0 s", "2.13.0", "17"),
         *("17.89 dB", "23.45 dB", "0.1234", "7,003", "640x480", "every 8th", "a window"),
         *("because of decode", "skipped", "incremental mapper: 49 images", "300 sparse points"),
+        *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
+        *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 squares"),
+        *("0.222 (11.1% of squares)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
+        *("63 % of this picture is unknown", "fill 17 % of what is missing"),
         *("1 held-out", "4 training", "1: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
@@ -88,6 +92,20 @@ def test_nothing_is_asked_of_a_network() -> None:
     assert policies[0].startswith("default-src 'none'")
 
 
+def nasty_coverage():
+    made = coverage()
+    for entry in (*made.record["views"], *made.record["viewpoints"]):
+        entry["name"] = entry["where"] = NASTY
+    made.record["floaters"]["cameras"] = {NASTY: 1}
+    return made
+
+
+def test_viewpoints_are_marked_from_above_among_the_cameras() -> None:
+    page = Page(report_html(report()))
+    marks = [a.get("class") for tag, a in page.tags if tag == "circle" and "class" in a]
+    assert [marks.count(kind) for kind in ("train", "test", "next")] == [4, 1, 1]
+
+
 def test_no_string_of_the_user_becomes_markup() -> None:
     nasty = metrics()
     nasty["per_view"][0]["name"] = NASTY
@@ -103,6 +121,7 @@ def test_no_string_of_the_user_becomes_markup() -> None:
         plan={"warnings": [NASTY], NASTY: NASTY},
         decisions={NASTY: [NASTY]},
         trained=trained(views=[dataclasses.replace(v, name=NASTY) for v in ring()]),
+        coverage=nasty_coverage(),
         comparisons=[dataclasses.replace(v, name=NASTY) for v in report().comparisons],
     )
     good, bad = Page(report_html(report())), Page(report_html(data))
@@ -115,6 +134,12 @@ def test_no_string_of_the_user_becomes_markup() -> None:
     assert drawn["cameras"][0]["name"] == NASTY
 
 
+def nothing_held_out() -> Coverage:
+    made = coverage()
+    error = {"squares": 0, "square_px": 8, "rank_correlation": None, "by_trust": []}
+    return Coverage(made.record | {"views": [], "viewpoints": [], "error": error}, {})
+
+
 @pytest.mark.parametrize(
     "changes",
     [
@@ -124,6 +149,9 @@ def test_no_string_of_the_user_becomes_markup() -> None:
         {"decisions": {}, "plan": {}},
         {"points_xyz": np.zeros((0, 3)), "points_rgb": np.zeros((0, 3), np.uint8)},
         {"trained": None},
+        {"coverage": None},
+        {"coverage": Coverage({"reason": "the scene shows no surface"}, {})},
+        {"coverage": nothing_held_out()},
         {"trained": trained(views=[])},
         {"reprojection_errors": np.full(7, -1.0), "track_lengths": np.zeros(0)},
         {"points_xyz": np.full((300, 3), np.nan)},

@@ -1,0 +1,272 @@
+"""``python -m benchmarks.coverage``: views taken away from the demo scene, and found again.
+
+Trains the demo scene from true poses without some of its views, asks what the rest did not see, and
+compares with the views that were taken away: how near the proposals come to them, and what
+photographing the proposals is worth, each against viewpoints drawn at random from those considered.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image
+from scipy.stats import spearmanr
+
+from pipeline.config.schema import Density, Init, Train
+from pipeline.coverage.sight import Draw, open_eye
+from pipeline.coverage.trust import trust_picture
+from pipeline.coverage.viewpoints import COUNT, Viewpoint, propose
+from pipeline.demo.cameras import lens, look_at, orbit
+from pipeline.demo.render import Rays, rays, render
+from pipeline.demo.scene import OBJECTS, shadow_maps
+from pipeline.demo.sensor import srgb, to_bytes
+from pipeline.metrics.image import psnr
+from pipeline.photos.load import load_rgb, resize_area
+from pipeline.scene.model import Camera, Points, Posed, View
+from pipeline.scene.views import scene_extent
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import gaussians_from_points
+from pipeline.training.render import Render, near_plane, render_view
+from pipeline.training.trainer import train
+
+Array = NDArray[np.float64]
+UP = np.array([0.0, 0.0, 1.0])
+POINTS_A_VIEW = 300
+BLOCK = 8
+RING, HIGH = 32, 16
+MAX_GAUSSIANS = 8000
+
+
+@dataclass(frozen=True)
+class Case:
+    """Which views are taken away, of the ring (``range(RING)``) and, if ``above``, of the smaller
+    ring above it."""
+
+    name: str
+    removed: range
+    above: bool = False
+
+
+CASES = (
+    Case("six neighbours of the ring", range(5, 11)),
+    Case("six others", range(20, 26)),
+    Case("five neighbours above", range(RING + 3, RING + 8), True),
+    Case("all above", range(RING, RING + HIGH), True),
+)
+
+
+class Studio:
+    """Takes photographs of the demo scene, once each."""
+
+    def __init__(self, folder: Path, width: int, height: int):
+        self.folder, self.camera = folder, lens("none", width, height)
+        self.through: Rays = rays(self.camera)
+        self.points: dict[str, tuple[Array, NDArray[np.uint8]]] = {}
+        shadow_maps()
+
+    def take(self, posed: Posed) -> View:
+        camera: Camera = self.camera
+        path = self.folder / posed.name
+        seen = render(posed, camera, self.through, OBJECTS)
+        colour = to_bytes(srgb(seen.light))
+        Image.fromarray(colour).save(path)
+        fx, fy, cx, cy = camera.pinhole
+        view = View(
+            *(posed.name, str(path), None, camera.width, camera.height, fx, fy, cx, cy),
+            posed.world_to_camera,
+            False,
+        )
+        rng = np.random.default_rng(len(self.points))
+        column = rng.integers(0, camera.width, POINTS_A_VIEW)
+        row = rng.integers(0, camera.height, POINTS_A_VIEW)
+        x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
+        local = np.stack([x, y, np.ones_like(x)], axis=1) * seen.depth[row, column, None]
+        self.points[posed.name] = (
+            (local - posed.translation) @ posed.rotation,
+            colour[row, column],
+        )
+        return view
+
+    def sparse(self, views: Sequence[View]) -> Points:
+        """What a reconstruction from these views would start from: true points that they show."""
+        xyz, rgb = (np.concatenate([self.points[v.name][i] for v in views]) for i in (0, 1))
+        return replace(Points.empty(), xyz=xyz, rgb=rgb)
+
+
+def cameras() -> list[Posed]:
+    """The demo's ring, and a smaller ring above it that looks down."""
+    posed = orbit([f"ring_{i:02d}.png" for i in range(RING)], 0)
+    for i in range(HIGH):
+        angle = 2 * np.pi * i / HIGH
+        centre = np.array([1.7 * np.cos(angle), 1.7 * np.sin(angle), 2.3])
+        rotation = look_at(centre, np.array([0.0, 0.0, 0.4]))
+        posed.append(Posed(f"high_{i:02d}.png", 1, rotation, -rotation @ centre))
+    return posed
+
+
+def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> Gaussians:
+    config = Train(
+        steps=steps,
+        background="black",
+        exposure="off",
+        lr_boost=4.0,
+        density=Density(max_gaussians=MAX_GAUSSIANS),
+    )
+    centres = np.stack([view.centre for view in views])
+    first = gaussians_from_points(studio.sparse(views), centres, Init(), config.sh_degree)
+    with TemporaryDirectory() as folder:
+        return train(
+            views,
+            Gaussians.from_arrays(first),
+            config,
+            seed=0,
+            threads=2,
+            extent=extent,
+            checkpoint_dir=Path(folder),
+        ).gaussians
+
+
+def drawer(gaussians: Gaussians, near: float) -> Draw:
+    def draw(view: View) -> Render:
+        return render_view(gaussians, view, near=near, threads=2)
+
+    return draw
+
+
+def quality(draw: Draw, views: Sequence[View]) -> float:
+    """Mean PSNR, dB."""
+    return float(np.mean([psnr(draw(view).rgb, load_rgb(view.image) / 255.0) for view in views]))
+
+
+def run_case(
+    case: Case, studio: Studio, views: list[View], steps: int, draws: int
+) -> dict[str, Any]:
+    """One case: train without the removed views, propose, compare, add, train again."""
+    there = range(RING + HIGH if case.above else RING)
+    removed = [views[i] for i in case.removed]
+    kept = [views[i] for i in there if i not in case.removed]
+    held_out, training = kept[::8], [v for i, v in enumerate(kept) if i % 8]
+    extent = scene_extent(training)
+    near = near_plane(extent)
+    draw = drawer(learn(studio, training, steps, extent), near)
+    eyes = [open_eye(view, draw) for view in training]
+    beyond = float(np.percentile(np.concatenate([e.depth[~e.open] for e in eyes]), 95))
+    outlook = propose(training, eyes, draw, UP, beyond)
+    trusted, errors = {}, {}
+    for name, group in (("held_out", held_out), ("removed", removed)):
+        maps = [squares(view, draw, eyes, beyond) for view in group]
+        trusted[name], errors[name] = (np.concatenate([m[i] for m in maps]) for i in (0, 1))
+    both = [np.concatenate(list(values.values())) for values in (trusted, errors)]
+    rng = np.random.default_rng(0)
+    proposed = [proposal.viewpoint for proposal in outlook.proposals]
+    chances = [pick(outlook.judged, rng) for _ in range(1000)]
+    before = {"held_out": quality(draw, held_out), "removed": quality(draw, removed)}
+
+    def worth(viewpoint: Viewpoint, name: str) -> dict[str, float]:
+        """What one more photograph adds, dB."""
+        added = photograph(studio, viewpoint, name)
+        better = drawer(learn(studio, [*training, added], steps, extent), near)
+        return {
+            "held_out": quality(better, held_out) - before["held_out"],
+            "removed": quality(better, removed) - before["removed"],
+        }
+
+    return {
+        "case": case.name,
+        "training_views": len(training),
+        "trust": {name: float(values.mean()) for name, values in trusted.items()},
+        "psnr": before,
+        "rank_correlation": float(spearmanr(*both).statistic),
+        "first": nearest(proposed[:1], removed),
+        "best_of_five": nearest(proposed, removed),
+        "random_first": median([nearest(found[:1], removed) for found in chances]),
+        "random_best_of_five": median([nearest(found, removed) for found in chances]),
+        "better_than_random": share_beaten(proposed, chances, removed),
+        "added_first": worth(proposed[0], "first.png"),
+        "added_random": [worth(c[0], f"random_{i}.png") for i, c in enumerate(chances[:draws])],
+        "surroundings": [outlook.before, outlook.after, len(outlook.judged)],
+    }
+
+
+def squares(view: View, draw: Draw, eyes: list, beyond: float) -> tuple[Array, Array]:
+    """Mean trust and squared error of squares of a view's map."""
+    eye = open_eye(view, draw)
+    found, _ = trust_picture(eye, eyes, beyond)
+    error = ((draw(view).rgb - load_rgb(view.image) / 255.0) ** 2).mean(axis=2)
+    height, width = (side // BLOCK for side in found.shape)
+    return tuple(  # type: ignore[return-value]
+        resize_area(np.asarray(values, np.float32), width, height).ravel()
+        for values in (found, error)
+    )
+
+
+def pick(viewpoints: Sequence[Viewpoint], rng: np.random.Generator) -> list[Viewpoint]:
+    return [viewpoints[i] for i in rng.choice(len(viewpoints), COUNT, replace=False)]
+
+
+def photograph(studio: Studio, viewpoint: Viewpoint, name: str) -> View:
+    pose = viewpoint.view.world_to_camera
+    return studio.take(Posed(name, 1, pose[:3, :3], pose[:3, 3]))
+
+
+def nearest(viewpoints: Sequence[Viewpoint], removed: Sequence[View]) -> list[float]:
+    """Metres and degrees from the nearest removed camera, of the viewpoint that is nearest."""
+    pairs = [
+        (
+            float(np.linalg.norm(v.view.centre - r.centre)),
+            angle(v.view.world_to_camera[2, :3], r.world_to_camera[2, :3]),
+        )
+        for v in viewpoints
+        for r in removed
+    ]
+    return list(min(pairs))
+
+
+def angle(a: Array, b: Array) -> float:
+    return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
+
+
+def median(pairs: list[list[float]]) -> list[float]:
+    return [float(v) for v in np.median(pairs, axis=0)]
+
+
+def share_beaten(
+    proposed: list[Viewpoint], chances: list[list[Viewpoint]], removed: list[View]
+) -> float:
+    """Share of the random draws whose first viewpoint is farther from every removed camera."""
+    own = nearest(proposed[:1], removed)[0]
+    return float(np.mean([nearest(found[:1], removed)[0] > own for found in chances]))
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.coverage", description=__doc__)
+    parser.add_argument("--size", default="200x150", help="of the photographs, pixels")
+    parser.add_argument("--steps", type=int, default=400)
+    parser.add_argument("--draws", type=int, default=3, help="random draws that are trained, too")
+    parser.add_argument("--cases", type=int, nargs="*", default=[*range(len(CASES))])
+    parser.add_argument("--out", type=Path, help="JSON of the results")
+    options = parser.parse_args()
+    width, height = map(int, options.size.split("x"))
+    results: list[Any] = []
+    with TemporaryDirectory() as folder:
+        studio = Studio(Path(folder), width, height)
+        views = [studio.take(posed) for posed in cameras()]
+        for i in options.cases:
+            results.append(run_case(CASES[i], studio, views, options.steps, options.draws))
+            print(json.dumps(results[-1], indent=1), flush=True)
+    if options.out:
+        options.out.write_text(json.dumps(results, indent=1))
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,166 @@
+"""The section of the page that shows what the photographs did not see."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.reporting.data import Coverage, ReportData, TrainedScene
+from pipeline.reporting.pictures import data_uri, trust_colours, trust_gradient, upright
+from pipeline.reporting.space import upright_frame
+from pipeline.reporting.text import count, escape, fixed
+
+_ABOVE = 440  # side of the plan, pixels
+_MARGIN = 28
+_TICK = 17  # length of a direction, pixels
+
+
+def coverage_section(data: ReportData) -> str:
+    """HTML of the section."""
+    shown = data.coverage
+    if shown is None or "surface" not in shown.record:
+        return '<p class="hint">Nothing is known of what the photographs saw.</p>'
+    record = shown.record
+    orientations = data.trained.orientations if data.trained else {}
+    worst = [view for view in record["views"] if "trust_map" in view]
+    return (
+        '<p class="hint">Trust says of each pixel how well the photographs determine it: how many '
+        "of them see the place, from how different directions, how sharply, and how near to the "
+        "direction of this view. It knows nothing of the photograph that the view is compared "
+        "with.</p>"
+        f'<div class="scale">trust 0<i style="background: {trust_gradient()}"></i>1</div>'
+        f'<div class="unseen"><div>{_views(shown, worst, orientations)}{_facts(record)}'
+        f"{_above(record['viewpoints'], data.trained)}</div><div>{_viewpoints(shown)}</div></div>"
+    )
+
+
+def _views(
+    shown: Coverage, views: Sequence[Mapping[str, Any]], orientations: Mapping[str, int]
+) -> str:
+    if not views:
+        return ""
+    items = "".join(
+        f"<li><p>{escape(view['name'])}: mean trust {fixed(view['trust'], 2)}, PSNR "
+        f"{fixed(view['psnr'], 2)} dB</p>{_pair(shown, view, orientations.get(view['name'], 1))}"
+        "</li>"
+        for view in sorted(views, key=lambda view: float(view["trust"]))
+    )
+    return f"<h3>Held-out views of least trust</h3><ol>{items}</ol>"
+
+
+def _facts(record: Mapping[str, Any]) -> str:
+    seen, error, floaters = record["surface"], record["error"], record["floaters"]
+    rows: list[tuple[str, str]] = []
+    if seen:
+        shares = ", ".join(f"by {name}: {share:.1%}" for name, share in seen["seen_by"].items())
+        rows += [
+            ("surface seen by photographs", shares),
+            ("parallax, median", f"{fixed(seen['median_parallax_deg'], 0)}\u00b0 or more"),
+        ]
+    views = record["views"]
+    if views:
+        rows += [
+            ("holes in held-out views", f"{np.mean([v['holes'] for v in views]):.2%} of pixels"),
+            ("floaters in them", f"{np.mean([v['floating'] for v in views]):.2%} of pixels"),
+        ]
+    near = ", ".join(f"{name} ({number})" for name, number in floaters["cameras"].items())
+    rows.append(
+        (
+            "floaters near cameras",
+            f"{count(floaters['gaussians'])} Gaussians" + (f", near {near}" if near else ""),
+        )
+    )
+    if error["rank_correlation"] is not None:
+        rows.append(
+            (
+                "trust and squared error",
+                f"rank correlation {_signed(error['rank_correlation'])} over "
+                f"{count(error['squares'])} squares of held-out views (\u22121: trust tells the "
+                "error; 0: it tells nothing)",
+            )
+        )
+    for row in error["by_trust"]:
+        low, high = row["trust"]
+        rows.append(
+            (
+                f"RMS error where trust is {low:g} to {high:g}",
+                f"{fixed(row['rmse'], 3)} ({row['share']:.1%} of squares)",
+            )
+        )
+    inside = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in rows)
+    return f"<dl>{inside}</dl>"
+
+
+def _viewpoints(shown: Coverage) -> str:
+    viewpoints = shown.record["viewpoints"]
+    if not viewpoints:
+        return "<h3>To photograph next</h3><p>No viewpoint nearby would add much.</p>"
+    items = "".join(
+        f"<li><p><b>{i + 1}.</b> {escape(_sentence(view['where']))} {view['unknown_percent']:.0f} "
+        f"% of this picture is unknown; it would fill {view['gain_percent']:.0f} % of what is "
+        f"missing around the photographs.</p>{_pair(shown, view, 1)}</li>"
+        for i, view in enumerate(viewpoints)
+    )
+    return (
+        '<h3>To photograph next</h3><p class="hint">Each adds to those before it. The pictures '
+        "are what the trained scene shows there now, and how far to trust it.</p>"
+        f"<ol>{items}</ol>"
+    )
+
+
+def _sentence(text: str) -> str:
+    return text[:1].upper() + text[1:] + "."
+
+
+def _pair(shown: Coverage, entry: Mapping[str, Any], orientation: int) -> str:
+    render, trust = shown.pictures[entry["render"]], shown.pictures[entry["trust_map"]]
+    pictures = (("render", render), ("trust", trust_colours(trust)))
+    images = "".join(
+        f'<img src="{data_uri(picture)}" width="{picture.shape[1]}" height="{picture.shape[0]}" '
+        f'alt="{kind}">'
+        for kind, picture in ((kind, upright(p, orientation)) for kind, p in pictures)
+    )
+    return f'<div class="pair">{images}</div>'
+
+
+def _above(viewpoints: Sequence[Mapping[str, Any]], scene: TrainedScene | None) -> str:
+    """Cameras and viewpoints from above, as SVG."""
+    if scene is None or not scene.views or not viewpoints:
+        return ""
+    frame = upright_frame(np.stack([view.world_to_camera[:3, :3] for view in scene.views]))
+    plan = frame[[0, 2]]
+    cameras = np.stack([view.centre for view in scene.views]) @ plan.T
+    places = np.array([v["position"] for v in viewpoints]) @ plan.T
+    both = np.concatenate([cameras, places])
+    low, size = both.min(axis=0), float(np.ptp(both, axis=0).max())
+    scale = (_ABOVE - 2 * _MARGIN) / size if size > 0 else 1.0
+    height = 2 * _MARGIN + scale * float(np.ptp(both[:, 1]))
+
+    def at(place: NDArray[np.float64]) -> NDArray[np.float64]:
+        return np.asarray(_MARGIN + (place - low) * scale)
+
+    marks = []
+    for view, place in zip(scene.views, at(cameras), strict=True):
+        kind = "test" if view.is_test else "train"
+        marks.append(
+            f'<circle class="{kind}" cx="{place[0]:.1f}" cy="{place[1]:.1f}" r="4"><title>'
+            f"{escape(view.name)}</title></circle>"
+        )
+    for i, (viewpoint, place) in enumerate(zip(viewpoints, at(places), strict=True)):
+        end = place + _TICK * (plan @ np.array(viewpoint["direction"]))
+        marks.append(
+            f'<path class="next" d="M{place[0]:.1f} {place[1]:.1f}L{end[0]:.1f} {end[1]:.1f}"/>'
+            f'<circle class="next" cx="{place[0]:.1f}" cy="{place[1]:.1f}" r="6"/>'
+            f'<text x="{place[0]:.1f}" y="{place[1] - 9:.1f}">{i + 1}</text>'
+        )
+    return (
+        f'<h3>From above</h3><svg class="above" viewBox="0 0 {_ABOVE} {height:.0f}" role="img" '
+        f'aria-label="cameras and viewpoints from above">{"".join(marks)}</svg>'
+    )
+
+
+def _signed(value: float) -> str:
+    return fixed(value, 2).replace("-", "\u2212")

@@ -98,7 +98,7 @@ class Step:
 
         def blend_backward() -> None:
             kept["slots"] = kernels.blend_backward(
-                s.records, s.entries, s.tile_begin, s.tile_end, view, *size, s.background,
+                s.records, s.entries, s.tile_begin, s.block_end, view, *size, s.background,
                 self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, False, threads,
             )  # fmt: skip
 

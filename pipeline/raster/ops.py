@@ -73,7 +73,7 @@ class _State:
     records: torch.Tensor  # (N, 16)
     entries: torch.Tensor  # (M, 3) int32
     tile_begin: torch.Tensor  # (tiles + 1,) int64
-    tile_end: torch.Tensor  # (tiles,) int64
+    block_end: torch.Tensor  # (tiles, 16) int32
     slots: torch.Tensor  # (N, 2) int32
 
 
@@ -164,11 +164,11 @@ def forward(
             f"{visible} Gaussians cover more than 2^27 image tiles of 16 x 16 pixels in one view",
             fix="draw smaller images, or look for Gaussians grown far too large",
         )
-    color, alpha, tile_end = ops.blend(
+    color, alpha, block_end = ops.blend(
         records, entries, tile_begin, view, *size, background, threads
     )
     state = _State(
-        inputs, view, size, background, options, records, entries, tile_begin, tile_end, slots
+        inputs, view, size, background, options, records, entries, tile_begin, block_end, slots
     )
     return Forward(color, alpha, radii, visible, dropped, state)
 
@@ -196,7 +196,7 @@ def backward(
         d_depth = _plain("d_depth", d_depth, (height, width))
     ops, threads = _ops(), _threads(s.options.threads)
     slot_gradients = ops.blend_backward(
-        s.records, s.entries, s.tile_begin, s.tile_end, s.view, width, height, s.background,
+        s.records, s.entries, s.tile_begin, s.block_end, s.view, width, height, s.background,
         fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
         means2d_abs, threads,
     )  # fmt: skip

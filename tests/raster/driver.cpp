@@ -95,12 +95,14 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     Binner binner;
     if (!binner.find(records.get(), radii.get(), s.count, view, threads, slots.get())) return;
     Array<Entry> entries(size_t(binner.intersections()));
-    Array<int64_t> begin(size_t(view.tiles() + 1)), end(size_t(view.tiles()));
+    Array<int64_t> begin(size_t(view.tiles() + 1));
+    Array<int32_t> block_end(size_t(kBlocks * view.tiles()));
     binner.write(entries.get(), begin.get());
     const Pairs pairs = {entries.get(), begin.get()};
     const float background[3] = {0.1f, 0.5f, 0.9f};
     Array<float> color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);
-    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(), end.get());
+    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(),
+          block_end.get());
     blend_depth(records.get(), pairs, view, threads, depth.get(), median.get());
     Array<float> target(3 * pixels), d_color(3 * pixels);
     Array<uint8_t> mask(pixels);
@@ -118,7 +120,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
                        {color.get(), alpha.get(), depth.get(), d_color.get(),
                         everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
                         background, everything},
-                       end.get(), threads, slot_gradients.get());
+                       block_end.get(), threads, slot_gradients.get());
         project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
                               slot_gradients.get(),
                               {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),

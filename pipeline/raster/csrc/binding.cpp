@@ -107,7 +107,7 @@ std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor
     return {entries, tile_begin, slots, fits};
 }
 
-// (H, W, 3) color, (H, W) alpha, (tiles) tile_end
+// (H, W, 3) color, (H, W) alpha, (tiles, kBlocks) block_end
 std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& entries,
                                          const Tensor& tile_begin, const Tensor& view,
                                          int64_t width, int64_t height, const Tensor& background,
@@ -115,11 +115,11 @@ std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& en
     const splat::View v = view_from(view, width, height, 0, false);
     Tensor color = new_floats({height, width, 3});
     Tensor alpha = new_floats({height, width});
-    Tensor tile_end = new_longs({v.tiles()});
+    Tensor block_end = new_ints({v.tiles(), splat::kBlocks});
     splat::blend(records_from(records), pairs_from(entries, tile_begin), v, floats(background),
                  int(threads), mutable_floats(color), mutable_floats(alpha),
-                 tile_end.mutable_data_ptr<int64_t>());
-    return {color, alpha, tile_end};
+                 block_end.mutable_data_ptr<int32_t>());
+    return {color, alpha, block_end};
 }
 
 // (H, W) depth, (H, W) median depth
@@ -136,7 +136,7 @@ std::tuple<Tensor, Tensor> blend_depth(const Tensor& records, const Tensor& entr
 
 // (M, 16) gradient slots
 Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor& tile_begin,
-                      const Tensor& tile_end, const Tensor& view, int64_t width, int64_t height,
+                      const Tensor& block_end, const Tensor& view, int64_t width, int64_t height,
                       const Tensor& background, const Tensor& color, const Tensor& alpha,
                       OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
                       OptionalTensor d_depth, bool absolute, int64_t threads) {
@@ -145,7 +145,7 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
                           view_from(view, width, height, 0, false),
                           {floats(color), floats(alpha), floats(depth), floats(d_color),
                            floats(d_alpha), floats(d_depth), floats(background), absolute},
-                          tile_end.const_data_ptr<int64_t>(), int(threads), mutable_floats(slots));
+                          block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
     return slots;
 }
 
@@ -212,7 +212,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "blend_depth(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int width, "
         "int height, int threads) -> (Tensor, Tensor)");
     m.def(
-        "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor tile_end, "
+        "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor block_end, "
         "Tensor view, int width, int height, Tensor background, Tensor color, Tensor alpha, "
         "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, bool absolute, "
         "int threads) -> Tensor");

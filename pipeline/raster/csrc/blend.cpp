@@ -1,72 +1,120 @@
 #include "blend.h"
 
+#include <algorithm>
+
 #include "tile.h"
 
 namespace splat {
 namespace {
 
-struct ColorSum {
-    f32x16 red[kBlocks] = {}, green[kBlocks] = {}, blue[kBlocks] = {};
+constexpr int kSize = 64, kAbreast = 4;
+using Gaussian = Batch<kSize>::Gaussian;
 
-    SPLAT_INLINE void add(int block, const TileGaussian& g, const Step& s, f32x16) {
-        red[block] += s.weight * g.rgb[0];
-        green[block] += s.weight * g.rgb[1];
-        blue[block] += s.weight * g.rgb[2];
+// What a block's pixels add up.
+struct Color {
+    f32x16 rgb[3] = {};
+
+    SPLAT_INLINE void add(const Gaussian& g, const Step& s, f32x16) {
+        for (int c = 0; c < 3; c++) rgb[c] += s.weight * g.rgb[c];
     }
 };
 
-struct DepthSum {
-    f32x16 mean[kBlocks] = {}, median[kBlocks] = {};
+struct Depth {
+    f32x16 mean = {}, median = {};
 
-    SPLAT_INLINE void add(int block, const TileGaussian& g, const Step& s, f32x16 before) {
-        mean[block] += s.weight * g.depth;
+    SPLAT_INLINE void add(const Gaussian& g, const Step& s, f32x16 before) {
+        mean += s.weight * g.depth;
         const Mask16 crossing = s.drawn & ge(before, splat16(0.5f)) & lt(s.after, splat16(0.5f));
-        median[block] = select(crossing, splat16(g.depth), median[block]);
+        median = select(crossing, splat16(g.depth), median);
     }
 };
 
-// Composites one tile; returns the entry after the last one needed.
+// Lists a block's pairs of a batch, in order, and nothing after them; returns how many.
+SPLAT_INLINE int list_pairs(const u32x16* blocks, int batch, int block, uint32_t* pair) {
+    int count = 0;
+    for (int n = 0; n < batch; n += 16) {
+        const uint32_t near = bits(has_bit(blocks[n / 16], block));
+        count += list_bits<kBlocks>(near, n * kBlocks + block, pair + count);
+    }
+    for (int k = 0; k < kAbreast; k++) pair[count + k] = Batch<kSize>::kNothing;
+    return count;
+}
+
+// Composites one tile. Goes through a batch block by block, so that a block's pixels stay in
+// registers. transmittance (kBlocks): what is left behind all. block_end (kBlocks): how many
+// entries there are until the last of a block's pixels stops, or all.
 template <class Sum>
-SPLAT_INLINE int64_t composite(const Record* records, const Pairs& pairs, int64_t index,
-                               const Tile& tile, f32x16* transmittance, Sum& sum) {
-    tile.start(transmittance);
-    uint32_t alive = alive_blocks(transmittance);
-    int64_t entry = pairs.tile_begin[index];
-    const int64_t end = pairs.tile_begin[index + 1];
-    Batch batch;
-    while (entry < end && alive) {
-        entry = batch.fill(records, pairs.entries, entry, end, tile, alive);
-        for (int i = 0; i < batch.pairs(); i++) {
-            const TileGaussian& g = batch.gaussian[batch.pair[i] / kBlocks];
-            const int block = int(batch.pair[i] % kBlocks);
-            const f32x16 before = transmittance[block];
-            sum.add(block, g, step(batch.alpha[i], block, transmittance, alive), before);
+SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const View& view,
+                            int64_t index, const Tile& tile, f32x16* transmittance, Sum* sums,
+                            int32_t* block_end) {
+    const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
+    f32x16 going[kBlocks];  // transmittance of pixels that have not stopped, else 0
+    uint32_t alive = 0;
+    for (int block = 0; block < kBlocks; block++) {
+        going[block] = tile.start(block);
+        transmittance[block] = splat16(1);
+        const bool inside = any(lt(splat16(0), going[block]));
+        alive |= uint32_t(inside) << block;
+        block_end[block] = inside ? int32_t(end - begin) : 0;
+    }
+    Batch<kSize> batch;
+    for (int64_t entry = begin; entry < end && alive; entry += batch.count) {
+        batch.fill(records, pairs.entries, entry, end, tile);
+        u32x16 blocks[kSize / 16] = {};
+        for (int n = 0; n < batch.count; n++) blocks[n / 16][n % 16] = batch.gaussian[n].blocks;
+        Ahead ahead(records, pairs, view, entry + batch.count, kSize);
+        for (uint32_t left = alive; left; left &= left - 1) {
+            for (int k = 0; k < kSize / kBlocks; k++) ahead.fetch();
+            const int block = __builtin_ctz(left);
+            uint32_t pair[kSize + 16];
+            const int count = list_pairs(blocks, batch.count, block, pair);
+            f32x16 before = going[block], behind = transmittance[block];
+            Sum sum = sums[block];
+            for (int i = 0; i < count; i += kAbreast) {
+                f32x16 alpha[kAbreast];
+                batch.alphas(pair + i, alpha);
+                for (int k = 0; k < kAbreast; k++) {
+                    const Step s(alpha[k], before);
+                    sum.add(batch.of(pair[i + k]), s, before);
+                    behind = select(s.drawn, s.after, behind);
+                    before = s.after;
+                }
+                // A pixel stops for good; its transmittance would soon be denormal.
+                const Mask16 still = ge(before, splat16(kTransmittanceMin));
+                before = keep(still, before);
+                if (!any(still)) {
+                    alive &= ~(1u << block);
+                    const uint32_t last = pair[std::min(i + kAbreast, count) - 1];
+                    block_end[block] = int32_t(entry - begin + last / kBlocks) + 1;
+                    break;
+                }
+            }
+            going[block] = before;
+            transmittance[block] = behind;
+            sums[block] = sum;
         }
     }
-    return entry;
 }
 
 }  // namespace
 
 void blend(const Record* records, const Pairs& pairs, const View& view, const float* background,
-           int threads, float* color, float* alpha, int64_t* tile_end) {
+           int threads, float* color, float* alpha, int32_t* block_end) {
     const int64_t tiles = view.tiles();
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
     for (int64_t index = 0; index < tiles; index++) {
         const Tile tile(index, view);
         f32x16 transmittance[kBlocks];
-        ColorSum sum;
-        tile_end[index] = composite(records, pairs, index, tile, transmittance, sum);
+        Color sums[kBlocks];
+        composite(records, pairs, view, index, tile, transmittance, sums,
+                  block_end + kBlocks * index);
         for (int block = 0; block < kBlocks; block++) {
-            const f32x16 left = abs(transmittance[block]);
-            const f32x16 rgb[3] = {sum.red[block] + left * background[0],
-                                   sum.green[block] + left * background[1],
-                                   sum.blue[block] + left * background[2]};
-            alignas(64) float pixels[3 * 16];
-            interleave(rgb, pixels);
-            tile.write<3>(block, pixels, view.width, color);
-            store(pixels, 1.0f - left);
-            tile.write<1>(block, pixels, view.width, alpha);
+            const f32x16 left = transmittance[block];
+            f32x16 rgb[3];
+            for (int c = 0; c < 3; c++) rgb[c] = sums[block].rgb[c] + left * background[c];
+            tile.write(block, rgb, view.width, color);
+            const f32x16 covered[1] = {1.0f - left};
+            tile.write(block, covered, view.width, alpha);
         }
     }
 }
@@ -78,14 +126,13 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
     for (int64_t index = 0; index < tiles; index++) {
         const Tile tile(index, view);
         f32x16 transmittance[kBlocks];
-        DepthSum sum;
-        composite(records, pairs, index, tile, transmittance, sum);
+        Depth sums[kBlocks];
+        int32_t block_end[kBlocks];
+        composite(records, pairs, view, index, tile, transmittance, sums, block_end);
         for (int block = 0; block < kBlocks; block++) {
-            alignas(64) float pixels[16];
-            store(pixels, sum.mean[block]);
-            tile.write<1>(block, pixels, view.width, depth);
-            store(pixels, sum.median[block]);
-            tile.write<1>(block, pixels, view.width, median);
+            const f32x16 mean[1] = {sums[block].mean}, middle[1] = {sums[block].median};
+            tile.write(block, mean, view.width, depth);
+            tile.write(block, middle, view.width, median);
         }
     }
 }

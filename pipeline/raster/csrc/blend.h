@@ -10,10 +10,10 @@ struct Pairs {
     const int64_t* tile_begin;
 };
 
-// color (H, W, 3) with the background (3) under it; alpha (H, W); tile_end (tiles): an entry
-// behind which no pixel of the tile draws.
+// color (H, W, 3) with the background (3) under it; alpha (H, W); block_end (tiles, kBlocks): the
+// number of the tile's entries behind which no pixel of the block draws.
 void blend(const Record* records, const Pairs& pairs, const View& view, const float* background,
-           int threads, float* color, float* alpha, int64_t* tile_end);
+           int threads, float* color, float* alpha, int32_t* block_end);
 
 // depth (H, W) sum of weight * z; median (H, W) z where the transmittance falls below 1/2, else 0.
 void blend_depth(const Record* records, const Pairs& pairs, const View& view, int threads,
@@ -28,7 +28,7 @@ struct ImageGradientsIn {
     bool absolute;
 };
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
-                    const ImageGradientsIn& in, const int64_t* tile_end, int threads,
+                    const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients);
 
 }  // namespace splat

@@ -13,63 +13,84 @@
 namespace splat {
 namespace {
 
-// What a tile's pixels ask for, and where they have come to.
-struct TileTargets {
-    f32x16 red[kBlocks], green[kBlocks], blue[kBlocks], alpha[kBlocks], depth[kBlocks];
-    f32x16 transmittance[kBlocks];
-    f32x16 behind[kBlocks];  // S: starts as the whole sum, ends as 0
+constexpr int kSize = 16, kAbreast = 4;
+
+// What a block's pixels ask for, and where they have come to.
+struct BlockTargets {
+    f32x16 rgb[3], alpha, depth;
+    f32x16 transmittance;  // 0 once stopped
+    f32x16 behind;         // S: starts as the whole sum, ends as 0
 
     // Pixels outside the image ask for nothing.
-    TileTargets(const Tile& tile, const View& view, const ImageGradientsIn& in) {
-        alignas(64) float pixels[3 * 16];
-        const auto plane = [&](int block, const float* image) {
-            tile.read<1>(block, image, view.width, pixels);
-            return load<f32x16>(pixels);
-        };
-        const auto rgb = [&](int block, const float* image, f32x16(&to)[3]) {
-            tile.read<3>(block, image, view.width, pixels);
-            deinterleave(pixels, to);
-        };
-        const float* background = in.background;
-        for (int block = 0; block < kBlocks; block++) {
-            f32x16 c[3], d[3];
-            rgb(block, in.color, c);
-            rgb(block, in.d_color, d);
-            // The background shows through 1 - alpha.
-            const f32x16 under = d[0] * background[0] + d[1] * background[1] + d[2] * background[2];
-            red[block] = d[0];
-            green[block] = d[1];
-            blue[block] = d[2];
-            alpha[block] = -under;
-            behind[block] = c[0] * d[0] + c[1] * d[1] + c[2] * d[2] - under;
-            if (in.d_alpha) {
-                const f32x16 d_alpha = plane(block, in.d_alpha);
-                alpha[block] += d_alpha;
-                behind[block] += plane(block, in.alpha) * d_alpha;
-            }
-            if (in.d_depth) {
-                depth[block] = plane(block, in.d_depth);
-                behind[block] += plane(block, in.depth) * depth[block];
-            }
+    SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
+                          const ImageGradientsIn& in) {
+        f32x16 color[3];
+        tile.read(block, in.color, view.width, color);
+        tile.read(block, in.d_color, view.width, rgb);
+        // The background shows through 1 - alpha.
+        f32x16 under = {};
+        behind = f32x16{};
+        for (int c = 0; c < 3; c++) {
+            under += rgb[c] * in.background[c];
+            behind += color[c] * rgb[c];
         }
-        tile.start(transmittance);
+        alpha = -under;
+        behind -= under;
+        const auto plane = [&](const float* image) {
+            f32x16 values[1];
+            tile.read(block, image, view.width, values);
+            return values[0];
+        };
+        if (in.d_alpha) {
+            const f32x16 d_alpha = plane(in.d_alpha);
+            alpha += d_alpha;
+            behind += plane(in.alpha) * d_alpha;
+        }
+        if (in.d_depth) {
+            depth = plane(in.d_depth);
+            behind += plane(in.depth) * depth;
+        }
+        transmittance = tile.start(block);
+    }
+};
+
+// The pairs of a batch, Gaussian by Gaussian, and their alphas: one flat list, because the end of a
+// short loop over a Gaussian's blocks would be mispredicted as often as not.
+struct GaussianPairs {
+    f32x16 alpha[kSize * kBlocks + kAbreast];
+    uint32_t pair[kSize * kBlocks + 16];
+    int first[kSize + 1];  // pair of each Gaussian, and the number of pairs
+
+    SPLAT_INLINE void list(const Batch<kSize>& batch, uint32_t alive) {
+        int count = 0;
+        for (int n = 0; n < batch.count; n++) {
+            first[n] = count;
+            count += list_bits<1>(batch.gaussian[n].blocks & alive, n * kBlocks, pair + count);
+        }
+        first[batch.count] = count;
+        for (int k = 0; k < kAbreast; k++) pair[count + k] = batch.kNothing;
+        for (int i = 0; i < count; i += kAbreast) {
+            f32x16 abreast[kAbreast];
+            batch.alphas(pair + i, abreast);
+            for (int k = 0; k < kAbreast; k++) alpha[i + k] = abreast[k];
+        }
     }
 };
 
 // One Gaussian over one block: adds to the lanes' moments.
 template <bool kDepthGradient, bool kAbsolute>
-SPLAT_INLINE void backward_pair(const TileGaussian& g, int block, f32x16 alpha, TileTargets& t,
-                                uint32_t& alive, f32x16 (&moments)[12]) {
-    const f32x16 u = g.u_at(block), w = g.w_at(block);
-    const Step s = step(alpha, block, t.transmittance, alive);
-    f32x16 e = t.alpha[block] + t.red[block] * g.rgb[0] + t.green[block] * g.rgb[1] +
-               t.blue[block] * g.rgb[2];
-    if (kDepthGradient) e += t.depth[block] * g.depth;
-    const f32x16 behind = t.behind[block] - s.weight * e;
-    t.behind[block] = behind;
+SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, f32x16 alpha,
+                                BlockTargets& t, f32x16 (&moments)[12]) {
+    const auto& g = batch.of(pair);
+    const f32x16 u = batch.u(pair), w = batch.w(pair);
+    const Step s(alpha, t.transmittance);
+    t.transmittance = keep(s.drawn, s.after);
+    f32x16 e = t.alpha + t.rgb[0] * g.rgb[0] + t.rgb[1] * g.rgb[1] + t.rgb[2] * g.rgb[2];
+    if (kDepthGradient) e += t.depth * g.depth;
+    t.behind -= s.weight * e;
     const f32x16 odds = alpha * reciprocal(1.0f - alpha);
     // Where alpha is held at its maximum it does not move with the Gaussian.
-    const f32x16 v = keep(s.drawn & lt(alpha, splat16(kAlphaMax)), s.weight * e - odds * behind);
+    const f32x16 v = keep(s.drawn & lt(alpha, splat16(kAlphaMax)), s.weight * e - odds * t.behind);
     const f32x16 vu = v * u, vw = v * w;
     moments[kV] += v;
     moments[kVU] += vu;
@@ -77,10 +98,8 @@ SPLAT_INLINE void backward_pair(const TileGaussian& g, int block, f32x16 alpha, 
     moments[kVUU] += vu * u;
     moments[kVUW] += vu * w;
     moments[kVWW] += vw * w;
-    moments[kRed] += s.weight * t.red[block];
-    moments[kGreen] += s.weight * t.green[block];
-    moments[kBlue] += s.weight * t.blue[block];
-    if (kDepthGradient) moments[kDepth] += s.weight * t.depth[block];
+    for (int c = 0; c < 3; c++) moments[kRed + c] += s.weight * t.rgb[c];
+    if (kDepthGradient) moments[kDepth] += s.weight * t.depth;
     if (kAbsolute) {
         moments[kAbsX] += abs(vu * g.uu);
         moments[kAbsY] += abs(vu * g.uw + vw * g.ww);
@@ -89,47 +108,54 @@ SPLAT_INLINE void backward_pair(const TileGaussian& g, int block, f32x16 alpha, 
 
 template <bool kDepthGradient, bool kAbsolute>
 void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
-                    const ImageGradientsIn& in, const int64_t* tile_end, int threads,
+                    const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
     const int64_t tiles = view.tiles();
 #pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
     for (int64_t index = 0; index < tiles; index++) {
-        int64_t entry = pairs.tile_begin[index];
-        const int64_t last = tile_end[index], end = pairs.tile_begin[index + 1];
-        if (entry == end) continue;
+        const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
+        if (begin == end) continue;
         const Tile tile(index, view);
-        TileTargets targets(tile, view, in);
-        uint32_t alive = alive_blocks(targets.transmittance);
-        Batch batch;
-        while (entry < last) {
-            entry = batch.fill(records, pairs.entries, entry, last, tile, alive);
-            const auto slot = [&](int n) {
-                return slot_gradients + int64_t(batch.gaussian[n].slot) * kSlotFloats;
-            };
-            for (int n = 0; n < batch.count; n++) __builtin_prefetch(slot(n), 1);
+        BlockTargets targets[kBlocks];
+        for (int block = 0; block < kBlocks; block++) targets[block].set(block, tile, view, in);
+        const i32x16 end_of_blocks = load<i32x16>(block_end + kBlocks * index);
+        Batch<kSize> batch;
+        GaussianPairs list;
+        const auto slot = [&](uint32_t number) {
+            return slot_gradients + int64_t(number) * kSlotFloats;
+        };
+        int64_t entry = begin;
+        for (; entry < end; entry += batch.count) {
+            const uint32_t alive = bits(gt(end_of_blocks, int32_t(entry - begin)));
+            if (!alive) break;
+            batch.fill(records, pairs.entries, entry, end, tile);
+            for (int n = 0; n < batch.count; n++)
+                __builtin_prefetch(slot(batch.gaussian[n].slot), 1);
+            list.list(batch, alive);
+            Ahead ahead(records, pairs, view, entry + batch.count, kSize);
             for (int n = 0; n < batch.count; n++) {
+                ahead.fetch();
                 f32x16 moments[12] = {};
-                for (int i = batch.first[n]; i < batch.first[n + 1]; i++)
-                    backward_pair<kDepthGradient, kAbsolute>(
-                        batch.gaussian[n], int(batch.pair[i] % kBlocks), batch.alpha[i], targets,
-                        alive, moments);
-                store(slot(n), sum_lanes(moments));
+                for (int i = list.first[n]; i < list.first[n + 1]; i++)
+                    backward_pair<kDepthGradient, kAbsolute>(batch, list.pair[i], list.alpha[i],
+                                                             targets[list.pair[i] % kBlocks],
+                                                             moments);
+                store(slot(batch.gaussian[n].slot), sum_lanes(moments));
             }
         }
-        for (; entry < end; entry++)
-            store(slot_gradients + int64_t(pairs.entries[entry].slot) * kSlotFloats, f32x16{});
+        for (; entry < end; entry++) store(slot(pairs.entries[entry].slot), f32x16{});
     }
 }
 
 }  // namespace
 
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
-                    const ImageGradientsIn& in, const int64_t* tile_end, int threads,
+                    const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
     const auto run =
         in.d_depth ? (in.absolute ? backward_tiles<true, true> : backward_tiles<true, false>)
                    : (in.absolute ? backward_tiles<false, true> : backward_tiles<false, false>);
-    run(records, pairs, view, in, tile_end, threads, slot_gradients);
+    run(records, pairs, view, in, block_end, threads, slot_gradients);
 }
 
 }  // namespace splat

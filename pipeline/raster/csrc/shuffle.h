@@ -59,6 +59,46 @@ SPLAT_INLINE void interleave(const f32x16 (&columns)[K], float* to) {
     interleave<K>(columns, to, std::make_integer_sequence<int, K>{});
 }
 
+// ---- 4 x 4 pixels: from rows, which begin with 4 pixels of K floats, to a vector per channel ----
+
+template <int K, int kChannel, int... kLanes>
+SPLAT_INLINE f32x16 channel_of(const f32x16* rows, std::integer_sequence<int, kLanes...>) {
+    const i32x16 order = {(16 * (kLanes / 4 % 2) + K * (kLanes % 4) + kChannel)...};
+    return __builtin_shuffle(__builtin_shuffle(rows[0], rows[1], order),
+                             __builtin_shuffle(rows[2], rows[3], order),
+                             i32x16{(kLanes < 8 ? kLanes : 16 + kLanes)...});
+}
+template <int K, int kRow, int... kLanes>
+SPLAT_INLINE f32x16 pixels_of(const f32x16* channels, std::integer_sequence<int, kLanes...>) {
+    constexpr auto pixel = [](int lane) { return 4 * kRow + lane / K % 4; };
+    f32x16 v = __builtin_shuffle(channels[0], i32x16{pixel(kLanes)...});
+    if constexpr (K == 3) {
+        v = __builtin_shuffle(v, channels[1],
+                              i32x16{(kLanes % K == 1 ? 16 + pixel(kLanes) : kLanes)...});
+        v = __builtin_shuffle(v, channels[2],
+                              i32x16{(kLanes % K == 2 ? 16 + pixel(kLanes) : kLanes)...});
+    }
+    return v;
+}
+template <int K, int... kChannels>
+SPLAT_INLINE void to_channels(const f32x16* rows, f32x16* channels,
+                              std::integer_sequence<int, kChannels...>) {
+    ((channels[kChannels] = channel_of<K, kChannels>(rows, SixteenLanes{})), ...);
+}
+template <int K, int... kRows>
+SPLAT_INLINE void to_rows(const f32x16* channels, f32x16* rows,
+                          std::integer_sequence<int, kRows...>) {
+    ((rows[kRows] = pixels_of<K, kRows>(channels, SixteenLanes{})), ...);
+}
+template <int K>
+SPLAT_INLINE void to_channels(const f32x16 (&rows)[4], f32x16 (&channels)[K]) {
+    to_channels<K>(rows, channels, std::make_integer_sequence<int, K>{});
+}
+template <int K>
+SPLAT_INLINE void to_rows(const f32x16 (&channels)[K], f32x16 (&rows)[4]) {
+    to_rows<K>(channels, rows, std::make_integer_sequence<int, 4>{});
+}
+
 // ---- 16 x 16 transposed ----
 
 template <int kStep, int... kLanes>

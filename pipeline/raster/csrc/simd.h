@@ -41,6 +41,24 @@ SPLAT_INLINE void store(T* to, V v) {
     std::memcpy(to, &v, sizeof(V));
 }
 
+// The first `count` lanes, 0 to 16, from and to memory; zeros stand for the others.
+SPLAT_INLINE f32x16 load_first(const float* from, int count) {
+#if SPLAT_AVX512
+    return _mm512_maskz_loadu_ps(__mmask16((1u << count) - 1), from);
+#else
+    f32x16 v = {};
+    std::memcpy(&v, from, count * sizeof(float));
+    return v;
+#endif
+}
+SPLAT_INLINE void store_first(float* to, f32x16 v, int count) {
+#if SPLAT_AVX512
+    _mm512_mask_storeu_ps(to, __mmask16((1u << count) - 1), v);
+#else
+    std::memcpy(to, &v, count * sizeof(float));
+#endif
+}
+
 // ---- Masks of 16 lanes: a mask register with AVX-512, lanes of 0 or -1 elsewhere ----
 
 #if SPLAT_AVX512
@@ -55,6 +73,9 @@ SPLAT_INLINE f32x16 select(Mask16 m, f32x16 yes, f32x16 no) {
     return _mm512_mask_mov_ps(no, m.bits, yes);
 }
 SPLAT_INLINE f32x16 keep(Mask16 m, f32x16 v) { return _mm512_maskz_mov_ps(m.bits, v); }
+SPLAT_INLINE f32x16 product(Mask16 m, f32x16 a, f32x16 b) {  // 0 where not m
+    return _mm512_maskz_mul_ps(m.bits, a, b);
+}
 SPLAT_INLINE uint32_t bits(Mask16 m) { return m.bits; }
 SPLAT_INLINE f32x16 min(f32x16 a, f32x16 b) { return _mm512_min_ps(a, b); }
 SPLAT_INLINE f32x16 max(f32x16 a, f32x16 b) { return _mm512_max_ps(a, b); }
@@ -78,6 +99,7 @@ SPLAT_INLINE f32x16 select(Mask16 m, f32x16 yes, f32x16 no) {
     return f32x16((m.lanes & i32x16(yes)) | (~m.lanes & i32x16(no)));
 }
 SPLAT_INLINE f32x16 keep(Mask16 m, f32x16 v) { return f32x16(m.lanes & i32x16(v)); }
+SPLAT_INLINE f32x16 product(Mask16 m, f32x16 a, f32x16 b) { return keep(m, a * b); }
 SPLAT_INLINE uint32_t bits(Mask16 m) {
     uint32_t packed = 0;
     for (int i = 0; i < 16; i++) packed |= uint32_t(m.lanes[i] & 1) << i;
@@ -121,6 +143,23 @@ SPLAT_INLINE Mask16 mask(uint32_t bits) {
 }
 #endif
 
+SPLAT_INLINE Mask16 gt(i32x16 a, int32_t b) {
+#if SPLAT_AVX512
+    return {_mm512_cmpgt_epi32_mask(__m512i(a), _mm512_set1_epi32(b))};
+#else
+    return {a > b};
+#endif
+}
+
+// Lanes of which bit number `bit` is set.
+SPLAT_INLINE Mask16 has_bit(u32x16 v, int bit) {
+#if SPLAT_AVX512
+    return {_mm512_test_epi32_mask(__m512i(v), _mm512_set1_epi32(1 << bit))};
+#else
+    return {-i32x16(v >> uint32_t(bit) & 1u)};
+#endif
+}
+
 SPLAT_INLINE bool any(Mask16 m) {
 #if SPLAT_AVX512
     return m.bits != 0;
@@ -131,18 +170,17 @@ SPLAT_INLINE bool any(Mask16 m) {
 #endif
 }
 
-// Writes base + i for every bit i of `bits`, lowest first; returns how many. May write junk up to
-// to[15].
+// Writes base + kStep i for every bit i of `bits`, lowest first; returns how many. May write junk
+// up to to[15].
+template <uint32_t kStep>
 SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
 #if SPLAT_AVX512
-    const __m512i all =
-        _mm512_add_epi32(_mm512_set1_epi32(int(base)),
-                         _mm512_setr_epi32(0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15));
-    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), all));
+    const u32x16 all = base + kStep * __builtin_convertvector(kLane, u32x16);
+    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), __m512i(all)));
     return __builtin_popcount(bits);
 #else
     int n = 0;
-    for (; bits; bits &= bits - 1) to[n++] = base + uint32_t(__builtin_ctz(bits));
+    for (; bits; bits &= bits - 1) to[n++] = base + kStep * uint32_t(__builtin_ctz(bits));
     return n;
 #endif
 }
@@ -152,9 +190,6 @@ SPLAT_INLINE u32x16 any_of_four(u32x16 v) {
     v |= __builtin_shuffle(v, u32x16{1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14});
     return v | __builtin_shuffle(v, u32x16{2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13});
 }
-
-// The sign bit alone turns: -x where m.
-SPLAT_INLINE f32x16 negate_where(Mask16 m, f32x16 v) { return select(m, -v, v); }
 
 SPLAT_INLINE f32x16 abs(f32x16 v) { return f32x16(i32x16(v) & 0x7fffffff); }
 

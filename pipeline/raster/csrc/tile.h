@@ -2,6 +2,7 @@
 // from it.
 #pragma once
 
+#include "blend.h"
 #include "shuffle.h"
 #include "types.h"
 
@@ -25,13 +26,11 @@ struct Tile {
         rows = int(view.height - y < kTile ? view.height - y : kTile);
     }
 
-    // Transmittance before the first Gaussian: 1 inside, a stopped pixel's outside.
-    SPLAT_INLINE void start(f32x16* transmittance) const {
-        for (int block = 0; block < kBlocks; block++) {
-            const Mask16 inside = lt(kColumn, splat16(float(columns - kBlock * (block % 4)))) &
-                                  lt(kRow, splat16(float(rows - kBlock * (block / 4))));
-            transmittance[block] = select(inside, splat16(1), splat16(-1));
-        }
+    // Transmittance of a block before the first Gaussian: 1 inside, 0 outside, where nothing draws.
+    SPLAT_INLINE f32x16 start(int block) const {
+        const Mask16 inside = lt(kColumn, splat16(float(columns - kBlock * (block % 4)))) &
+                              lt(kRow, splat16(float(rows - kBlock * (block / 4))));
+        return keep(inside, splat16(1));
     }
 
     // Calls visit(row in the block, pixel in an image of this width, number of pixels) for each of
@@ -41,144 +40,132 @@ struct Tile {
         const int left = kBlock * (block % 4), top = kBlock * (block / 4);
         const int across = columns - left < kBlock ? columns - left : kBlock;
         const int down = rows - top < kBlock ? rows - top : kBlock;
-        if (across == kBlock)  // a constant, for the compiler
-            for (int row = 0; row < down; row++)
-                visit(row, (y + top + row) * width + x + left, kBlock);
-        else if (across > 0)
+        if (across > 0)
             for (int row = 0; row < down; row++)
                 visit(row, (y + top + row) * width + x + left, across);
     }
-    // A block of an image of `kChannels` floats a pixel; zeros outside it.
-    template <int kChannels>
-    SPLAT_INLINE void read(int block, const float* image, int64_t width, float* pixels) const {
-        std::memset(pixels, 0, kChannels * 16 * sizeof(float));
+    // A block of an image of K floats a pixel, a vector a channel; zeros outside it.
+    template <int K>
+    SPLAT_INLINE void read(int block, const float* image, int64_t width,
+                           f32x16 (&channels)[K]) const {
+        f32x16 pixels[kBlock] = {};
         each_row(block, width,
                  [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
-                     std::memcpy(pixels + kChannels * kBlock * row, image + kChannels * pixel,
-                                 kChannels * count * sizeof(float));
+                     pixels[row] = load_first(image + K * pixel, K * count);
                  });
+        to_channels(pixels, channels);
     }
-    template <int kChannels>
-    SPLAT_INLINE void write(int block, const float* pixels, int64_t width, float* image) const {
+    template <int K>
+    SPLAT_INLINE void write(int block, const f32x16 (&channels)[K], int64_t width,
+                            float* image) const {
+        f32x16 pixels[kBlock];
+        to_rows(channels, pixels);
         each_row(block, width,
                  [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
-                     std::memcpy(image + kChannels * pixel, pixels + kChannels * kBlock * row,
-                                 kChannels * count * sizeof(float));
+                     store_first(image + K * pixel, pixels[row], K * count);
                  });
     }
 };
 
-// log2(alpha) of a Gaussian over a tile: log2_opacity - u^2 - w^2, where u and w are those of the
-// first block plus what a block's place adds. The origin's are found in float64, so that a centre
-// a thousand pixels away costs no digits.
-struct alignas(64) TileGaussian {
-    f32x16 u, w;
-    float u_step[kBlocks], w_step[kBlocks];
-    float uu, uw, ww, log2_opacity;  // as in the Record
-    float rgb[3], depth;
-    uint32_t slot;
+// Asks for the next batch's records a few at a time between other work: they are met in no order,
+// and many at once would wait for each other.
+class Ahead {
+  public:
+    // Of the `count` entries from number `next` of all on: past the end of a tile lies another.
+    SPLAT_INLINE Ahead(const Record* records, const Pairs& pairs, const View& view, int64_t next,
+                       int64_t count)
+        : records_(records), next_(pairs.entries + next) {
+        const int64_t left = pairs.tile_begin[view.tiles()] - next;
+        end_ = next_ + (left < count ? left : count);
+    }
 
-    SPLAT_INLINE void set(const Record& g, uint32_t slot_, const Tile& tile) {
-        const double dx = double(tile.x) + 0.5 - g.x, dy = double(tile.y) + 0.5 - g.y;
-        const f32x16 across = kColumn * g.uu + kRow * g.uw, down = kRow * g.ww;
-        u = float(g.uu * dx + g.uw * dy) + across;
-        w = float(g.ww * dy) + down;
-        store(u_step, float(kBlock) * across);  // blocks lie in a tile as pixels do in a block
-        store(w_step, float(kBlock) * down);
-        std::memcpy(&uu, &g.uu, 8 * sizeof(float));
-        slot = slot_;
+    SPLAT_INLINE void fetch() {
+        if (next_ < end_) __builtin_prefetch(records_ + (next_++)->gaussian);
     }
-    SPLAT_INLINE f32x16 u_at(int block) const { return u + u_step[block]; }
-    SPLAT_INLINE f32x16 w_at(int block) const { return w + w_step[block]; }
-    SPLAT_INLINE f32x16 power(f32x16 u_here, f32x16 w_here) const {
-        return log2_opacity - u_here * u_here - w_here * w_here;
-    }
+
+  private:
+    const Record* records_;
+    const Entry *next_, *end_;
 };
 
-// Some Gaussians of a tile, and their (Gaussian, block) pairs in order: one flat list, because the
-// end of a short loop over a Gaussian's blocks would be mispredicted as often as not.
+// The next Gaussians of a tile, as seen from it, and (Gaussian, block) pairs of them, numbered
+// 16 * place in the batch + block.
+//
+// log2(alpha) = log2_opacity - u^2 - w^2 (see Record), where u and w are those of a block's first
+// pixel plus what a pixel's place in the block adds. The tile's first pixel's are found in
+// float64, so that a centre a thousand pixels away costs no digits.
+template <int kSize>
 struct Batch {
-    static constexpr int kSize = 16, kAbreast = 4;
-    TileGaussian gaussian[kSize];
-    f32x16 alpha[kSize * kBlocks + kAbreast];   // of a pair; 0 where less than kAlphaMin
-    uint32_t pair[kSize * kBlocks + kAbreast];  // number in the batch * 16 + block
-    int first[kSize + 1];                       // pair of each Gaussian, and the number of pairs
+    struct alignas(64) Gaussian {
+        f32x16 across;                   // u in a block, less its first pixel's
+        float uu, uw, ww, log2_opacity;  // as in the Record
+        float rgb[3], depth;
+        uint32_t slot, blocks;  // as in the Entry
+    };
+    static constexpr uint32_t kNothing = kSize * kBlocks;  // a pair that draws nothing, to fill up
+
     int count;
+    Gaussian gaussian[kSize + 1];
+    alignas(64) float first_u[kNothing + kBlocks], first_w[kNothing + kBlocks];  // of each pair
 
-    SPLAT_INLINE int pairs() const { return first[count]; }
+    Batch() {
+        gaussian[kSize] = Gaussian{};
+        gaussian[kSize].log2_opacity = 2 * kLog2AlphaMin;
+        std::memset(first_u + kNothing, 0, kBlocks * sizeof(float));
+        std::memset(first_w + kNothing, 0, kBlocks * sizeof(float));
+    }
 
-    // Fills the batch from entries [from, end), looking at `alive` blocks only; returns the entry
-    // after the last one taken.
-    SPLAT_INLINE int64_t fill(const Record* records, const Entry* entries, int64_t from,
-                              int64_t end, const Tile& tile, uint32_t alive) {
-        constexpr int64_t kAhead = 16;
-        count = 0;
-        int pairs = 0;
-        const int64_t stop = end - from < kSize ? end : from + kSize;
-        for (int64_t e = from; e < stop; e++) {
-            if (e + kAhead < end) __builtin_prefetch(records + entries[e + kAhead].gaussian);
-            gaussian[count].set(records[entries[e].gaussian], entries[e].slot, tile);
-            first[count] = pairs;
-            pairs += list_bits(entries[e].blocks & alive, count * kBlocks, pair + pairs);
-            count++;
+    // Takes them from entries [from, end).
+    SPLAT_INLINE void fill(const Record* records, const Entry* entries, int64_t from, int64_t end,
+                           const Tile& tile) {
+        count = int(end - from < kSize ? end - from : kSize);
+        for (int n = 0; n < count; n++) {
+            const Entry& e = entries[from + n];
+            const Record& r = records[e.gaussian];
+            const double dx = double(tile.x) + 0.5 - r.x, dy = double(tile.y) + 0.5 - r.y;
+            Gaussian& g = gaussian[n];
+            std::memcpy(&g.uu, &r.uu, 8 * sizeof(float));
+            g.slot = e.slot;
+            g.blocks = e.blocks;
+            const f32x16 across = kColumn * r.uu + kRow * r.uw;
+            g.across = across;
+            // Blocks lie in a tile as pixels do in a block.
+            store(first_u + kBlocks * n, float(kBlock) * across + float(r.uu * dx + r.uw * dy));
+            store(first_w + kBlocks * n, float(kBlock) * kRow * r.ww + float(r.ww * dy));
         }
-        first[count] = pairs;
-        for (int i = 0; i < kAbreast; i++) pair[pairs + i] = 0;
-        // Some at once: one alone is a chain of some fifty cycles, and few fit into the
-        // processor's window.
-        for (int i = 0; i < pairs; i += kAbreast) {
-            f32x16 power[kAbreast];
-            for (int k = 0; k < kAbreast; k++) {
-                const TileGaussian& g = gaussian[pair[i + k] / kBlocks];
-                const int block = int(pair[i + k] % kBlocks);
-                power[k] = g.power(g.u_at(block), g.w_at(block));
-            }
-            f32x16 raw[kAbreast];
-            exp2(power, raw);
-            // Zero where nothing is seen: junk there could be denormal, which costs a hundred
-            // cycles.
-            for (int k = 0; k < kAbreast; k++)
-                alpha[i + k] =
-                    keep(ge(power[k], splat16(kLog2AlphaMin)), min(raw[k], splat16(kAlphaMax)));
+    }
+
+    SPLAT_INLINE const Gaussian& of(uint32_t pair) const { return gaussian[pair / kBlocks]; }
+    SPLAT_INLINE f32x16 u(uint32_t pair) const { return of(pair).across + first_u[pair]; }
+    SPLAT_INLINE f32x16 w(uint32_t pair) const { return kRow * of(pair).ww + first_w[pair]; }
+
+    // The alphas of some pairs at once, because one alone is a chain of some fifty cycles; 0 where
+    // less than kAlphaMin.
+    template <int kCount>
+    SPLAT_INLINE void alphas(const uint32_t* pairs, f32x16 (&alpha)[kCount]) const {
+        f32x16 power[kCount], raw[kCount];
+        for (int k = 0; k < kCount; k++) {
+            const f32x16 here_u = u(pairs[k]), here_w = w(pairs[k]);
+            power[k] = of(pairs[k]).log2_opacity - here_u * here_u - here_w * here_w;
         }
-        return stop;
+        exp2(power, raw);
+        // Junk where nothing is seen could be denormal, which costs a hundred cycles.
+        for (int k = 0; k < kCount; k++)
+            alpha[k] = keep(ge(power[k], splat16(kLog2AlphaMin)), min(raw[k], splat16(kAlphaMax)));
     }
 };
 
 // The blending of one Gaussian over one block of pixels.
 struct Step {
-    Mask16 drawn;   // contributes
+    f32x16 after;   // transmittance behind it, if it is drawn
+    Mask16 drawn;   // contributes, or has an alpha of 0
     f32x16 weight;  // transmittance before * alpha where drawn, else 0
-    f32x16 after;   // transmittance after, where drawn
-};
 
-// Takes a block's transmittance one Gaussian further. A stopped pixel has its transmittance's sign
-// turned: its next one is negative too, under the minimum, so it never draws again. A block whose
-// last pixel stops leaves `alive`.
-SPLAT_INLINE Step step(f32x16 alpha, int block, f32x16* transmittance, uint32_t& alive) {
-    Step s;
-    const f32x16 before = transmittance[block], zero = {};
-    const f32x16 weight = alpha * before;
-    s.after = before - weight;
-    const Mask16 visible = lt(zero, alpha);
-    s.drawn = visible & ge(s.after, splat16(kTransmittanceMin));
-    s.weight = keep(s.drawn, weight);
-    f32x16 next = select(s.drawn, s.after, before);
-    const Mask16 stopped = and_not(visible, s.drawn) & lt(zero, before);
-    if (__builtin_expect(any(stopped), 0)) {
-        next = negate_where(stopped, next);
-        if (!any(lt(zero, next))) alive &= ~(1u << block);
+    SPLAT_INLINE Step(f32x16 alpha, f32x16 before) {
+        after = before - alpha * before;
+        drawn = ge(after, splat16(kTransmittanceMin));
+        weight = product(drawn, alpha, before);
     }
-    transmittance[block] = next;
-    return s;
-}
-
-// The blocks that have a pixel to draw.
-SPLAT_INLINE uint32_t alive_blocks(const f32x16* transmittance) {
-    uint32_t alive = 0;
-    for (int block = 0; block < kBlocks; block++)
-        alive |= uint32_t(any(lt(splat16(0), transmittance[block]))) << block;
-    return alive;
-}
+};
 
 }  // namespace splat

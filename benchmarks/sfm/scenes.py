@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
+from typing import Any
 
 from pipeline.config.load import scene_config
 from pipeline.config.presets import PRESETS
@@ -103,6 +104,12 @@ def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]
     return found
 
 
+def settled(scene: Scene, raw: Mapping[str, Any]) -> Config:
+    """What the plan makes of these options for the scene, its poses to be found anew."""
+    config = scene_config({**raw, "poses": "ignore"}, scene.name)
+    return make_plan(scene.scan, config).config
+
+
 def _settled(scene: Scene, preset: str, mapper: str, pairs: str) -> Config:
     raw = {"preset": preset, "matches": {"pairs": pairs}, "sfm": {"mapper": mapper}}
-    return make_plan(scene.scan, scene_config({**raw, "poses": "ignore"}, scene.name)).config
+    return settled(scene, raw)

@@ -105,7 +105,7 @@ class Sfm(Section):
     """Camera poses and sparse points."""
 
     mapper: Literal["auto", "incremental", "global"] = Field(
-        "auto", description="auto: incremental up to 150 photographs, global above."
+        "auto", description="auto: incremental, and global where that gives no good model."
     )
     camera_model: Literal[
         "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"

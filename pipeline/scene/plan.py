@@ -34,8 +34,6 @@ STAGES = (
 # 40 photographs are 780 pairs: two minutes on two cores, and no pair is missed. Above it the
 # neighbours that the scene's own descriptors propose give the same poses in a fraction of that.
 EXHAUSTIVE_PHOTOS = 40
-# Above it global mapping is faster at the same accuracy; below it incremental is sturdier.
-INCREMENTAL_PHOTOS = 150
 # GPS errs by some metres: only a capture much larger than that can be sorted by it.
 SPATIAL_METRES = 50.0
 SPATIAL_SHARE = 0.9
@@ -93,7 +91,7 @@ class Plan(BaseModel):
 def make_plan(scan: Scan, config: Config) -> Plan:
     """Decide what ``scan`` needs. ``Plan.config`` has no "auto" left that can be settled now."""
     pairs, pairs_reason = _pairs(scan, config)
-    mapper, mapper_reason = _mapper(scan, config)
+    mapper, mapper_reason = _mapper(config)
     camera_model, model_reason = _camera_model(scan, config)
     sharing, sharing_reason = _share_cameras(scan, config)
     background, background_reason = _background(scan, config)
@@ -218,16 +216,12 @@ def _keypoints(scan: Scan, config: Config) -> str:
     )
 
 
-def _mapper(scan: Scan, config: Config) -> Choice:
-    count, wanted = len(scan.photos), config.sfm.mapper
+def _mapper(config: Config) -> Choice:
+    wanted = config.sfm.mapper
     if wanted != "auto":
         return wanted, f"{wanted} mapper, as configured"
-    if count <= INCREMENTAL_PHOTOS:
-        return (
-            "incremental",
-            f"incremental mapper: {count} photographs, not above {INCREMENTAL_PHOTOS}",
-        )
-    return "global", f"global mapper: {count} photographs, more than {INCREMENTAL_PHOTOS}"
+    # Its time grows with the photographs as such, the global one's with their square (docs/sfm.md).
+    return "incremental", "incremental mapper; the global one where its model is not good"
 
 
 def _camera_model(scan: Scan, config: Config) -> Choice:

@@ -180,7 +180,7 @@ def test_what_the_user_sets_stays(tmp_path):
     [
         (40, {}, "exhaustive", "incremental"),
         (41, {}, "retrieval", "incremental"),
-        (151, {}, "retrieval", "global"),
+        (151, {}, "retrieval", "incremental"),
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0)}, "spatial", "incremental"),
         # GPS noise around one place sorts nothing.
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-6 * i, 0.0)}, "retrieval", "incremental"),

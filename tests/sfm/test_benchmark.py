@@ -5,15 +5,20 @@ from __future__ import annotations
 import json
 import re
 from dataclasses import replace
+from itertools import combinations
 
+import numpy as np
 import pytest
 
 from benchmarks.sfm.__main__ import main, plot, table
+from benchmarks.sfm.mappers import between
+from benchmarks.sfm.mappers import tables as mapper_tables
 from benchmarks.sfm.measure import Cost, Run, summarise
 from benchmarks.sfm.scenes import configurations, load_scene
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
+from pipeline.scene.model import Posed, Reconstruction
 
 ERROR = PoseError(0.1, 0.1, 0.02, 0.02, 0.004, 5.0, 1.0, {1.0: 0.9, 5.0: 1.0, 10.0: 1.0}, 8, 8)
 
@@ -95,3 +100,37 @@ def test_it_measures_ours_and_pycolmaps(demo, tmp_path, capsys):
     assert all(cost["cpu_s"] > 0 for run in found["runs"] for cost in run["costs"].values())
     assert re.search(r"\| demo \| \*\*fast/incremental/exhaustive\*\* \|", capsys.readouterr().out)
     assert "<circle" in (tmp_path / "a.svg").read_text()
+
+
+def test_views_between_cameras_lie_between_neighbours():
+    # On a line, all turned alike but for one: a view is between it and its two nearest.
+    turned = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+    images = {}
+    for i in range(6):
+        rotation = turned if i == 5 else np.eye(3)
+        images[i] = Posed(f"{i}.jpg", 1, rotation, -rotation @ np.array([float(i * i), 0, 0]))
+    model = Reconstruction({}, images)
+    found = between(model, 40)
+    again = between(model, 40)
+    for (rotation, centre), (same, _) in zip(found, again, strict=True):
+        np.testing.assert_array_equal(rotation, same)
+        np.testing.assert_allclose(rotation @ rotation.T, np.eye(3), atol=1e-12)
+        assert 0 <= centre[0] <= 25 and not centre[1:].any()
+        if centre[0] <= 9:
+            np.testing.assert_allclose(rotation, np.eye(3), atol=1e-12)
+    assert len({float(centre[0]) for _, centre in found}) == 40
+
+
+def test_the_mappers_table_tells_seeds_and_mappers_apart():
+    names = [(mapper, seed) for mapper in ("incremental", "global") for seed in (0, 1)]
+    costs = {name: Cost(10.0 if name[0] == "global" else 4.0, 1.0) for name in names}
+    likeness = {
+        (a, b): (35.0, 0.99) if a[0] == b[0] else (30.0, 0.95) for a, b in combinations(names, 2)
+    }
+    lines = mapper_tables({"s": (costs, likeness)}).splitlines()
+    assert "| s | 4.0 | 10.0 |" in lines
+    assert (
+        "| s | global, two seeds | 1 | 35.00 (35.00 to 35.00) | 0.9900 (0.9900 to 0.9900) |"
+        in lines
+    )
+    assert any(line.startswith("| s | incremental against global | 4 | 30.00") for line in lines)

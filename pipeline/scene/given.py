@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.runtime.errors import UserError
 from pipeline.scene.colmap import read_model
@@ -16,12 +18,47 @@ from pipeline.scene.names import NameIndex
 from pipeline.scene.scan import Scan
 from pipeline.scene.transforms import read_transforms
 
+# Of a stage with poses: what frame they are in, where they are not as they were given.
+GEOREFERENCE = "georeference.json"
 # Shapes of a photograph and of its camera differ by rounding in reduced copies, not by more.
 _ASPECT_TOLERANCE = 0.02
+# Gaussians and most files of them are float32, of 24 bits. A scene farther from the origin than
+# this many of its own sizes has fewer than 17 left: a hundredth of a pixel at a focal length of
+# 1000 pixels.
+_FAR = 100.0
 
 
-def load_given(scan: Scan) -> Reconstruction:
-    """Poses in COLMAP's convention, named by and sized for the photographs of the manifest.
+@dataclass(frozen=True)
+class Given:
+    """The poses a scene brings.
+
+    Attributes:
+        model: in the given world, moved by ``-origin``.
+        origin: (3,) float64, a round place near the cameras where the scene is too far from the
+            given world's zero for float32; else zeros.
+    """
+
+    model: Reconstruction
+    origin: NDArray[np.float64]
+
+    def sidecar(self) -> dict[str, Any] | None:
+        """The content of ``georeference.json``; None where nothing was moved."""
+        if not self.origin.any():
+            return None
+        return {
+            "method": "given",
+            "axes": "those of the given poses",
+            "origin": dict(zip("xyz", self.origin.tolist(), strict=True)),
+            "projection": None,
+            "scale": 1.0,
+            "rotation": np.eye(3).tolist(),
+            "translation": (-self.origin).tolist(),
+        }
+
+
+def load_given(scan: Scan) -> Given:
+    """Poses in COLMAP's convention, named by and sized for the photographs of the manifest, near
+    the origin.
 
     Points keep the observations in those photographs; points seen in none of them are dropped.
 
@@ -49,7 +86,27 @@ def load_given(scan: Scan) -> Reconstruction:
         model, _ = read_poses_bounds(path, scan.listed)
     else:
         model = read_model(path)
-    return fit_to_photos(model, photos, str(path))
+    return _near_origin(fit_to_photos(model, photos, str(path)))
+
+
+def _near_origin(model: Reconstruction) -> Given:
+    if not model.images:
+        return Given(model, np.zeros(3))
+    centres = np.stack([image.centre for image in model.images.values()])
+    mean = centres.mean(0)
+    seen = model.points.xyz if len(model.points) else centres
+    size = float(np.median(np.linalg.norm(seen - mean, axis=1)))
+    if size == 0 or np.abs(mean).max() <= _FAR * size:
+        return Given(model, np.zeros(3))
+    # Round, so that a photograph more or less gives the same origin, and people can read it.
+    step = 10.0 ** np.ceil(np.log10(size))
+    origin = np.round(mean / step) * step
+    images = {
+        number: replace(image, translation=image.rotation @ (origin - image.centre))
+        for number, image in model.images.items()
+    }
+    points = replace(model.points, xyz=model.points.xyz - origin)
+    return Given(Reconstruction(model.cameras, images, points), origin)
 
 
 def fit_to_photos(

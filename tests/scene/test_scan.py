@@ -110,7 +110,7 @@ def test_smaller_copies_match_the_model_by_stem(tmp_path, long_side, chosen):
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
     result = look(tmp_path, config(views={"max_long_side_px": long_side}))
     assert result.image_folder == chosen
-    model = load_given(result)
+    model = load_given(result).model
     size = (result.photos[0].width, result.photos[0].height)
     assert sorted(model.by_name()) == names(result)
     (camera,) = model.cameras.values()
@@ -161,7 +161,7 @@ def test_only_a_smaller_copy_is_there(tmp_path):
     write_sparse(tmp_path / "sparse", ["p00.JPG", "p01.JPG"], (64, 48))
     result = look(tmp_path)
     assert (result.image_folder, result.poses.path) == ("images_4", "sparse")
-    assert next(iter(load_given(result).cameras.values())).width == 16
+    assert next(iter(load_given(result).model.cameras.values())).width == 16
 
 
 def test_configured_folder(tmp_path):
@@ -187,7 +187,7 @@ def test_given_colmap_model_and_truth(tmp_path):
     assert result.truth == tmp_path / "sparse_gt"
     assert any("gone.jpg" in line for line in result.warnings)
     assert any("p02.jpg" in line and "no given pose" in line for line in result.warnings)
-    model = load_given(result)
+    model = load_given(result).model
     assert sorted(model.by_name()) == listed[:2]
     assert model.points.track_length.tolist() == [2]
     assert look(tmp_path, config(poses="ignore")).poses is None
@@ -211,7 +211,7 @@ def test_nerf_synthetic(tmp_path):
         write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, f"transforms_{split}.json")
     result = look(tmp_path)
     expected = ["test/r_0.png", "test/r_1.png", "train/r_0.png", "train/r_1.png"]
-    assert names(result) == expected == sorted(load_given(result).by_name())
+    assert names(result) == expected == sorted(load_given(result).model.by_name())
     assert (result.num_alpha, result.poses.kind, result.poses.pinhole) == (4, "transforms", True)
     assert any("2 of 6 cameras have no photograph" in line for line in result.warnings)
     assert names(look(tmp_path, config(poses="ignore"))) == expected
@@ -225,7 +225,7 @@ def test_nerfstudio_with_masks(tmp_path):
     result = look(tmp_path)
     assert (result.image_folder, names(result)) == ("images", ["p00.jpg", "p01.jpg"])
     assert (result.num_masks, result.poses.models) == (2, ("OPENCV",))
-    (camera,) = load_given(result).cameras.values()
+    (camera,) = load_given(result).model.cameras.values()
     assert (camera.width, camera.pinhole[0]) == (64, 25)
 
 
@@ -238,7 +238,7 @@ def test_transforms_with_absolute_paths_and_photographs_elsewhere(tmp_path):
     frames = [frame(path=path) for path in inside + outside]
     write(folder, {"fl_x": 50, "frames": frames})
     result = look(folder)
-    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).by_name())
+    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).model.by_name())
     assert any("2 of 4 cameras have no photograph" in line for line in result.warnings)
 
 
@@ -249,7 +249,7 @@ def test_llff_goes_by_order_even_past_a_broken_photograph(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", rows)
     result = look(tmp_path)
     assert result.poses.kind == "llff"
-    centres = {name: image.centre[0] for name, image in load_given(result).by_name().items()}
+    centres = {name: image.centre[0] for name, image in load_given(result).model.by_name().items()}
     assert centres == {"p00.jpg": 0, "p02.jpg": 2}
     picture(tmp_path / "images" / "p03.jpg")
     with pytest.raises(UserError, match="3 poses, but images/ holds 4"):

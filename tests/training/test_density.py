@@ -157,7 +157,7 @@ def test_without_split_or_clone_the_other_is_done_to_all() -> None:
 
 
 def mcmc(**options: object) -> McmcDensity:
-    return McmcDensity(Density(strategy="mcmc", **options))  # type: ignore[arg-type]
+    return McmcDensity(Density(strategy="mcmc", **options), extent=1.0)  # type: ignore[arg-type]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)

@@ -1,5 +1,6 @@
 """Scanning a scene folder: each layout users bring, EXIF facts, fingerprints, messages."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -11,7 +12,7 @@ from PIL import Image
 
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import write_model
+from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.given import load_given
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
 from pipeline.scene.scan import Scan, scan
@@ -191,6 +192,33 @@ def test_given_colmap_model_and_truth(tmp_path):
     assert sorted(model.by_name()) == listed[:2]
     assert model.points.track_length.tolist() == [2]
     assert look(tmp_path, config(poses="ignore")).poses is None
+
+
+@pytest.mark.parametrize(("away", "moved"), [(0.0, False), (50.0, False), (1e5, True), (1e9, True)])
+def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
+    """float32 has 24 bits: at 1e5 of a scene's sizes from the origin they tell no pixel from the
+    next. What the cameras see stays the same, and the way back is told."""
+    files = photos(tmp_path / "images", 4)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    near, shift = read_model(folder), away * np.array([0.6, -0.64, 0.48])
+    images = {
+        i: dataclasses.replace(image, translation=image.translation - image.rotation @ shift)
+        for i, image in near.images.items()
+    }
+    points = dataclasses.replace(near.points, xyz=near.points.xyz + shift)
+    write_model(folder, Reconstruction(near.cameras, images, points))
+    given = load_given(look(tmp_path))
+    assert bool(given.origin.any()) == moved == (given.sidecar() is not None)
+    for i, image in given.model.images.items():
+        local = image.rotation @ given.model.points.xyz[0] + image.translation
+        np.testing.assert_allclose(local, near.images[i].translation, atol=1e-15 * away + 1e-12)
+    if moved:
+        assert np.abs(given.model.points.xyz).max() < 10
+        assert (given.origin == np.round(given.origin)).all()
+        back = given.model.points.xyz[0] + given.origin
+        np.testing.assert_allclose(back, shift, rtol=1e-12)
+        assert given.sidecar()["origin"] == dict(zip("xyz", given.origin, strict=True))
 
 
 def test_truth_is_never_an_input(tmp_path):

@@ -105,7 +105,7 @@ MUTANTS: dict[str, Mutant] = {
         "log_scales=config.lr_scales * factor",
         "log_scales=config.lr_quats * factor",
         "the scales' learning rate taken from the rotations",
-        ("tests/training/test_trainer.py",),
+        ("tests/training/test_first_step.py",),
     ),
     "decay_off_by_one": Mutant(
         "pipeline/training/schedule.py",
@@ -140,7 +140,7 @@ MUTANTS: dict[str, Mutant] = {
         "d_color = loss.grad if gain is None else loss.grad * gain",
         "d_color = loss.grad",
         "exposure left out of the gradient",
-        ("tests/training/test_trainer.py",),
+        ("tests/training/test_first_step.py",),
     ),
     "exposure_free": Mutant(
         "pipeline/photos/exposure.py",
@@ -161,7 +161,7 @@ MUTANTS: dict[str, Mutant] = {
         "training = [view for view in views if not view.is_test]",
         "training = list(views)",
         "training on the held-out views",
-        ("tests/stages", "tests/e2e/test_regression.py"),
+        ("tests/e2e/test_regression.py",),
     ),
     "undistort_half_pixel": Mutant(
         "pipeline/photos/undistort.py",

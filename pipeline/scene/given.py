@@ -27,6 +27,9 @@ _ASPECT_TOLERANCE = 0.02
 # 1000 pixels.
 _FAR = 100.0
 
+# Focal lengths over the longer side, from 175 degrees of view to a twentieth of one.
+_LENSES = (0.02, 1000.0)
+
 
 @dataclass(frozen=True)
 class Given:
@@ -117,7 +120,8 @@ def fit_to_photos(
     Names match exactly or without their suffix. Ids of images stay.
 
     Raises:
-        UserError: a camera of another shape than its photograph; ``source`` names the poses.
+        UserError: a camera of another shape than its photograph, or with a focal length that no
+            lens has; ``source`` names the poses.
     """
     index = NameIndex(photos)
     images: dict[int, Posed] = {}
@@ -132,7 +136,7 @@ def fit_to_photos(
             continue
         taken.add(name)
         photo, camera = photos[name], model.cameras[image.camera_id]
-        _check_shape(photo, camera, source)
+        _check_camera(photo, camera, source)
         key = (image.camera_id, photo.width, photo.height)
         if key not in ids:
             if image.camera_id in cameras:
@@ -148,7 +152,16 @@ def fit_to_photos(
     return Reconstruction(cameras, images, _points_in(model.points, scale))
 
 
-def _check_shape(photo: Photo, camera: Camera, source: str) -> None:
+def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
+    longer = max(camera.width, camera.height)
+    lens = [focal / longer for focal in camera.pinhole[:2]]
+    if not (_LENSES[0] <= min(lens) and max(lens) <= _LENSES[1]):
+        raise UserError(
+            f"{photo.name}: its given camera has a focal length of {camera.pinhole[0]:g} pixels at "
+            f"{camera.width}x{camera.height}, which no lens has",
+            file=source,
+            fix="give focal lengths in pixels of the pictures, or set poses: ignore",
+        )
     want, found = camera.width / camera.height, photo.width / photo.height
     # One pixel of rounding in either side of a small copy.
     slack = _ASPECT_TOLERANCE + 1 / min(photo.width, photo.height)

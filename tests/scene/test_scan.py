@@ -221,6 +221,21 @@ def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
         assert given.sidecar()["origin"] == dict(zip("xyz", given.origin, strict=True))
 
 
+@pytest.mark.parametrize(("focal", "ok"), [(1.0, False), (2.0, True), (6e4, True), (1e9, False)])
+def test_a_focal_length_that_no_lens_has_is_told(tmp_path, focal, ok):
+    files = photos(tmp_path / "images", 2)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    model = read_model(folder)
+    camera = dataclasses.replace(model.cameras[1], params=np.array([focal, focal, 32, 24]))
+    write_model(folder, dataclasses.replace(model, cameras={1: camera}))
+    if ok:
+        assert load_given(look(tmp_path)).model.cameras[1].pinhole[0] == focal
+    else:
+        with pytest.raises(UserError, match="focal length of"):
+            load_given(look(tmp_path))
+
+
 def test_truth_is_never_an_input(tmp_path):
     files = photos(tmp_path / "images", 2)
     before = look(tmp_path)

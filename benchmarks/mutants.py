@@ -260,6 +260,10 @@ class Result:
 
 
 def copy_project(target: Path) -> None:
+    """The sources, and beside them what is compiled of them already."""
+    built = Path(os.environ.get("SPLATMAKE_CACHE", ROOT / "build" / "native"))
+    if built.is_dir():
+        shutil.copytree(built, target.parent / "native")
     target.mkdir()
     ignored = shutil.ignore_patterns("__pycache__", ".pytest_cache")
     for source in ROOT.iterdir():

@@ -182,7 +182,7 @@ MUTANTS: dict[str, Mutant] = {
         "np.array([fx * sx, fy * sy, cx * sx, cy * sy, *rest])",
         "np.array([fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5, *rest])",
         "the principal point half a pixel off in reduced pictures",
-        ("tests/scene",),
+        ("tests/scene/test_views.py",),
     ),
     "opengl_axes": Mutant(
         "pipeline/scene/transforms.py",

@@ -149,7 +149,8 @@ def one_view(given: bool) -> Callable[[Path, Path], None]:
         (folder / "images").mkdir()
         shutil.copy(room / "images" / image.name, folder / "images" / image.name)
         if given:
-            write_model(folder / "sparse/0", replace(model, images={1: image}))
+            points = _untracked(model.points, alone=False)
+            write_model(folder / "sparse/0", Reconstruction(model.cameras, {1: image}, points))
 
     return make
 

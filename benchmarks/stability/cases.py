@@ -280,7 +280,11 @@ def exposed(factor: float, every: int = 1) -> Callable[[Pixels, int], Pixels]:
     """Every n-th photograph's values times ``factor``, clipped."""
 
     def change(rgb: Pixels, number: int) -> Pixels:
-        return rgb if number % every else np.rint(rgb * factor).clip(0, 255).astype(np.uint8)
+        return (
+            rgb
+            if number % every
+            else np.rint(rgb.astype(np.float64) * factor).clip(0, 255).astype(np.uint8)
+        )
 
     return change
 

@@ -16,6 +16,7 @@ import re
 import subprocess
 import sys
 import tempfile
+import textwrap
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -116,15 +117,16 @@ def table(outcomes: list[Outcome]) -> str:
     by_name = {outcome.case: outcome for outcome in outcomes}
     for o in outcomes:
         case = CASES[o.case]
+        message = textwrap.shorten(o.message, 200, placeholder=" ...")
         if o.psnr is None:
-            rest = f"| error | | | | {o.message} |"
+            rest = f"| error | | | | {message} |"
         else:
             reference = by_name.get(case.reference)
             compared = case.expected == "same" and reference is not None and reference is not o
             against = ""
             if compared and reference is not None and reference.psnr is not None:
                 against = f"{o.psnr - reference.psnr:+.3f} ({case.reference})"
-            rest = f"| {o.psnr:.2f} | {against} | {o.ssim:.4f} | {o.gaussians} | {o.message} |"
+            rest = f"| {o.psnr:.2f} | {against} | {o.ssim:.4f} | {o.gaussians} | {message} |"
         wrong = "" if o.right else " **WRONG**"
         lines.append(f"| {o.case}{wrong} | {case.what} {rest}")
     return "\n".join(lines)

@@ -372,7 +372,7 @@ CAMERAS = {
         taken(ring(1.9), about(ring()), given=True, focal=0.25),
         "focal length of 0.19 widths (138 degrees)",
         "works",
-        least=20.0,
+        least=15.0,
     ),
     "tele": Case(
         taken(ring(46.0, 25.0, 6.0), about(ring()), given=True, focal=20.0, alone=True),

@@ -29,7 +29,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.gltf import write_gltf
 from pipeline.splats.ply import write_points_ply, write_splat_ply
 from pipeline.splats.splat import write_splat
-from pipeline.splats.spz import write_spz
+from pipeline.splats.spz import unfit, write_spz
 from stages.command import main
 
 
@@ -54,6 +54,9 @@ class Scene:
 
 # Cameras belong to the pictures as they are, whatever size training took them in.
 FULL_SIZE = Views(max_long_side_px=2**31)
+
+# Of Gaussians that a format cannot hold: some specks are always lost.
+TOLERATED_SHARE = 0.05
 
 # format -> the file or folder, and what writes it.
 WRITERS: dict[str, tuple[str, Callable[[Path, Scene], None]]] = {
@@ -92,6 +95,13 @@ def run(job: Job) -> None:
         file, write = WRITERS[name]
         write(job.out / file, scene)
         files.append(file)
+    lost = unfit(scene.gaussians) if "spz" in config.formats else 0
+    if lost > TOLERATED_SHARE * len(scene.gaussians):
+        job.warn(
+            f"point_cloud.spz: {lost} of {len(scene.gaussians)} Gaussians are too small or too "
+            "large for SPZ's numbers in the unit of the poses; take point_cloud.ply, or give the "
+            "poses in a unit in which the scene measures about 1 to 100"
+        )
     protocol = choose_protocol(scene.views, split, train)
     orientation = {photo.name: photo.orientation for photo in manifest.photos}
     up = up_direction(

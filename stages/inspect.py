@@ -1,17 +1,18 @@
 """Look at the scene folder thoroughly once: which photographs are whole, which poses came along.
 
 Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses were given and
-``truth`` where the scene has ``sparse_gt``, ``gcp_list.txt`` where it has that.
+``truth`` where the scene has ``sparse_gt``, ``gcp_list.txt`` where it has that, and
+``georeference.json`` where given poses were moved.
 """
 
 from pathlib import Path
 
 from pipeline.config.schema import Config, Inspect, Views
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.gcp import GCP_FILE, read_ground_control
-from pipeline.scene.given import load_given
+from pipeline.scene.given import GEOREFERENCE, load_given
 from pipeline.scene.scan import scan
 from pipeline.scene.verify import verify_photos
 from stages.command import main
@@ -36,8 +37,16 @@ def run(job: Job) -> None:
     }
     if found.poses is not None:
         given = load_given(found.model_copy(update={"manifest": manifest}))
-        write_model(job.out / "sparse" / "0", given)
-        job.counters |= {"given_poses": len(given.images), "given_points": len(given.points)}
+        write_model(job.out / "sparse" / "0", given.model)
+        job.counters["given_poses"] = len(given.model.images)
+        job.counters["given_points"] = len(given.model.points)
+        moved = given.sidecar()
+        if moved is not None:
+            write_json(job.out / GEOREFERENCE, moved)
+            job.decide(
+                "the given poses are too far from their origin for float32: everything is moved "
+                f"so that {', '.join(f'{v:.9g}' for v in given.origin)} is the new one (frame.json)"
+            )
     if found.ground_control is not None and found.poses is None:
         # Malformed, it is told now and not after hours.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])

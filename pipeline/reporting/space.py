@@ -7,6 +7,8 @@ from __future__ import annotations
 
 import base64
 import json
+import math
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +28,8 @@ _MAX_POINTS = 25_000
 # The view's box is [-1, 1]; points out to this many boxes are kept, in 16-bit integers.
 _REACH = 4.0
 _STEP = _REACH / 32767
+# Radii of scenes that SPZ holds well: its sizes reach from e^-10 to e^5.9, its steps are 2^-20.
+_SPZ_RADII = (0.1, 100.0)
 
 
 def viewer_script() -> str:
@@ -39,6 +43,7 @@ def space_section(data: ReportData, room: int) -> str:
     Args:
         room: bytes that the Gaussians may take in the page.
     """
+    data = sized_for_spz(data)
     scene = data.trained
     if scene is None:
         return '<p class="hint">There is no trained scene.</p>'
@@ -70,6 +75,29 @@ def space_section(data: ReportData, room: int) -> str:
         f'<script type="application/json" id="space-data">{_json(viewer_data(data, scene))}'
         f'</script><script type="text/plain" id="splats">{_base64(packed.spz)}</script>'
     )
+
+
+def sized_for_spz(data: ReportData) -> ReportData:
+    """The same scene, of radius 1 where its own is none for SPZ."""
+    scene = data.trained
+    if scene is None:
+        return data
+    centres = np.array([view.centre for view in scene.views]).reshape(-1, 3)
+    finite = np.isfinite(data.points_xyz).all(axis=1)
+    _, radius = _robust_box(data.points_xyz[finite], centres)
+    if _SPZ_RADII[0] <= radius <= _SPZ_RADII[1]:
+        return data
+    whole = scene.gaussians
+    gaussians = replace(
+        whole, means=whole.means / radius, log_scales=whole.log_scales - math.log(radius)
+    )
+    views = []
+    for view in scene.views:
+        pose = view.world_to_camera.copy()
+        pose[:3, 3] /= radius
+        views.append(replace(view, world_to_camera=pose))
+    trained = replace(scene, gaussians=gaussians, views=views, near=scene.near / radius)
+    return replace(data, trained=trained, points_xyz=data.points_xyz / radius)
 
 
 def _shown(scene: TrainedScene, packed: Packed) -> str:

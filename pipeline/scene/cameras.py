@@ -133,7 +133,7 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             file=folder,
             fix="add them, or give a finished scene's results folder",
         )
-    model = load_given(found)
+    model = load_given(found).model
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
     train = Train(background="random" if found.num_alpha else "black")

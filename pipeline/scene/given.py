@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.runtime.errors import UserError
 from pipeline.scene.colmap import read_model
@@ -16,12 +18,50 @@ from pipeline.scene.names import NameIndex
 from pipeline.scene.scan import Scan
 from pipeline.scene.transforms import read_transforms
 
+# Of a stage with poses: what frame they are in, where they are not as they were given.
+GEOREFERENCE = "georeference.json"
 # Shapes of a photograph and of its camera differ by rounding in reduced copies, not by more.
 _ASPECT_TOLERANCE = 0.02
+# Gaussians and most files of them are float32, of 24 bits. A scene farther from the origin than
+# this many of its own sizes has fewer than 17 left: a hundredth of a pixel at a focal length of
+# 1000 pixels.
+_FAR = 100.0
+
+# Focal lengths over the longer side, from 175 degrees of view to a twentieth of one.
+_LENSES = (0.02, 1000.0)
 
 
-def load_given(scan: Scan) -> Reconstruction:
-    """Poses in COLMAP's convention, named by and sized for the photographs of the manifest.
+@dataclass(frozen=True)
+class Given:
+    """The poses a scene brings.
+
+    Attributes:
+        model: in the given world, moved by ``-origin``.
+        origin: (3,) float64, a round place near the cameras where the scene is too far from the
+            given world's zero for float32; else zeros.
+    """
+
+    model: Reconstruction
+    origin: NDArray[np.float64]
+
+    def sidecar(self) -> dict[str, Any] | None:
+        """The content of ``georeference.json``; None where nothing was moved."""
+        if not self.origin.any():
+            return None
+        return {
+            "method": "given",
+            "axes": "those of the given poses",
+            "origin": dict(zip("xyz", self.origin.tolist(), strict=True)),
+            "projection": None,
+            "scale": 1.0,
+            "rotation": np.eye(3).tolist(),
+            "translation": (-self.origin).tolist(),
+        }
+
+
+def load_given(scan: Scan) -> Given:
+    """Poses in COLMAP's convention, named by and sized for the photographs of the manifest, near
+    the origin.
 
     Points keep the observations in those photographs; points seen in none of them are dropped.
 
@@ -49,7 +89,27 @@ def load_given(scan: Scan) -> Reconstruction:
         model, _ = read_poses_bounds(path, scan.listed)
     else:
         model = read_model(path)
-    return fit_to_photos(model, photos, str(path))
+    return _near_origin(fit_to_photos(model, photos, str(path)))
+
+
+def _near_origin(model: Reconstruction) -> Given:
+    if not model.images:
+        return Given(model, np.zeros(3))
+    centres = np.stack([image.centre for image in model.images.values()])
+    mean = centres.mean(0)
+    seen = model.points.xyz if len(model.points) else centres
+    size = float(np.median(np.linalg.norm(seen - mean, axis=1)))
+    if size == 0 or np.abs(mean).max() <= _FAR * size:
+        return Given(model, np.zeros(3))
+    # Round, so that a photograph more or less gives the same origin, and people can read it.
+    step = 10.0 ** np.ceil(np.log10(size))
+    origin = np.round(mean / step) * step
+    images = {
+        number: replace(image, translation=image.rotation @ (origin - image.centre))
+        for number, image in model.images.items()
+    }
+    points = replace(model.points, xyz=model.points.xyz - origin)
+    return Given(Reconstruction(model.cameras, images, points), origin)
 
 
 def fit_to_photos(
@@ -60,7 +120,8 @@ def fit_to_photos(
     Names match exactly or without their suffix. Ids of images stay.
 
     Raises:
-        UserError: a camera of another shape than its photograph; ``source`` names the poses.
+        UserError: a camera of another shape than its photograph, or with a focal length that no
+            lens has; ``source`` names the poses.
     """
     index = NameIndex(photos)
     images: dict[int, Posed] = {}
@@ -75,7 +136,7 @@ def fit_to_photos(
             continue
         taken.add(name)
         photo, camera = photos[name], model.cameras[image.camera_id]
-        _check_shape(photo, camera, source)
+        _check_camera(photo, camera, source)
         key = (image.camera_id, photo.width, photo.height)
         if key not in ids:
             if image.camera_id in cameras:
@@ -91,7 +152,16 @@ def fit_to_photos(
     return Reconstruction(cameras, images, _points_in(model.points, scale))
 
 
-def _check_shape(photo: Photo, camera: Camera, source: str) -> None:
+def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
+    longer = max(camera.width, camera.height)
+    lens = [focal / longer for focal in camera.pinhole[:2]]
+    if not (_LENSES[0] <= min(lens) and max(lens) <= _LENSES[1]):
+        raise UserError(
+            f"{photo.name}: its given camera has a focal length of {camera.pinhole[0]:g} pixels at "
+            f"{camera.width}x{camera.height}, which no lens has",
+            file=source,
+            fix="give focal lengths in pixels of the pictures, or set poses: ignore",
+        )
     want, found = camera.width / camera.height, photo.width / photo.height
     # One pixel of rounding in either side of a small copy.
     slack = _ASPECT_TOLERANCE + 1 / min(photo.width, photo.height)

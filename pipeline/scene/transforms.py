@@ -269,7 +269,9 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     if not _is_number(scale) or scale <= 0:
         raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
     moved[:3] *= scale
-    if not np.linalg.det(moved[:3, :3]) > 1e-12:
+    # A volume: a millionth of the axes' cube is flat, whatever their unit.
+    size = float(np.abs(moved[:3, :3]).max())
+    if not np.linalg.det(moved[:3, :3]) > 1e-6 * size**3:
         raise UserError("applied_transform: expected a similarity", file=file, fix=_FIX)
     return moved
 

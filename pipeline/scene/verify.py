@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
@@ -24,7 +24,8 @@ def verify_photos(
         min_photos: fewer good ones than this is an error.
 
     Returns:
-        The manifest without them (its warnings extended), and one warning each.
+        The manifest without them (its warnings extended), and one warning each, one more where
+        photographs are copies of others.
 
     Raises:
         UserError: fewer than ``min_photos`` are whole; every broken one is named.
@@ -47,8 +48,26 @@ def verify_photos(
             file=Path(manifest.photos[0].path).parent if manifest.photos else None,
             fix="replace the broken files by whole ones, or lower inspect.min_images",
         )
+    warnings += _copies(good)
     update = {"photos": good, "warnings": (*manifest.warnings, *warnings)}
     return manifest.model_copy(update=update), warnings
+
+
+def _copies(photos: Sequence[Photo]) -> list[str]:
+    """A warning where files are the same to the byte."""
+    first: dict[str, str] = {}
+    pairs = [
+        f"{photo.name} = {first[photo.digest]}"
+        for photo in photos
+        if first.setdefault(photo.digest, photo.name) != photo.name
+    ]
+    if not pairs:
+        return []
+    some = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
+    return [
+        f"copies of other photographs: {len(pairs)} ({some}): one that is held out while "
+        "training sees its copy makes the measures too good; remove the copies"
+    ]
 
 
 def _fault_of(photo: Photo) -> str | None:

@@ -114,6 +114,7 @@ def scene_extent(views: list[View]) -> float:
         if chosen:
             centres = np.stack([view.centre for view in chosen])
             radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-            if radius > 0:
+            # What is left of a distance by the rounding of poses is none.
+            if radius > 1e-9 * float(np.abs(centres).max()):
                 return 1.1 * radius
     return 1.0

@@ -47,13 +47,13 @@ def describe_frame(
     return {
         "axes": f"{AXES}; {placed['axes']}" if placed else AXES,
         "axes_of": {name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
-        "up": _rounded(up),
+        "up": np.round(up, 6).tolist(),
         "unit": placed.get("unit", UNIT),
         "georeference": {k: placed[k] for k in ("method", "origin", "projection") if k in placed},
         "cameras": {
             "count": len(views),
-            "centre": _rounded(centres.mean(0)),
-            "extent": _rounded(scene_extent(list(views))),
+            "centre": [_digits(value) for value in centres.mean(0)],
+            "extent": _digits(scene_extent(list(views))),
         },
         "gaussians": {"count": len(gaussians), "sh_degree": gaussians.sh_degree},
         "colour": "display-ready sRGB: 0.5 + spherical harmonics, blended as it is",
@@ -61,5 +61,6 @@ def describe_frame(
     }
 
 
-def _rounded(values: Any) -> Any:
-    return np.round(values, 6).tolist()
+def _digits(value: float) -> float:
+    """Seven significant ones: a unit may be of any size."""
+    return float(f"{value:.7g}")

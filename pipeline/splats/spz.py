@@ -34,6 +34,8 @@ _MAX_FRACTION_BITS = 20
 # Gaussians farther than this many times the usual distance are strays: they are drawn nearer, so
 # that the rest keeps its resolution.
 _FAR = 512.0
+# Of sizes: a byte, in sixteenths.
+_LOG_SCALES = (-10.0, 255 / 16 - 10)
 _QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller parts lie within 1 / sqrt(2).
 # Niantic's own reader refuses more.
 MAX_GAUSSIANS = 10_000_000
@@ -85,6 +87,16 @@ def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
         to_bytes(sh[:, 1:] * 128 + 128),
     )
     return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
+
+
+def unfit(gaussians: Gaussians) -> int:
+    """How many Gaussians SPZ cannot hold in this unit: larger or smaller than its range of sizes,
+    or smaller than half a step of its places."""
+    means, log_scales = (a.astype(np.float64) for a in list(gaussians.arrays().values())[:2])
+    bits, shrink = _grid(means)
+    longest = log_scales.max(axis=1, initial=-np.inf) + np.log(shrink[:, 0])
+    least = max(_LOG_SCALES[0], -(bits + 1) * np.log(2.0))
+    return int(((longest < least) | (longest > _LOG_SCALES[1])).sum())
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:

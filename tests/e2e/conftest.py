@@ -6,24 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.harness import TINY, TINY_DEMO, copy_project, environment, snakemake, subprocess, sys
-
-
-def make_scene(project: Path, scene: str, *options: str) -> None:
-    """Make a tiny demo scene in ``data/<scene>`` of a project."""
-    subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pipeline.demo",
-            f"data/{scene}",
-            *TINY_DEMO,
-            *options,
-        ],
-        cwd=project,
-        env=environment(project),
-        check=True,
-    )
+from tests.e2e.harness import TINY, copy_project, make_scene, snakemake
 
 
 @pytest.fixture(scope="session")

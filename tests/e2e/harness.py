@@ -37,6 +37,23 @@ def copy_project(target: Path) -> Path:
     return target
 
 
+def make_scene(project: Path, scene: str, *options: str) -> None:
+    """Make a tiny demo scene in ``data/<scene>`` of a project."""
+    subprocess.run(
+        [
+            sys.executable,
+            "-m",
+            "pipeline.demo",
+            f"data/{scene}",
+            *TINY_DEMO,
+            *options,
+        ],
+        cwd=project,
+        env=environment(project),
+        check=True,
+    )
+
+
 def copy_run(source: Path, target: Path) -> Path:
     """Copy a project together with its results, keeping times, as if it had always been there."""
     subprocess.run(["cp", "-a", str(source), str(target)], check=True)

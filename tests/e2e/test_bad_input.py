@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.conftest import make_scene
-from tests.e2e.harness import TINY, copy_project, copy_run, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_project, copy_run, make_scene, rules_run, snakemake
 
 pytestmark = pytest.mark.slow
 

@@ -9,8 +9,7 @@ import shutil
 
 import pytest
 
-from tests.e2e.conftest import make_scene
-from tests.e2e.harness import TINY, copy_project, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
 from tests.e2e.test_bad_input import noise
 
 pytestmark = pytest.mark.slow

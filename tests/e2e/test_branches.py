@@ -6,8 +6,7 @@ import json
 
 import pytest
 
-from tests.e2e.conftest import make_scene
-from tests.e2e.harness import TINY, copy_project, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
 
 pytestmark = pytest.mark.slow
 

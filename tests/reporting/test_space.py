@@ -14,7 +14,13 @@ import torch
 from pipeline.reporting.fit import fit, prominence
 from pipeline.reporting.page import report_html
 from pipeline.reporting.pictures import upright
-from pipeline.reporting.space import space_section, upright_camera, viewer_data, viewer_script
+from pipeline.reporting.space import (
+    sized_for_spz,
+    space_section,
+    upright_camera,
+    viewer_data,
+    viewer_script,
+)
 from pipeline.scene.model import View
 from pipeline.splats.spz import decode_spz, encode_spz
 from tests.reporting.made import gaussians, report, ring, trained
@@ -53,6 +59,37 @@ def test_the_frame_is_upright_robust_and_keeps_shapes() -> None:
     assert len(packed) == 200  # the stray one is left out
     placed = points[:200] @ frame[:3, :3].T + frame[:3, 3]
     np.testing.assert_allclose(packed * made["step"], placed, atol=made["step"])
+
+
+@pytest.mark.parametrize("unit", [1e-4, 1e4])
+def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
+    """In the page's SPZ sizes and places are of a fixed unit; what is seen is the same."""
+    rng = np.random.default_rng(0)
+    whole = gaussians()
+    large = dataclasses.replace(
+        whole, means=whole.means * unit, log_scales=whole.log_scales + np.log(unit)
+    )
+    views = []
+    for view in ring():
+        pose = view.world_to_camera.copy()
+        pose[:3, 3] *= unit
+        views.append(dataclasses.replace(view, world_to_camera=pose))
+    points = rng.normal(size=(300, 3)) * 0.5
+    data = report(
+        trained=trained(gaussians=large, views=views, near=0.03 * unit), points_xyz=points * unit
+    )
+    made = sized_for_spz(data)
+    scene = made.trained
+    assert scene is not None
+    found = decode_spz(encode_spz(scene.gaussians))
+    assert (found.log_scales > -9).all() and (found.log_scales < 4).all()
+    scale = scene.near / 0.03
+    assert 0.1 < scale < 10
+    np.testing.assert_allclose(scene.gaussians.means, scale * whole.means, rtol=1e-4, atol=1e-6)
+    for ours, view in zip(scene.views, ring(), strict=True):
+        np.testing.assert_allclose(ours.centre, scale * view.centre, atol=1e-6)
+    np.testing.assert_allclose(made.points_xyz, scale * points, rtol=1e-6)
+    assert sized_for_spz(made) is made
 
 
 def test_from_the_air_up_is_what_lies_behind_the_cameras() -> None:

@@ -50,13 +50,13 @@ def test_exif_of_a_phone():
 
 def test_bonsai_poses_explain_its_points():
     seen = look("mip360_bonsai")
-    model = load_given(seen)
+    model = load_given(seen).model
     assert len(model.images) == 292 and len(model.points) == 91_625
     assert float(np.mean(model.points.error)) < 1.0
 
 
 def test_lego_cameras_look_at_the_model():
-    model = load_given(look("nerf_lego"))
+    model = load_given(look("nerf_lego")).model
     for image in model.images.values():
         # All stand on a sphere around the origin and look at it.
         ahead = image.rotation[2]

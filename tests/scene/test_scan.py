@@ -1,5 +1,6 @@
 """Scanning a scene folder: each layout users bring, EXIF facts, fingerprints, messages."""
 
+import dataclasses
 import json
 import os
 import shutil
@@ -11,7 +12,7 @@ from PIL import Image
 
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import write_model
+from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.given import load_given
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
 from pipeline.scene.scan import Scan, scan
@@ -110,7 +111,7 @@ def test_smaller_copies_match_the_model_by_stem(tmp_path, long_side, chosen):
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
     result = look(tmp_path, config(views={"max_long_side_px": long_side}))
     assert result.image_folder == chosen
-    model = load_given(result)
+    model = load_given(result).model
     size = (result.photos[0].width, result.photos[0].height)
     assert sorted(model.by_name()) == names(result)
     (camera,) = model.cameras.values()
@@ -161,7 +162,7 @@ def test_only_a_smaller_copy_is_there(tmp_path):
     write_sparse(tmp_path / "sparse", ["p00.JPG", "p01.JPG"], (64, 48))
     result = look(tmp_path)
     assert (result.image_folder, result.poses.path) == ("images_4", "sparse")
-    assert next(iter(load_given(result).cameras.values())).width == 16
+    assert next(iter(load_given(result).model.cameras.values())).width == 16
 
 
 def test_configured_folder(tmp_path):
@@ -187,10 +188,52 @@ def test_given_colmap_model_and_truth(tmp_path):
     assert result.truth == tmp_path / "sparse_gt"
     assert any("gone.jpg" in line for line in result.warnings)
     assert any("p02.jpg" in line and "no given pose" in line for line in result.warnings)
-    model = load_given(result)
+    model = load_given(result).model
     assert sorted(model.by_name()) == listed[:2]
     assert model.points.track_length.tolist() == [2]
     assert look(tmp_path, config(poses="ignore")).poses is None
+
+
+@pytest.mark.parametrize(("away", "moved"), [(0.0, False), (50.0, False), (1e5, True), (1e9, True)])
+def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
+    """float32 has 24 bits: at 1e5 of a scene's sizes from the origin they tell no pixel from the
+    next. What the cameras see stays the same, and the way back is told."""
+    files = photos(tmp_path / "images", 4)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    near, shift = read_model(folder), away * np.array([0.6, -0.64, 0.48])
+    images = {
+        i: dataclasses.replace(image, translation=image.translation - image.rotation @ shift)
+        for i, image in near.images.items()
+    }
+    points = dataclasses.replace(near.points, xyz=near.points.xyz + shift)
+    write_model(folder, Reconstruction(near.cameras, images, points))
+    given = load_given(look(tmp_path))
+    assert bool(given.origin.any()) == moved == (given.sidecar() is not None)
+    for i, image in given.model.images.items():
+        local = image.rotation @ given.model.points.xyz[0] + image.translation
+        np.testing.assert_allclose(local, near.images[i].translation, atol=1e-15 * away + 1e-12)
+    if moved:
+        assert np.abs(given.model.points.xyz).max() < 10
+        assert (given.origin == np.round(given.origin)).all()
+        back = given.model.points.xyz[0] + given.origin
+        np.testing.assert_allclose(back, shift, rtol=1e-12)
+        assert given.sidecar()["origin"] == dict(zip("xyz", given.origin, strict=True))
+
+
+@pytest.mark.parametrize(("focal", "ok"), [(1.0, False), (2.0, True), (6e4, True), (1e9, False)])
+def test_a_focal_length_that_no_lens_has_is_told(tmp_path, focal, ok):
+    files = photos(tmp_path / "images", 2)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    model = read_model(folder)
+    camera = dataclasses.replace(model.cameras[1], params=np.array([focal, focal, 32, 24]))
+    write_model(folder, dataclasses.replace(model, cameras={1: camera}))
+    if ok:
+        assert load_given(look(tmp_path)).model.cameras[1].pinhole[0] == focal
+    else:
+        with pytest.raises(UserError, match="focal length of"):
+            load_given(look(tmp_path))
 
 
 def test_truth_is_never_an_input(tmp_path):
@@ -211,7 +254,7 @@ def test_nerf_synthetic(tmp_path):
         write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, f"transforms_{split}.json")
     result = look(tmp_path)
     expected = ["test/r_0.png", "test/r_1.png", "train/r_0.png", "train/r_1.png"]
-    assert names(result) == expected == sorted(load_given(result).by_name())
+    assert names(result) == expected == sorted(load_given(result).model.by_name())
     assert (result.num_alpha, result.poses.kind, result.poses.pinhole) == (4, "transforms", True)
     assert any("2 of 6 cameras have no photograph" in line for line in result.warnings)
     assert names(look(tmp_path, config(poses="ignore"))) == expected
@@ -225,7 +268,7 @@ def test_nerfstudio_with_masks(tmp_path):
     result = look(tmp_path)
     assert (result.image_folder, names(result)) == ("images", ["p00.jpg", "p01.jpg"])
     assert (result.num_masks, result.poses.models) == (2, ("OPENCV",))
-    (camera,) = load_given(result).cameras.values()
+    (camera,) = load_given(result).model.cameras.values()
     assert (camera.width, camera.pinhole[0]) == (64, 25)
 
 
@@ -238,7 +281,7 @@ def test_transforms_with_absolute_paths_and_photographs_elsewhere(tmp_path):
     frames = [frame(path=path) for path in inside + outside]
     write(folder, {"fl_x": 50, "frames": frames})
     result = look(folder)
-    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).by_name())
+    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).model.by_name())
     assert any("2 of 4 cameras have no photograph" in line for line in result.warnings)
 
 
@@ -249,7 +292,7 @@ def test_llff_goes_by_order_even_past_a_broken_photograph(tmp_path):
     np.save(tmp_path / "poses_bounds.npy", rows)
     result = look(tmp_path)
     assert result.poses.kind == "llff"
-    centres = {name: image.centre[0] for name, image in load_given(result).by_name().items()}
+    centres = {name: image.centre[0] for name, image in load_given(result).model.by_name().items()}
     assert centres == {"p00.jpg": 0, "p02.jpg": 2}
     picture(tmp_path / "images" / "p03.jpg")
     with pytest.raises(UserError, match="3 poses, but images/ holds 4"):

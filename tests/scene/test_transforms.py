@@ -78,6 +78,15 @@ def test_nerf_synthetic_splits_angle_and_missing_suffix(tmp_path):
     np.testing.assert_allclose(project(model, point), expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e6])
+def test_a_scale_of_any_size_is_undone(tmp_path, scale):
+    pose = np.eye(4)
+    pose[:3, 3] = scale * np.array([1.0, 2.0, 3.0])
+    content = {"fl_x": 100, "applied_scale": scale, "frames": [frame(pose)]}
+    (image,) = read_transforms(write(tmp_path, content), SIZES).images.values()
+    np.testing.assert_allclose(image.centre, [1, 2, 3], rtol=1e-12)
+
+
 def test_applied_transform_and_scale_are_undone(tmp_path):
     matrix, _, _ = opengl_camera(2)
     moved = np.array([[0.0, 1, 0, 3], [1, 0, 0, -2], [0, 0, -1, 5], [0, 0, 0, 1]])

@@ -44,3 +44,12 @@ def test_too_few_left_is_an_error_that_names_them(manifest):
     with pytest.raises(UserError, match=r"only 4 of \d photographs") as error:
         verify_photos(manifest, threads=1, min_photos=5)
     assert "cut_a.jpg" in str(error.value)
+
+
+def test_copies_are_named(tmp_path):
+    """A held-out photograph whose copy is trained on measures memory."""
+    files = photos(tmp_path, 3)
+    (tmp_path / "q.jpg").write_bytes(files[1].read_bytes())
+    manifest = scan(tmp_path, "s", Config(), cache=None).manifest
+    (warning,) = verify_photos(manifest, threads=1)[1]
+    assert "q.jpg = p01.jpg" in warning and warning.startswith("copies of other photographs: 1 (")

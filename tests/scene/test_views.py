@@ -67,6 +67,20 @@ def test_extent():
     assert scene_extent(views[:1]) == 1.0
 
 
+def test_rounding_is_no_extent():
+    """Cameras in one place, whose poses say so to the last bit but one."""
+    manifest, model = make(9)
+    rng = np.random.default_rng(0)
+    images = {}
+    for number, image in model.images.items():
+        turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        centre = np.array([0.3, -7.0, 2.0])
+        images[number] = Posed(image.name, 1, turned, -turned @ centre)
+    views = load_views(manifest, Reconstruction(model.cameras, images), Views(), Split())
+    assert len({tuple(view.centre) for view in views}) > 1
+    assert scene_extent(views) == 1.0
+
+
 def test_up_is_what_the_cameras_agree_on():
     """Cameras around a y-down world that look down at it: tilts cancel, up stays."""
     rotations = []

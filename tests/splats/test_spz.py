@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.ply import read_splat_ply
-from pipeline.splats.spz import decode_spz, encode_spz, read_spz, write_spz
+from pipeline.splats.spz import decode_spz, encode_spz, read_spz, unfit, write_spz
 from tests.splats.samples import Within, sample, turn
 
 DATA = Path(__file__).parent / "data"
@@ -48,6 +48,14 @@ def test_resolution_follows_the_scenes_size(size) -> None:
     found = decode_spz(encode_spz(gaussians))
     error = (found.means - gaussians.means).abs().max()
     assert error <= max(2.0**-21, gaussians.means.abs().max() * 2.0**-22)
+
+
+@pytest.mark.parametrize(("unit", "few"), [(1e-4, False), (1.0, True), (20.0, True), (1e4, False)])
+def test_a_unit_that_the_format_has_no_numbers_for_is_noticed(unit, few) -> None:
+    gaussians = sample(200)
+    gaussians.means *= unit
+    gaussians.log_scales[:] = np.log(0.05 * unit)
+    assert (unfit(gaussians) == 0) == few
 
 
 def test_a_stray_far_away_costs_the_others_no_resolution_and_looks_the_same() -> None:

@@ -13,6 +13,7 @@ from hypothesis import strategies as st
 
 from pipeline.config.schema import Density
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density import make_strategy
 from pipeline.training.density.gradient import SPLIT_SHRINK, GradientDensity
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.strategy import rotations
@@ -157,7 +158,7 @@ def test_without_split_or_clone_the_other_is_done_to_all() -> None:
 
 
 def mcmc(**options: object) -> McmcDensity:
-    return McmcDensity(Density(strategy="mcmc", **options))  # type: ignore[arg-type]
+    return McmcDensity(Density(strategy="mcmc", **options), extent=1.0)  # type: ignore[arg-type]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -223,3 +224,43 @@ def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
     mcmc(opacity_cost=0.1, scale_cost=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
     assert torch.allclose(gradients.opacity_logits, logits.grad)
     assert torch.allclose(gradients.log_scales, scales.grad)
+
+
+@pytest.mark.parametrize("scale", [2.0**-13, 2.0**13])
+@pytest.mark.parametrize("kind", ["gradient", "mcmc"])
+def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) -> None:
+    """The same scene in another unit: the same is cloned, split, moved and costs the same."""
+    found = []
+    for unit in (1.0, scale):
+        gaussians, adam = marked(200)
+        gaussians.means *= unit
+        gaussians.log_scales += math.log(unit)
+        gaussians.opacity_logits[:60] = -6.0
+        config = Density(strategy=kind, split_scale=0.13, prune_scale=0.17)  # type: ignore[arg-type]
+        density = make_strategy(config, extent=1.5 * unit)
+        density.start(200)
+        if isinstance(density, GradientDensity):
+            density.gradient_sum += torch.linspace(0, 4e-4, 200)
+            density.seen += 1
+        costs = SimpleNamespace(opacity_logits=torch.zeros(200), log_scales=torch.zeros(200, 3))
+        density.regularise(gaussians, costs)  # type: ignore[arg-type]
+        rng = np.random.Generator(np.random.PCG64(0))
+        density.explore(gaussians, 1e-6 * unit, rng)
+        result, changes = density.refine(
+            gaussians, adam, rng, densify=True, prune_huge=True, budget=300
+        )
+        log_scales = result.log_scales - math.log(unit)
+        found.append((changes, costs.log_scales, result.means / unit, log_scales))
+    assert found[0][0] == found[1][0]
+    for ours, other in zip(found[0][1:], found[1][1:], strict=True):
+        assert torch.allclose(ours, other, rtol=1e-4, atol=1e-5)
+
+
+def test_pulls_are_measured_in_normalised_device_coordinates() -> None:
+    """A pixel is 2 / width of them: by the published threshold, whatever the picture's size."""
+    density = strategy(2)
+    pulls = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
+    gradients = SimpleNamespace(means2d=pulls, means2d_abs=None)
+    forward = SimpleNamespace(radii=torch.ones(2))
+    density.observe(forward, gradients, 200, 100)  # type: ignore[arg-type]
+    assert torch.allclose(density.gradient_sum, torch.tensor([3e-4, 2e-4]))

@@ -11,5 +11,5 @@ __all__ = ["Changes", "GradientDensity", "McmcDensity", "Strategy", "make_strate
 def make_strategy(config: Density, extent: float) -> Strategy:
     """What ``config.strategy`` names; ``extent`` is the scene's size in the world's unit."""
     if config.strategy == "mcmc":
-        return McmcDensity(config)
+        return McmcDensity(config, extent)
     return GradientDensity(config, extent)

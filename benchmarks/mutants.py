@@ -1,0 +1,359 @@
+"""Deliberate faults, one at a time, and the test that notices each.
+
+    python -m benchmarks.mutants            # all: some twenty minutes on two cores
+    python -m benchmarks.mutants sh_sign    # these
+
+Each fault is put into a copy of the project, whose tests then run up to the first failure. First
+the same tests run without a fault: they must pass, or a failure would say nothing. The exit code
+is 1 if a fault survives.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[1]
+COPIED = ("pipeline", "stages", "benchmarks", "tests", "config", "profiles", "docs")
+SECONDS = 1800
+
+
+@dataclass(frozen=True)
+class Mutant:
+    """One fault.
+
+    Attributes:
+        file: relative to the project.
+        old: occurs there exactly once.
+        new: what takes its place.
+        what: the mistake it stands for.
+        tests: of these files or folders at least one test must fail.
+    """
+
+    file: str
+    old: str
+    new: str
+    what: str
+    tests: tuple[str, ...]
+
+
+_CSRC = "pipeline/raster/csrc"
+_KERNELS = ("tests/raster/test_kernels.py",)
+_LOSS = ("tests/raster/test_loss_adam.py",)
+
+MUTANTS: dict[str, Mutant] = {
+    "half_gradient": Mutant(
+        f"{_CSRC}/project_math.h",
+        "d_cam.x * row(view.rotation, 0) + d_cam.y",
+        "0.5 * d_cam.x * row(view.rotation, 0) + d_cam.y",
+        "a share of the means' gradient halved",
+        _KERNELS,
+    ),
+    "pixel_centre": Mutant(
+        f"{_CSRC}/project_math.h",
+        "p.x = view.fx * u + view.cx;",
+        "p.x = view.fx * u + view.cx - 0.5;",
+        "pixel centres at whole numbers",
+        _KERNELS,
+    ),
+    "sh_sign": Mutant(
+        f"{_CSRC}/sh.h",
+        "term(3, -a1 * x, splat16(-a1), o, o);",
+        "term(3, a1 * x, splat16(a1), o, o);",
+        "the sign of a spherical harmonic, in value and derivative alike",
+        _KERNELS,
+    ),
+    "behind": Mutant(
+        f"{_CSRC}/blend_backward.cpp",
+        "s.weight * e - odds * behind",
+        "s.weight * e + odds * behind",
+        "what lies behind a Gaussian counted with the wrong sign",
+        _KERNELS,
+    ),
+    "ssim_constant": Mutant(
+        f"{_CSRC}/loss.cpp",
+        "kC1 = 1e-4f, kC2 = 9e-4f",
+        "kC1 = 1e-4f, kC2 = 3e-4f",
+        "another constant in SSIM",
+        _LOSS,
+    ),
+    "loss_scale": Mutant(
+        f"{_CSRC}/loss.cpp",
+        "const double l1_scale = (1 - ssim_weight) / double(count);",
+        "const double l1_scale = 0.5 * (1 - ssim_weight) / double(count);",
+        "the gradient of L1 halved",
+        _LOSS,
+    ),
+    "adam_bias": Mutant(
+        f"{_CSRC}/adam.cpp",
+        "std::pow(s.beta2, double(s.step))",
+        "std::pow(s.beta2, double(s.step + 1))",
+        "Adam's bias correction one step late",
+        _LOSS,
+    ),
+    "rates_swapped": Mutant(
+        "pipeline/training/trainer.py",
+        "log_scales=config.lr_scales * factor",
+        "log_scales=config.lr_quats * factor",
+        "the scales' learning rate taken from the rotations",
+        ("tests/training/test_first_step.py",),
+    ),
+    "decay_off_by_one": Mutant(
+        "pipeline/training/schedule.py",
+        "t = (step - 1) / max(1, self.steps - 1)",
+        "t = step / max(1, self.steps - 1)",
+        "the means' learning rate one step ahead",
+        ("tests/training/test_schedule.py",),
+    ),
+    "late_reset": Mutant(
+        "pipeline/training/schedule.py",
+        "step + self.reset_interval <= self.refine_stop",
+        "step <= self.refine_stop",
+        "an opacity reset with nothing after it to recover in",
+        ("tests/training/test_schedule.py",),
+    ),
+    "split_grows": Mutant(
+        "pipeline/training/density/gradient.py",
+        "result.log_scales[children] -= math.log(SPLIT_SHRINK)",
+        "result.log_scales[children] += math.log(SPLIT_SHRINK)",
+        "halves of a split larger than the whole",
+        ("tests/training/test_density.py",),
+    ),
+    "ndc": Mutant(
+        "pipeline/training/density/gradient.py",
+        "pull[:, 0] * (0.5 * width)",
+        "pull[:, 0] * width",
+        "the pull on a mean measured in widths rather than in NDC",
+        ("tests/training/test_density.py",),
+    ),
+    "exposure_gradient": Mutant(
+        "pipeline/training/trainer.py",
+        "d_color = loss.grad if gain is None else loss.grad * gain",
+        "d_color = loss.grad",
+        "exposure left out of the gradient",
+        ("tests/training/test_first_step.py",),
+    ),
+    "exposure_free": Mutant(
+        "pipeline/photos/exposure.py",
+        "gains[measured] -= gains[measured].mean(axis=0)",
+        "gains[measured] -= gains[measured].min(axis=0)",
+        "the typical photograph's gain not 1",
+        ("tests/photos/test_exposure.py",),
+    ),
+    "split_off_by_one": Mutant(
+        "pipeline/scene/model.py",
+        "return every > 0 and index % every == 0",
+        "return every > 0 and index % every == 1",
+        "held out: the second of every eight views instead of the first",
+        ("tests/scene/test_views.py",),
+    ),
+    "leak": Mutant(
+        "stages/train.py",
+        "training = [view for view in views if not view.is_test]",
+        "training = list(views)",
+        "training on the held-out views",
+        ("tests/e2e/test_regression.py",),
+    ),
+    "undistort_half_pixel": Mutant(
+        "pipeline/photos/undistort.py",
+        "map_x[part], map_y[part] = xy[..., 0] - 0.5, xy[..., 1] - 0.5",
+        "map_x[part], map_y[part] = xy[..., 0], xy[..., 1]",
+        "undistorted pictures half a pixel off",
+        ("tests/photos/test_undistort.py",),
+    ),
+    "sift_half_pixel": Mutant(
+        "pipeline/sfm/sift.py",
+        "table[:, :2] + 0.5,",
+        "table[:, :2],",
+        "keypoints half a pixel off",
+        ("tests/sfm/test_features.py",),
+    ),
+    "resized_centre": Mutant(
+        "pipeline/scene/model.py",
+        "np.array([fx * sx, fy * sy, cx * sx, cy * sy, *rest])",
+        "np.array([fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5, *rest])",
+        "the principal point half a pixel off in reduced pictures",
+        ("tests/scene/test_views.py",),
+    ),
+    "opengl_axes": Mutant(
+        "pipeline/scene/transforms.py",
+        "_FLIP_YZ = np.diag([1.0, -1.0, -1.0])",
+        "_FLIP_YZ = np.diag([-1.0, -1.0, 1.0])",
+        "transforms.json's axes taken for others",
+        ("tests/scene/test_transforms.py",),
+    ),
+    "quaternion": Mutant(
+        "pipeline/scene/rotations.py",
+        "[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],",
+        "[1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],",
+        "a row of a rotation transposed",
+        ("tests/scene/test_colmap.py",),
+    ),
+    "spacing": Mutant(
+        "pipeline/splats/init.py",
+        "spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1)\n    else:",
+        "spacing = cKDTree(xyz).query(xyz, k + 1)[0].mean(1)\n    else:",
+        "a point counted among its own neighbours",
+        ("tests/splats/test_init.py",),
+    ),
+    "ply_order": Mutant(
+        "pipeline/splats/ply.py",
+        "sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),",
+        "sh[:, 1:].reshape(count, len(rest)),",
+        "PLY's colours coefficient by coefficient instead of channel by channel",
+        ("tests/splats/test_ply.py",),
+    ),
+    "spz_rounding": Mutant(
+        "pipeline/splats/spz.py",
+        "to_bytes((log_scales + np.log(shrink) + 10) * 16),",
+        "to_bytes((log_scales + np.log(shrink) + 10) * 16 - 0.5),",
+        "SPZ's scales cut off instead of rounded",
+        ("tests/splats/test_spz.py",),
+    ),
+    "psnr_peak": Mutant(
+        "pipeline/metrics/image.py",
+        "return min(-10.0 * np.log10(error), PSNR_CAP) if error > 0.0 else PSNR_CAP",
+        "return min(-10.0 * np.log10(error) + 0.1, PSNR_CAP) if error > 0.0 else PSNR_CAP",
+        "a tenth of a decibel too much",
+        ("tests/metrics/test_image.py",),
+    ),
+    "ssim_window": Mutant(
+        "pipeline/metrics/image.py",
+        "_SIGMA = 1.5",
+        "_SIGMA = 1.6",
+        "another window in the SSIM that is reported",
+        ("tests/metrics/test_image.py",),
+    ),
+    "pose_scale": Mutant(
+        "pipeline/metrics/pose.py",
+        "return scale, rotation, mean_target - scale * rotation @ mean_source",
+        "return scale, rotation, mean_target - rotation @ mean_source",
+        "the scale left out of an alignment's shift",
+        ("tests/metrics/test_pose.py",),
+    ),
+    "judge": Mutant(
+        "pipeline/sfm/judge.py",
+        "e.parallax < MIN_PARALLAX[which],",
+        "e.parallax < 0,",
+        "a camera that only turned is believed",
+        ("tests/sfm/test_judge.py",),
+    ),
+}
+
+
+@dataclass(frozen=True)
+class Result:
+    """``caught``: the first test that failed; empty where none did."""
+
+    name: str
+    caught: str
+    seconds: float
+
+
+def copy_project(target: Path) -> None:
+    """The sources, and beside them what is compiled of them already."""
+    built = Path(os.environ.get("SPLATMAKE_CACHE", ROOT / "build" / "native"))
+    if built.is_dir():
+        shutil.copytree(built, target.parent / "native")
+    target.mkdir()
+    ignored = shutil.ignore_patterns("__pycache__", ".pytest_cache")
+    for source in ROOT.iterdir():
+        if source.is_dir() and source.name in COPIED:
+            shutil.copytree(source, target / source.name, ignore=ignored)
+        elif source.is_file():
+            shutil.copy(source, target / source.name)
+
+
+def first_failure(project: Path, tests: Sequence[str]) -> str:
+    """The first test that fails, "" where all pass.
+
+    Raises:
+        RuntimeError: the tests could not run at all.
+    """
+    missing = [test for test in tests if not (project / test).exists()]
+    if missing:
+        raise RuntimeError(f"no such tests: {', '.join(missing)}")
+    done = subprocess.run(
+        [sys.executable, "-m", "pytest", "-x", "-q", "-p", "no:cacheprovider", *tests],
+        cwd=project,
+        # Compiled anew: a changed kernel has a key of its own.
+        env=os.environ
+        | {"SPLATMAKE_CACHE": str(project.parent / "native"), "PYTHONPATH": str(project)},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=SECONDS,
+        check=False,
+    )
+    if done.returncode == 0:
+        return ""
+    failed = re.search(r"^(?:FAILED|ERROR) (\S+)", done.stdout, re.M)
+    if done.returncode != 1 or failed is None:
+        raise RuntimeError(f"pytest ended with {done.returncode}:\n{done.stdout[-3000:]}")
+    return failed[1]
+
+
+def try_mutant(name: str, project: Path) -> Result:
+    """Put the fault in, run its tests, take it out again."""
+    mutant = MUTANTS[name]
+    file = project / mutant.file
+    text = file.read_text()
+    if text.count(mutant.old) != 1:
+        raise RuntimeError(f"{name}: {mutant.file} holds its text {text.count(mutant.old)} times")
+    start = time.monotonic()
+    file.write_text(text.replace(mutant.old, mutant.new))
+    try:
+        caught = first_failure(project, mutant.tests)
+    finally:
+        file.write_text(text)
+    return Result(name, caught, time.monotonic() - start)
+
+
+def row(result: Result) -> str:
+    """As Markdown."""
+    mutant = MUTANTS[result.name]
+    caught = f"`{result.caught}`" if result.caught else "**survived**"
+    return f"| {mutant.what} | `{mutant.file}` | {caught} | {result.seconds:.0f} |"
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.mutants",
+        description=__doc__,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("mutants", nargs="*", metavar="NAME", help=f"of {', '.join(MUTANTS)}")
+    names = parser.parse_args().mutants or list(MUTANTS)
+    unknown = set(names) - MUTANTS.keys()
+    if unknown:
+        parser.error(f"no such mutant: {', '.join(sorted(unknown))}")
+    with tempfile.TemporaryDirectory(prefix="mutants-") as folder:
+        project = Path(folder) / "project"
+        copy_project(project)
+        tests = list(dict.fromkeys(test for name in names for test in MUTANTS[name].tests))
+        broken = first_failure(project, tests)
+        if broken:
+            print(f"error: without any fault, {broken} fails: mend that first", file=sys.stderr)
+            return 2
+        print("| fault | in | caught by | seconds |\n|---|---|---|---|", flush=True)
+        survivors = []
+        for name in names:
+            result = try_mutant(name, project)
+            print(row(result), flush=True)
+            if not result.caught:
+                survivors.append(name)
+    print(f"\n{len(names)} faults, surviving: {', '.join(survivors) or 'none'}")
+    return 1 if survivors else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

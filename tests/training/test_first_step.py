@@ -1,0 +1,90 @@
+"""One step, looked at closely: longer runs forgive a wrong rate or gradient."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.raster import l1_ssim
+from pipeline.training import trainer
+from pipeline.training.trainer import train
+from tests.training.conftest import TinyScene, tiny_config
+
+RATES = {
+    "lr_means": 1e-3,
+    "lr_scales": 2e-3,
+    "lr_quats": 3e-3,
+    "lr_opacities": 5e-3,
+    "lr_sh0": 7e-3,
+    "lr_boost": 2.0,
+    "lr_final_share": 1.0,
+}
+
+
+def test_each_parameter_steps_as_far_as_its_own_rate_says(scene: TinyScene, tmp_path: Path) -> None:
+    """Adam's first step is the rate itself, up or down; the means' counts in extents."""
+    extent = 3.0
+    result = train(
+        scene.views,
+        scene.initial,
+        tiny_config(1, **RATES),
+        seed=0,
+        threads=1,
+        extent=extent,
+        checkpoint_dir=tmp_path,
+    )
+    expected = {
+        "means": RATES["lr_means"] * extent,
+        "log_scales": RATES["lr_scales"],
+        "quats": RATES["lr_quats"],
+        "opacity_logits": RATES["lr_opacities"],
+        "sh": RATES["lr_sh0"],
+    }
+    for name, tensor in result.gaussians.tensors().items():
+        before = scene.initial.with_sh_degree(result.gaussians.sh_degree).tensors()[name]
+        moved = float((tensor - before).abs().max())
+        assert moved == pytest.approx(2.0 * expected[name], rel=1e-3), name
+
+
+def test_what_is_differentiated_is_the_loss_that_is_measured(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through each photograph's exposure, against finite differences of the picture."""
+    seen: dict[str, Any] = {}
+    backward, loss = trainer.backward, trainer.l1_ssim
+
+    def watched_backward(rendered: Any, d_color: Any, **options: Any) -> Any:
+        seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
+        return backward(rendered, d_color, **options)
+
+    def watched_loss(picture: Any, wanted: Any, weight: float, *rest: Any) -> Any:
+        seen["wanted"], seen["weight"] = wanted, weight
+        return loss(picture, wanted, weight, *rest)
+
+    monkeypatch.setattr(trainer, "backward", watched_backward)
+    monkeypatch.setattr(trainer, "l1_ssim", watched_loss)
+    gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
+    train(
+        scene.views,
+        scene.initial,
+        tiny_config(1),
+        seed=0,
+        threads=1,
+        extent=scene.extent,
+        gains=gains,
+        checkpoint_dir=tmp_path,
+    )
+    gain = torch.tensor(gains[0], dtype=torch.float32)
+
+    def measured(picture: torch.Tensor) -> float:
+        return l1_ssim(picture * gain, seen["wanted"], seen["weight"]).loss
+
+    for channel in range(3):
+        step = torch.zeros_like(seen["color"])
+        step[..., channel] = 1e-3 * torch.sign(seen["d_color"][..., channel])
+        slope = (measured(seen["color"] + step) - measured(seen["color"] - step)) / 2
+        assert slope == pytest.approx(float((step * seen["d_color"]).sum()), rel=0.05)

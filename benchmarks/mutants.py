@@ -74,8 +74,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "behind": Mutant(
         f"{_CSRC}/blend_backward.cpp",
-        "s.weight * e - odds * behind",
-        "s.weight * e + odds * behind",
+        "s.weight * e - odds * t.behind",
+        "s.weight * e + odds * t.behind",
         "what lies behind a Gaussian counted with the wrong sign",
         _KERNELS,
     ),

@@ -57,9 +57,9 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
     seen: dict[str, Any] = {}
     backward, loss = trainer.backward, trainer.l1_ssim
 
-    def watched_backward(rendered: Any, d_color: Any, **options: Any) -> Any:
+    def watched_backward(rendered: Any, d_color: Any, *rest: Any, **options: Any) -> Any:
         seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
-        return backward(rendered, d_color, **options)
+        return backward(rendered, d_color, *rest, **options)
 
     def watched_loss(picture: Any, wanted: Any, weight: float, *rest: Any) -> Any:
         seen["wanted"], seen["weight"] = wanted, weight

@@ -120,7 +120,9 @@ def propose(
     # Each viewpoint counts the same, however much of its picture is surface.
     weight = 1 / np.bincount(owner, minlength=len(opened))[owner] / len(opened)
     known = trust(evidence.information, evidence.support, points.towards)
-    before, left, proposals = float(weight @ known), set(range(len(opened))), list[Proposal]()
+    # Sums, not products of vectors: BLAS sums by the number of threads.
+    before = float((weight * known).sum())
+    left, proposals = set(range(len(opened))), list[Proposal]()
     while left and len(proposals) < COUNT:
         gains = np.full(len(opened), -np.inf)
         for i in left:
@@ -135,7 +137,7 @@ def propose(
         left.remove(best)
         evidence.add(sightings[best], points)
         known = trust(evidence.information, evidence.support, points.towards)
-    return Outlook(proposals, viewpoints, before, float(weight @ known))
+    return Outlook(proposals, viewpoints, before, float((weight * known).sum()))
 
 
 def _surfaces(eyes: Sequence[Eye], beyond: float) -> tuple[Points, NDArray[np.intp]]:

@@ -55,7 +55,9 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
     for view in views:
         number = numbers[view.name]
         here = owner[order[np.searchsorted(ids, number) : np.searchsorted(ids, number, "right")]]
-        camera = points.xyz[here] @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+        # einsum, not a product of matrices: BLAS may round by the number of threads.
+        camera = np.einsum("ij,nj->ni", view.world_to_camera[:3, :3], points.xyz[here])
+        camera += view.world_to_camera[:3, 3]
         z = camera[:, 2]
         with np.errstate(divide="ignore", invalid="ignore"):
             xy = camera[:, :2] / z[:, None] * (view.fx, view.fy) + (view.cx, view.cy)

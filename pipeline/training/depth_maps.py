@@ -159,6 +159,10 @@ def _solve(kind: str, values: Array, z: Array) -> tuple[float, float]:
     median = np.median(off, axis=1)
     best = int(median.argmin())
     met = off[best] <= max(3 * float(median[best]), 1e-9)
-    rows = np.stack([values, np.ones_like(values)], 1)[met] / target[met, None]
-    slope, shift = np.linalg.lstsq(rows, np.ones(int(met.sum())), rcond=None)[0].tolist()
-    return slope, shift
+    # The normal equations, in plain sums: BLAS sums by the number of threads.
+    u, w = values[met] / target[met], 1.0 / target[met]
+    uu, uw, ww, u1, w1 = (float(term.sum()) for term in (u * u, u * w, w * w, u, w))
+    scale = uu * ww - uw * uw
+    if scale <= 0:
+        return float(a[best]), float(b[best])
+    return (ww * u1 - uw * w1) / scale, (uu * w1 - uw * u1) / scale

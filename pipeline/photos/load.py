@@ -6,6 +6,7 @@ own framing is checked here instead.
 
 from __future__ import annotations
 
+import contextlib
 import struct
 import zipfile
 import zlib
@@ -18,6 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.runtime.errors import UserError
+from pipeline.scene import heif
+from pipeline.scene.names import suffix_of
 
 Picture = NDArray[Any]
 FIX = "Replace the file by a whole one, or remove it from the folder."
@@ -173,8 +176,11 @@ def _read(path: Path) -> Picture:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=FIX) from None
     if _is_cut_off(data):
         raise UserError("the picture is cut off or damaged", file=path, fix=FIX)
-    picture = None
-    if data:
+    picture: Picture | None = None
+    if suffix_of(path.name) in heif.HEIF_SUFFIXES:
+        with contextlib.suppress(OSError, ValueError):
+            picture = heif.read_pixels(path)
+    elif data:
         try:
             picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
         except cv2.error:

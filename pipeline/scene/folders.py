@@ -67,7 +67,8 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
         kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
         warnings.append(
             f"{folder}: {len(unread)} {kinds} pictures are left out (first: {min(unread)}): "
-            "convert them to JPEG or PNG, keeping their EXIF"
+            "convert them to JPEG or PNG, keeping their EXIF (HEIC is read where pillow-heif is "
+            "installed)"
         )
     return sorted(names)
 

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
+from pipeline.scene import heif
+
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 # Camera makers' RAW formats that LibRaw reads.
 RAW_SUFFIXES = frozenset(
@@ -14,8 +16,9 @@ RAW_SUFFIXES = frozenset(
     """.split()  # noqa: SIM905
 )
 # Pictures this program does not read; named in a warning.
-UNREAD_SUFFIXES = frozenset({".heic", ".heif", ".avif", ".jxl", ".jp2", ".gif"})
-PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES
+_HEIF = heif.HEIF_SUFFIXES if heif.installed() else frozenset[str]()
+UNREAD_SUFFIXES = (heif.HEIF_SUFFIXES | {".avif", ".jxl", ".jp2", ".gif"}) - _HEIF
+PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES | _HEIF
 
 
 def suffix_of(name: str) -> str:

@@ -15,6 +15,7 @@ from PIL import ExifTags, Image
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.runtime.errors import UserError
+from pipeline.scene import heif
 from pipeline.scene.names import RAW_SUFFIXES, suffix_of
 
 Image.MAX_IMAGE_PIXELS = None  # The user's own photographs: 200 megapixels are no attack.
@@ -75,6 +76,8 @@ def read_facts(path: Path) -> FileFacts:
         digest = digest_of(path)
         if suffix_of(path.name) in RAW_SUFFIXES:
             return _raw_facts(path, digest)
+        if suffix_of(path.name) in heif.HEIF_SUFFIXES:
+            heif.register()
         with _quiet(), Image.open(path) as image:
             width, height = image.size
             if _bits(image) > 16:

@@ -10,7 +10,9 @@ from PIL import Image
 
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
+from pipeline.scene import heif
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.names import suffix_of
 
 
 def verify_photos(
@@ -86,6 +88,8 @@ def _fault_of(photo: Photo) -> str | None:
 
 
 def _decode(path: str) -> None:
+    if suffix_of(path) in heif.HEIF_SUFFIXES:
+        heif.register()
     with Image.open(path) as image:
         image.load()
 

@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.runtime.errors import UserError
+from pipeline.scene import heif
 from pipeline.scene.manifest import Photo
+from pipeline.scene.names import suffix_of
 from pipeline.sfm.keypoints import Keypoints, root_sift
 
 # COLMAP's peak threshold (0.02 / 3); OpenCV divides this value by its layers. Half of OpenCV's
@@ -26,7 +30,11 @@ class Picture:
     """
 
     def __init__(self, photo: Photo, max_long_side_px: int):
-        pixels = cv2.imread(photo.path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
+        pixels: NDArray[Any] | None
+        if suffix_of(photo.path) in heif.HEIF_SUFFIXES:
+            pixels = heif.read_pixels(photo.path)
+        else:
+            pixels = cv2.imread(photo.path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
         if pixels is None:
             raise UserError("cannot be read as a picture", file=photo.path, fix="remove it")
         height, width = pixels.shape[:2]

@@ -7,8 +7,6 @@ Outputs: ``evaluation.json`` with ``renders/``, ``coverage.json`` with ``coverag
 import json
 from dataclasses import asdict
 
-import numpy as np
-
 from pipeline.config.schema import Evaluate, Split, Train, Views
 from pipeline.coverage.measure import World, measure_coverage
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
@@ -18,7 +16,7 @@ from pipeline.runtime.job import Job
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import View
-from pipeline.scene.views import load_views, up_direction
+from pipeline.scene.views import load_views, scene_up
 from pipeline.splats.gaussians import Gaussians
 from stages.command import main
 
@@ -59,14 +57,10 @@ def run(job: Job) -> None:
 
 
 def world_of(job: Job, manifest: Manifest, views: list[View]) -> World:
-    orientation = {photo.name: photo.orientation for photo in manifest.photos}
-    up = up_direction(
-        np.stack([view.world_to_camera[:3, :3] for view in views]),
-        [orientation[view.name] for view in views],
-    )
+    up = scene_up(views, manifest)
     placed = job.inputs["poses"] / "georeference.json"
-    metric = placed.is_file() and json.loads(placed.read_text())["method"] != "level"
-    return World(up, "m" if metric else None)
+    unit = json.loads(placed.read_text()).get("unit", "") if placed.is_file() else ""
+    return World(up, "m" if unit.startswith("metres") else None)
 
 
 if __name__ == "__main__":

@@ -22,7 +22,7 @@ from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.transforms import write_transforms
-from pipeline.scene.views import load_views, up_direction
+from pipeline.scene.views import load_views, scene_up
 from pipeline.splats.files import prepare
 from pipeline.splats.frame import describe_frame
 from pipeline.splats.gaussians import Gaussians
@@ -103,11 +103,7 @@ def run(job: Job) -> None:
             "poses in a unit in which the scene measures about 1 to 100"
         )
     protocol = choose_protocol(scene.views, split, train)
-    orientation = {photo.name: photo.orientation for photo in manifest.photos}
-    up = up_direction(
-        np.stack([view.world_to_camera[:3, :3] for view in scene.views]),
-        [orientation[view.name] for view in scene.views],
-    )
+    up = scene_up(scene.views, manifest)
     render = {
         "background": list(protocol.background),
         "near": protocol.near,

@@ -118,3 +118,10 @@ def scene_extent(views: list[View]) -> float:
             if radius > 1e-9 * float(np.abs(centres).max()):
                 return 1.1 * radius
     return 1.0
+
+
+def scene_up(views: Sequence[View], manifest: Manifest) -> NDArray[np.float64]:
+    """(3,) ``up_direction`` of these views' cameras as their photographs were held."""
+    orientation = {photo.name: photo.orientation for photo in manifest.photos}
+    rotations = np.stack([view.world_to_camera[:3, :3] for view in views])
+    return up_direction(rotations, [orientation[view.name] for view in views])

@@ -21,7 +21,7 @@ SOURCES = Path(__file__).parent / "csrc"
 # exp2 away. -ffp-contract=fast is GCC's default, said aloud: a * b + c is one rounding everywhere.
 FLAGS = [
     *("-std=c++17", "-O3", "-march=native", "-fno-math-errno", "-fno-trapping-math"),
-    *("-ffp-contract=fast", "-fopenmp", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-maybe-uninitialized"),
+    *("-ffp-contract=fast", "-pthread", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-maybe-uninitialized"),
 ]
 _lock = threading.Lock()
 _loaded: Path | None = None

@@ -93,7 +93,7 @@ def test_sanitizers_find_nothing(tmp_path: Path) -> None:
     """Every kernel over 300 wild scenes under the address and undefined-behaviour sanitizers."""
     compile_driver(
         tmp_path / "driver",
-        *("-std=c++17", "-O1", "-g", "-march=native", "-fopenmp", "-Wno-psabi"),
+        *("-std=c++17", "-O1", "-g", "-march=native", "-pthread", "-Wno-psabi"),
         *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
     )
     done = subprocess.run([tmp_path / "driver"], capture_output=True, text=True, timeout=600)

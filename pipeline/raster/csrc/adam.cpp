@@ -4,6 +4,7 @@
 #include <vector>
 
 #include "simd.h"
+#include "threads.h"
 
 namespace splat {
 
@@ -22,8 +23,7 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         p -= load<f32x16>(rates.data() + 16 * (k % s.num_rates)) * m / (sqrt(v) * scale + eps);
     };
     const int64_t vectors = count / 16;
-#pragma omp parallel for num_threads(threads) schedule(static)
-    for (int64_t k = 0; k < vectors; k++) {
+    parallel_for(vectors, 1024, threads, [&](int64_t k) {
         const int64_t i = 16 * k;
         f32x16 p = load<f32x16>(param + i), m = load<f32x16>(exp_avg + i);
         f32x16 v = load<f32x16>(exp_avg_sq + i);
@@ -31,7 +31,7 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         store(param + i, p);
         store(exp_avg + i, m);
         store(exp_avg_sq + i, v);
-    }
+    });
     const int64_t done = 16 * vectors, bytes = (count - done) * int64_t(sizeof(float));
     if (bytes == 0) return;
     f32x16 p = {}, g = {}, m = {}, v = {};

@@ -5,6 +5,7 @@
 #include <cstring>
 
 #include "simd.h"
+#include "threads.h"
 
 namespace splat {
 namespace {
@@ -172,8 +173,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
     const int parts = threads * kPartsPerThread;
     parts_ = std::vector<Part>(parts);
     std::atomic<int64_t> total{0};
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-    for (int number = 0; number < parts; number++) {
+    parallel_for(parts, 1, threads, [&](int64_t number) {
         Part& part = parts_[number];
         part.begin = count * number / parts;
         part.end = count * (number + 1) / parts;
@@ -234,7 +234,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
             }
         }
         list_pairs();
-    }
+    });
     intersections_ = 0;
     for (const Part& part : parts_) intersections_ += part.used;
     return intersections_ <= kMaxIntersections;
@@ -256,28 +256,25 @@ void Binner::write(Entry* entries, int64_t* tile_begin) {
     std::vector<uint32_t> first(parts, 0);
     for (int number = 1; number < parts; number++)
         first[number] = first[number - 1] + uint32_t(parts_[number - 1].used);
-#pragma omp parallel num_threads(threads_)
-    {
-#pragma omp for schedule(dynamic, 1)
-        for (int number = 0; number < parts; number++) {
-            Part& part = parts_[number];
-            uint32_t slot = first[number];
-            for (int64_t i = part.begin; i < part.end; i++) {
-                slots_[i].first = slot;
-                slot += slots_[i].count;
-            }
-            slot = first[number];
-            for (int64_t k = 0; k < part.used; k++) {
-                const Found& f = part.found[k];
-                by_tile[part.tile_count[f.tile]++] = {{f.gaussian, slot++, f.blocks}, f.depth};
-            }
+    parallel_for(parts, 1, threads_, [&](int64_t number) {
+        Part& part = parts_[number];
+        uint32_t slot = first[number];
+        for (int64_t i = part.begin; i < part.end; i++) {
+            slots_[i].first = slot;
+            slot += slots_[i].count;
         }
+        slot = first[number];
+        for (int64_t k = 0; k < part.used; k++) {
+            const Found& f = part.found[k];
+            by_tile[part.tile_count[f.tile]++] = {{f.gaussian, slot++, f.blocks}, f.depth};
+        }
+    });
+    parallel_ranges(tiles_, 16, threads_, [&](int64_t begin, int64_t end) {
         TileSorter sorter;
-#pragma omp for schedule(dynamic, 16)
-        for (int64_t tile = 0; tile < tiles_; tile++)
+        for (int64_t tile = begin; tile < end; tile++)
             sorter.sort(by_tile.get() + tile_begin[tile], tile_begin[tile + 1] - tile_begin[tile],
                         entries + tile_begin[tile]);
-    }
+    });
 }
 
 }  // namespace splat

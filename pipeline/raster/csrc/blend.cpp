@@ -2,6 +2,7 @@
 
 #include <algorithm>
 
+#include "threads.h"
 #include "tile.h"
 
 namespace splat {
@@ -101,8 +102,7 @@ SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const Vie
 void blend(const Record* records, const Pairs& pairs, const View& view, const float* background,
            int threads, float* color, float* alpha, int32_t* block_end) {
     const int64_t tiles = view.tiles();
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
-    for (int64_t index = 0; index < tiles; index++) {
+    parallel_for(tiles, 4, threads, [&](int64_t index) {
         const Tile tile(index, view);
         f32x16 transmittance[kBlocks];
         Color sums[kBlocks];
@@ -116,14 +116,13 @@ void blend(const Record* records, const Pairs& pairs, const View& view, const fl
             const f32x16 covered[1] = {1.0f - left};
             tile.write(block, covered, view.width, alpha);
         }
-    }
+    });
 }
 
 void blend_depth(const Record* records, const Pairs& pairs, const View& view, int threads,
                  float* depth, float* median) {
     const int64_t tiles = view.tiles();
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
-    for (int64_t index = 0; index < tiles; index++) {
+    parallel_for(tiles, 4, threads, [&](int64_t index) {
         const Tile tile(index, view);
         f32x16 transmittance[kBlocks];
         Depth sums[kBlocks];
@@ -134,7 +133,7 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
             tile.write(block, mean, view.width, depth);
             tile.write(block, middle, view.width, median);
         }
-    }
+    });
 }
 
 }  // namespace splat

@@ -8,6 +8,7 @@
 // a sum whose order is fixed.
 
 #include "blend.h"
+#include "threads.h"
 #include "tile.h"
 
 namespace splat {
@@ -111,10 +112,9 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
     const int64_t tiles = view.tiles();
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 4)
-    for (int64_t index = 0; index < tiles; index++) {
+    parallel_for(tiles, 4, threads, [&](int64_t index) {
         const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
-        if (begin == end) continue;
+        if (begin == end) return;
         const Tile tile(index, view);
         BlockTargets targets[kBlocks];
         for (int block = 0; block < kBlocks; block++) targets[block].set(block, tile, view, in);
@@ -144,7 +144,7 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
             }
         }
         for (; entry < end; entry++) store(slot(pairs.entries[entry].slot), f32x16{});
-    }
+    });
 }
 
 }  // namespace

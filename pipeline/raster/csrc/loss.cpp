@@ -17,6 +17,7 @@
 
 #include "memory.h"
 #include "simd.h"
+#include "threads.h"
 
 namespace splat {
 namespace {
@@ -251,14 +252,13 @@ LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float*
     const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
     const int64_t bands = std::max(std::min(int64_t(threads), height / kBandRows), int64_t(1));
     std::vector<double> row_l1(strips * height), row_ssim(strips * height);
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 1)
-    for (int64_t unit = 0; unit < strips * bands; unit++) {
+    parallel_for(strips * bands, 1, threads, [&](int64_t unit) {
         const int64_t number = unit / bands, band = unit % bands, begin = number * across;
-        if (begin >= values) continue;
+        if (begin >= values) return;
         Strip strip(in, window, l1_scale, ssim_scale, begin, std::min(begin + across, values));
         strip.walk(height * band / bands, height * (band + 1) / bands, grad,
                    row_l1.data() + number * height, row_ssim.data() + number * height);
-    }
+    });
     double l1 = 0, ssim = 0;
     for (double sum : row_l1) l1 += sum;
     for (double sum : row_ssim) ssim += sum;

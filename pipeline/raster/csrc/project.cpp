@@ -1,6 +1,9 @@
 #include "project.h"
 
+#include <atomic>
+
 #include "group.h"
+#include "threads.h"
 
 namespace splat {
 namespace {
@@ -110,36 +113,41 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                            float* radii) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
-    int64_t visible = 0, dropped = 0;
-#pragma omp parallel for num_threads(threads) schedule(static) reduction(+ : visible, dropped)
-    for (int64_t number = 0; number < count; number++) {
-        const Group group(in, number);
-        Seen seen[2];
-        CameraCenter::Toward toward[2];
-        for (int h = 0; h < 2; h++) {
-            const Inputs half = group.half(h);
-            seen[h] = see(half, view);
-            toward[h] = center.toward(half.mean);
+    std::atomic<int64_t> all_visible{0}, all_dropped{0};
+    parallel_ranges(count, 32, threads, [&](int64_t begin, int64_t end) {
+        int64_t visible = 0, dropped = 0;
+        for (int64_t number = begin; number < end; number++) {
+            const Group group(in, number);
+            Seen seen[2];
+            CameraCenter::Toward toward[2];
+            for (int h = 0; h < 2; h++) {
+                const Inputs half = group.half(h);
+                seen[h] = see(half, view);
+                toward[h] = center.toward(half.mean);
+            }
+            const uint32_t there = (1u << group.count) - 1;
+            uint32_t drawn = there & (seen[0].drawn | seen[1].drawn << 8);
+            dropped += __builtin_popcount(there & (seen[0].dropped | seen[1].dropped << 8));
+            if (drawn) {
+                ShBlock sh;
+                sh.read(view.sh_degree, in.sh + sh_width * group.first, sh_width, drawn);
+                f32x16 rgb[3], rows[16];
+                const uint32_t sane =
+                    sh_colors(directions(toward), view.sh_degree, sh, kShMax, rgb);
+                dropped += __builtin_popcount(drawn & ~sane);
+                drawn &= sane;
+                visible += __builtin_popcount(drawn);
+                make_records(seen, rgb, rows);
+                for (int lane = 0; lane < kGroup; lane++)
+                    if (drawn >> lane & 1) store(records + group.first + lane, rows[lane]);
+            }
+            write_column(keep(mask(drawn), narrow(seen[0].radius, seen[1].radius)), group.count,
+                         radii + group.first);
         }
-        const uint32_t there = (1u << group.count) - 1;
-        uint32_t drawn = there & (seen[0].drawn | seen[1].drawn << 8);
-        dropped += __builtin_popcount(there & (seen[0].dropped | seen[1].dropped << 8));
-        if (drawn) {
-            ShBlock sh;
-            sh.read(view.sh_degree, in.sh + sh_width * group.first, sh_width, drawn);
-            f32x16 rgb[3], rows[16];
-            const uint32_t sane = sh_colors(directions(toward), view.sh_degree, sh, kShMax, rgb);
-            dropped += __builtin_popcount(drawn & ~sane);
-            drawn &= sane;
-            visible += __builtin_popcount(drawn);
-            make_records(seen, rgb, rows);
-            for (int lane = 0; lane < kGroup; lane++)
-                if (drawn >> lane & 1) store(records + group.first + lane, rows[lane]);
-        }
-        write_column(keep(mask(drawn), narrow(seen[0].radius, seen[1].radius)), group.count,
-                     radii + group.first);
-    }
-    return {visible, dropped};
+        all_visible += visible;
+        all_dropped += dropped;
+    });
+    return {all_visible, all_dropped};
 }
 
 }  // namespace splat

@@ -1,5 +1,6 @@
 #include "group.h"
 #include "project.h"
+#include "threads.h"
 
 namespace splat {
 namespace {
@@ -95,8 +96,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const float* slot_gradients, const GaussianGradients& out) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
-#pragma omp parallel for num_threads(threads) schedule(dynamic, 32)
-    for (int64_t number = 0; number < count; number++) {
+    parallel_for(count, 32, threads, [&](int64_t number) {
         const Group group(in, number);
         const int64_t first = group.first;
         uint32_t drawn = 0;
@@ -145,7 +145,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         write_rows(g.means2d, group.count, out.means2d + 2 * first);
         if (out.means2d_abs) write_rows(absolute, group.count, out.means2d_abs + 2 * first);
         sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
-    }
+    });
 }
 
 }  // namespace splat

@@ -1,0 +1,162 @@
+#include "threads.h"
+
+#include <algorithm>
+#include <atomic>
+#include <chrono>
+#include <condition_variable>
+#include <mutex>
+#include <new>
+#include <system_error>
+#include <thread>
+#if defined(__unix__) || defined(__APPLE__)
+#include <pthread.h>
+#endif
+
+namespace splat {
+namespace {
+
+// How long a thread looks for work before it sleeps: longer than the serial part of a step.
+constexpr auto kWatch = std::chrono::milliseconds(10);
+// Looks between two offers to let another thread have the processor. The offer is what makes
+// watching bearable beside other work: two trainings at once share two processors fairly.
+constexpr int kLooks = 16;
+
+inline void pause() {
+#if defined(__x86_64__)
+    __builtin_ia32_pause();
+#elif defined(__aarch64__)
+    asm volatile("yield");
+#endif
+}
+
+// Threads that join the loop that is open, if they come in time: nobody waits for those that do
+// not, so that a sleeper that is slow to wake costs no more than its help.
+class Crew {
+  public:
+    void run(int64_t count, int64_t grain, int threads, RangeBody body, const void* context) {
+        const int64_t ranges = (count + grain - 1) / grain;
+        const int helpers = int(std::min<int64_t>({threads, ranges, kMostHelpers + 1})) - 1;
+        // One loop at a time: another caller's, and a loop within a loop, run on their own.
+        if (helpers < 1 || busy_.exchange(true, std::memory_order_acquire)) {
+            if (count > 0) body(context, 0, count);
+            return;
+        }
+        hire(helpers);
+        body_ = body, context_ = context, count_ = count, grain_ = grain;
+        next_.store(0, std::memory_order_relaxed);
+        // Generation, open, nobody in it yet.
+        const uint64_t generation = state_.load(std::memory_order_relaxed) / kGeneration + 1;
+        state_.store(generation * kGeneration + kOpen + uint64_t(helpers) * kPlace);
+        if (sleepers_.load() > 0) {
+            const std::lock_guard<std::mutex> lock(mutex_);
+            wake_.notify_all();
+        }
+        work();
+        state_.fetch_and(~kOpen);
+        for (int looks = 0; state_.load(std::memory_order_acquire) % kPlace; looks++)
+            look_again(looks);
+        busy_.store(false, std::memory_order_release);
+    }
+
+  private:
+    // state_: | generation | places left: 8 bits | open: 1 bit | threads inside: 15 bits |
+    static constexpr uint64_t kOpen = 1 << 15, kPlace = 1 << 16, kGeneration = 1 << 24;
+    static constexpr int64_t kMostHelpers = 255;
+
+    static void look_again(int looks) {
+        if (looks % kLooks == kLooks - 1)
+            std::this_thread::yield();
+        else
+            pause();
+    }
+
+    void hire(int helpers) {
+        try {
+            for (; hired_ < helpers; hired_++) std::thread([this] { serve(); }).detach();
+        } catch (const std::system_error&) {
+            // No more to be had: those that are there do it.
+        }
+    }
+
+    void work() {
+        for (;;) {
+            const int64_t begin = next_.fetch_add(grain_, std::memory_order_relaxed);
+            if (begin >= count_) return;
+            body_(context_, begin, std::min(begin + grain_, count_));
+        }
+    }
+
+    // There is a loop to join that this thread, whose last was `done`, has not been in.
+    bool open(uint64_t done) const { return can_join(state_.load(), done); }
+    static bool can_join(uint64_t state, uint64_t done) {
+        return state / kGeneration != done && state & kOpen && state / kPlace % 256;
+    }
+    bool join(uint64_t& done) {
+        uint64_t seen = state_.load();
+        while (can_join(seen, done))
+            if (state_.compare_exchange_weak(seen, seen + 1 - kPlace)) {
+                done = seen / kGeneration;
+                return true;
+            }
+        return false;
+    }
+
+    // Looks for a loop to join, for a while.
+    bool watch(uint64_t& done) {
+        const auto since = std::chrono::steady_clock::now();
+        for (int looks = 0; !join(done); looks++) {
+            look_again(looks);
+            if (looks % 256 == 255 && std::chrono::steady_clock::now() - since > kWatch)
+                return false;
+        }
+        return true;
+    }
+
+    void serve() {
+        uint64_t done = 0;
+        for (;;) {
+            // Whoever is woken too late for a loop watches for the next: there will be one.
+            while (!watch(done)) {
+                std::unique_lock<std::mutex> lock(mutex_);
+                sleepers_++;
+                if (!open(done)) wake_.wait(lock);
+                sleepers_--;
+            }
+            work();
+            state_.fetch_sub(1, std::memory_order_release);
+        }
+    }
+
+    std::atomic<uint64_t> state_{0};
+    std::atomic<bool> busy_{false};
+    std::atomic<int> sleepers_{0};
+    std::mutex mutex_;
+    std::condition_variable wake_;
+    int hired_ = 0;
+
+    // Of the open loop
+    RangeBody body_;
+    const void* context_;
+    int64_t count_, grain_;
+    alignas(64) std::atomic<int64_t> next_{0};
+};
+
+// Never destroyed: its threads outlive everything static. A fork has none of them and begins anew.
+Crew& crew() {
+    alignas(Crew) static unsigned char memory[sizeof(Crew)];
+    static Crew* const one = [] {
+#if defined(__unix__) || defined(__APPLE__)
+        pthread_atfork(nullptr, nullptr, [] { new (memory) Crew; });
+#endif
+        return new (memory) Crew;
+    }();
+    return *one;
+}
+
+}  // namespace
+
+void run_ranges(int64_t count, int64_t grain, int threads, RangeBody body, const void* context) {
+    crew().run(count, grain, threads, body, context);
+}
+
+}  // namespace splat

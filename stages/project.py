@@ -63,7 +63,7 @@ class SnakemakeProject:
         os.environ["PATH"] = os.pathsep.join(
             [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
         )
-        # Spinning OpenMP threads slow whatever runs beside them.
+        # Libraries' OpenMP threads that spin slow whatever runs beside them.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
     # --- one scene ------------------------------------------------------------------------

@@ -10,7 +10,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-# Threads that wait must not spin: they would take the time of other work, and be counted.
+# torch's threads, which the twin runs on, must not spin: they would take our kernels' time.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from benchmarks.raster.accuracy import accuracy, twin_ratio

@@ -56,8 +56,8 @@ def measured_peak(threads: int) -> Peak:
     with tempfile.TemporaryDirectory() as folder:
         library = Path(folder) / "peak.so"
         source = Path(__file__).with_name("peak.cpp")
-        command = [*build.compiler(), *build.FLAGS, "-I", str(build.SOURCES), "-shared"]
-        subprocess.run([*command, str(source), "-o", str(library)], check=True)
+        flags = [*build.FLAGS, "-fopenmp", "-I", str(build.SOURCES), "-shared"]
+        subprocess.run([*build.compiler(), *flags, str(source), "-o", str(library)], check=True)
         loaded = ctypes.CDLL(str(library))
     for function in (loaded.peak_flops, loaded.peak_bytes):
         function.restype = ctypes.c_double
@@ -105,7 +105,7 @@ class Step:
         def project_backward() -> None:
             kept["gradients"] = kernels.project_backward(
                 *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
-                kept["slots"], False, threads,
+                kept["slots"], False, None, None, None, None, threads,
             )  # fmt: skip
 
         def adam() -> None:

@@ -17,6 +17,7 @@ from pipeline.raster.types import (
     RasterCamera,
     RasterOptions,
     RenderOutput,
+    ShAdam,
 )
 
 if TYPE_CHECKING:
@@ -29,6 +30,7 @@ __all__ = [
     "RasterCamera",
     "RasterOptions",
     "RenderOutput",
+    "ShAdam",
     "adam_step",
     "backward",
     "forward",

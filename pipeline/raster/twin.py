@@ -17,7 +17,7 @@ from dataclasses import dataclass
 import torch
 import torch.nn.functional as F
 
-from pipeline.raster.types import RasterCamera, RasterOptions, RenderOutput
+from pipeline.raster.types import RasterCamera, RasterOptions, RenderOutput, ShAdam
 
 # The same numbers, with their reasons, are in csrc/constants.h.
 DILATION = 0.3
@@ -354,3 +354,26 @@ def adam_step(
     exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
     denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
     param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
+
+
+def sh_adam(sh: torch.Tensor, grad: torch.Tensor, visible: torch.Tensor, adam: ShAdam) -> None:
+    """Adam over the harmonics (N, K, 3) of the Gaussians in view, ``visible`` (N,) bool; all in
+    place, of sh's type but for ``adam.last``.
+
+    n steps without a gradient multiply the moments by beta1^n and beta2^n, and move the parameter
+    by m / sqrt(v) times r + r^2 + ... + r^n, r = beta1 / sqrt(beta2); the bias corrections and
+    rates of the present step are taken for all of them. What is left then is a usual step.
+    """
+    rows = torch.nonzero(visible)[:, 0]
+    missed = (adam.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
+    rates = torch.full(sh.shape[1:], adam.rate, dtype=sh.dtype)
+    rates[0] = adam.rate0
+    ratio = adam.beta1 / math.sqrt(adam.beta2)
+    drift = ratio * (1 - ratio**missed) / (1 - ratio)
+    m, v, p = adam.exp_avg[rows], adam.exp_avg_sq[rows], sh[rows]
+    scale = math.sqrt(1 - adam.beta2**adam.step)
+    p -= rates / (1 - adam.beta1**adam.step) * drift * m / (v.sqrt() / scale + adam.eps)
+    m, v = m * adam.beta1**missed, v * adam.beta2**missed
+    adam_step(p, grad[rows], m, v, rates.flatten().tolist(), adam.step)
+    sh[rows], adam.exp_avg[rows], adam.exp_avg_sq[rows] = p, m, v
+    adam.last[rows] = adam.step

@@ -57,6 +57,7 @@ class Gradients:
     """dL/d(parameter), float32, each shaped as its parameter; zero for what is not visible.
 
     Attributes:
+        sh: without rows where ``backward`` used it up (``ShAdam``).
         means2d: (N, 2) dL/d(pixel position of the centre).
         means2d_abs: (N, 2) the sum over pixels of the absolute value of each pixel's share of
             means2d (AbsGS, Ye et al. 2024); None when not asked for.
@@ -69,6 +70,32 @@ class Gradients:
     sh: torch.Tensor
     means2d: torch.Tensor
     means2d_abs: torch.Tensor | None
+
+
+@dataclass(frozen=True)
+class ShAdam:
+    """Adam over the spherical harmonics of what is in view (``backward``'s ``sh_adam``).
+
+    A Gaussian out of view for n steps gets, in the next step in view, what n steps without a
+    gradient would have done (``twin.sh_adam``): the same as dense Adam, but for the colour it is
+    drawn with in that one step.
+
+    Attributes:
+        exp_avg, exp_avg_sq: (N, K, 3) float32, moved in place.
+        last: (N,) int32, the step of each Gaussian's last update, 0 before the first; in place.
+        rate0, rate: learning rates of the constant coefficient and of the others.
+        step: from 1.
+    """
+
+    exp_avg: torch.Tensor
+    exp_avg_sq: torch.Tensor
+    last: torch.Tensor
+    rate0: float
+    rate: float
+    step: int
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
 
 
 @dataclass(frozen=True)

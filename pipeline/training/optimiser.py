@@ -1,4 +1,7 @@
-"""Adam over the five arrays of Gaussians, whose rows come and go."""
+"""Adam over the five arrays of Gaussians, whose rows come and go.
+
+The harmonics, four fifths of a Gaussian, are moved inside the backward pass and in view alone.
+"""
 
 from __future__ import annotations
 
@@ -7,7 +10,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipeline.raster import Gradients, adam_step
+from pipeline.raster import Gradients, ShAdam, adam_step
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA1, BETA2 = 0.9, 0.999
@@ -32,28 +35,35 @@ class Adam:
 
     Attributes:
         first, second: by the name of the array, of its shape, float32.
+        last: (N,) int32, the step in which each row's harmonics were last moved.
     """
 
     def __init__(self, gaussians: Gaussians):
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        self.last = torch.zeros(len(gaussians), dtype=torch.int32)
+
+    def harmonics(self, rates: Rates, step: int) -> ShAdam:
+        """For ``backward``, which moves ``sh``; ``step`` counts from 1."""
+        return ShAdam(
+            self.first["sh"], self.second["sh"], self.last, rates.sh0, rates.shN, step,
+            BETA1, BETA2, EPSILON,
+        )  # fmt: skip
 
     def step(
         self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
     ) -> None:
-        """Move ``gaussians`` in place; ``step`` counts from 1 (bias correction)."""
-        higher = gaussians.sh.shape[1] - 1
-        # The constant coefficient's three channels have a rate of their own.
-        sh_rates = [rates.sh0] * 3 + [rates.shN] * 3 * higher
+        """Move all of ``gaussians`` but ``sh``, in place; ``step`` counts from 1."""
         for name, parameter in gaussians.tensors().items():
-            rate = sh_rates if name == "sh" else getattr(rates, name)
+            if name == "sh":
+                continue
             adam_step(
                 parameter,
                 getattr(gradients, name),
                 self.first[name],
                 self.second[name],
-                rate,
+                getattr(rates, name),
                 step,
                 BETA1,
                 BETA2,
@@ -67,6 +77,7 @@ class Adam:
             for name, tensor in moments.items():
                 moments[name] = tensor[rows].contiguous()
                 moments[name][fresh] = 0.0
+        self.last = self.last[rows]
 
     def forget(self, name: str) -> None:
         """Zero the moments of one array."""

@@ -82,7 +82,7 @@ class TrainState:
             result[f"parameter.{name}"] = tensor.numpy()
             result[f"first.{name}"] = self.adam.first[name].numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
-        return result | self.density.arrays()
+        return result | {"last": self.adam.last.numpy()} | self.density.arrays()
 
     def values(self) -> dict[str, Any]:
         """The rest, as JSON; floats survive exactly."""
@@ -107,6 +107,7 @@ class TrainState:
         for name in self.gaussians.tensors():
             self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
             self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
+        self.adam.last = torch.from_numpy(arrays["last"])
         self.density.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]

@@ -37,7 +37,7 @@ from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 3
+STATE_VERSION = 4
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -259,17 +259,18 @@ class _Run:
         loss = l1_ssim(seen, wanted, config.ssim_weight, target.ignored, self.threads)
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
+        rates = self.rates()
         gradients = backward(
             rendered,
             d_color,
             *self.depth_gradients(rendered, index),
             means2d_abs=config.density.absolute_gradient,
+            sh_adam=state.adam.harmonics(rates, step),
         )
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
         state.density.regularise(state.gaussians, gradients)
-        rates = self.rates()
         state.adam.step(state.gaussians, gradients, rates, step, self.threads)
         if state.clock <= self.schedule.refine_stop:
             state.density.explore(state.gaussians, rates.means, state.rng)

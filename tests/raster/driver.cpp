@@ -124,12 +124,23 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
         project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
                               slot_gradients.get(),
                               {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                               d_sh.get(), d_means2d.get(), d_abs.get()});
+                               d_sh.get(), d_means2d.get(), d_abs.get()},
+                              nullptr);
     }
     Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
+    Array<int32_t> last(n);
+    const ShAdam sh_adam({s.sh.get(), m.get(), v.get(), last.get()},
+                         {1e-2, 1e-3, 0.9, 0.999, 1e-15, 9});
+    project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
+                          slot_gradients.get(),
+                          {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), nullptr,
+                           d_means2d.get(), d_abs.get()},
+                          &sh_adam);
+    for (Array<float>* moments : {&m, &v}) expect_finite(*moments, "moments");
     const double rate = 1e-2;
     adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
+    // A NaN that was given stays one: what is not drawn is not moved.
     Array<float>* results[] = {&color,    &alpha,   &depth,     &median, &d_color,   &d_means,
                                &d_scales, &d_quats, &d_opacity, &d_sh,   &d_means2d, &param};
     const char* names[] = {"color",    "alpha",   "depth",     "median", "d_color",   "d_means",

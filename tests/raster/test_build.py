@@ -89,14 +89,17 @@ def test_two_builds_at_once_leave_one_whole_library(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_sanitizers_find_nothing(tmp_path: Path) -> None:
-    """Every kernel over 300 wild scenes under the address and undefined-behaviour sanitizers."""
+@pytest.mark.parametrize("kinds", ["address,undefined", "thread"])
+def test_sanitizers_find_nothing(tmp_path: Path, kinds: str) -> None:
+    """Every kernel over 300 wild scenes, on one to three threads."""
     compile_driver(
         tmp_path / "driver",
         *("-std=c++17", "-O1", "-g", "-march=native", "-pthread", "-Wno-psabi"),
-        *("-fsanitize=address,undefined", "-fno-sanitize-recover=all"),
+        *(f"-fsanitize={kinds}", "-fno-sanitize-recover=all"),
     )
     done = subprocess.run([tmp_path / "driver"], capture_output=True, text=True, timeout=600)
+    if "unexpected memory mapping" in done.stderr:
+        pytest.skip("this system's memory layout is not the sanitizer's")
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
     assert done.stdout.strip() == "clean"
 

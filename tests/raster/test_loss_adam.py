@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import pytest
 import torch
 
 from pipeline import raster
-from pipeline.raster import twin
-from tests.raster.scenes import relative
+from pipeline.raster import RasterCamera, RasterOptions, ShAdam, twin
+from tests.raster.scenes import Scene, camera, random_scene, relative
 
 
 def images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
@@ -127,3 +129,78 @@ def test_adam_refuses_what_it_cannot_update_in_place() -> None:
         raster.adam_step(a, torch.zeros(4), a, a, 0.1, 1)
     with pytest.raises(ValueError, match="step"):
         raster.adam_step(a, a, a, a, 0.1, 0)
+
+
+def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:
+    """A scene of which the camera sees a part; and a gradient on the picture."""
+    scene, cam = random_scene(5, 333, degree=degree), camera(70, 50)
+    scene[0][::3, 2] *= -1  # behind it
+    d_color = torch.randn(50, 70, 3, generator=torch.Generator().manual_seed(9))
+    return scene, cam, d_color
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_harmonics_in_view_move_as_the_twins_do(degree: int) -> None:
+    scene, cam, d_color = sh_scene(degree)
+    gen = torch.Generator().manual_seed(4)
+    fwd = raster.forward(*scene, cam, RasterOptions(sh_degree=degree))
+    plain = raster.backward(fwd, d_color)
+    sh = scene[4]
+    # Some have waited for longer than any table.
+    last = torch.randint(0, 1000, (len(sh),), generator=gen, dtype=torch.int32)
+    last[::2] = 998
+    ours = ShAdam(
+        1e-3 * torch.randn(sh.shape, generator=gen), 1e-5 * torch.rand(sh.shape, generator=gen),
+        last, 0.01, 0.002, 1000,
+    )  # fmt: skip
+    theirs = dataclasses.replace(
+        ours,
+        exp_avg=ours.exp_avg.double(),
+        exp_avg_sq=ours.exp_avg_sq.double(),
+        last=ours.last.clone(),
+    )
+    expected, untouched = sh.double(), ours.exp_avg.clone()
+    visible = fwd.radii > 0
+    twin.sh_adam(expected, plain.sh.double(), visible, theirs)
+    moved = raster.backward(fwd, d_color, sh_adam=ours)
+    assert 0 < visible.sum() < len(sh)
+    assert torch.allclose(sh.double(), expected, rtol=0, atol=2e-6)
+    assert relative(ours.exp_avg, theirs.exp_avg) < 1e-5
+    assert relative(ours.exp_avg_sq, theirs.exp_avg_sq) < 1e-5
+    assert torch.equal(ours.last, theirs.last)
+    assert torch.equal(ours.exp_avg[~visible], untouched[~visible])
+    assert len(moved.sh) == 0 and torch.equal(moved.means, plain.means)
+
+
+def test_what_was_out_of_view_catches_up_with_dense_adam() -> None:
+    """A gradient in every tenth step: at each the parameter is where dense Adam has it, but for
+    what rates and corrections of other steps make of the drift."""
+    gen = torch.Generator().manual_seed(6)
+    dense = torch.randn(200, 1, 3, generator=gen, dtype=torch.float64)
+    sparse, (m, v) = dense.clone(), torch.zeros(2, 200, 1, 3, dtype=torch.float64)
+    state = ShAdam(
+        torch.zeros_like(dense), torch.zeros_like(dense),
+        torch.zeros(200, dtype=torch.int32), 1e-3, 1e-3, 1,
+    )  # fmt: skip
+    everyone = torch.ones(200, dtype=torch.bool)
+    start = dense.clone()
+    for step in range(1, 2001):
+        seen = step % 10 == 0
+        grad = torch.randn(dense.shape, generator=gen, dtype=torch.float64) + 0.3
+        twin.adam_step(dense, grad if seen else torch.zeros_like(grad), m, v, 1e-3, step)
+        if seen:
+            twin.sh_adam(sparse, grad, everyone, dataclasses.replace(state, step=step))
+    assert (sparse - dense).norm() < 0.01 * (dense - start).norm()
+
+
+def test_harmonics_refuse_moments_that_do_not_fit() -> None:
+    scene, cam, d_color = sh_scene(1)
+    fwd = raster.forward(*scene, cam, RasterOptions(sh_degree=1))
+    like, last = torch.zeros_like(scene[4]), torch.zeros(333, dtype=torch.int32)
+    for wrong, says in (
+        (ShAdam(like[:5], like, last, 0.1, 0.1, 1), "moments"),
+        (ShAdam(like, like, last.long(), 0.1, 0.1, 1), "last"),
+        (ShAdam(like, like, last, 0.1, 0.1, 0), "step"),
+    ):
+        with pytest.raises(ValueError, match=says):
+            raster.backward(fwd, d_color, sh_adam=wrong)

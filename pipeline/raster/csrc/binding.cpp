@@ -150,16 +150,26 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
 }
 
 // Gradients of means, log_scales, quats, opacity_logits, sh, means2d, and means2d_abs (0 rows
-// when not asked for)
+// when not asked for). With exp_avg, exp_avg_sq, last and sh_adam, 6 float64, step and
+// ShAdamSettings, sh is moved and has no gradients (0 rows).
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
     int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool absolute, int64_t threads) {
+    const Tensor& slots, const Tensor& slot_gradients, bool absolute, OptionalTensor exp_avg,
+    OptionalTensor exp_avg_sq, OptionalTensor last, OptionalTensor sh_adam, int64_t threads) {
     const int64_t n = means.size(0);
+    std::optional<splat::ShAdam> adam;
+    if (sh_adam) {
+        const double* s = sh_adam->const_data_ptr<double>();
+        adam.emplace(
+            splat::ShAdamState{mutable_floats(sh), mutable_floats(*exp_avg),
+                               mutable_floats(*exp_avg_sq), last->mutable_data_ptr<int32_t>()},
+            splat::ShAdamSettings{s[0], s[1], s[2], s[3], s[4], int64_t(s[5])});
+    }
     Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
            d_quats = new_floats({n, 4});
-    Tensor d_opacity = new_floats({n}), d_sh = new_floats({n, sh.size(1), 3});
+    Tensor d_opacity = new_floats({n}), d_sh = new_floats({adam ? 0 : n, sh.size(1), 3});
     Tensor d_means2d = new_floats({n, 2}), d_abs = new_floats({absolute ? n : 0, 2});
     splat::project_view_backward(
         gaussians_from(means, log_scales, quats, opacity_logits, sh),
@@ -167,8 +177,9 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backw
         floats(radii), reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
         floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
-         mutable_floats(d_opacity), mutable_floats(d_sh), mutable_floats(d_means2d),
-         absolute ? mutable_floats(d_abs) : nullptr});
+         mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
+         mutable_floats(d_means2d), absolute ? mutable_floats(d_abs) : nullptr},
+        adam ? &*adam : nullptr);
     return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs};
 }
 
@@ -218,8 +229,9 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "int threads) -> Tensor");
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
-        "Tensor sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
+        "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
         "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool absolute, "
+        "Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? sh_adam, "
         "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, int threads) -> "

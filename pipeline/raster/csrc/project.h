@@ -1,6 +1,7 @@
 // Stage 1: world Gaussians to Records on the image, and at the very end the way back.
 #pragma once
 
+#include "sh_adam.h"
 #include "types.h"
 
 namespace splat {
@@ -15,15 +16,17 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                            float* radii);
 
 // dL/d(parameter), each shaped as its parameter; means2d and means2d_abs (N, 2), the latter may
-// be null. All are written, zeros where there is nothing.
+// be null, and sh where it is used up at once. All are written, zeros where there is nothing.
 struct GaussianGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh, *means2d, *means2d_abs;
 };
 
 // Sums the gradient slots of each Gaussian in their order and takes the sums back to its
-// parameters. A Gaussian of which any gradient leaves float32 gets zeros.
+// parameters. A Gaussian of which any gradient leaves float32 gets zeros. With sh_adam the
+// harmonics of those in view are moved, too.
 void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const Record* records, const float* radii, const Slots* slots,
-                           const float* slot_gradients, const GaussianGradients& out);
+                           const float* slot_gradients, const GaussianGradients& out,
+                           const ShAdam* sh_adam);
 
 }  // namespace splat

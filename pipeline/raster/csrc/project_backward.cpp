@@ -93,7 +93,8 @@ struct GroupGradients {
 
 void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const Record* records, const float* radii, const Slots* slots,
-                           const float* slot_gradients, const GaussianGradients& out) {
+                           const float* slot_gradients, const GaussianGradients& out,
+                           const ShAdam* sh_adam) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
     parallel_for(count, 32, threads, [&](int64_t number) {
@@ -144,7 +145,9 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         write_column(g.opacity_logit, group.count, out.opacity_logits + first);
         write_rows(g.means2d, group.count, out.means2d + 2 * first);
         if (out.means2d_abs) write_rows(absolute, group.count, out.means2d_abs + 2 * first);
-        sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
+        sh.to_rows(view.sh_degree);
+        if (out.sh) sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
+        if (sh_adam) sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
     });
 }
 

@@ -73,10 +73,13 @@ struct ShBlock {
         }
         for (int j = 0; 16 * j < active; j++) transpose(value + 16 * j);
     }
-    // The way back: `count` rows, zeros after the active floats.
-    SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) {
+    // Half the way back: value[16 j + lane] are floats 16 j to 16 j + 15 of that lane's row.
+    SPLAT_INLINE void to_rows(int degree) {
+        for (int j = 0; 16 * j < 3 * sh_count(degree); j++) transpose(value + 16 * j);
+    }
+    // The rest of it: `count` rows, zeros after the active floats.
+    SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) const {
         const int active = 3 * sh_count(degree);
-        for (int j = 0; 16 * j < active; j++) transpose(value + 16 * j);
         for (int lane = 0; lane < count; lane++) {
             float* const row = sh + width * lane;
             for (int j = 0; 16 * j < active; j++) {

@@ -1,0 +1,103 @@
+// Adam for spherical harmonics inside the backward pass, where their gradients are still in
+// registers, and of the Gaussians in view alone: four fifths of a Gaussian are harmonics, and most
+// are out of most views. What an update out of view would have done, moments that decay and a drift
+// that fades with them, is made good at the next one in view.
+#pragma once
+
+#include <cmath>
+
+#include "sh.h"
+
+namespace splat {
+
+struct ShAdamSettings {
+    double rate0, rate;  // of the constant coefficient and of the others
+    double beta1, beta2, eps;
+    int64_t step;  // from 1
+};
+
+// Moments of sh (N, K, 3) and the step of each Gaussian's last update (N), 0 before the first.
+struct ShAdamState {
+    float *sh, *exp_avg, *exp_avg_sq;
+    int32_t* last;
+};
+
+class ShAdam {
+  public:
+    ShAdam(const ShAdamState& state, const ShAdamSettings& s) : state_(state), step_(s.step) {
+        const double to_rate = 1 / (1 - std::pow(s.beta1, double(s.step)));
+        for (int i = 0; i < 48; i++) rates_[i] = float((i < 3 ? s.rate0 : s.rate) * to_rate);
+        scale_ = float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))));
+        eps_ = float(s.eps);
+        beta1_ = float(s.beta1), rest1_ = float(1 - s.beta1);
+        beta2_ = float(s.beta2), rest2_ = float(1 - s.beta2);
+        // A step without a gradient moves by m / sqrt(v), which falls by this each time.
+        ratio_ = float(s.beta1 / std::sqrt(s.beta2));
+        for (int missed = 0; missed < kTable; missed++) table_[missed] = after(missed);
+    }
+
+    // gradient: of the group whose first Gaussian is `first`, after ShBlock::to_rows.
+    SPLAT_INLINE void update(int degree, const ShBlock& gradient, int64_t first, int64_t width,
+                             uint32_t lanes) const {
+        const int active = 3 * sh_count(degree);
+        for (; lanes; lanes &= lanes - 1) {
+            const int lane = __builtin_ctz(lanes);
+            const int64_t row = width * (first + lane);
+            int32_t& last = state_.last[first + lane];
+            const int64_t missed = step_ - 1 - last;
+            last = int32_t(step_);
+            const Past past = missed < kTable ? table_[missed] : after(missed);
+            for (int j = 0; 16 * j < active; j++) {
+                const int here = active - 16 * j < 16 ? active - 16 * j : 16;
+                const int64_t at = row + 16 * j;
+                f32x16 p = read(state_.sh + at, here), m = read(state_.exp_avg + at, here);
+                f32x16 v = read(state_.exp_avg_sq + at, here);
+                const f32x16 g = gradient.value[16 * j + lane],
+                             rate = load<f32x16>(rates_ + 16 * j);
+                p -= rate * past.drift * m / (sqrt(v) * scale_ + eps_);
+                m = m * past.keep1 + g * rest1_;
+                v = v * past.keep2 + g * g * rest2_;
+                p -= rate * m / (sqrt(v) * scale_ + eps_);
+                write(p, state_.sh + at, here);
+                write(m, state_.exp_avg + at, here);
+                write(v, state_.exp_avg_sq + at, here);
+            }
+        }
+    }
+
+  private:
+    // What so many steps without a gradient, and the decay of the next, do to the moments; and how
+    // far they move the parameter, in moves of the last step.
+    struct Past {
+        float keep1, keep2, drift;
+    };
+    static constexpr int kTable = 256;
+
+    Past after(int64_t missed) const {
+        const float n = float(missed);
+        return {std::pow(beta1_, n + 1), std::pow(beta2_, n + 1),
+                ratio_ * (1 - std::pow(ratio_, n)) / (1 - ratio_)};
+    }
+
+    // The common case without a copy through memory.
+    static SPLAT_INLINE f32x16 read(const float* from, int count) {
+        if (count == 16) return load<f32x16>(from);
+        f32x16 value = {};
+        std::memcpy(&value, from, count * sizeof(float));
+        return value;
+    }
+    static SPLAT_INLINE void write(f32x16 value, float* to, int count) {
+        if (count == 16)
+            store(to, value);
+        else
+            std::memcpy(to, &value, count * sizeof(float));
+    }
+
+    ShAdamState state_;
+    int64_t step_;
+    float rates_[48], scale_, eps_, beta1_, rest1_, beta2_, rest2_;
+    float ratio_;
+    Past table_[kTable];
+};
+
+}  // namespace splat

@@ -79,8 +79,10 @@ class Step:
         target = torch.rand(size[1], size[0], 3, generator=gen)
         params = [g.clone() for g in s.inputs]
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
+        last = torch.zeros(scene.count, dtype=torch.int32)
         # Rates of 0, so that every repeat draws the same.
         rate = torch.zeros(1, dtype=torch.float64)
+        sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
         self.d_color = kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)[3]
         kept: dict[str, Any] = {}
 
@@ -105,11 +107,11 @@ class Step:
         def project_backward() -> None:
             kept["gradients"] = kernels.project_backward(
                 *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
-                kept["slots"], False, None, None, None, None, threads,
+                kept["slots"], False, *moments[4], last, sh_adam, threads,
             )  # fmt: skip
 
         def adam() -> None:
-            for p, g, (m, v) in zip(params, kept["gradients"][:5], moments, strict=True):
+            for p, g, (m, v) in zip(params[:4], kept["gradients"], moments, strict=False):
                 kernels.adam_step(p, g, m, v, rate, 1, 0.9, 0.999, 1e-15, threads)
 
         self.operators: dict[str, Callable[[], None]] = {
@@ -118,7 +120,7 @@ class Step:
             "blend": blend,
             "loss": loss,
             "blend backward": blend_backward,
-            "projection, SH backward": project_backward,
+            "projection, SH backward": project_backward,  # and the harmonics' Adam
             "Adam": adam,
         }
 
@@ -128,6 +130,7 @@ class Step:
         n, pixels = self.scene.count, self.state.size[0] * self.state.size[1]
         visible, tiles = int((self.drawn.radii > 0).sum()), self.drawn.num_intersections
         row = 4 * sum(g[0].numel() for g in self.state.inputs) if n else 0
+        sh = 4 * self.state.inputs[4][0].numel() if n else 0
         record, entry, slot = 64, 12, 64
         # 8 blurs (5 forward, 3 of the gradient) of 6 taps, twice: 17 operations; some 30 beside
         loss = 3 * pixels * (8 * 2 * 17 + 30)
@@ -137,8 +140,11 @@ class Step:
             "blend": Cost(28 * pairs, visible * record + tiles * entry + 16 * pixels),
             "loss": Cost(loss, 36 * pixels),
             "blend backward": Cost(56 * pairs, tiles * (entry + slot) + 28 * pixels),
-            "projection, SH backward": Cost(n * 800, 2 * n * row + tiles * slot),
-            "Adam": Cost(0, 7 * n * row),
+            # The harmonics and their moments are read and written where they are in view.
+            "projection, SH backward": Cost(
+                n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
+            ),
+            "Adam": Cost(0, 7 * n * (row - sh)),
         }
 
     def once(self) -> dict[str, Timing]:

@@ -162,7 +162,7 @@ class Init(Section):
         "auto", description="auto: sparse points, triangulated if the poses came without any."
     )
     num_random: Positive = Field(50_000, description="Gaussians of a random start.")
-    opacity: Share = Field(0.1, description="Opacity of a new Gaussian.")
+    opacity: Share = Field(0.3, description="Opacity of a new Gaussian.")
     max_points: Positive = Field(
         200_000,
         description="More sparse points are thinned to this, or to "
@@ -239,7 +239,7 @@ class Train(Section):
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
     coarse_until: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.3, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
+        0.15, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."

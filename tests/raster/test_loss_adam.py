@@ -204,3 +204,15 @@ def test_harmonics_refuse_moments_that_do_not_fit() -> None:
     ):
         with pytest.raises(ValueError, match=says):
             raster.backward(fwd, d_color, sh_adam=wrong)
+
+
+def test_harmonics_of_a_gradient_beyond_float32s_squares_stay_finite() -> None:
+    scene, cam, d_color = sh_scene(3)
+    fwd = raster.forward(*scene, cam, RasterOptions())
+    adam = ShAdam(
+        torch.zeros_like(scene[4]), torch.zeros_like(scene[4]),
+        torch.zeros(333, dtype=torch.int32), 0.1, 0.1, 1,
+    )  # fmt: skip
+    for step in (1, 2, 9):
+        raster.backward(fwd, 1e25 * d_color, sh_adam=dataclasses.replace(adam, step=step))
+    assert scene[4].isfinite().all()

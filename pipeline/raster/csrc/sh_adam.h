@@ -44,7 +44,7 @@ class ShAdam {
             const int lane = __builtin_ctz(lanes);
             const int64_t row = width * (first + lane);
             int32_t& last = state_.last[first + lane];
-            const int64_t missed = step_ - 1 - last;
+            const int64_t missed = last < step_ ? step_ - 1 - last : 0;
             last = int32_t(step_);
             const Past past = missed < kTable ? table_[missed] : after(missed);
             for (int j = 0; 16 * j < active; j++) {
@@ -54,10 +54,10 @@ class ShAdam {
                 f32x16 v = read(state_.exp_avg_sq + at, here);
                 const f32x16 g = gradient.value[16 * j + lane],
                              rate = load<f32x16>(rates_ + 16 * j);
-                p -= rate * past.drift * m / (sqrt(v) * scale_ + eps_);
+                if (missed) p -= rate * past.drift * m * inverse_root(v);
                 m = m * past.keep1 + g * rest1_;
                 v = v * past.keep2 + g * g * rest2_;
-                p -= rate * m / (sqrt(v) * scale_ + eps_);
+                p -= rate * m * inverse_root(v);
                 write(p, state_.sh + at, here);
                 write(m, state_.exp_avg + at, here);
                 write(v, state_.exp_avg_sq + at, here);
@@ -77,6 +77,11 @@ class ShAdam {
         const float n = float(missed);
         return {std::pow(beta1_, n + 1), std::pow(beta2_, n + 1),
                 ratio_ * (1 - std::pow(ratio_, n)) / (1 - ratio_)};
+    }
+
+    // A moment of infinity, of a gradient beyond 1e19, stands still as a division would have it.
+    SPLAT_INLINE f32x16 inverse_root(f32x16 v) const {
+        return reciprocal(min(sqrt(v) * scale_ + eps_, splat16(1e37f)));
     }
 
     // The common case without a copy through memory.

@@ -238,8 +238,10 @@ class Train(Section):
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
-    coarse_until: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.15, description="Share of the steps trained at reduced resolution (1/4, then 1/2)."
+    coarse_until: Literal["auto"] | Annotated[float, Field(ge=0, lt=1)] = Field(
+        "auto",
+        description="Share of the steps, or of `budget_minutes`, trained at reduced resolution "
+        "(1/4, then 1/2). auto: 0.15 of the steps or 0.3 of the minutes.",
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."

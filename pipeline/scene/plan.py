@@ -369,14 +369,18 @@ def _init(scan: Scan, config: Config) -> StagePlan:
     )
 
 
-def training_memory_mb(scan: Scan, config: Config) -> int:
+def memory_mb(pixels: int, gaussians: int) -> int:
     """What training takes at most, roughly, in MB: the program, every view's 8-bit pixels (and a
     quarter more while they are coarse), and each Gaussian's parameters, moments, gradients and
     what it writes while a view is drawn. Measured on scenes of 60 000 to 213 000 Gaussians."""
+    return round(PROGRAM_MB + (1.25 * 3 * pixels + GAUSSIAN_BYTES * gaussians) / 1e6)
+
+
+def training_memory_mb(scan: Scan, config: Config) -> int:
+    """``memory_mb`` of the scene's views and its budget."""
     sizes = [view_size(p.width, p.height, config.views.max_long_side_px) for p in scan.photos]
     pixels = sum(width * height for width, height in sizes)
-    gaussians = config.train.density.max_gaussians
-    return round(PROGRAM_MB + (1.25 * 3 * pixels + GAUSSIAN_BYTES * gaussians) / 1e6)
+    return memory_mb(pixels, config.train.density.max_gaussians)
 
 
 def _length(config: Config) -> str:

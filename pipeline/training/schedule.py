@@ -19,6 +19,9 @@ NOMINAL_STEPS = 7000
 # Fewer steps than this between two densifications say too little about a gradient's mean.
 MIN_REFINE_INTERVAL = 10
 COARSE_FACTORS = (4, 2)
+# Shares of a run. A coarse step costs a third of a full one: 0.3 of the minutes are half of the
+# steps. bonsai in 4 minutes: 28.5 dB with 0.3, 28.3 dB with 0.15.
+COARSE_STEPS, COARSE_MINUTES = 0.15, 0.3
 # The papers' length of a run, for which the configured learning rates are right. The noise of one
 # view a step asks that a run of fewer goes farther in each: by the root, as for batches. At 3000
 # steps three times the rates were best and five times worse than three: four is the most.
@@ -62,6 +65,9 @@ class Schedule:
     def of(config: Train) -> Schedule:
         """The schedule of ``config.steps`` steps, or of ``config.budget_minutes``."""
         steps = config.steps if config.budget_minutes is None else NOMINAL_STEPS
+        coarse = config.coarse_until
+        if coarse == "auto":
+            coarse = COARSE_STEPS if config.budget_minutes is None else COARSE_MINUTES
         shrink = min(1.0, steps / NOMINAL_STEPS)
         density = config.density
         interval = min(density.interval, MIN_REFINE_INTERVAL)
@@ -69,7 +75,7 @@ class Schedule:
             steps=steps,
             sh_degree=config.sh_degree,
             sh_interval=max(1, round(config.sh_interval * shrink)),
-            coarse_steps=int(config.coarse_until * steps),
+            coarse_steps=int(coarse * steps),
             refine_start=round(density.start_step * shrink),
             refine_stop=round(density.stop_share * steps),
             refine_interval=max(interval, round(density.interval * shrink)),

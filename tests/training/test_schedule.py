@@ -68,3 +68,11 @@ def test_the_budget_grows_with_the_pictures() -> None:
     budgets = [schedule.budget_at(step) for step in range(1, Train().steps + 1)]
     assert budgets == sorted(budgets)
     assert set(budgets) == {500, 707, 1000}
+
+
+def test_a_run_of_minutes_is_coarse_for_longer() -> None:
+    """Its share is of the time, and coarse steps take little of it."""
+    by_steps, by_minutes = Schedule.of(Train(steps=1000)), Schedule.of(Train(budget_minutes=1))
+    assert by_steps.coarse_steps == 150
+    assert by_minutes.coarse_steps / by_minutes.steps == pytest.approx(0.3)
+    assert Schedule.of(Train(steps=1000, coarse_until=0.0)).coarse_steps == 0

@@ -1,0 +1,111 @@
+"""``python -m benchmarks.memory``: what training takes at most, beside what the plan says.
+
+Trains a made scene of many views and Gaussians for a few steps that pass through every phase:
+coarse and full pictures, all SH bands, density control, a checkpoint. What it looks like does not
+matter to memory, so every view is the same picture of noise.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import sys
+from pathlib import Path
+from tempfile import TemporaryDirectory
+
+import numpy as np
+from PIL import Image
+
+from pipeline.config.schema import Density, Train
+from pipeline.demo.cameras import lens, orbit
+from pipeline.runtime.atomic import write_json
+from pipeline.scene.model import View
+from pipeline.scene.plan import memory_mb
+from pipeline.scene.views import scene_extent
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training import trainer
+from pipeline.training.trainer import train
+
+PIXELS_ACROSS = 3.0  # of a Gaussian's 3-sigma radius
+
+
+def made_views(count: int, width: int, height: int, folder: Path) -> list[View]:
+    """``count`` views of one picture, around the origin."""
+    rng = np.random.default_rng(0)
+    small = rng.integers(0, 256, (height // 8 + 1, width // 8 + 1, 3), np.uint8)
+    picture = Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC)
+    picture.save(folder / "0.jpg")
+    camera = lens("none", width, height)
+    fx, fy, cx, cy = camera.params
+    views = []
+    for number, posed in enumerate(orbit([str(i) for i in range(count)], seed=0)):
+        image = folder / f"{number}.jpg"
+        if number:
+            os.link(folder / "0.jpg", image)
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = posed.rotation, posed.translation
+        views.append(View(image.name, str(image), None, width, height, fx, fy, cx, cy, pose, False))
+    return views
+
+
+def made_gaussians(count: int, focal: float) -> Gaussians:
+    """Small ones all over the middle of the scene."""
+    rng = np.random.default_rng(1)
+    scale = PIXELS_ACROSS / 3 * 2.3 / focal
+    return Gaussians.from_arrays({
+        "means": rng.uniform(-1, 1, (count, 3)) + np.array([0, 0, 0.45]),
+        "log_scales": np.log(scale) + rng.normal(0, 0.3, (count, 3)),
+        "quats": rng.normal(size=(count, 4)),
+        "opacity_logits": rng.normal(0, 1, count),
+        "sh": rng.normal(0, 0.3, (count, 16, 3)),
+    })  # fmt: skip
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
+    )
+    parser.add_argument("--gaussians", type=int, default=1_000_000)
+    parser.add_argument("--views", type=int, default=200)
+    parser.add_argument("--size", type=int, nargs=2, default=[1600, 1067], metavar=("W", "H"))
+    parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--json", type=Path, help="write the figures as data")
+    args = parser.parse_args()
+    width, height = args.size
+    trainer.CHECKPOINT_SECONDS = 5.0
+    with TemporaryDirectory() as name:
+        folder = Path(name)
+        views = made_views(args.views, width, height, folder)
+        result = train(
+            views,
+            made_gaussians(args.gaussians, views[0].fx),
+            Train(steps=args.steps, density=Density(max_gaussians=args.gaussians)),
+            seed=0,
+            threads=args.threads,
+            extent=scene_extent(views),
+            checkpoint_dir=folder / "checkpoints",
+        )
+        saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))
+    unit = 1 if sys.platform == "darwin" else 1024
+    figures = {
+        "gaussians": len(result.gaussians),
+        "most_gaussians": result.counters["max_gaussians"],
+        "views": args.views,
+        "width": width,
+        "height": height,
+        "seconds_a_step": round(result.seconds / result.steps, 3),
+        "checkpoints_mb": round(saved / 1e6),
+        "planned_mb": memory_mb(args.views * width * height, args.gaussians),
+        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6),
+    }
+    for key, value in figures.items():
+        print(f"{key:18} {value}")
+    if args.json:
+        write_json(args.json, figures)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -33,7 +33,9 @@ inline void pause() {
 // not, so that a sleeper that is slow to wake costs no more than its help.
 class Crew {
   public:
-    void run(int64_t count, int64_t grain, int threads, RangeBody body, const void* context) {
+    // A body that throws ends the program: its neighbours are at work on what it would take along.
+    void run(int64_t count, int64_t grain, int threads, RangeBody body,
+             const void* context) noexcept {
         const int64_t ranges = (count + grain - 1) / grain;
         const int helpers = int(std::min<int64_t>({threads, ranges, kMostHelpers + 1})) - 1;
         // One loop at a time: another caller's, and a loop within a loop, run on their own.

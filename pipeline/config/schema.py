@@ -215,7 +215,8 @@ class Density(Section):
     scale_cost: Rate = Field(0.01, description="mcmc: weight of the mean scale in the loss.")
     pixels_per_gaussian: Annotated[float, Field(gt=0)] = Field(
         2.0,
-        description="Budget: a view's pixels over this, or fewer where there are few photographs.",
+        description="Budget: a view's pixels over this, or fewer where there are few photographs "
+        "or `budget_minutes`.",
     )
     max_gaussians: Positive = Field(
         1_000_000, description="Budget: never more Gaussians than this, whatever the pixels."

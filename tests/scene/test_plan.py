@@ -294,6 +294,15 @@ def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
     assert any("30 depth maps" in text for text in plan.stages["train"].decisions)
 
 
+def test_a_run_of_minutes_gets_no_more_gaussians_than_it_can_train(tmp_path):
+    scan = many(tmp_path, 2000, width=lambda i: 80, height=lambda i: 60)
+    train = {"budget_minutes": 0.5, "density": {"pixels_per_gaussian": 0.1}}
+    plan = make_plan(scan, Config.model_validate({"train": train}))
+    assert plan.config.train.density.max_gaussians == 25_000
+    text = "at most 25000 Gaussians: 50000 for each of 0.5 minutes"
+    assert text in plan.stages["train"].decisions
+
+
 def test_training_says_what_memory_it_takes(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}

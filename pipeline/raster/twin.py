@@ -374,6 +374,7 @@ def sh_adam(sh: torch.Tensor, grad: torch.Tensor, visible: torch.Tensor, adam: S
     scale = math.sqrt(1 - adam.beta2**adam.step)
     p -= rates / (1 - adam.beta1**adam.step) * drift * m / (v.sqrt() / scale + adam.eps)
     m, v = m * adam.beta1**missed, v * adam.beta2**missed
-    adam_step(p, grad[rows], m, v, rates.flatten().tolist(), adam.step)
+    betas = adam.beta1, adam.beta2
+    adam_step(p, grad[rows], m, v, rates.flatten().tolist(), adam.step, *betas, adam.eps)
     sh[rows], adam.exp_avg[rows], adam.exp_avg_sq[rows] = p, m, v
     adam.last[rows] = adam.step

@@ -46,6 +46,5 @@ def test_tolerances_are_those_of_the_seeds(expected):
 
     for name, stored in expected["measured"].items():
         scatter = 3 * statistics.stdev(stored["seeds"])
-        # Seeds are stored with five digits.
-        assert stored["tolerance"] == pytest.approx(max(scatter, MEASURED[name]), rel=5e-3), name
+        assert stored["tolerance"] == pytest.approx(max(scatter, MEASURED[name]), rel=1e-3), name
         assert stored["expected"] == pytest.approx(statistics.mean(stored["seeds"]), rel=1e-4)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import resource
 import sys
 from pathlib import Path
 from tempfile import TemporaryDirectory
@@ -20,6 +19,7 @@ from PIL import Image
 from pipeline.config.schema import Density, Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.runtime.atomic import write_json
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.model import View
 from pipeline.scene.plan import memory_mb
 from pipeline.scene.views import scene_extent
@@ -88,7 +88,6 @@ def main() -> int:
             checkpoint_dir=folder / "checkpoints",
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))
-    unit = 1 if sys.platform == "darwin" else 1024
     figures = {
         "gaussians": len(result.gaussians),
         "most_gaussians": result.counters["max_gaussians"],
@@ -98,7 +97,7 @@ def main() -> int:
         "seconds_a_step": round(result.seconds / result.steps, 3),
         "checkpoints_mb": round(saved / 1e6),
         "planned_mb": memory_mb(args.views * width * height, args.gaussians),
-        "peak_mb": round(resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * unit / 1e6),
+        "peak_mb": round(peak_memory_mb() * 2**20 / 1e6),
     }
     for key, value in figures.items():
         print(f"{key:18} {value}")

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import argparse
 import json
-import resource
 import sys
 import time
 from dataclasses import asdict
@@ -17,6 +16,7 @@ from tempfile import TemporaryDirectory
 from benchmarks.surface import align, measure, true_points
 from pipeline.config.schema import Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
@@ -50,7 +50,7 @@ def main() -> int:
         pictures = Pictures(gaussians, views, look, Path(folder))
         mesh, grid = build_mesh(DepthMaps(pictures), options.voxel, options.threads)
     seconds = {"wall": time.monotonic() - start, "cpu": time.process_time() - cpu}
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+    peak = peak_memory_mb()
     if mesh is None or grid is None:
         print("no mesh: the views' depths agree on no surface", file=sys.stderr)
         return 1

@@ -1,4 +1,4 @@
-"""``python -m pipeline``: convert, render and measure files of Gaussians, whoever trained them."""
+"""``python -m pipeline``: convert, render, measure and look at Gaussians, whoever trained them."""
 
 from __future__ import annotations
 
@@ -17,6 +17,7 @@ EXAMPLES = """examples:
   python -m pipeline convert point_cloud.ply scene.spz --min-opacity 0.02
   python -m pipeline render scene.spz --cameras data/garden/sparse/0 -o renders
   python -m pipeline evaluate point_cloud.ply --scene results/garden
+  python -m pipeline view results/garden
 
 To reconstruct a scene from photographs: snakemake --cores all results/NAME/metrics.json
 """
@@ -80,6 +81,19 @@ def _evaluate(
         f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)",
     ]
     _tell(lines, found["warnings"])
+
+
+def _view(model: Path, cameras: Path | None, **options: Any) -> None:
+    from pipeline.watching.server import serve
+    from pipeline.watching.source import Source
+
+    serve(Source(model, cameras), **options)
+
+
+def _tensorboard(**options: Any) -> None:
+    from pipeline.watching.tensorboard import write_events
+
+    _tell(write_events(**options), [])
 
 
 def _tell(lines: list[str], warnings: list[str]) -> None:
@@ -168,6 +182,44 @@ def _parser() -> argparse.ArgumentParser:
         "(default: as the scene was trained, else 8)",
     )
     _add_rendering(sub, "the scene's", "as the scene was trained")
+
+    sub = commands.add_parser(
+        "view",
+        help="show a scene in the browser, also while it is being trained (needs viser)",
+        description="A page in the browser that shows a scene, rendered by the rasterizer that "
+        "trains it. Of a training under way it shows the newest checkpoint, two a minute.",
+    )
+    sub.set_defaults(command=_view)
+    sub.add_argument(
+        "model", type=Path, metavar="SCENE", help="results/NAME, or with --cameras a " + MODEL
+    )
+    sub.add_argument(
+        "--cameras", type=Path, metavar="PATH", help="as for render (default: the scene's own)"
+    )
+    sub.add_argument(
+        "--host", default="127.0.0.1", help="0.0.0.0 lets others in (default: %(default)s)"
+    )
+    sub.add_argument("--port", type=_positive, default=8080, help="(default: %(default)s)")
+    sub.add_argument(
+        "--side", type=_positive, default=800, metavar="PIXELS", help="longer side (default: 800)"
+    )
+    sub.add_argument(
+        "--threads", type=_positive, default=1, help="(default: 1, for a training needs the rest)"
+    )
+
+    sub = commands.add_parser(
+        "tensorboard", help="write trainings' curves as TensorBoard's files (needs tensorboard)"
+    )
+    sub.set_defaults(command=_tensorboard)
+    sub.add_argument(
+        "folders", type=Path, nargs="+", metavar="FOLDER", help="results/NAME, or results for all"
+    )
+    sub.add_argument(
+        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the files"
+    )
+    sub.add_argument(
+        "--follow", action="store_true", help="go on with what trainings add, until Ctrl-C"
+    )
     return parser
 
 

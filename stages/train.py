@@ -14,6 +14,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths
 from pipeline.training.depth_maps import add_maps
 from pipeline.training.trainer import train
@@ -48,6 +49,7 @@ def run(job: Job) -> None:
         gains=np.array([gains[view.name] for view in training]) if gains else None,
         depths=known,
         checkpoint_dir=job.scratch / "checkpoints",
+        journal=job.logs / journal.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
     # After a kill: what earlier processes spent on the same training.

@@ -69,6 +69,7 @@ def export(scene: Path, **options) -> tuple[Path, Job]:
         scratch=out.parent,
         shared_cache=out.parent,
         threads=1,
+        logs=out.parent,
     )
     run(job)
     final = scene / "export"

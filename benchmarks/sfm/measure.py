@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import resource
 import statistics
-import sys
 import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
@@ -15,6 +14,7 @@ from benchmarks.sfm.scenes import REFERENCE, Configuration, Scene
 from pipeline.config.schema import Config
 from pipeline.metrics.pose import PoseError, pose_error
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.isolate import run_isolated
@@ -167,10 +167,7 @@ def measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
     before = _used()
     step(*arguments)
     after = _used()
-    unit = 2**20 if sys.platform == "darwin" else 2**10
-    kinds = (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)
-    peak = max(resource.getrusage(kind).ru_maxrss for kind in kinds) / unit
-    return Cost(after - before, peak)
+    return Cost(after - before, peak_memory_mb())
 
 
 def _used() -> float:

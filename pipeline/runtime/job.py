@@ -42,6 +42,7 @@ from pydantic import BaseModel
 
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.runtime.progress import Console, write_progress_to
 
 SIDE_CARS = ("stage.json", "run.json", ".stage.json")
@@ -65,6 +66,7 @@ class Job:
         counters, decisions, warnings: recorded in ``stage.json``; fill them in.
         published: extra declared outputs: file in ``out`` -> path where it is wanted as well.
         timings: recorded in ``run.json``.
+        logs: folder for what tells how a run went; not part of the result.
     """
 
     stage: str
@@ -75,6 +77,7 @@ class Job:
     scratch: Path
     shared_cache: Path
     threads: int
+    logs: Path
     counters: dict[str, Any] = field(default_factory=dict)
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -199,6 +202,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
             scratch=scratch,
             shared_cache=scratch_root / f"{request.stage}-cache",
             threads=request.threads,
+            logs=scene_folder / "logs" if request.log is None else request.log.parent,
         )
         # Temporary files belong on the results' disk, where a kill leaves them to be found.
         os.environ["TMPDIR"] = str(scratch / "tmp")
@@ -362,11 +366,10 @@ def run_facts(job: Job, wall: float) -> dict[str, Any]:
     """How a run went: times in seconds, memory in MiB, versions, commit, host."""
     own = resource.getrusage(resource.RUSAGE_SELF)
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes on macOS, KiB on Linux
     return {
         "wall_s": round(wall, 3),
         "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in (own, children)), 3),
-        "peak_rss_mb": round(max(own.ru_maxrss, children.ru_maxrss) / unit, 1),
+        "peak_rss_mb": round(peak_memory_mb(), 1),
         "threads": job.threads,
         "seed": job.key["seed"],
         "host": platform.node(),

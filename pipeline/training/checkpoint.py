@@ -95,6 +95,12 @@ def load_latest(
     return None
 
 
+def newest(folder: Path) -> Checkpoint | None:
+    """The newest whole checkpoint of any run, for looking at; None if there is none."""
+    found = map(_load, sorted(folder.glob(PATTERN), reverse=True))
+    return next((checkpoint for checkpoint in found if checkpoint is not None), None)
+
+
 def _load(path: Path) -> Checkpoint | None:
     try:
         data = path.read_bytes()

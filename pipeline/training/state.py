@@ -100,9 +100,7 @@ class TrainState:
     def restore(self, step: int, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
         """Become what ``arrays()`` and ``values()`` described."""
         self.step, self.order = step, arrays["order"]
-        self.gaussians = Gaussians.from_arrays(
-            {name: arrays[f"parameter.{name}"] for name in self.gaussians.tensors()}
-        )
+        self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians)
         for name in self.gaussians.tensors():
             self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
@@ -116,3 +114,10 @@ class TrainState:
         self.window = Window(**values["window"])
         self.curve, self.curve_seconds = values["curve"], values["curve_seconds"]
         self.seconds = values["seconds"]
+
+
+def gaussians_of(arrays: dict[str, NDArray[Any]]) -> Gaussians:
+    """The Gaussians among a state's arrays."""
+    prefix = "parameter."
+    found = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
+    return Gaussians.from_arrays(found)

@@ -30,6 +30,7 @@ from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
 from pipeline.training.depth import KnownDepths, depth_gradients
+from pipeline.training.journal import Journal
 from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
@@ -88,6 +89,7 @@ def train(
     checkpoint_dir: Path,
     gains: NDArray[np.float64] | None = None,
     depths: Sequence[KnownDepths] | None = None,
+    journal: Path | None = None,
     on_log: Callable[[str], None] | None = None,
 ) -> TrainResult:
     """Optimise ``initial`` until its renders look like ``views``.
@@ -104,6 +106,7 @@ def train(
             views without alpha.
         depths: what is known beforehand of each view's depths (``training.depth``), to which
             renders are held with ``Train.depth_weight``.
+        journal: file for how it goes, second by second (``training.journal``).
         on_log: called with one line for each warning.
 
     Raises:
@@ -122,7 +125,7 @@ def train(
         run = _Run(
             views, initial, config, seed, threads, extent, gains, depths, checkpoint_dir, on_log
         )
-        return run.train()
+        return run.train(journal)
     finally:
         torch.set_num_threads(torch_threads)
 
@@ -198,7 +201,7 @@ class _Run:
         if self.on_log is not None:
             self.on_log(message)
 
-    def train(self) -> TrainResult:
+    def train(self, journal_file: Path | None) -> TrainResult:
         state, steps = self.state, self.schedule.steps
         # What happened to checkpoints is told, but is no part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
@@ -208,6 +211,7 @@ class _Run:
         seconds_before = state.seconds
         progress = Progress("training", steps, unit="steps" if self.counts_steps else "parts")
         progress.start_at(state.clock)
+        journal = Journal(journal_file, state.step)
         records = max(1, steps // CURVE_RECORDS)
         while state.clock < steps:
             before = state.clock
@@ -220,6 +224,7 @@ class _Run:
                 self.save()
                 saved = time.monotonic()
             progress.advance(state.clock - before, note=self.note())
+            journal.write(state, steps, self.factor(), progress.seconds_left())
         return self.result()
 
     @property
@@ -242,7 +247,7 @@ class _Run:
         places, step = self.advance(), state.step
         self.raise_sh_degree()
         index = state.next_view()
-        factor = usable_factor(self.views, self.schedule.resolution_factor(state.clock))
+        factor = self.factor()
         target, camera = self.targets.get(index, factor), self.camera(index, factor)
         background = self.draw_background()
         options = RasterOptions(
@@ -322,6 +327,10 @@ class _Run:
         if degree > state.gaussians.sh_degree:
             state.gaussians = state.gaussians.with_sh_degree(degree)
             state.adam.resize_bands(degree)
+
+    def factor(self) -> int:
+        """What pictures are reduced by in this step."""
+        return usable_factor(self.views, self.schedule.resolution_factor(self.state.clock))
 
     def draw_background(self) -> Colour:
         if self.background == "random":

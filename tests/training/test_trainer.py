@@ -16,7 +16,7 @@ from pipeline.config.schema import Train
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import targets, trainer
+from pipeline.training import journal, targets, trainer
 from pipeline.training.checkpoint import PATTERN
 from pipeline.training.render import render_view
 from pipeline.training.trainer import TrainResult, train
@@ -31,6 +31,7 @@ def run(
     threads: int = 1,
     seed: int = 3,
     said: list[str] | None = None,
+    journal: Path | None = None,
 ) -> TrainResult:
     return train(
         scene.views if views is None else views,
@@ -40,6 +41,7 @@ def run(
         threads=threads,
         extent=scene.extent,
         checkpoint_dir=folder,
+        journal=journal,
         on_log=None if said is None else said.append,
     )
 
@@ -116,6 +118,29 @@ def test_killed_at_twenty_random_steps_and_resumed_gives_the_same_bytes(
                 run(scene, tmp_path / f"{call}", config)
         run(scene, tmp_path / f"{call}", config).gaussians.save(tmp_path / "resumed.npz")
         assert (tmp_path / "resumed.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_the_journal_has_each_step_once_after_a_kill(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "logs" / "train.metrics.jsonl"
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(journal, "SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 23)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path, journal=file)
+    with open(file, "a") as half:
+        half.write('{"time": 1, "step": 2')
+    result = run(scene, tmp_path, journal=file)
+    lines = journal.read_journal(file)
+    assert [line["step"] for line in lines] == list(range(1, 41))
+    assert lines[-1]["share"] == 1
+    assert lines[-1]["psnr"] == result.curve[-1]["psnr"]
+    assert lines[-1]["num_gaussians"] == len(result.gaussians)
+    assert lines[-1]["seconds_left"] == 0 < lines[5]["seconds_left"]
+    run(scene, tmp_path / "again", journal=file)
+    assert len(journal.read_journal(file)) == 40
 
 
 def test_minutes_pass_through_the_whole_schedule(

@@ -1,0 +1,1 @@
+"""Watching a training from outside, in a browser or in TensorBoard: it knows nothing of it."""

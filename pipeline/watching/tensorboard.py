@@ -1,0 +1,93 @@
+"""Trainings' journals as TensorBoard's event files."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.runtime.errors import UserError
+from pipeline.training.journal import NAME, read_journal
+
+SCALARS = {
+    "loss": "train/loss",
+    "psnr": "train/psnr_db",
+    "num_gaussians": "scene/num_gaussians",
+    "sh_degree": "scene/sh_degree",
+    "resolution": "schedule/resolution",
+    "share": "schedule/share",
+    "memory_mb": "machine/memory_mb",
+    "seconds": "machine/seconds",
+}
+FOLLOW_SECONDS = 5.0
+
+
+def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
+    """Write each run's journal into ``out/<run>``, in place of the events that stood there.
+
+    Args:
+        folders: results of runs (``results/NAME``), or the folder that holds them.
+        follow: go on with what trainings add, until interrupted.
+
+    Returns:
+        What was done, line by line.
+
+    Raises:
+        UserError: no journal found, or TensorBoard is not installed.
+    """
+    journals = {file.parent.parent.name: file for folder in folders for file in _journals(folder)}
+    if not journals:
+        raise UserError(
+            f"expected a training's {NAME} in logs/, found none",
+            file=folders[0],
+            fix="train first; name a run's folder (results/NAME) or the one that holds them",
+        )
+    writer = _writer()
+    done = dict.fromkeys(journals, 0)
+    for name in journals:
+        for old in (out / name).glob("events.out.tfevents.*"):
+            old.unlink()
+    files = {name: writer(str(out / name)) for name in journals}
+    try:
+        while True:
+            for name, file in journals.items():
+                records = read_journal(file)
+                if len(records) < done[name]:
+                    done[name] = 0  # The run has begun anew.
+                for record in records[done[name] :]:
+                    _write(files[name], record)
+                done[name] = len(records)
+                files[name].flush()
+            if not follow:
+                break
+            time.sleep(FOLLOW_SECONDS)
+    except KeyboardInterrupt:
+        pass
+    finally:
+        for each in files.values():
+            each.close()
+    lines = [f"{out / name}: {count} records" for name, count in done.items()]
+    return [*lines, f"look at them with: tensorboard --logdir {out}"]
+
+
+def _write(writer: Any, record: dict[str, float | None]) -> None:
+    for key, tag in SCALARS.items():
+        value = record.get(key)
+        if value is not None:
+            writer.add_scalar(tag, value, int(record["step"] or 0), record["time"])
+
+
+def _journals(folder: Path) -> list[Path]:
+    own = folder / "logs" / NAME
+    return [own] if own.is_file() else sorted(folder.glob(f"*/logs/{NAME}"))
+
+
+def _writer() -> Any:
+    try:
+        from torch.utils.tensorboard import SummaryWriter
+    except ImportError as error:
+        raise UserError(
+            f"TensorBoard is not installed ({error})", fix="pip install tensorboard==2.21.0"
+        ) from None
+    return SummaryWriter

@@ -1,0 +1,140 @@
+"""Watching from outside: the newest state, as the right camera sees it; curves arrive."""
+
+from __future__ import annotations
+
+import json
+import os
+import urllib.request
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.__main__ import main
+from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import write_model
+from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.rotations import rotation_to_quat
+from pipeline.splats.ply import write_splat_ply
+from pipeline.training import checkpoint
+from pipeline.training.checkpoint import Checkpoint
+from pipeline.training.journal import NAME
+from pipeline.watching.server import Page, Room, picture_size
+from pipeline.watching.source import Source
+from tests.training.conftest import FOCAL, HEIGHT, WIDTH, ball, camera_at
+
+
+@pytest.fixture
+def scene(tmp_path: Path) -> Path:
+    """A run's folder with cameras, as it is while training."""
+    folder = tmp_path / "results" / "ball"
+    poses = {}
+    for index in range(4):
+        pose = camera_at(index * np.pi / 2).world_to_camera
+        poses[index + 1] = Posed(f"{index}.png", 1, pose[:3, :3], pose[:3, 3])
+    camera = Camera("PINHOLE", WIDTH, HEIGHT, np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]))
+    write_model(folder / "sfm" / "sparse" / "0", Reconstruction({1: camera}, poses))
+    (folder / "plan.json").write_text("{}")
+    return folder
+
+
+def add_checkpoint(scene: Path, step: int, count: int, time: int) -> None:
+    arrays = {f"parameter.{k}": v for k, v in ball(count, 1).arrays().items()}
+    folder = scene / ".scratch" / "train" / "abc" / "checkpoints"
+    file = checkpoint.save(folder, Checkpoint(step, "id", arrays, {}))
+    os.utime(file, (time, time))
+
+
+def add_journal(scene: Path, steps: int) -> None:
+    (scene / "logs").mkdir(exist_ok=True)
+    lines = [
+        {"time": 1e9 + step, "step": step, "share": step / 10, "loss": 1 / step, "psnr": 20 + step}
+        for step in range(1, steps + 1)
+    ]
+    (scene / "logs" / NAME).write_text("".join(json.dumps(line) + "\n" for line in lines))
+
+
+def test_the_newest_state_is_shown(scene: Path) -> None:
+    with pytest.raises(UserError, match="found neither"):
+        Source(scene, None)
+    add_checkpoint(scene, 10, 30, 1000)
+    source = Source(scene, None)
+    assert source.shown.told == "step 10, 30 Gaussians"
+    assert not source.renew()
+    add_checkpoint(scene, 20, 40, 2000)
+    add_journal(scene, 5)
+    assert source.renew()
+    assert source.shown.told == "step 20, 40 Gaussians, PSNR 25.00 dB, 50% done"
+    (scene / "train").mkdir()
+    ball(50, 1).save(scene / "train" / "gaussians.npz")
+    assert source.renew()
+    assert source.shown.told == "50 Gaussians, trained"
+    # Snakemake removes what it makes anew: the last state stays in sight.
+    (scene / "train" / "gaussians.npz").unlink()
+    for file in (scene / ".scratch").rglob("checkpoint_*"):
+        file.unlink()
+    assert not source.renew()
+
+
+def test_a_file_of_gaussians_wants_cameras(scene: Path, tmp_path: Path) -> None:
+    file = tmp_path / "scene.ply"
+    write_splat_ply(file, ball(20, 1))
+    with pytest.raises(UserError, match="says nothing about cameras"):
+        Source(file, None)
+    assert len(Source(file, scene).shown.gaussians) == 20
+
+
+def test_a_camera_of_the_browser_is_the_one_of_the_scene() -> None:
+    views = [camera_at(angle) for angle in (0.3, 1.7, 4.0)]
+    room = Room(views)
+    for view in views:
+        placed = room.from_world(view.centre)
+        assert np.linalg.norm(placed) <= 1 + 1e-12
+        again = room.view(
+            rotation_to_quat(view.world_to_camera[:3, :3].T),
+            placed,
+            2 * np.arctan(HEIGHT / 2 / FOCAL),
+            (WIDTH, HEIGHT),
+        )
+        np.testing.assert_allclose(again.world_to_camera, view.world_to_camera, atol=1e-12)
+        assert again.fx == pytest.approx(FOCAL) == again.fy
+        assert (again.cx, again.cy) == (view.cx, view.cy)
+
+
+@pytest.mark.parametrize(("aspect", "size"), [(2.0, (100, 50)), (0.5, (50, 100)), (1e-4, (1, 100))])
+def test_a_picture_has_the_windows_shape(aspect: float, size: tuple[int, int]) -> None:
+    assert picture_size(aspect, 100) == size
+
+
+def test_the_page_is_served_and_renders(scene: Path) -> None:
+    pytest.importorskip("viser", reason="viser is not installed")
+    add_checkpoint(scene, 10, 30, 1000)
+    page = Page(Source(scene, None), host="127.0.0.1", port=18080, side=64, threads=1)
+    try:
+        with urllib.request.urlopen(f"http://127.0.0.1:{page.port}", timeout=30) as answer:
+            assert answer.status == 200
+        picture = page.render(page.source.views[1])
+        assert picture.shape == (HEIGHT, WIDTH, 3)
+        assert picture.max() > 50
+        start = np.asarray(page.server.initial_camera.position)
+        np.testing.assert_allclose(start, page.room.from_world(page.source.views[1].centre))
+    finally:
+        page.stop()
+
+
+def test_curves_arrive_in_tensorboard(
+    scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pytest.importorskip("tensorboard", reason="tensorboard is not installed")
+    from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
+
+    out = tmp_path / "events"
+    assert main(["tensorboard", str(scene.parent), "-o", str(out)]) == 2
+    assert "found none" in capsys.readouterr().err
+    for steps in (3, 5):
+        add_journal(scene, steps)
+        assert main(["tensorboard", str(scene.parent), "-o", str(out)]) == 0
+        events = EventAccumulator(str(out / "ball")).Reload()
+        found = events.Scalars("train/psnr_db")
+        assert [(e.step, e.value) for e in found] == [(s, 20.0 + s) for s in range(1, steps + 1)]
+        assert found[0].wall_time == 1e9 + 1

@@ -187,10 +187,11 @@ def run(name: str, call: int, tally: Tally) -> None:
     image = twin.blend(projection, colors, camera, options)
     sure = image.margin > MARGIN
     d_color *= sure[..., None]
-    found = backward(drawn, d_color)
+    found = backward(drawn, d_color, camera=True)
 
     values = [drawn.color, drawn.alpha, drawn.depth, drawn.median_depth, drawn.radii]
-    values += [getattr(found, f.name) for f in fields(found)]
+    values += [getattr(found, f.name) for f in fields(found) if f.name != "camera"]
+    values += vars(found.camera).values()
     tally.not_finite += sum(int((~v.isfinite()).sum()) for v in values)
     tally.cases += PER_CALL
     tally.drawn += drawn.num_visible

@@ -12,6 +12,7 @@ import importlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.raster.types import (
+    CameraGradients,
     Gradients,
     LossResult,
     RasterCamera,
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from pipeline.raster.ops import Forward, adam_step, backward, forward, l1_ssim, render
 
 __all__ = [
+    "CameraGradients",
     "Forward",
     "Gradients",
     "LossResult",

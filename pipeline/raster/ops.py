@@ -11,6 +11,7 @@ import torch
 
 from pipeline.raster import build
 from pipeline.raster.types import (
+    CameraGradients,
     Gradients,
     LossResult,
     RasterCamera,
@@ -187,6 +188,7 @@ def backward(
     d_depth: torch.Tensor | None = None,
     *,
     means2d_abs: bool = True,
+    camera: bool = False,
     sh_adam: ShAdam | None = None,
 ) -> Gradients:
     """The gradients of a scalar, given its gradients on the images.
@@ -194,6 +196,7 @@ def backward(
     Args:
         d_color: (H, W, 3) float32; d_alpha, d_depth: (H, W) float32 or None.
         means2d_abs: sum absolute values too; about a fifth of the time.
+        camera: give the camera's gradients, too.
         sh_adam: move the harmonics of the Gaussians in view by Adam at once, in place, instead
             of giving their gradients: those are four fifths of all, and would only be written
             to be read again.
@@ -211,13 +214,16 @@ def backward(
         fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
         means2d_abs, threads,
     )  # fmt: skip
-    d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs = ops.project_backward(
+    d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_camera = ops.project_backward(
         *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias, s.records,
-        fwd.radii, s.slots, slot_gradients, means2d_abs, *_moments(sh_adam, s.inputs[4]), threads,
+        fwd.radii, s.slots, slot_gradients, means2d_abs, camera, *_moments(sh_adam, s.inputs[4]),
+        threads,
     )  # fmt: skip
+    parts = d_camera.split([3, 3, 2, 2]) if camera else None
     return Gradients(
-        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs if means2d_abs else None
-    )
+        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs if means2d_abs else None,
+        None if parts is None else CameraGradients(*parts),
+    )  # fmt: skip
 
 
 def _moments(adam: ShAdam | None, sh: torch.Tensor) -> tuple[torch.Tensor | None, ...]:

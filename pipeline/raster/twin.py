@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import torch
 import torch.nn.functional as F
@@ -63,6 +64,27 @@ def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
         2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
     ]  # fmt: skip
     return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def moved(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
+    """The camera after a ``change`` (10,), whose gradient at zero is ``CameraGradients``.
+
+    A point at x in the camera's frame comes to exp([r]) x + t, r and t the first six values ([r]:
+    the matrix of the cross product with r, radians; t in the world's unit); the others add to
+    fx, fy, cx, cy, in pixels. The fields of what is returned are tensors.
+    """
+    skew = torch.zeros(3, 3, dtype=change.dtype)
+    skew = skew.index_put(
+        (torch.tensor([2, 0, 1, 1, 2, 0]), torch.tensor([1, 2, 0, 2, 0, 1])),
+        torch.cat([change[:3], -change[:3]]),
+    )
+    left = torch.eye(4, dtype=change.dtype)
+    left = torch.cat([torch.cat([torch.linalg.matrix_exp(skew), change[3:6, None]], 1), left[3:]])
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    intrinsics: list[Any] = [value + change[6 + i] for i, value in enumerate(pinhole)]
+    fx, fy, cx, cy = intrinsics
+    pose = left @ camera.world_to_camera.to(change.dtype)
+    return RasterCamera(camera.width, camera.height, fx, fy, cx, cy, pose)
 
 
 def project(

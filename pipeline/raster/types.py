@@ -42,7 +42,7 @@ class RasterOptions:
         near: Gaussians whose centre has camera z <= near are not drawn. In scene units, and
             scenes from photographs have an arbitrary scale: choose it well under the distance
             of the nearest thing worth drawing.
-        threads: OpenMP threads, 0 for all. The result does not depend on it.
+        threads: 0 for all. The result does not depend on it.
     """
 
     sh_degree: int = 3
@@ -50,6 +50,22 @@ class RasterOptions:
     antialias: bool = False
     near: float = 0.01
     threads: int = 0
+
+
+@dataclass(frozen=True)
+class CameraGradients:
+    """dL/d(change of the camera), float64; ``twin.moved`` says what a change does.
+
+    Attributes:
+        rotation: (3,) the scene turned about the camera's centre, radians about its axes.
+        translation: (3,) the scene shifted in the camera's frame, world unit.
+        focal, principal: (2,) focal lengths and principal point, pixels.
+    """
+
+    rotation: torch.Tensor
+    translation: torch.Tensor
+    focal: torch.Tensor
+    principal: torch.Tensor
 
 
 @dataclass(frozen=True)
@@ -61,6 +77,7 @@ class Gradients:
         means2d: (N, 2) dL/d(pixel position of the centre).
         means2d_abs: (N, 2) the sum over pixels of the absolute value of each pixel's share of
             means2d (AbsGS, Ye et al. 2024); None when not asked for.
+        camera: None when not asked for.
     """
 
     means: torch.Tensor
@@ -70,6 +87,7 @@ class Gradients:
     sh: torch.Tensor
     means2d: torch.Tensor
     means2d_abs: torch.Tensor | None
+    camera: CameraGradients | None
 
 
 @dataclass(frozen=True)

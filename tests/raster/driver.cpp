@@ -63,10 +63,11 @@ Scene ordinary(std::mt19937& random, int64_t count, int degree) {
     return s;
 }
 
-void expect_finite(Array<float>& values, const char* what) {
+template <class T>
+void expect_finite(Array<T>& values, const char* what) {
     for (size_t i = 0; i < values.size; i++)
         if (!std::isfinite(values[i])) {
-            std::printf("%s[%zu] = %g\n", what, i, values[i]);
+            std::printf("%s[%zu] = %g\n", what, i, double(values[i]));
             std::exit(1);
         }
 }
@@ -115,17 +116,18 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     Array<float> slot_gradients(entries.size * kSlotFloats);
     Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
     Array<float> d_means2d(2 * n), d_abs(2 * n);
+    Array<double> d_camera(kCameraParameters);
     for (const bool everything : {true, false}) {
         blend_backward(records.get(), pairs, view,
                        {color.get(), alpha.get(), depth.get(), d_color.get(),
                         everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
                         background, everything},
                        block_end.get(), threads, slot_gradients.get());
-        project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
-                              slot_gradients.get(),
-                              {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                               d_sh.get(), d_means2d.get(), d_abs.get()},
-                              nullptr);
+        project_view_backward(
+            in, view, threads, records.get(), radii.get(), slots.get(), slot_gradients.get(),
+            {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), d_sh.get(),
+             d_means2d.get(), d_abs.get(), everything ? d_camera.get() : nullptr},
+            nullptr);
     }
     Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
     Array<int32_t> last(n);
@@ -134,8 +136,9 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
                           slot_gradients.get(),
                           {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), nullptr,
-                           d_means2d.get(), d_abs.get()},
+                           d_means2d.get(), d_abs.get(), nullptr},
                           &sh_adam);
+    expect_finite(d_camera, "d_camera");
     for (Array<float>* moments : {&m, &v}) expect_finite(*moments, "moments");
     const double rate = 1e-2;
     adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import pytest
 import torch
@@ -63,6 +64,38 @@ def test_kernels_match_the_twin(
         for name, want in zip(NAMES, wanted, strict=False):
             assert relative(getattr(found, name), want) <= 1e-5, name
         assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
+
+
+@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:5])
+def test_the_cameras_gradients_match_the_twin(
+    seed: int, count: int, size: tuple[int, int], options: RasterOptions
+) -> None:
+    """Ten sums over all Gaussians, in which much cancels: 1e-5 of what they are sums of."""
+    scene, cam = random_scene(seed, count, size=0.15), camera(*size, turned=seed % 2 == 1)
+    change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+    _, _, image = twin_image(scene, twin.moved(cam, change), options)
+    gen = torch.Generator().manual_seed(seed + 100)
+    sure = image.margin > 1e-5
+    d_color = torch.randn(*image.color.shape, generator=gen) * sure[..., None]
+    d_depth = torch.randn(*image.depth.shape, generator=gen) * sure
+    total = (image.color * d_color).sum() + (image.depth * d_depth).sum()
+    (wanted,) = torch.autograd.grad(total, change)
+    fwd = raster.forward(*scene, cam, options)
+    found = [
+        raster.backward(
+            raster.forward(*scene, cam, replace(options, threads=threads)),
+            d_color,
+            d_depth=d_depth,
+            camera=True,
+        ).camera
+        for threads in (1, 3)
+    ]
+    assert found[0] is not None and found[1] is not None
+    parts = [torch.cat([f.rotation, f.translation, f.focal, f.principal]) for f in found]
+    assert torch.equal(*parts)
+    for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
+        assert relative(parts[0][part], wanted[part]) <= 1e-5, part
+    assert raster.backward(fwd, d_color).camera is None
 
 
 def test_absolute_gradients_are_the_sum_of_each_pixels() -> None:

@@ -41,6 +41,25 @@ def test_sh_colors_have_the_right_gradient(degree: int) -> None:
     )
 
 
+def test_a_moved_camera_has_the_right_gradient() -> None:
+    """Of the projection and of the colours, which see the camera's centre."""
+    scene = [t.detach() for t in doubles()]
+
+    def outputs(change: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        cam = twin.moved(CAMERA, change)
+        p = twin.project(*scene, cam, RasterOptions())
+        return p.means2d, p.conics, p.depths, twin.sh_colors(scene[0], scene[4], cam, 3)
+
+    change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(outputs, [change], eps=1e-6, atol=1e-7)
+    # A turn to the right by a quarter brings what is ahead to the left edge of the world.
+    quarter = torch.zeros(10, dtype=torch.float64)
+    quarter[1] = -torch.pi / 2
+    ahead = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    turned = twin.moved(camera(11, 9), quarter).world_to_camera
+    assert torch.allclose(turned @ ahead, torch.tensor([-1.0, 0, 0, 0], dtype=torch.float64))
+
+
 @pytest.mark.parametrize("background", [None, (0.2, 0.4, 0.9)])
 def test_blending_has_the_right_gradient(background: tuple[float, float, float] | None) -> None:
     options = RasterOptions(background=background)

@@ -33,8 +33,12 @@ def check(
     gen = torch.Generator().manual_seed(seed)
     shape = (cam.height, cam.width)
     d_alpha, d_depth = torch.randn(shape, generator=gen), torch.randn(shape, generator=gen)
-    g = raster.backward(fwd, torch.randn(*shape, 3, generator=gen), d_alpha, d_depth)
+    g = raster.backward(fwd, torch.randn(*shape, 3, generator=gen), d_alpha, d_depth, camera=True)
+    assert g.camera is not None
+    assert all(value.isfinite().all() for value in vars(g.camera).values())
     for field in dataclasses.fields(g):
+        if field.name == "camera":
+            continue
         gradient = getattr(g, field.name)
         assert gradient.isfinite().all(), field.name
         assert not gradient[fwd.radii == 0].any(), field.name

@@ -149,15 +149,16 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
     return slots;
 }
 
-// Gradients of means, log_scales, quats, opacity_logits, sh, means2d, and means2d_abs (0 rows
-// when not asked for). With exp_avg, exp_avg_sq, last and sh_adam, 6 float64, step and
-// ShAdamSettings, sh is moved and has no gradients (0 rows).
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
+// Gradients of means, log_scales, quats, opacity_logits, sh, means2d, means2d_abs and the camera's
+// parameters (float64; both of no rows when not asked for). With exp_avg, exp_avg_sq, last and
+// sh_adam, 6 float64, step and ShAdamSettings, sh is moved and has no gradients (0 rows).
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
     int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool absolute, OptionalTensor exp_avg,
-    OptionalTensor exp_avg_sq, OptionalTensor last, OptionalTensor sh_adam, int64_t threads) {
+    const Tensor& slots, const Tensor& slot_gradients, bool absolute, bool camera,
+    OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last, OptionalTensor sh_adam,
+    int64_t threads) {
     const int64_t n = means.size(0);
     std::optional<splat::ShAdam> adam;
     if (sh_adam) {
@@ -171,6 +172,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backw
            d_quats = new_floats({n, 4});
     Tensor d_opacity = new_floats({n}), d_sh = new_floats({adam ? 0 : n, sh.size(1), 3});
     Tensor d_means2d = new_floats({n, 2}), d_abs = new_floats({absolute ? n : 0, 2});
+    Tensor d_camera =
+        new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
     splat::project_view_backward(
         gaussians_from(means, log_scales, quats, opacity_logits, sh),
         view_from(view, width, height, sh_degree, antialias), int(threads), records_from(records),
@@ -178,9 +181,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backw
         floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
          mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
-         mutable_floats(d_means2d), absolute ? mutable_floats(d_abs) : nullptr},
+         mutable_floats(d_means2d), absolute ? mutable_floats(d_abs) : nullptr,
+         camera ? d_camera.mutable_data_ptr<double>() : nullptr},
         adam ? &*adam : nullptr);
-    return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs};
+    return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_camera};
 }
 
 // loss, l1, ssim, (H, W, 3) gradient
@@ -231,8 +235,9 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
         "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
         "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool absolute, "
-        "Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? sh_adam, "
-        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+        "bool camera, Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? "
+        "sh_adam, "
+        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, int threads) -> "
         "(float, float, float, Tensor)");

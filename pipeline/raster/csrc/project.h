@@ -16,9 +16,11 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                            float* radii);
 
 // dL/d(parameter), each shaped as its parameter; means2d and means2d_abs (N, 2), the latter may
-// be null, and sh where it is used up at once. All are written, zeros where there is nothing.
+// be null, and sh where it is used up at once. camera: kCameraParameters sums over the Gaussians,
+// may be null. All are written, zeros where there is nothing.
 struct GaussianGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh, *means2d, *means2d_abs;
+    double* camera;
 };
 
 // Sums the gradient slots of each Gaussian in their order and takes the sums back to its

@@ -1,3 +1,6 @@
+#include <cmath>
+#include <vector>
+
 #include "group.h"
 #include "project.h"
 #include "threads.h"
@@ -89,6 +92,24 @@ struct GroupGradients {
     }
 };
 
+// A group's share in the camera's gradients. d_mean: through the direction of view, which a shift
+// of the scene in the camera's frame turns as a shift of the means does.
+void add_camera(const Group& group, const View& view, const ImageGradients (&image)[2],
+                const InputGradients (&half)[2], const f32x16 (&d_mean)[3], uint32_t sound,
+                double* out) {
+    for (int h = 0; h < 2; h++) {
+        Lanes share[kCameraParameters];
+        camera_backward(project(group.half(h), view), image[h], half[h], view, share);
+        const Vec3 turned = {widen(d_mean[0], h), widen(d_mean[1], h), widen(d_mean[2], h)};
+        for (int i = 0; i < 3; i++) share[3 + i] += dot(row(view.rotation, i), turned);
+        for (int lane = 0; lane < kProjectLanes; lane++) {
+            if (!(sound >> (kProjectLanes * h + lane) & 1)) continue;
+            for (int k = 0; k < kCameraParameters; k++)
+                if (std::isfinite(share[k][lane])) out[k] += share[k][lane];
+        }
+    }
+}
+
 }  // namespace
 
 void project_view_backward(const Gaussians& in, const View& view, int threads,
@@ -97,6 +118,8 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const ShAdam* sh_adam) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
+    // A group's sums each in their place, so that threads do not matter.
+    std::vector<double> camera(out.camera ? kCameraParameters * count : 0);
     parallel_for(count, 32, threads, [&](int64_t number) {
         const Group group(in, number);
         const int64_t first = group.first;
@@ -139,6 +162,9 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (f32x16& v : absolute) clear(v);
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
+        if (out.camera)
+            add_camera(group, view, image, half, d_mean, bits(sound),
+                       camera.data() + kCameraParameters * number);
         write_rows(g.mean, group.count, out.means + 3 * first);
         write_rows(g.log_scale, group.count, out.log_scales + 3 * first);
         write_rows(g.quat, group.count, out.quats + 4 * first);
@@ -149,6 +175,11 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         if (out.sh) sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
         if (sh_adam) sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);
     });
+    for (int k = 0; out.camera && k < kCameraParameters; k++) {
+        out.camera[k] = 0;
+        for (int64_t number = 0; number < count; number++)
+            out.camera[k] += camera[kCameraParameters * number + k];
+    }
 }
 
 }  // namespace splat

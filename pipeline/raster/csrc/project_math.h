@@ -110,6 +110,8 @@ struct ImageGradients {
 struct InputGradients {
     Vec3 mean, log_scale;
     Lanes quat[4], opacity_logit;
+    // Of intermediate values, for the camera's share: the centre in its frame, T's rows.
+    Vec3 cam, t[2];
 };
 
 SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGradients& g,
@@ -128,7 +130,7 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
     }
     // Sigma' = H H^T, H = T M
     const Vec3 d_h[2] = {2.0 * d_xx * p.h[0] + d_xy * p.h[1], 2.0 * d_yy * p.h[1] + d_xy * p.h[0]};
-    Vec3 d_t[2], d_m[3];
+    Vec3(&d_t)[2] = out.t, d_m[3];
     for (int i = 0; i < 2; i++)
         d_t[i] = {dot(p.m[0], d_h[i]), dot(p.m[1], d_h[i]), dot(p.m[2], d_h[i])};
     d_m[0] = p.t[0].x * d_h[0] + p.t[1].x * d_h[1];
@@ -165,13 +167,41 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
         select(free_u == p.u, -view.fx * p.inv_z * dot(d_t[0], forward), zero) + view.fx * g.x;
     const Lanes d_v =
         select(free_v == p.v, -view.fy * p.inv_z * dot(d_t[1], forward), zero) + view.fy * g.y;
-    const Vec3 d_cam = {
+    const Vec3& d_cam = out.cam = {
         d_u * p.inv_z, d_v * p.inv_z,
         g.depth -
             (dot(d_t[0], p.t[0]) + dot(d_t[1], p.t[1]) + d_u * free_u + d_v * free_v) * p.inv_z};
     out.mean =
         d_cam.x * row(view.rotation, 0) + d_cam.y * row(view.rotation, 1) + d_cam.z * forward;
     return out;
+}
+
+// dL/d(each of the camera's parameters), but for what the direction of view does to the colour
+// (twin.py's `moved` says what the parameters mean). g and d: as project_backward took and gave
+// them.
+SPLAT_INLINE void camera_backward(const Projected& p, const ImageGradients& g,
+                                  const InputGradients& d, const View& view,
+                                  Lanes (&out)[kCameraParameters]) {
+    const Vec3 w[3] = {row(view.rotation, 0), row(view.rotation, 1), row(view.rotation, 2)};
+    // T = (f / z) (W_i - u W_2), and a turn moves the columns of W as it moves the centre.
+    const Lanes scale_x = view.fx * p.inv_z, scale_y = view.fy * p.inv_z;
+    const Vec3 d_w[3] = {scale_x * d.t[0], scale_y * d.t[1],
+                         (-scale_x * p.u) * d.t[0] + (-scale_y * p.v) * d.t[1]};
+    out[0] = p.cam.y * d.cam.z - p.cam.z * d.cam.y + dot(w[1], d_w[2]) - dot(w[2], d_w[1]);
+    out[1] = p.cam.z * d.cam.x - p.cam.x * d.cam.z + dot(w[2], d_w[0]) - dot(w[0], d_w[2]);
+    out[2] = p.cam.x * d.cam.y - p.cam.y * d.cam.x + dot(w[0], d_w[1]) - dot(w[1], d_w[0]);
+    out[3] = d.cam.x;
+    out[4] = d.cam.y;
+    out[5] = d.cam.z;
+    // Where u is clamped it stands at a place of the image, and goes as (c_x + ...) / f_x.
+    const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z, zero = splat8(0.0);
+    const Lanes along_u = dot(d.t[0], w[2]) * p.inv_z, along_v = dot(d.t[1], w[2]) * p.inv_z;
+    const Lanes held_u = select(free_u == p.u, zero, along_u);
+    const Lanes held_v = select(free_v == p.v, zero, along_v);
+    out[6] = g.x * free_u + (dot(d.t[0], w[0]) * p.inv_z - p.u * along_u) + p.u * held_u;
+    out[7] = g.y * free_v + (dot(d.t[1], w[1]) * p.inv_z - p.v * along_v) + p.v * held_v;
+    out[8] = g.x + held_u;
+    out[9] = g.y + held_v;
 }
 
 }  // namespace splat

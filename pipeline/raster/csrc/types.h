@@ -7,6 +7,10 @@
 
 namespace splat {
 
+// What gradients of a camera are of: a turn and a shift of the scene in its frame, focal lengths,
+// principal point.
+constexpr int kCameraParameters = 10;
+
 // A pinhole view. Pixel centres at half integers; camera x right, y down, z forward.
 struct View {
     int64_t width, height;

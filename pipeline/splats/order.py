@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import torch
 from torch import Tensor
 
 from pipeline.splats.gaussians import Gaussians
@@ -9,16 +10,21 @@ from pipeline.splats.gaussians import Gaussians
 _BITS = 21  # Three of them fit into 63.
 
 
-def in_morton_order(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians sorted along a Z-order curve through their bounding box, of 2^21 cells a side;
-    those of one cell keep their order."""
-    if not len(gaussians):
-        return gaussians
-    low, high = gaussians.means.double().aminmax(dim=0)
+def morton_order(means: Tensor) -> Tensor:
+    """(N,) int64 indices that sort ``means`` (N, 3) along a Z-order curve through their bounding
+    box, of 2^21 cells a side; those of one cell keep their order."""
+    if not len(means):
+        return torch.zeros(0, dtype=torch.int64)
+    low, high = means.double().aminmax(dim=0)
     size = (high - low).clamp(min=1e-30)
-    cells = ((gaussians.means - low) / size * (2**_BITS - 1)).long()
+    cells = ((means - low) / size * (2**_BITS - 1)).long()
     code = _spread(cells[:, 0]) | _spread(cells[:, 1]) << 1 | _spread(cells[:, 2]) << 2
-    return gaussians.select(code.argsort(stable=True))
+    return code.argsort(stable=True)
+
+
+def in_morton_order(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians sorted by ``morton_order``."""
+    return gaussians.select(morton_order(gaussians.means))
 
 
 def _spread(values: Tensor) -> Tensor:

@@ -26,6 +26,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.order import in_morton_order
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
@@ -38,7 +39,7 @@ from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 4
+STATE_VERSION = 5
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -173,6 +174,7 @@ class _Run:
             )
             chosen = np.sort(rng.permutation(len(gaussians))[:budget])
             gaussians = gaussians.select(torch.from_numpy(chosen))
+        gaussians = in_morton_order(gaussians)
         density = make_strategy(config.density, extent)
         density.start(len(gaussians))
         self.state = TrainState(
@@ -308,6 +310,7 @@ class _Run:
                 budget=schedule.budget_at(state.clock),
             )
             state.counters.changes.add(changes)
+            state.reorder()
             if not len(state.gaussians):
                 raise UserError(
                     f"every Gaussian has died by step {state.step}: none was of any use to the "

@@ -1,6 +1,7 @@
 #include "project.h"
 
 #include <atomic>
+#include <cmath>
 
 #include "group.h"
 #include "threads.h"
@@ -22,6 +23,61 @@ SPLAT_INLINE PixelRange pixel_range(Lanes center, Lanes extent, int64_t size) {
     const Lanes end = splat8(double(size - 1));
     return {select(first > 0.0, first, splat8(0.0)), select(last < end, last, end)};
 }
+
+// How many standard deviations a Gaussian of full opacity reaches, rounded up.
+constexpr double kMostReach = 3.34;
+
+// 0 where every input is finite. float32 values cannot overflow a float64 sum: it is finite when
+// they are.
+SPLAT_INLINE Lanes finite_sum(const Inputs& in, Lanes norm2) {
+    const Lanes sum = (in.mean.x + in.mean.y + in.mean.z) +
+                      (in.log_scale.x + in.log_scale.y + in.log_scale.z) +
+                      (norm2 + in.opacity_logit);
+    return sum - sum;
+}
+
+// Tells groups that are out of view with a fraction of the projection's work. What is near in the
+// arrays is near in space, so that in a trained scene most groups end here.
+class OutOfView {
+  public:
+    explicit OutOfView(const View& view) : view_(view) {
+        // The Jacobian's rows are f / z (1, u) long, u clamped.
+        const auto length = [](double focal, double center, double size) {
+            const double u = (center > size - center ? center : size - center) / focal;
+            return kMostReach * focal * std::hypot(1.0, u + kFrustumMargin * 0.5 * size / focal);
+        };
+        reach_x_ = length(view.fx, view.cx, double(view.width));
+        reach_y_ = length(view.fy, view.cy, double(view.height));
+    }
+    // Whether none of eight Gaussians can be drawn, and none is to be counted as dropped: true
+    // only where a bound on their ellipses is sure of it.
+    SPLAT_INLINE bool sure(const Inputs& in) const {
+        const Vec3 cam = in_camera(in.mean, view_);
+        const Lanes inv_z = reciprocal(cam.z);
+        const Lanes x = view_.fx * cam.x * inv_z + view_.cx;
+        const Lanes y = view_.fy * cam.y * inv_z + view_.cy;
+        const auto larger = [](Lanes a, Lanes b) { return select(a > b, a, b); };
+        const Lanes longest = larger(in.log_scale.x, larger(in.log_scale.y, in.log_scale.z));
+        // The root of a^2 + kDilation is under a + 0.55; a pixel for roundings.
+        const Lanes scale = exp(longest) * inv_z;
+        const Lanes reach_x = reach_x_ * scale + (0.55 * kMostReach + 1.0);
+        const Lanes reach_y = reach_y_ * scale + (0.55 * kMostReach + 1.0);
+        const i64x8 beside = i64x8(x + reach_x < 0.0) | i64x8(x - reach_x > double(view_.width)) |
+                             i64x8(y + reach_y < 0.0) | i64x8(y - reach_y > double(view_.height));
+        // Far from every overflow for which a Gaussian would be dropped.
+        const i64x8 tame = i64x8(larger(reach_x, reach_y) < 1e12) & i64x8(cam.z < 1e12) &
+                           i64x8(larger(x, -x) < 1e12) & i64x8(larger(y, -y) < 1e12);
+        const Lanes norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] +
+                            in.quat[2] * in.quat[2] + in.quat[3] * in.quat[3];
+        const i64x8 usable = i64x8(finite_sum(in, norm2) == 0.0) & i64x8(norm2 >= kQuatNorm2Min);
+        const i64x8 behind = i64x8(cam.z <= view_.near);
+        return bits(usable & (behind | (beside & tame))) == 0xff;
+    }
+
+  private:
+    const View& view_;
+    double reach_x_, reach_y_;
+};
 
 // Eight Gaussians on the image.
 struct Seen {
@@ -54,12 +110,7 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
     s.columns = pixel_range(p.x, extent_x + kBoxSlack, view.width);
     s.rows = pixel_range(p.y, extent_y + kBoxSlack, view.height);
 
-    // Every input is finite and the quaternion has a direction. float32 values cannot overflow a
-    // float64 sum: it is finite when they are.
-    const Lanes sum = (in.mean.x + in.mean.y + in.mean.z) +
-                      (in.log_scale.x + in.log_scale.y + in.log_scale.z) +
-                      (p.norm2 + in.opacity_logit);
-    const i64x8 usable = i64x8(sum - sum == 0.0) & i64x8(p.norm2 >= kQuatNorm2Min);
+    const i64x8 usable = i64x8(finite_sum(in, p.norm2) == 0.0) & i64x8(p.norm2 >= kQuatNorm2Min);
     const i64x8 in_front = i64x8(p.cam.z > view.near);
     // The centre may lie anywhere, but the depth is kept in float32.
     const i64x8 sound = i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
@@ -112,6 +163,7 @@ SPLAT_INLINE void make_records(const Seen (&s)[2], const f32x16 (&rgb)[3], f32x1
 ProjectCounts project_view(const Gaussians& in, const View& view, int threads, Record* records,
                            float* radii) {
     const CameraCenter center(view);
+    const OutOfView out_of_view(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
     std::atomic<int64_t> all_visible{0}, all_dropped{0};
     parallel_ranges(count, 32, threads, [&](int64_t begin, int64_t end) {
@@ -120,6 +172,11 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
             const Group group(in, number);
             Seen seen[2];
             CameraCenter::Toward toward[2];
+            if (group.count == kGroup && out_of_view.sure(group.half(0)) &&
+                out_of_view.sure(group.half(1))) {
+                store(radii + group.first, f32x16{});
+                continue;
+            }
             for (int h = 0; h < 2; h++) {
                 const Inputs half = group.half(h);
                 seen[h] = see(half, view);

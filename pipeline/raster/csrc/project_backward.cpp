@@ -1,4 +1,5 @@
 #include <cmath>
+#include <cstring>
 #include <vector>
 
 #include "group.h"
@@ -92,6 +93,20 @@ struct GroupGradients {
     }
 };
 
+// The gradients of `count` Gaussians from `first` on that nothing is asked of.
+void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t sh_width) {
+    const auto clear = [&](float* to, int64_t width) {
+        if (to) std::memset(to + width * first, 0, size_t(width) * count * sizeof(float));
+    };
+    clear(out.means, 3);
+    clear(out.log_scales, 3);
+    clear(out.quats, 4);
+    clear(out.opacity_logits, 1);
+    clear(out.means2d, 2);
+    clear(out.means2d_abs, 2);
+    clear(out.sh, sh_width);
+}
+
 // A group's share in the camera's gradients. d_mean: through the direction of view, which a shift
 // of the scene in the camera's frame turns as a shift of the means does.
 void add_camera(const Group& group, const View& view, const ImageGradients (&image)[2],
@@ -127,6 +142,10 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (int lane = 0; lane < group.count; lane++)
             drawn |= uint32_t(radii[first + lane] > 0 && slots[first + lane].count > 0) << lane;
 
+        if (!drawn) {
+            write_zeros(out, first, group.count, sh_width);
+            return;
+        }
         const GroupMoments asked(records + first, slots + first, slot_gradients, drawn);
         ImageGradients image[2];
         InputGradients half[2];

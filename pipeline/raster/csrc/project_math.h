@@ -48,6 +48,12 @@ struct Projected {
     Lanes det, opacity;
 };
 
+SPLAT_INLINE Vec3 in_camera(const Vec3& mean, const View& view) {
+    const double* t = view.translation;
+    return {dot(row(view.rotation, 0), mean) + t[0], dot(row(view.rotation, 1), mean) + t[1],
+            dot(row(view.rotation, 2), mean) + t[2]};
+}
+
 SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     Projected p;
     p.norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] + in.quat[2] * in.quat[2] +
@@ -64,9 +70,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     for (int i = 0; i < 3; i++)
         p.m[i] = {p.r[i].x * p.scale[0], p.r[i].y * p.scale[1], p.r[i].z * p.scale[2]};
 
-    const double* t = view.translation;
-    p.cam = {dot(row(view.rotation, 0), in.mean) + t[0], dot(row(view.rotation, 1), in.mean) + t[1],
-             dot(row(view.rotation, 2), in.mean) + t[2]};
+    p.cam = in_camera(in.mean, view);
     p.inv_z = reciprocal(p.cam.z);
     const Lanes u = p.cam.x * p.inv_z, v = p.cam.y * p.inv_z;
     p.x = view.fx * u + view.cx;

@@ -10,6 +10,7 @@ import torch
 
 from pipeline.raster import RasterCamera
 from pipeline.scene.colmap import read_model
+from pipeline.splats.order import morton_order
 from pipeline.splats.ply import read_splat_ply
 
 Arrays = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
@@ -38,7 +39,8 @@ def synthetic(count: int, width: int, height: int, radius: float) -> Scene:
 
     On the image: 3-sigma radius log-normal with mean ``radius`` pixels and sigma 0.5, minor axis
     0.3 to 1 of the major one, any direction; depth 1 to 10; opacity logits normal with sigma 1.5.
-    In the world: thin discs that face the camera, of spherical harmonics of degree 3.
+    In the world: thin discs that face the camera, of spherical harmonics of degree 3. In Morton
+    order, as training lays them.
     """
     rng = np.random.default_rng(count)
     focal = 1.2 * width
@@ -61,7 +63,8 @@ def synthetic(count: int, width: int, height: int, radius: float) -> Scene:
         width, height, focal, focal, width / 2, height / 2, torch.eye(4, dtype=torch.float64)
     )
     name = f"{count} at {width}x{height}, radius {radius:g}"
-    return Scene(name, gaussians, camera)  # type: ignore[arg-type]
+    order = morton_order(gaussians[0])
+    return Scene(name, tuple(field[order] for field in gaussians), camera)  # type: ignore[arg-type]
 
 
 def trained(folder: Path) -> Scene:

@@ -100,6 +100,27 @@ MUTANTS: dict[str, Mutant] = {
         "Adam's bias correction one step late",
         _LOSS,
     ),
+    "no_drift": Mutant(
+        f"{_CSRC}/sh_adam.h",
+        "if (missed) p -= rate * past.drift * m * inverse_root(v);",
+        "",
+        "what Adam would have done out of view never made good",
+        _LOSS,
+    ),
+    "short_reach": Mutant(
+        f"{_CSRC}/project.cpp",
+        "kMostReach = 3.34",
+        "kMostReach = 2.0",
+        "the bound by which Gaussians out of view are told, too small",
+        _KERNELS,
+    ),
+    "camera_turn": Mutant(
+        f"{_CSRC}/project_math.h",
+        "+ dot(w[2], d_w[0]) - dot(w[0], d_w[2])",
+        "- dot(w[2], d_w[0]) + dot(w[0], d_w[2])",
+        "a turned camera turns the ellipses the wrong way",
+        _KERNELS,
+    ),
     "rates_swapped": Mutant(
         "pipeline/training/trainer.py",
         "log_scales=config.lr_scales * factor",

@@ -66,6 +66,33 @@ def test_kernels_match_the_twin(
         assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
 
 
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_out_of_view_is_told_sixteen_at_a_time(seed: int) -> None:
+    """Clusters of 16 all about the camera, from grains to giants that just reach into the image:
+    what the quick look leaves out is what the twin does not see, and nothing else."""
+    gen = torch.Generator().manual_seed(seed)
+    clusters = 400
+    scene = random_scene(seed, 16 * clusters)
+    place = 6 * torch.randn(clusters, 3, generator=gen)
+    size = 10 ** (3 * torch.rand(clusters, generator=gen) - 2.5)
+
+    def each(values: torch.Tensor) -> torch.Tensor:
+        return values.repeat_interleave(16, 0)
+
+    shift = torch.randn(16 * clusters, 3, generator=gen) * each(size)[:, None]
+    scene[0][:] = each(place) + 0.3 * shift
+    scene[1][:] += each(size).log()[:, None] - math.log(0.07)
+    scene[2][:: 16 * 37] = 0.0  # no rotation: dropped, and counted, wherever it is
+    cam, options = camera(40, 30, turned=seed % 2 == 1), RasterOptions()
+    fwd = raster.forward(*scene, cam, options)
+    wanted = twin.project(*(t.double() for t in scene), cam, options)
+    seen = torch.nonzero(fwd.radii)[:, 0]
+    assert torch.equal(seen, wanted.index)
+    assert fwd.num_dropped == wanted.num_dropped >= 10
+    whole = (fwd.radii.view(clusters, 16) > 0).sum(1)
+    assert (whole == 0).sum() > 100 and ((whole > 0) & (whole < 16)).sum() > 20
+
+
 @pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:5])
 def test_the_cameras_gradients_match_the_twin(
     seed: int, count: int, size: tuple[int, int], options: RasterOptions

@@ -19,12 +19,13 @@ from pipeline.scene.model import View
 from pipeline.scene.views import load_views, scene_up
 from pipeline.splats.gaussians import Gaussians
 from stages.command import main
+from stages.models import trained_model
 
 
 def run(job: Job) -> None:
     manifest = Manifest.read(job.inputs["views"] / "images.json")
     split = job.section(Split)
-    model = read_model(job.inputs["model"] / "sparse" / "0")
+    model = trained_model(job)
     views = load_views(manifest, model, job.section(Views), split)
     train = job.section(Train)
     protocol = choose_protocol(views, split, train)
@@ -43,7 +44,8 @@ def run(job: Job) -> None:
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
-        estimated = read_model(job.inputs["poses"] / "sparse" / "0")
+        found = read_model(job.inputs["poses"] / "sparse" / "0")
+        estimated = model if train.refine_poses else found
         evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
     world = world_of(job, manifest, views)

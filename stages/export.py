@@ -18,7 +18,7 @@ from pipeline.config.schema import Export, Split, Train, Views
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.colmap import write_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.transforms import write_transforms
@@ -31,6 +31,7 @@ from pipeline.splats.ply import write_points_ply, write_splat_ply
 from pipeline.splats.splat import write_splat
 from pipeline.splats.spz import unfit, write_spz
 from stages.command import main
+from stages.models import trained_model
 
 
 @dataclass(frozen=True)
@@ -80,7 +81,7 @@ WRITERS: dict[str, tuple[str, Callable[[Path, Scene], None]]] = {
 def run(job: Job) -> None:
     config, train, split = job.section(Export), job.section(Train), job.section(Split)
     manifest = Manifest.read(job.inputs["views"] / "images.json")
-    model = read_model(job.inputs["model"] / "sparse" / "0")
+    model = trained_model(job)
     trained = Gaussians.load(job.inputs["train"] / "gaussians.npz")
     scene = Scene(
         gaussians=prepare(trained, config.sh_degree, config.min_opacity, config.morton_order),

@@ -17,19 +17,19 @@ from pipeline.reporting.headline import headline
 from pipeline.reporting.page import write_report
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job, read_stage, run_facts
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views
 from pipeline.splats.gaussians import Gaussians
 from stages.command import main
+from stages.models import trained_model
 
 
 def run(job: Job) -> None:
     start = time.perf_counter()
     plan = job.key["plan"]
     manifest = Manifest.read(job.inputs["views"] / "images.json")
-    model = read_model(job.inputs["model"] / "sparse" / "0")
+    model = trained_model(job)
     views = load_views(manifest, model, job.section(Views), job.section(Split))
     evaluation = read_json(job.inputs["evaluate"] / "evaluation.json")
     protocol = choose_protocol(views, job.section(Split), job.section(Train))

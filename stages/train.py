@@ -1,17 +1,19 @@
-"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``."""
+"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``; and
+where the cameras were moved with them ``sparse/0``."""
 
 import sys
 import time
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.schema import Split, Train, Views
 from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model
+from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.model import Reconstruction, View, with_poses
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
@@ -62,6 +64,9 @@ def run(job: Job) -> None:
             "machine and its load, so another run gives other bits"
         )
     result.gaussians.save(job.out / "gaussians.npz")
+    if result.poses is not None:
+        write_model(job.out / "sparse" / "0", with_poses(model, result.poses))
+        job.decide(moved_by(views, result.poses))
     write_json(job.out / "curve.json", result.curve)
     write_json(job.out / "exposure.json", gains)
     job.counters |= {
@@ -90,6 +95,23 @@ def find_depths(
         )
     job.counters["depth_maps"] = sum(kinds.values())
     return known
+
+
+def moved_by(views: list[View], poses: dict[str, NDArray[np.float64]]) -> str:
+    """How far training has moved the cameras, in words."""
+    turned, shifted = [], []
+    for view in views:
+        if view.name in poses:
+            now, before = poses[view.name], view.world_to_camera
+            cosine = ((now[:3, :3] * before[:3, :3]).sum() - 1) / 2
+            turned.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+            centre = -(now[:3, :3] * now[:3, 3:]).sum(0)
+            shifted.append(float(np.linalg.norm(centre - view.centre)))
+    share = np.median(shifted) / scene_extent(views)
+    return (
+        f"cameras were moved with the scene: by {np.median(turned):.3f} degrees and {share:.2%} of "
+        "the scene's extent (medians)"
+    )
 
 
 def choose_gains(job: Job, views: list[View], model: Reconstruction) -> dict[str, list[float]]:

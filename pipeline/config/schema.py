@@ -259,6 +259,12 @@ class Train(Section):
         "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.3 with "
         "depth maps, 0.03 for up to 20 photographs, else 0.",
     )
+    refine_poses: bool = Field(
+        False,
+        description="Move the cameras with the Gaussians, where given poses are off by a little. "
+        "Held-out cameras are fitted to their photographs before they are measured on, and the "
+        "protocol says so.",
+    )
     salt_and_pepper: Share = Field(
         0.0,
         description="An experiment: this share of the training pixels is black or white at random. "
@@ -280,6 +286,11 @@ class Train(Section):
     )
     lr_final_share: Annotated[float, Field(gt=0, le=1)] = Field(
         0.1, description="to this share of themselves."
+    )
+    lr_poses: Rate = Field(
+        5e-4,
+        description="With `refine_poses`: radians and extents, falling as the means' rate does; "
+        "not boosted.",
     )
     lr_scales: Rate = 5e-3
     lr_quats: Rate = 1e-3

@@ -16,11 +16,13 @@ from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
+from pipeline.raster import RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.model import View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.poses import fit_pose
 from pipeline.training.render import near_plane, render_view
 
 #: Training views that are rendered, too: what the model makes of pictures that it has seen.
@@ -37,6 +39,9 @@ EXPOSURE_PROTOCOL = (
     "renders multiplied by each photograph's gains (one a channel), which were measured at the "
     "sparse points, in held-out photographs too; psnr_without_gains is as rendered"
 )
+POSES_PROTOCOL = (
+    "each held-out camera moved to where the scene, which stays as it is, fits its photograph best"
+)
 Mask = NDArray[np.bool_]
 
 BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
@@ -52,6 +57,7 @@ class Protocol:
         every: each this-many-th view was held out of training; 0: none was, these were seen.
         background: RGB in [0, 1] behind renders and transparent photographs.
         near: near plane of the renders, as in training; world unit.
+        extent: the scene's size, world unit.
     """
 
     views: list[View]
@@ -59,6 +65,7 @@ class Protocol:
     every: int
     background: tuple[float, float, float]
     near: float
+    extent: float
 
 
 def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protocol:
@@ -71,12 +78,14 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
     training = [view for view in views if not view.is_test]
     picks = np.linspace(0, len(training) - 1, min(NUM_SEEN, len(training))).round().astype(int)
     white = train.background in ("white", "random")
+    extent = scene_extent(list(views))
     return Protocol(
         held_out or list(views),
         [training[i] for i in picks] if held_out else [],
         split.holdout_every if held_out else 0,
         WHITE if white else BLACK,
-        near_plane(scene_extent(list(views))),
+        near_plane(extent),
+        extent,
     )
 
 
@@ -115,6 +124,19 @@ def evaluate_views(
 
     def compare(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view.image, view.mask, view.width, view.height)
+        photo = reference(pixels, protocol.background)
+        if train.refine_poses and view.is_test:
+            options = RasterOptions(
+                sh_degree=gaussians.sh_degree,
+                background=protocol.background,
+                antialias=train.antialias,
+                near=protocol.near,
+                threads=threads,
+            )
+            gain, weight = gains.get(view.name), train.ssim_weight
+            view = fit_pose(
+                gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
+            )
         rendered = render_view(
             gaussians,
             view,
@@ -124,7 +146,6 @@ def evaluate_views(
             near=protocol.near,
             threads=threads,
         )
-        photo = reference(pixels, protocol.background)
         return rendered.rgb, photo, pixels.mask
 
     def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
@@ -173,7 +194,8 @@ def evaluate_views(
         "per_view": per_view,
         "warnings": warnings,
         "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None)
-        | {"exposure": EXPOSURE_PROTOCOL if gains else None},
+        | {"exposure": EXPOSURE_PROTOCOL if gains else None}
+        | {"poses": POSES_PROTOCOL if train.refine_poses else None},
     }
 
 

@@ -6,7 +6,8 @@ centres at half integers. Other conventions are converted where files are read a
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -162,6 +163,16 @@ class Reconstruction:
 
     def by_name(self) -> dict[str, Posed]:
         return {image.name: image for image in self.images.values()}
+
+
+def with_poses(model: Reconstruction, poses: Mapping[str, NDArray[np.float64]]) -> Reconstruction:
+    """The model with other poses, (4, 4) world to camera by name; those not named stay."""
+
+    def moved(image: Posed) -> Posed:
+        pose = poses.get(image.name, image.world_to_camera)
+        return replace(image, rotation=pose[:3, :3], translation=pose[:3, 3])
+
+    return replace(model, images={key: moved(image) for key, image in model.images.items()})
 
 
 @dataclass(frozen=True)

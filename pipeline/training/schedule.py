@@ -41,6 +41,7 @@ class Schedule:
         reset_interval: steps between opacity resets.
         max_gaussians: the budget.
         lr_means, lr_means_final: of the first and the last step, times the scene's extent.
+        lr_poses: of the first step; falls as the means' rate does.
         lr_boost: all rates are multiplied by this (None: see ``PAPER_STEPS``).
         lr_decay_from, lr_final_share: from this share of the run on, all other rates fall to this
             share of themselves.
@@ -57,6 +58,7 @@ class Schedule:
     max_gaussians: int
     lr_means: float
     lr_means_final: float
+    lr_poses: float
     lr_boost: float | None
     lr_decay_from: float
     lr_final_share: float
@@ -83,6 +85,7 @@ class Schedule:
             max_gaussians=density.max_gaussians,
             lr_means=config.lr_means,
             lr_means_final=config.lr_means_final,
+            lr_poses=config.lr_poses,
             lr_boost=None if config.lr_boost == "auto" else config.lr_boost,
             lr_decay_from=config.lr_decay_from,
             lr_final_share=config.lr_final_share,
@@ -103,6 +106,10 @@ class Schedule:
             return self.lr_means
         t = (step - 1) / max(1, self.steps - 1)
         return self.lr_means ** (1 - t) * self.lr_means_final**t
+
+    def lr_poses_at(self, step: int) -> float:
+        """In radians and extents."""
+        return self.lr_poses * (self.lr_means_at(step) / self.lr_means if self.lr_means else 1.0)
 
     def lr_boost_of(self, run: float) -> float:
         """What all rates are multiplied by in a run of so many steps."""

@@ -33,13 +33,14 @@ from pipeline.training.density import make_strategy
 from pipeline.training.depth import KnownDepths, depth_gradients
 from pipeline.training.journal import Journal
 from pipeline.training.optimiser import Adam, Rates
+from pipeline.training.poses import Poses
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
 from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 5
+STATE_VERSION = 6
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -66,6 +67,7 @@ class TrainResult:
         warnings: for a person; deterministic.
         steps: optimiser steps done.
         seconds: training time in all, over every process that worked on it.
+        poses: (4, 4) world to camera of each view by name, where they were refined.
     """
 
     gaussians: Gaussians
@@ -77,6 +79,7 @@ class TrainResult:
     warnings: list[str]
     steps: int
     seconds: float
+    poses: dict[str, NDArray[np.float64]] | None
 
 
 def train(
@@ -177,8 +180,9 @@ class _Run:
         gaussians = in_morton_order(gaussians)
         density = make_strategy(config.density, extent)
         density.start(len(gaussians))
+        poses = Poses.of(self.views, gaussians, extent) if config.refine_poses else None
         self.state = TrainState(
-            gaussians, Adam(gaussians), density, rng, rng.permutation(len(self.views))
+            gaussians, Adam(gaussians), density, poses, rng, rng.permutation(len(self.views))
         )
 
     def drop_hidden_views(self) -> None:
@@ -272,8 +276,11 @@ class _Run:
             d_color,
             *self.depth_gradients(rendered, index),
             means2d_abs=config.density.absolute_gradient,
+            camera=state.poses is not None,
             sh_adam=state.adam.harmonics(rates, step),
         )
+        if state.poses is not None and gradients.camera is not None:
+            state.poses.step(index, gradients.camera, self.schedule.lr_poses_at(state.clock))
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
@@ -359,7 +366,8 @@ class _Run:
     def camera(self, index: int, factor: int) -> RasterCamera:
         if (index, factor) not in self.cameras:
             self.cameras[index, factor] = raster_camera(self.views[index], factor)
-        return self.cameras[index, factor]
+        camera, poses = self.cameras[index, factor], self.state.poses
+        return camera if poses is None else poses.camera(camera, index)
 
     def check(self, loss: float, num_visible: int, num_dropped: int, index: int) -> None:
         """Stop where going on makes no sense; count what is odd."""
@@ -422,7 +430,14 @@ class _Run:
             warnings=self.warnings,
             steps=state.step,
             seconds=state.seconds,
+            poses=self.poses_by_name(),
         )
+
+    def poses_by_name(self) -> dict[str, NDArray[np.float64]] | None:
+        if self.state.poses is None:
+            return None
+        names = [view.name for view in self.views]
+        return dict(zip(names, self.state.poses.poses, strict=True))
 
 
 def _identity(

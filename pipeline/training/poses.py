@@ -1,0 +1,157 @@
+"""Poses that move with the Gaussians, for cameras that are off by a little.
+
+Each view's pose goes down the loss's gradient (``raster.CameraGradients``) by an Adam of its own:
+after each look at the view, a turn and a shift of the scene in the camera's frame are laid over the
+pose. Lin et al. 2021, "BARF", and its followers do so; coarse pictures first help here, too. The
+turn is about what the view sees: about the camera's centre it would be nearly the same as a shift,
+and where two parameters do the same thing a gradient hardly tells them apart.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.raster import CameraGradients, RasterCamera, RasterOptions, backward, forward, l1_ssim
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.render import raster_camera
+
+Array = NDArray[np.float64]
+
+BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
+# A held-out camera is fitted in so many looks; the rate falls from the first to the last by this.
+FIT_STEPS, FIT_RATE, FIT_FALL = 100, 5e-3, 0.01
+
+
+@dataclass
+class Poses:
+    """All views' poses and their moments.
+
+    Attributes:
+        poses: (V, 4, 4) world to camera.
+        pivots: (V,) how far before the camera is what the view sees, world unit.
+        extent: the scene's size; shifts count in it.
+        first, second: (V, 6) Adam's moments: of the turn (radians) and the shift (extents).
+        looks: (V,) int64, steps of each view.
+    """
+
+    poses: Array
+    pivots: Array
+    extent: float
+    first: Array = field(init=False)
+    second: Array = field(init=False)
+    looks: NDArray[np.int64] = field(init=False)
+
+    def __post_init__(self) -> None:
+        count = len(self.poses)
+        self.first, self.second = np.zeros((count, 6)), np.zeros((count, 6))
+        self.looks = np.zeros(count, np.int64)
+
+    @staticmethod
+    def of(views: Sequence[View], gaussians: Gaussians, extent: float) -> Poses:
+        """The views' poses as they are, in a scene that looks like ``gaussians``."""
+        means = gaussians.means.double().numpy()
+        pivots = np.array([_distance(view, means, extent) for view in views])
+        return Poses(np.stack([view.world_to_camera for view in views]), pivots, extent)
+
+    def camera(self, camera: RasterCamera, index: int) -> RasterCamera:
+        """A view's camera where it is now."""
+        return replace(camera, world_to_camera=torch.from_numpy(self.poses[index].copy()))
+
+    def step(self, index: int, gradients: CameraGradients, rate: float) -> None:
+        """Move one view's pose; ``rate`` is radians and extents."""
+        pivot = np.array([0.0, 0.0, self.pivots[index]])
+        shift = gradients.translation.numpy()
+        turn = gradients.rotation.numpy() - np.cross(pivot, shift)
+        gradient = np.concatenate([turn, shift * self.extent])
+        self.looks[index] += 1
+        looks = int(self.looks[index])
+        self.first[index] += (1 - BETA1) * (gradient - self.first[index])
+        self.second[index] += (1 - BETA2) * (gradient**2 - self.second[index])
+        mean = self.first[index] / (1 - BETA1**looks)
+        spread = np.sqrt(self.second[index] / (1 - BETA2**looks))
+        change = -rate * mean / (spread + EPSILON)
+        left = rigid(change[:3], change[3:] * self.extent + pivot)
+        left[:3, 3] -= (left[:3, :3] * pivot).sum(1)
+        # Sums, not "@": its bits may depend on the number of threads.
+        self.poses[index] = (left[:, :, None] * self.poses[index][None]).sum(1)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What a checkpoint must hold."""
+        return {
+            "pose.poses": self.poses,
+            "pose.first": self.first,
+            "pose.second": self.second,
+            "pose.looks": self.looks,
+        }
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self.poses, self.looks = arrays["pose.poses"], arrays["pose.looks"]
+        self.first, self.second = arrays["pose.first"], arrays["pose.second"]
+
+
+def _distance(view: View, means: Array, extent: float) -> float:
+    """Median depth of the means (N, 3) that lie in the view, the extent if none does."""
+    pose = view.world_to_camera
+    cam = np.stack([(means * row[:3]).sum(1) + row[3] for row in pose[:3]], 1)
+    z = np.maximum(cam[:, 2], 1e-12)
+    x, y = view.fx * cam[:, 0] / z + view.cx, view.fy * cam[:, 1] / z + view.cy
+    inside = (cam[:, 2] > 0) & (x >= 0) & (x <= view.width) & (y >= 0) & (y <= view.height)
+    return float(np.median(cam[inside, 2])) if inside.any() else extent
+
+
+def rigid(turn: Array, shift: Array) -> Array:
+    """(4, 4) exp of the turn (3,), radians, by Rodrigues' formula, and then the shift (3,)."""
+    angle = math.sqrt(float((turn**2).sum()))
+    x, y, z = turn
+    skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
+    square = np.outer(turn, turn) - angle**2 * np.eye(3)
+    # sin(a) / a and (1 - cos(a)) / a^2, whose quotients lose all digits at 0
+    sine = math.sin(angle) / angle if angle > 1e-4 else 1 - angle**2 / 6
+    cosine = (1 - math.cos(angle)) / angle**2 if angle > 1e-4 else 0.5 - angle**2 / 24
+    matrix = np.eye(4)
+    matrix[:3, :3] += sine * skew + cosine * square
+    matrix[:3, 3] = shift
+    return matrix
+
+
+def fit_pose(
+    gaussians: Gaussians,
+    view: View,
+    photo: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    gain: Sequence[float] | None,
+    options: RasterOptions,
+    extent: float,
+    ssim_weight: float,
+) -> View:
+    """A held-out view with its pose moved to where the scene fits its photograph best; the scene
+    stays as it is.
+
+    Args:
+        photo: (H, W, 3), over the background of ``options``.
+        mask: (H, W), false where a pixel counts for nothing.
+        gain: a factor for each channel of the render.
+    """
+    poses = Poses.of([view], gaussians, extent)
+    camera = raster_camera(view)
+    wanted = torch.from_numpy(np.ascontiguousarray(photo))
+    ignored = None if mask is None else torch.from_numpy(~mask)
+    factor = torch.tensor([1.0, 1.0, 1.0] if gain is None else list(gain), dtype=torch.float32)
+    best, least = poses.poses[0].copy(), math.inf
+    for number in range(FIT_STEPS):
+        rendered = forward(*gaussians.parameters(), poses.camera(camera, 0), options)
+        loss = l1_ssim(rendered.color * factor, wanted, ssim_weight, ignored, options.threads)
+        if loss.loss < least:
+            best, least = poses.poses[0].copy(), loss.loss
+        found = backward(rendered, loss.grad * factor, means2d_abs=False, camera=True).camera
+        assert found is not None
+        poses.step(0, found, FIT_RATE * FIT_FALL ** (number / (FIT_STEPS - 1)))
+    return replace(view, world_to_camera=best)

@@ -265,6 +265,11 @@ class Train(Section):
         "Held-out cameras are fitted to their photographs before they are measured on, and the "
         "protocol says so.",
     )
+    pose_reach: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.02,
+        description="With `refine_poses`: how far a camera can go in all, in radians and in the "
+        "scene's extents. More than poses are off by.",
+    )
     salt_and_pepper: Share = Field(
         0.0,
         description="An experiment: this share of the training pixels is black or white at random. "
@@ -286,11 +291,6 @@ class Train(Section):
     )
     lr_final_share: Annotated[float, Field(gt=0, le=1)] = Field(
         0.1, description="to this share of themselves."
-    )
-    lr_poses: Rate = Field(
-        5e-4,
-        description="With `refine_poses`: radians and extents, falling as the means' rate does; "
-        "not boosted.",
     )
     lr_scales: Rate = 5e-3
     lr_quats: Rate = 1e-3

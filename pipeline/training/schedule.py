@@ -27,6 +27,8 @@ COARSE_STEPS, COARSE_MINUTES = 0.15, 0.3
 # steps three times the rates were best and five times worse than three: four is the most.
 PAPER_STEPS = 30_000
 MAX_BOOST = 4.0
+# A camera's last step over its first: the means' rates fall as far.
+POSE_FALL = 0.01
 
 
 @dataclass(frozen=True)
@@ -41,7 +43,6 @@ class Schedule:
         reset_interval: steps between opacity resets.
         max_gaussians: the budget.
         lr_means, lr_means_final: of the first and the last step, times the scene's extent.
-        lr_poses: of the first step; falls as the means' rate does.
         lr_boost: all rates are multiplied by this (None: see ``PAPER_STEPS``).
         lr_decay_from, lr_final_share: from this share of the run on, all other rates fall to this
             share of themselves.
@@ -58,7 +59,6 @@ class Schedule:
     max_gaussians: int
     lr_means: float
     lr_means_final: float
-    lr_poses: float
     lr_boost: float | None
     lr_decay_from: float
     lr_final_share: float
@@ -85,7 +85,6 @@ class Schedule:
             max_gaussians=density.max_gaussians,
             lr_means=config.lr_means,
             lr_means_final=config.lr_means_final,
-            lr_poses=config.lr_poses,
             lr_boost=None if config.lr_boost == "auto" else config.lr_boost,
             lr_decay_from=config.lr_decay_from,
             lr_final_share=config.lr_final_share,
@@ -107,9 +106,11 @@ class Schedule:
         t = (step - 1) / max(1, self.steps - 1)
         return self.lr_means ** (1 - t) * self.lr_means_final**t
 
-    def lr_poses_at(self, step: int) -> float:
-        """In radians and extents."""
-        return self.lr_poses * (self.lr_means_at(step) / self.lr_means if self.lr_means else 1.0)
+    def pose_step_at(self, step: int, looks: float) -> float:
+        """How far a camera goes in a look, as a share of all that it can: falls log-linearly to
+        ``POSE_FALL`` of the first, and sums to 1 over ``looks`` in a run."""
+        fall = math.log(POSE_FALL)
+        return float(math.exp(fall * step / self.steps) * fall / (POSE_FALL - 1) / looks)
 
     def lr_boost_of(self, run: float) -> float:
         """What all rates are multiplied by in a run of so many steps."""

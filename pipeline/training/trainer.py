@@ -280,7 +280,9 @@ class _Run:
             sh_adam=state.adam.harmonics(rates, step),
         )
         if state.poses is not None and gradients.camera is not None:
-            state.poses.step(index, gradients.camera, self.schedule.lr_poses_at(state.clock))
+            looks = max(1.0, self.run_length() / len(self.views))
+            share = self.schedule.pose_step_at(state.clock, looks)
+            state.poses.step(index, gradients.camera, config.pose_reach * share)
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
@@ -350,9 +352,7 @@ class _Run:
 
     def rates(self) -> Rates:
         config, schedule, state = self.config, self.schedule, self.state
-        # As many steps as the run will have if they go on as until now.
-        run = schedule.steps if self.counts_steps else state.step * schedule.steps / state.clock
-        boost = schedule.lr_boost_of(run)
+        boost = schedule.lr_boost_of(self.run_length())
         factor = boost * schedule.lr_decay_at(state.clock)
         return Rates(
             means=schedule.lr_means_at(state.clock) * boost * self.extent,
@@ -362,6 +362,11 @@ class _Run:
             sh0=config.lr_sh0 * factor,
             shN=config.lr_shN * factor,
         )
+
+    def run_length(self) -> float:
+        """Steps in all; where the run has minutes: if they go on as until now."""
+        state, steps = self.state, self.schedule.steps
+        return steps if self.counts_steps else state.step * steps / state.clock
 
     def camera(self, index: int, factor: int) -> RasterCamera:
         if (index, factor) not in self.cameras:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import pytest
 
 from pipeline.config.schema import Density, Train
-from pipeline.training.schedule import Schedule
+from pipeline.training.schedule import POSE_FALL, Schedule
 
 
 @pytest.mark.parametrize("steps", [1, 10, 60, 600, 2000, 7000, 30_000])
@@ -76,3 +76,12 @@ def test_a_run_of_minutes_is_coarse_for_longer() -> None:
     assert by_steps.coarse_steps == 150
     assert by_minutes.coarse_steps / by_minutes.steps == pytest.approx(0.3)
     assert Schedule.of(Train(steps=1000, coarse_until=0.0)).coarse_steps == 0
+
+
+@pytest.mark.parametrize(("steps", "views"), [(4000, 50), (1500, 3)])
+def test_a_cameras_steps_add_up_to_its_reach(steps: int, views: int) -> None:
+    schedule = Schedule.of(Train(steps=steps))
+    looks = steps / views
+    shares = [schedule.pose_step_at(step, looks) for step in range(1, steps + 1)]
+    assert sum(shares) / views == pytest.approx(1.0, rel=1e-2)
+    assert shares[-1] == pytest.approx(POSE_FALL * shares[0], rel=1e-2)

@@ -19,6 +19,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths
 from pipeline.training.depth_maps import add_maps
+from pipeline.training.poses import followed
 from pipeline.training.trainer import train
 from stages.command import main
 
@@ -65,7 +66,8 @@ def run(job: Job) -> None:
         )
     result.gaussians.save(job.out / "gaussians.npz")
     if result.poses is not None:
-        write_model(job.out / "sparse" / "0", with_poses(model, result.poses))
+        poses = followed(views, result.poses)
+        write_model(job.out / "sparse" / "0", with_poses(model, poses))
         job.decide(moved_by(views, result.poses))
     write_json(job.out / "curve.json", result.curve)
     write_json(job.out / "exposure.json", gains)

@@ -10,7 +10,7 @@ and where two parameters do the same thing a gradient hardly tells them apart.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Any
 
@@ -95,6 +95,34 @@ class Poses:
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
         self.poses, self.looks = arrays["pose.poses"], arrays["pose.looks"]
         self.first, self.second = arrays["pose.first"], arrays["pose.second"]
+
+
+def followed(views: Sequence[View], moved: Mapping[str, Array]) -> dict[str, Array]:
+    """All views' poses, (4, 4) by name, after some of them have ``moved``: the others, held out of
+    training, follow the motion that is common to those, for a scene may drift as a whole.
+
+    The motion is a turn, the mean of all cameras' (Markley et al. 2007 in matrices: the rotation
+    nearest to their sum), and a shift between the means of their centres.
+    """
+    old = {view.name: view for view in views if view.name in moved}
+    total = np.zeros((3, 3))
+    before, after = np.zeros(3), np.zeros(3)
+    for name, view in old.items():
+        rotation = moved[name][:3, :3]
+        total += np.einsum("ki,kj->ij", rotation, view.world_to_camera[:3, :3])
+        before += view.centre / len(old)
+        after -= np.einsum("ki,k->i", rotation, moved[name][:3, 3]) / len(old)
+    u, _, vt = np.linalg.svd(total)
+    sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
+    turn = np.einsum("ij,jk,kl->il", u, sign, vt)
+    result = {}
+    for view in views:
+        pose = np.eye(4)
+        pose[:3, :3] = np.einsum("ij,kj->ik", view.world_to_camera[:3, :3], turn)
+        centre = np.einsum("ij,j->i", turn, view.centre - before) + after
+        pose[:3, 3] = -np.einsum("ij,j->i", pose[:3, :3], centre)
+        result[view.name] = moved.get(view.name, pose)
+    return result
 
 
 def _distance(view: View, means: Array, extent: float) -> float:

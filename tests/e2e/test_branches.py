@@ -53,7 +53,7 @@ def test_given_poses_can_be_ignored(project):
 def test_cameras_that_training_moves_are_what_comes_out(project):
     """On the masked scene: its poses are exact, so that what moves them must do no harm."""
     make_scene(project, "moving", "--poses", "colmap", "--masks", *PINHOLE)
-    config = {**TINY, "train": {**TINY["train"], "refine_poses": True}}
+    config = {**TINY, "train": {**TINY["train"], "refine_poses": True, "pose_reach": 0.003}}
     snakemake(project, "results/moving/metrics.json", config=config)
     results = project / "results" / "moving"
     found = json.loads((results / "metrics.json").read_text())
@@ -62,8 +62,6 @@ def test_cameras_that_training_moves_are_what_comes_out(project):
     assert 0 < found["pose_error"]["rotation_median_deg"] < 0.3
     given = read_model(project / "data" / "moving" / "sparse" / "0").by_name()
     exported = read_model(results / "export" / "sparse" / "0").by_name()
-    moved = [
-        abs(image.rotation - given[name].rotation).max() > 1e-5 for name, image in exported.items()
-    ]
-    # Every eighth is held out and stays; the others went a little.
-    assert [not m for m in moved] == [number % 8 == 0 for number in range(len(moved))]
+    assert exported.keys() == given.keys()
+    for name, image in exported.items():
+        assert 1e-5 < abs(image.rotation - given[name].rotation).max() < 0.02

@@ -13,7 +13,7 @@ from PIL import Image
 from pipeline.raster import RasterOptions
 from pipeline.scene.model import View
 from pipeline.training import trainer
-from pipeline.training.poses import fit_pose, rigid
+from pipeline.training.poses import fit_pose, followed, rigid
 from pipeline.training.trainer import TrainResult, train
 from tests.training.conftest import TinyScene, tiny_config
 
@@ -55,6 +55,20 @@ def test_a_held_out_camera_is_fitted_to_its_photograph(scene: TinyScene, index: 
         scene.truth, wrong, seen, mask, gain, RasterOptions(1, threads=1), scene.extent, 0.2
     )
     assert distance(found, view) < 0.05 * distance(wrong, view)
+
+
+def test_cameras_that_were_not_moved_follow_the_others(scene: TinyScene) -> None:
+    """The whole scene drifts by one motion: a turn of the world and a shift."""
+    drift = rigid(np.array([0.3, -0.2, 0.5]), np.array([5.0, -3.0, 1.0]))
+    true = {view.name: view.world_to_camera @ np.linalg.inv(drift) for view in scene.views}
+    held_out = {scene.views[0].name, scene.views[4].name}
+    moved = {name: pose for name, pose in true.items() if name not in held_out}
+    found = followed(scene.views, moved)
+    assert list(found) == [view.name for view in scene.views]
+    for name, pose in true.items():
+        np.testing.assert_allclose(found[name], pose, atol=1e-12)
+        if name not in held_out:
+            assert found[name] is moved[name]
 
 
 def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object) -> TrainResult:

@@ -100,11 +100,12 @@ def test_uncommented_defaults_are_the_defaults():
     assert Config.model_validate(values) == Config()
 
 
-def test_every_ablation_is_a_configuration_that_differs_from_the_default():
-    path = Path(__file__).parents[2] / "config" / "ablations.yaml"
+@pytest.mark.parametrize(("file", "base"), [("ablations", "balanced"), ("skipping", "plan")])
+def test_every_configuration_of_a_batch_differs_from_the_default(file, base):
+    path = Path(__file__).parents[2] / "config" / f"{file}.yaml"
     raw = yaml.safe_load(path.read_text())
     found = {name: scene_config(raw, "fox", name) for name in raw["configs"]}
-    assert found.pop("balanced") == Config()
+    assert found.pop(base) == Config()
     assert all(config != Config() for config in found.values())
     assert len(set(map(Config.model_dump_json, found.values()))) == len(found)
 

@@ -1,0 +1,68 @@
+"""The tables that a batch's benchmark.json gives."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import compare
+
+
+def row(scene: str, config: str, psnr: float, **changes: Any) -> dict[str, Any]:
+    stages = ("decode", "features", "matches", "sfm", "undistort", "train")
+    quality = dict.fromkeys(compare.QUALITY, 1.0)
+    return {
+        **quality,
+        **{f"{stage}_cpu_s": 10.0 for stage in stages},
+        **{"scene": scene, "config": config, "seed": 0, "status": "ok", "psnr": psnr},
+        **{"ssim": psnr / 40, "num_gaussians": 50_000, "wall_s": 30.0, "cpu_s": 60.0},
+        **changes,
+    }
+
+
+def test_configurations_stand_beside_the_base() -> None:
+    lines = compare.against(
+        [
+            row("a", "plan", 30.0),
+            row("b", "plan", 20.0),
+            row("a", "other", 31.0, train_cpu_s=70.0),
+            row("b", "other", 20.5, decode_cpu_s=None),
+            row("b", "broken", 0.0, status="failed", message="no poses"),
+        ],
+        "plan",
+    )
+    assert lines[0].startswith("| | a | b | mean |")
+    assert lines[2] == "| **plan** | 30.00 dB, .750 | 20.00 dB, .500 |  | 50, 10 | 50k |"
+    assert lines[3] == "| other | +1.00, +.025 | +0.50, +.012 | +0.75 dB | 45, 40 | 50k |"
+    assert lines[4] == "| broken | no run | failed: no poses |  |  |  |"
+    assert {line.count("|") for line in lines} == {lines[0].count("|")}
+
+
+def test_a_second_batch_is_the_same_or_says_in_what_it_differs(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    first = [row("a", "fast", 30.0), row("b", "fast", 20.0)]
+    second = [row("a", "fast", 30.0, wall_s=33.0), row("b", "fast", 20.5, ssim=0.5)]
+    files = []
+    for name, rows in (("first", first), ("second", second)):
+        files.append(str(tmp_path / f"{name}.json"))
+        Path(files[-1]).write_text(json.dumps({"runs": rows}))
+    monkeypatch.setattr("sys.argv", ["compare", *files])
+    assert compare.main() == 0
+    told = capsys.readouterr().out
+    assert "| a@fast | the same | 30, 33 | 60, 60 |" in told
+    assert "| b@fast | psnr 20.0 and 20.5 | 30, 30 | 60, 60 |" in told
+    assert "wall_s, second to first: median 1.05, 1.00 to 1.10" in told
+
+
+def test_what_is_no_batch_is_said(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "benchmark.json"
+    file.write_text("{}")
+    monkeypatch.setattr("sys.argv", ["compare", str(file)])
+    assert compare.main() == 2
+    assert f"error: {file}" in capsys.readouterr().err

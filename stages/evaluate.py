@@ -44,8 +44,8 @@ def run(job: Job) -> None:
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
-        found = read_model(job.inputs["poses"] / "sparse" / "0")
-        estimated = model if train.refine_poses else found
+        poses = job.inputs["poses"] / "sparse" / "0"
+        estimated = model if train.refine_poses else read_model(poses)
         evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
     world = world_of(job, manifest, views)

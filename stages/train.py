@@ -5,7 +5,6 @@ import sys
 import time
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.config.schema import Split, Train, Views
 from pipeline.photos.exposure import measure_exposures, sample_views
@@ -19,7 +18,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths
 from pipeline.training.depth_maps import add_maps
-from pipeline.training.poses import followed
+from pipeline.training.poses import followed, moved_by
 from pipeline.training.trainer import train
 from stages.command import main
 
@@ -97,23 +96,6 @@ def find_depths(
         )
     job.counters["depth_maps"] = sum(kinds.values())
     return known
-
-
-def moved_by(views: list[View], poses: dict[str, NDArray[np.float64]]) -> str:
-    """How far training has moved the cameras, in words."""
-    turned, shifted = [], []
-    for view in views:
-        if view.name in poses:
-            now, before = poses[view.name], view.world_to_camera
-            cosine = ((now[:3, :3] * before[:3, :3]).sum() - 1) / 2
-            turned.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
-            centre = -(now[:3, :3] * now[:3, 3:]).sum(0)
-            shifted.append(float(np.linalg.norm(centre - view.centre)))
-    share = np.median(shifted) / scene_extent(views)
-    return (
-        f"cameras were moved with the scene: by {np.median(turned):.3f} degrees and {share:.2%} of "
-        "the scene's extent (medians)"
-    )
 
 
 def choose_gains(job: Job, views: list[View], model: Reconstruction) -> dict[str, list[float]]:

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.raster import CameraGradients, RasterCamera, RasterOptions, backward, forward, l1_ssim
 from pipeline.scene.model import View
+from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.render import raster_camera
 
@@ -123,6 +124,23 @@ def followed(views: Sequence[View], moved: Mapping[str, Array]) -> dict[str, Arr
         pose[:3, 3] = -np.einsum("ij,j->i", pose[:3, :3], centre)
         result[view.name] = moved.get(view.name, pose)
     return result
+
+
+def moved_by(views: Sequence[View], poses: Mapping[str, Array]) -> str:
+    """How far training has moved the cameras, to these ``poses`` by name, in words."""
+    turned, shifted = [], []
+    for view in views:
+        if view.name in poses:
+            now, before = poses[view.name], view.world_to_camera
+            cosine = ((now[:3, :3] * before[:3, :3]).sum() - 1) / 2
+            turned.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+            centre = -(now[:3, :3] * now[:3, 3:]).sum(0)
+            shifted.append(float(np.linalg.norm(centre - view.centre)))
+    share = np.median(shifted) / scene_extent(list(views))
+    return (
+        f"cameras were moved with the scene: by {np.median(turned):.3f} degrees and {share:.2%} of "
+        "the scene's extent (medians)"
+    )
 
 
 def _distance(view: View, means: Array, extent: float) -> float:

@@ -21,6 +21,12 @@ RUN = (
 )
 
 
+onstart:
+    # No limit on jobs started a second: Snakemake keeps to its own by looking for work once a second
+    # for each job that has ended while others wait, a fifth of a core after eighty.
+    workflow.scheduler.job_rate_limiter = None
+
+
 onerror:
     project.after_failure()
 

@@ -1,5 +1,6 @@
-"""What the configurations of a batch are worth, or how well a second batch repeats the first.
+"""The runs of a batch, what its configurations are worth, or how well a second batch repeats it.
 
+    python -m benchmarks.compare results/benchmark.json --each
     python -m benchmarks.compare results/benchmark.json --base balanced
     python -m benchmarks.compare first/benchmark.json results/benchmark.json
 
@@ -35,6 +36,38 @@ QUALITY = (
 POSES = ("decode", "features", "matches", "sfm", "undistort")
 
 Row = dict[str, Any]
+
+
+def each(rows: Sequence[Row]) -> list[str]:
+    """Each run for itself: quality, and wall seconds by stage."""
+    lines = [
+        "| run | PSNR | on training views | SSIM | Gaussians | posed | rotation, centres | poses s "
+        "| training s | in all s | most MB | |",
+        "|---" * 12 + "|",
+    ]
+    for row in rows:
+        name = f"{row['scene']}@{row['config']}"
+        if row["status"] != "ok":
+            lines.append(f"| {name} | {row['status']}: {row['message']} {'| ' * 10}|")
+            continue
+        turned, moved = row["rotation_error_deg"], row["centre_error_share"]
+        known = turned is not None and moved is not None
+        cells = [
+            name,
+            f"{row['psnr']:.2f} dB",
+            "" if row["train_psnr"] is None else f"{row['train_psnr']:.2f}",
+            _short(row["ssim"]),
+            f"{row['num_gaussians'] / 1e3:.0f}k",
+            f"{row['registered_images']}/{row['total_images']}",
+            f"{turned:.3f} degrees, {moved:.2%}" if known else "",
+            f"{_wall(row, POSES):.0f}",
+            f"{_wall(row, ('train',)):.0f}",
+            f"{row['wall_s']:.0f}",
+            f"{row['peak_rss_mb']:.0f}",
+            "warned" if row["warnings"] else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
 
 
 def against(rows: Sequence[Row], base: str) -> list[str]:
@@ -104,6 +137,10 @@ def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
     return lines
 
 
+def _wall(row: Row, stages: Sequence[str]) -> float:
+    return sum(row[f"{stage}_wall_s"] or 0.0 for stage in stages)
+
+
 def _cpu(row: Row, stages: Sequence[str]) -> float:
     return sum(row[f"{stage}_cpu_s"] or 0.0 for stage in stages)
 
@@ -123,6 +160,9 @@ def main() -> int:
         metavar="CONFIG",
         help="what the others are beside (default: %(default)s)",
     )
+    parser.add_argument(
+        "--each", action="store_true", help="each run of one batch, without comparing"
+    )
     options = parser.parse_args()
     if len(options.batches) > 2:
         parser.error("expected one file, or two to compare")
@@ -133,6 +173,9 @@ def main() -> int:
         except (OSError, ValueError, KeyError) as error:
             print(f"error: {path}: expected a batch's benchmark.json: {error}", file=sys.stderr)
             return EXIT_USER_ERROR
+    if options.each and len(batches) == 1:
+        print("\n".join(each(batches[0])))
+        return 0
     if len(batches) == 1 and options.base not in {row["config"] for row in batches[0]}:
         print(f"error: {options.batches[0]}: no configuration {options.base}", file=sys.stderr)
         return EXIT_USER_ERROR

@@ -1,5 +1,5 @@
 """Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``; and
-where the cameras were moved with them ``sparse/0``."""
+where cameras or lenses were moved with them ``sparse/0``."""
 
 import sys
 import time
@@ -18,6 +18,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths
 from pipeline.training.depth_maps import add_maps
+from pipeline.training.lenses import changed_by, with_lenses
 from pipeline.training.poses import followed, moved_by
 from pipeline.training.trainer import train
 from stages.command import main
@@ -64,10 +65,14 @@ def run(job: Job) -> None:
             "machine and its load, so another run gives other bits"
         )
     result.gaussians.save(job.out / "gaussians.npz")
+    if result.lenses is not None:
+        model = with_lenses(model, result.lenses)
+        job.decide(changed_by(result.lenses))
     if result.poses is not None:
-        poses = followed(views, result.poses)
-        write_model(job.out / "sparse" / "0", with_poses(model, poses))
+        model = with_poses(model, followed(views, result.poses))
         job.decide(moved_by(views, result.poses))
+    if result.lenses is not None or result.poses is not None:
+        write_model(job.out / "sparse" / "0", model)
     write_json(job.out / "curve.json", result.curve)
     write_json(job.out / "exposure.json", gains)
     job.counters |= {

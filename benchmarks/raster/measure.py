@@ -101,7 +101,8 @@ class Step:
         def blend_backward() -> None:
             kept["slots"] = kernels.blend_backward(
                 s.records, s.entries, s.tile_begin, s.block_end, view, *size, s.background,
-                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, False, threads,
+                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, False, 0,
+                threads,
             )  # fmt: skip
 
         def project_backward() -> None:

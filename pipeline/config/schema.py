@@ -259,6 +259,11 @@ class Train(Section):
         "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.3 with "
         "depth maps, 0.03 for up to 20 photographs, else 0.",
     )
+    masked_opacity: Rate = Field(
+        0.1,
+        description="How strongly what is drawn where a mask hides the photograph is made to "
+        "vanish, beside the error of other pixels; 0: nothing is asked of masked pixels.",
+    )
     refine_poses: bool = Field(
         False,
         description="Move the cameras with the Gaussians, where given poses are off by a little. "
@@ -270,10 +275,25 @@ class Train(Section):
         description="With `refine_poses`: how far a camera can go in all, in radians and in the "
         "scene's extents. More than poses are off by.",
     )
+    refine_intrinsics: bool = Field(
+        False,
+        description="Adjust each camera's focal length and principal point with the Gaussians, "
+        "where given ones are off by a little. Views of one camera share them.",
+    )
+    intrinsics_reach: Annotated[float, Field(gt=0, lt=1)] = Field(
+        0.02,
+        description="With `refine_intrinsics`: how far they can go in all, in shares of the focal "
+        "length. More than they are off by.",
+    )
     salt_and_pepper: Share = Field(
         0.0,
         description="An experiment: this share of the training pixels is black or white at random. "
         "Held-out views stay as they are.",
+    )
+    gradients_per_pixel: Annotated[int, Field(ge=0)] = Field(
+        0,
+        description="An experiment: a pixel's gradients go only to so many Gaussians, the first "
+        "that it draws; 0: to all.",
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")

@@ -212,7 +212,7 @@ def backward(
     slot_gradients = ops.blend_backward(
         s.records, s.entries, s.tile_begin, s.block_end, s.view, width, height, s.background,
         fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
-        means2d_abs, threads,
+        means2d_abs, s.options.gradients_per_pixel, threads,
     )  # fmt: skip
     d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_camera = ops.project_backward(
         *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias, s.records,

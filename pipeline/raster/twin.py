@@ -245,7 +245,7 @@ def blend(
         T_i = prod_{j < i} (1 - alpha_j),  C = sum_i T_i alpha_i c_i + T_n background
 
     in order of depth, equal depths by index. A pixel stops before the Gaussian that would take its
-    transmittance below 1e-4.
+    transmittance below 1e-4. Gradients go to the first ``gradients_per_pixel`` that a pixel draws.
     """
     dtype, height, width = colors.dtype, camera.height, camera.width
     order = torch.sort(projection.depths.detach().float(), stable=True).indices
@@ -263,10 +263,18 @@ def blend(
     # Transmittance never grows, so "has not stopped" is one comparison with the running product.
     alive = torch.cumprod(1 - alpha, 1) >= TRANSMITTANCE_MIN
     drawn = torch.where(alive, alpha, torch.zeros_like(alpha))
+    beyond = torch.cumsum(drawn > 0, 1) > (options.gradients_per_pixel or math.inf)
+    drawn = torch.where(beyond, drawn.detach(), drawn)
     after = torch.cumprod(1 - drawn, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
     weight = before * drawn
-    rgb = weight @ color
+
+    def composed(values: torch.Tensor) -> torch.Tensor:
+        if not beyond.any():
+            return weight @ values
+        return (weight * ~beyond) @ values + (weight * beyond) @ values.detach()
+
+    rgb = composed(color)
     opaque = weight.sum(1)
     if options.background is not None:
         rgb = rgb + (1 - opaque).unsqueeze(-1) * torch.tensor(options.background, dtype=dtype)
@@ -285,7 +293,7 @@ def blend(
         )
     shape = (height, width)
     return Blend(
-        rgb.reshape(height, width, 3), opaque.reshape(shape), (weight @ depth).reshape(shape),
+        rgb.reshape(height, width, 3), opaque.reshape(shape), composed(depth).reshape(shape),
         median.reshape(shape), margin.reshape(shape), int((drawn > 0).sum()),
     )  # fmt: skip
 

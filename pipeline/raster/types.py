@@ -42,6 +42,9 @@ class RasterOptions:
         near: Gaussians whose centre has camera z <= near are not drawn. In scene units, and
             scenes from photographs have an arbitrary scale: choose it well under the distance
             of the nearest thing worth drawing.
+        gradients_per_pixel: a pixel's gradients go only to so many Gaussians, the first that it
+            draws (the ablation of Kerbl et al. 2023, sec. 7.3, "unlimited depth complexity of
+            splats that receive gradients"); 0: to all.
         threads: 0 for all. The result does not depend on it.
     """
 
@@ -49,6 +52,7 @@ class RasterOptions:
     background: tuple[float, float, float] | None = None
     antialias: bool = False
     near: float = 0.01
+    gradients_per_pixel: int = 0
     threads: int = 0
 
 

@@ -186,6 +186,7 @@ class View:
         fx, fy, cx, cy: pixels, at the target resolution.
         world_to_camera: (4, 4) float64.
         is_test: held out.
+        camera_id: key into ``Reconstruction.cameras``; views of one camera share its lens.
     """
 
     name: str
@@ -199,6 +200,7 @@ class View:
     cy: float
     world_to_camera: NDArray[np.float64]
     is_test: bool
+    camera_id: int = 0
 
     @property
     def centre(self) -> NDArray[np.float64]:

@@ -62,6 +62,7 @@ def load_views(
                 cy=cy,
                 world_to_camera=image.world_to_camera,
                 is_test=is_held_out(index, every),
+                camera_id=image.camera_id,
             )
         )
     return result

@@ -23,10 +23,10 @@ from pipeline.scene.model import View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.render import raster_camera
+from pipeline.training.rows import RowAdam
 
 Array = NDArray[np.float64]
 
-BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 # A held-out camera is fitted in so many looks; the rate falls from the first to the last by this.
 FIT_STEPS, FIT_RATE, FIT_FALL = 100, 5e-3, 0.01
 
@@ -39,21 +39,16 @@ class Poses:
         poses: (V, 4, 4) world to camera.
         pivots: (V,) how far before the camera is what the view sees, world unit.
         extent: the scene's size; shifts count in it.
-        first, second: (V, 6) Adam's moments: of the turn (radians) and the shift (extents).
-        looks: (V,) int64, steps of each view.
+        adam: (V, 6) of the turn (radians) and the shift (extents).
     """
 
     poses: Array
     pivots: Array
     extent: float
-    first: Array = field(init=False)
-    second: Array = field(init=False)
-    looks: NDArray[np.int64] = field(init=False)
+    adam: RowAdam = field(init=False)
 
     def __post_init__(self) -> None:
-        count = len(self.poses)
-        self.first, self.second = np.zeros((count, 6)), np.zeros((count, 6))
-        self.looks = np.zeros(count, np.int64)
+        self.adam = RowAdam((len(self.poses), 6))
 
     @staticmethod
     def of(views: Sequence[View], gaussians: Gaussians, extent: float) -> Poses:
@@ -71,14 +66,7 @@ class Poses:
         pivot = np.array([0.0, 0.0, self.pivots[index]])
         shift = gradients.translation.numpy()
         turn = gradients.rotation.numpy() - np.cross(pivot, shift)
-        gradient = np.concatenate([turn, shift * self.extent])
-        self.looks[index] += 1
-        looks = int(self.looks[index])
-        self.first[index] += (1 - BETA1) * (gradient - self.first[index])
-        self.second[index] += (1 - BETA2) * (gradient**2 - self.second[index])
-        mean = self.first[index] / (1 - BETA1**looks)
-        spread = np.sqrt(self.second[index] / (1 - BETA2**looks))
-        change = -rate * mean / (spread + EPSILON)
+        change = self.adam.step(index, np.concatenate([turn, shift * self.extent]), rate)
         left = rigid(change[:3], change[3:] * self.extent + pivot)
         left[:3, 3] -= (left[:3, :3] * pivot).sum(1)
         # Sums, not "@": its bits may depend on the number of threads.
@@ -86,16 +74,11 @@ class Poses:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What a checkpoint must hold."""
-        return {
-            "pose.poses": self.poses,
-            "pose.first": self.first,
-            "pose.second": self.second,
-            "pose.looks": self.looks,
-        }
+        return {"pose.poses": self.poses, **self.adam.arrays("pose")}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        self.poses, self.looks = arrays["pose.poses"], arrays["pose.looks"]
-        self.first, self.second = arrays["pose.first"], arrays["pose.second"]
+        self.poses = arrays["pose.poses"]
+        self.adam.restore("pose", arrays)
 
 
 def followed(views: Sequence[View], moved: Mapping[str, Array]) -> dict[str, Array]:

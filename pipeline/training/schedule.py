@@ -106,7 +106,7 @@ class Schedule:
         t = (step - 1) / max(1, self.steps - 1)
         return self.lr_means ** (1 - t) * self.lr_means_final**t
 
-    def pose_step_at(self, step: int, looks: float) -> float:
+    def camera_step_at(self, step: int, looks: float) -> float:
         """How far a camera goes in a look, as a share of all that it can: falls log-linearly to
         ``POSE_FALL`` of the first, and sums to 1 over ``looks`` in a run."""
         fall = math.log(POSE_FALL)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.order import morton_order
 from pipeline.training.density import Changes, Strategy
+from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam
-from pipeline.training.poses import Poses
 
 
 @dataclass
@@ -50,7 +50,7 @@ class TrainState:
     """The state after ``step`` steps.
 
     Attributes:
-        poses: of the views, where they are moved, too.
+        cameras: what of the views' moves, too.
         clock: where the run is in its schedule: ``step``, unless it has minutes instead of steps.
         order: (V,) int64, this epoch's order of views; ``position`` of them are done.
         curve: records without times; ``curve_seconds`` has the time of each.
@@ -60,7 +60,7 @@ class TrainState:
     gaussians: Gaussians
     adam: Adam
     density: Strategy
-    poses: Poses | None
+    cameras: MovingCameras
     rng: np.random.Generator
     order: NDArray[np.int64]
     position: int = 0
@@ -94,8 +94,8 @@ class TrainState:
             result[f"parameter.{name}"] = tensor.numpy()
             result[f"first.{name}"] = self.adam.first[name].numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
-        poses = {} if self.poses is None else self.poses.arrays()
-        return result | {"last": self.adam.last.numpy()} | self.density.arrays() | poses
+        result |= self.density.arrays() | self.cameras.arrays()
+        return result | {"last": self.adam.last.numpy()}
 
     def values(self) -> dict[str, Any]:
         """The rest, as JSON; floats survive exactly."""
@@ -120,8 +120,7 @@ class TrainState:
             self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])
         self.adam.last = torch.from_numpy(arrays["last"])
         self.density.restore(arrays)
-        if self.poses is not None:
-            self.poses.restore(arrays)
+        self.cameras.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]
         counters = dict(values["counters"])

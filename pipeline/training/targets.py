@@ -43,6 +43,15 @@ class Target:
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
+    def thinning(self, weight: float) -> Tensor | None:
+        """(H, W) float32 dL/d(alpha) by which what is drawn on ignored pixels grows thin, None
+        where nothing is asked of them. ``weight``: of such a pixel's alpha beside the mean error
+        of another pixel's colours."""
+        if self.ignored is None or not weight:
+            return None
+        counted = self.ignored.numel() - int(self.ignored.sum())
+        return self.ignored * (weight / max(1, counted))
+
 
 class Targets:
     """All views' pixels in memory; those of a reduced resolution are made once, when first asked

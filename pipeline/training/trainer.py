@@ -32,8 +32,8 @@ from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
 from pipeline.training.depth import KnownDepths, depth_gradients
 from pipeline.training.journal import Journal
+from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam, Rates
-from pipeline.training.poses import Poses
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
 from pipeline.training.state import TrainState, Window
@@ -68,6 +68,7 @@ class TrainResult:
         steps: optimiser steps done.
         seconds: training time in all, over every process that worked on it.
         poses: (4, 4) world to camera of each view by name, where they were refined.
+        lenses: (3,) change of each camera's lens by id (``Lenses``), where they were refined.
     """
 
     gaussians: Gaussians
@@ -80,6 +81,7 @@ class TrainResult:
     steps: int
     seconds: float
     poses: dict[str, NDArray[np.float64]] | None
+    lenses: dict[int, NDArray[np.float64]] | None
 
 
 def train(
@@ -180,10 +182,9 @@ class _Run:
         gaussians = in_morton_order(gaussians)
         density = make_strategy(config.density, extent)
         density.start(len(gaussians))
-        poses = Poses.of(self.views, gaussians, extent) if config.refine_poses else None
-        self.state = TrainState(
-            gaussians, Adam(gaussians), density, poses, rng, rng.permutation(len(self.views))
-        )
+        cameras = MovingCameras.of(self.views, gaussians, extent, config)
+        order = rng.permutation(len(self.views))
+        self.state = TrainState(gaussians, Adam(gaussians), density, cameras, rng, order)
 
     def drop_hidden_views(self) -> None:
         """A view that its mask hides asks for nothing, and would only feed Adam zeros."""
@@ -261,6 +262,7 @@ class _Run:
             background=background,
             antialias=config.antialias,
             near=self.near,
+            gradients_per_pixel=config.gradients_per_pixel,
             threads=self.threads,
         )
         rendered = forward(*state.gaussians.parameters(), camera, options)
@@ -274,15 +276,13 @@ class _Run:
         gradients = backward(
             rendered,
             d_color,
-            *self.depth_gradients(rendered, index),
+            *self.further_gradients(rendered, target, index),
             means2d_abs=config.density.absolute_gradient,
-            camera=state.poses is not None,
+            camera=state.cameras.move,
             sh_adam=state.adam.harmonics(rates, step),
         )
-        if state.poses is not None and gradients.camera is not None:
-            looks = max(1.0, self.run_length() / len(self.views))
-            share = self.schedule.pose_step_at(state.clock, looks)
-            state.poses.step(index, gradients.camera, config.pose_reach * share)
+        if gradients.camera is not None:
+            state.cameras.step(index, camera, gradients.camera, config, self.camera_share)
         state.density.observe(rendered, gradients, camera.width, camera.height)
         if config.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
@@ -298,12 +298,17 @@ class _Run:
             state.window.samples += 1
         self.control_density(places)
 
-    def depth_gradients(self, rendered: Forward, index: int) -> tuple[Tensor | None, Tensor | None]:
-        """(d_alpha, d_depth) of the known depths; None in steps that don't look at them."""
+    def further_gradients(
+        self, rendered: Forward, target: Target, index: int
+    ) -> tuple[Tensor | None, Tensor | None]:
+        """(d_alpha, d_depth) of what is asked for beside colours: emptiness where a mask hides the
+        photograph, and in some steps the known depths."""
+        empty = target.thinning(self.config.masked_opacity)
         if self.depths is None or self.state.step % DEPTH_EVERY or not len(self.depths[index]):
-            return None, None
+            return empty, None
         weight = self.depth_weight * DEPTH_EVERY
-        return depth_gradients(rendered, self.depths[index], self.views[index], weight)
+        d_alpha, d_depth = depth_gradients(rendered, self.depths[index], self.views[index], weight)
+        return d_alpha if empty is None else d_alpha + empty, d_depth
 
     def control_density(self, places: range) -> None:
         """Do what is due at these places of the schedule."""
@@ -371,8 +376,13 @@ class _Run:
     def camera(self, index: int, factor: int) -> RasterCamera:
         if (index, factor) not in self.cameras:
             self.cameras[index, factor] = raster_camera(self.views[index], factor)
-        camera, poses = self.cameras[index, factor], self.state.poses
-        return camera if poses is None else poses.camera(camera, index)
+        return self.state.cameras.camera(self.cameras[index, factor], index)
+
+    def camera_share(self, looks: float) -> float:
+        """What is due in this step of all that a camera may move, if this share of the steps looks
+        at it."""
+        run = max(1.0, self.run_length() * looks)
+        return self.schedule.camera_step_at(self.state.clock, run)
 
     def check(self, loss: float, num_visible: int, num_dropped: int, index: int) -> None:
         """Stop where going on makes no sense; count what is odd."""
@@ -422,7 +432,7 @@ class _Run:
         )
 
     def result(self) -> TrainResult:
-        state = self.state
+        state, lenses = self.state, self.state.cameras.lenses
         if state.counters.blind_steps:
             self.warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
         return TrainResult(
@@ -436,13 +446,14 @@ class _Run:
             steps=state.step,
             seconds=state.seconds,
             poses=self.poses_by_name(),
+            lenses=None if lenses is None else lenses.by_id(),
         )
 
     def poses_by_name(self) -> dict[str, NDArray[np.float64]] | None:
-        if self.state.poses is None:
+        poses = self.state.cameras.poses
+        if poses is None:
             return None
-        names = [view.name for view in self.views]
-        return dict(zip(names, self.state.poses.poses, strict=True))
+        return dict(zip([view.name for view in self.views], poses.poses, strict=True))
 
 
 def _identity(

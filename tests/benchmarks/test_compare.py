@@ -41,6 +41,27 @@ def test_configurations_stand_beside_the_base() -> None:
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
 
 
+def test_each_run_of_a_batch_is_a_row() -> None:
+    """Stages that a scene did not need count as no time; a truth that is not known stays blank."""
+    stages = ("decode", "features", "matches", "sfm", "undistort", "train")
+    times = {f"{stage}_wall_s": 5.0 for stage in stages} | {"decode_wall_s": None}
+    more = {"total_images": 12, "registered_images": 11, "peak_rss_mb": 512.4, "warnings": 2}
+    lines = compare.each(
+        [
+            row("a", "fast", 30.0, **times, **more, rotation_error_deg=0.0123),
+            row("b", "fast", 20.0, **times, **more, rotation_error_deg=None, train_psnr=None),
+            row("c", "fast", 0.0, status="failed", message="no poses"),
+        ]
+    )
+    assert lines[2] == (
+        "| a@fast | 30.00 dB | 1.00 | .750 | 50k | 11/12 | 0.012 degrees, 100.00% | 20 | 5 | 30 "
+        "| 512 | warned |"
+    )
+    assert lines[3].startswith("| b@fast | 20.00 dB |  | .500 | 50k | 11/12 |  | 20 |")
+    assert lines[4].startswith("| c@fast | failed: no poses |")
+    assert {line.count("|") for line in lines} == {lines[0].count("|")}
+
+
 def test_a_second_batch_is_the_same_or_says_in_what_it_differs(
     tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:

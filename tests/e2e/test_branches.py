@@ -53,15 +53,22 @@ def test_given_poses_can_be_ignored(project):
 def test_cameras_that_training_moves_are_what_comes_out(project):
     """On the masked scene: its poses are exact, so that what moves them must do no harm."""
     make_scene(project, "moving", "--poses", "colmap", "--masks", *PINHOLE)
-    config = {**TINY, "train": {**TINY["train"], "refine_poses": True, "pose_reach": 0.003}}
+    moves = {"refine_poses": True, "pose_reach": 0.003}
+    moves |= {"refine_intrinsics": True, "intrinsics_reach": 0.003}
+    config = {**TINY, "train": {**TINY["train"], **moves}}
     snakemake(project, "results/moving/metrics.json", config=config)
     results = project / "results" / "moving"
     found = json.loads((results / "metrics.json").read_text())
     assert "held-out camera moved" in found["protocol"]["poses"]
     assert found["psnr"] > 18
     assert 0 < found["pose_error"]["rotation_median_deg"] < 0.3
-    given = read_model(project / "data" / "moving" / "sparse" / "0").by_name()
-    exported = read_model(results / "export" / "sparse" / "0").by_name()
+    told = read_model(project / "data" / "moving" / "sparse" / "0")
+    model = read_model(results / "export" / "sparse" / "0")
+    given, exported = told.by_name(), model.by_name()
     assert exported.keys() == given.keys()
+    for name, image in exported.items():
+        before, now = told.cameras[given[name].camera_id], model.cameras[image.camera_id]
+        factor = now.pinhole[0] / now.width / (before.pinhole[0] / before.width)
+        assert 1e-6 < abs(factor - 1) < 0.01
     for name, image in exported.items():
         assert 1e-5 < abs(image.rotation - given[name].rotation).max() < 0.02

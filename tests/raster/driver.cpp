@@ -121,7 +121,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
         blend_backward(records.get(), pairs, view,
                        {color.get(), alpha.get(), depth.get(), d_color.get(),
                         everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
-                        background, everything},
+                        background, everything, everything ? 0 : 3},
                        block_end.get(), threads, slot_gradients.get());
         project_view_backward(
             in, view, threads, records.get(), radii.get(), slots.get(), slot_gradients.get(),

@@ -18,6 +18,7 @@ CASES = [
     (2, 500, (71, 50), RasterOptions(antialias=True, sh_degree=1)),
     (3, 200, (33, 17), RasterOptions(sh_degree=0, background=(1.0, 1.0, 1.0))),
     (4, 300, (16, 80), RasterOptions(sh_degree=2, antialias=True, background=(0.0, 0.3, 0.0))),
+    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), gradients_per_pixel=4)),
     (5, 60, (1, 1), RasterOptions()),
     (6, 250, (130, 3), RasterOptions(near=3.5)),
 ]
@@ -93,7 +94,7 @@ def test_what_is_out_of_view_is_told_sixteen_at_a_time(seed: int) -> None:
     assert (whole == 0).sum() > 100 and ((whole > 0) & (whole < 16)).sum() > 20
 
 
-@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:5])
+@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:6])
 def test_the_cameras_gradients_match_the_twin(
     seed: int, count: int, size: tuple[int, int], options: RasterOptions
 ) -> None:

@@ -82,6 +82,6 @@ def test_a_run_of_minutes_is_coarse_for_longer() -> None:
 def test_a_cameras_steps_add_up_to_its_reach(steps: int, views: int) -> None:
     schedule = Schedule.of(Train(steps=steps))
     looks = steps / views
-    shares = [schedule.pose_step_at(step, looks) for step in range(1, steps + 1)]
+    shares = [schedule.camera_step_at(step, looks) for step in range(1, steps + 1)]
     assert sum(shares) / views == pytest.approx(1.0, rel=1e-2)
     assert shares[-1] == pytest.approx(POSE_FALL * shares[0], rel=1e-2)

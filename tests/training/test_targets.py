@@ -64,6 +64,9 @@ def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None
     counting = picture[:2, :2].reshape(4, 3)[1:]
     assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
     assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
+    thinning = targets.get(0, 1).thinning(0.5)
+    assert thinning is not None and targets.get(0, 1).thinning(0.0) is None
+    np.testing.assert_allclose(thinning, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
 
 
 def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:

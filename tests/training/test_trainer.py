@@ -234,6 +234,27 @@ def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) ->
     assert_same(*results)
 
 
+def test_what_only_a_mask_sees_vanishes(scene: TinyScene, tmp_path: Path) -> None:
+    """Nobody asks for anything there, and left alone it stands in the way of other cameras."""
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    views = [replace(view, mask=str(tmp_path / "mask.png")) for view in scene.views[:2]]
+    seen = []
+    for weight in (0.0, 0.1):
+        config = tiny_config(200, density={"stop_share": 0.0, "prune_opacity": 0.0})
+        config = config.model_copy(update={"masked_opacity": weight})
+        result = run(scene, tmp_path / f"c{weight}", config, views=views)
+        renders = [render_view(result.gaussians, view) for view in views]
+        halves = [
+            (r.alpha[:, : WIDTH // 2].mean(), r.alpha[:, WIDTH // 2 :].mean()) for r in renders
+        ]
+        seen.append(np.mean(halves, 0))
+    (left, left_right), (thinned, right) = seen
+    assert thinned < 0.5 * left
+    assert right == pytest.approx(left_right, rel=0.2)
+
+
 def test_gains_explain_photographs_that_are_exposed_differently(
     scene: TinyScene, tmp_path: Path
 ) -> None:

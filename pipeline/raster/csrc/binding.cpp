@@ -139,12 +139,12 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
                       const Tensor& block_end, const Tensor& view, int64_t width, int64_t height,
                       const Tensor& background, const Tensor& color, const Tensor& alpha,
                       OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
-                      OptionalTensor d_depth, bool absolute, int64_t threads) {
+                      OptionalTensor d_depth, bool absolute, int64_t per_pixel, int64_t threads) {
     Tensor slots = new_floats({entries.size(0), splat::kSlotFloats});
     splat::blend_backward(records_from(records), pairs_from(entries, tile_begin),
                           view_from(view, width, height, 0, false),
                           {floats(color), floats(alpha), floats(depth), floats(d_color),
-                           floats(d_alpha), floats(d_depth), floats(background), absolute},
+                           floats(d_alpha), floats(d_depth), floats(background), absolute, per_pixel},
                           block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
     return slots;
 }
@@ -230,7 +230,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor block_end, "
         "Tensor view, int width, int height, Tensor background, Tensor color, Tensor alpha, "
         "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, bool absolute, "
-        "int threads) -> Tensor");
+        "int per_pixel, int threads) -> Tensor");
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
         "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "

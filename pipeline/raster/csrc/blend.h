@@ -20,12 +20,14 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
                  float* depth, float* median);
 
 // The gradient slots (intersections, kSlotFloats). d_alpha and d_depth may be null; depth is
-// blend_depth's, needed with d_depth only. Absolute moments are filled in if asked for.
+// blend_depth's, needed with d_depth only. Absolute moments are filled in if asked for. A pixel's
+// gradients go to the per_pixel Gaussians that it draws first; 0: to all.
 struct ImageGradientsIn {
     const float *color, *alpha, *depth;        // what forward made
     const float *d_color, *d_alpha, *d_depth;  // dL/d of it
     const float* background;
     bool absolute;
+    int64_t per_pixel;
 };
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,

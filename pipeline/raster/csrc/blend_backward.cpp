@@ -21,6 +21,7 @@ struct BlockTargets {
     f32x16 rgb[3], alpha, depth;
     f32x16 transmittance;  // 0 once stopped
     f32x16 behind;         // S: starts as the whole sum, ends as 0
+    f32x16 left;           // Gaussians yet to be given to, where that is limited
 
     // Pixels outside the image ask for nothing.
     SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
@@ -52,6 +53,17 @@ struct BlockTargets {
             behind += plane(in.depth) * depth;
         }
         transmittance = tile.start(block);
+        left = splat16(float(in.per_pixel));
+    }
+
+    // A pixel that has given to as many as it may asks for nothing more.
+    SPLAT_INLINE void count(const Step& s) {
+        left -= keep(lt(splat16(0), s.weight), splat16(1));
+        const Mask16 more = lt(splat16(0), left);
+        for (f32x16& channel : rgb) channel = keep(more, channel);
+        alpha = keep(more, alpha);
+        depth = keep(more, depth);
+        behind = keep(more, behind);
     }
 };
 
@@ -79,7 +91,7 @@ struct GaussianPairs {
 };
 
 // One Gaussian over one block: adds to the lanes' moments.
-template <bool kDepthGradient, bool kAbsolute>
+template <bool kDepthGradient, bool kAbsolute, bool kLimited>
 SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, f32x16 alpha,
                                 BlockTargets& t, f32x16 (&moments)[12]) {
     const auto& g = batch.of(pair);
@@ -105,9 +117,10 @@ SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, f32x16
         moments[kAbsX] += abs(vu * g.uu);
         moments[kAbsY] += abs(vu * g.uw + vw * g.ww);
     }
+    if (kLimited) t.count(s);
 }
 
-template <bool kDepthGradient, bool kAbsolute>
+template <bool kDepthGradient, bool kAbsolute, bool kLimited>
 void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
@@ -137,9 +150,9 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
                 ahead.fetch();
                 f32x16 moments[12] = {};
                 for (int i = list.first[n]; i < list.first[n + 1]; i++)
-                    backward_pair<kDepthGradient, kAbsolute>(batch, list.pair[i], list.alpha[i],
-                                                             targets[list.pair[i] % kBlocks],
-                                                             moments);
+                    backward_pair<kDepthGradient, kAbsolute, kLimited>(
+                        batch, list.pair[i], list.alpha[i], targets[list.pair[i] % kBlocks],
+                        moments);
                 store(slot(batch.gaussian[n].slot), sum_lanes(moments));
             }
         }
@@ -147,14 +160,24 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
     });
 }
 
+using BackwardTiles = decltype(&backward_tiles<false, false, false>);
+
+template <bool kLimited>
+BackwardTiles choose(bool depth_gradient, bool absolute) {
+    if (depth_gradient)
+        return absolute ? backward_tiles<true, true, kLimited>
+                        : backward_tiles<true, false, kLimited>;
+    return absolute ? backward_tiles<false, true, kLimited>
+                    : backward_tiles<false, false, kLimited>;
+}
+
 }  // namespace
 
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
-    const auto run =
-        in.d_depth ? (in.absolute ? backward_tiles<true, true> : backward_tiles<true, false>)
-                   : (in.absolute ? backward_tiles<false, true> : backward_tiles<false, false>);
+    const BackwardTiles run =
+        (in.per_pixel > 0 ? choose<true> : choose<false>)(in.d_depth, in.absolute);
     run(records, pairs, view, in, block_end, threads, slot_gradients);
 }
 

@@ -182,9 +182,24 @@ def _configs(results: Sequence[Result]) -> str:
         f'<p class="hint">Means over the {count(len(scenes))} scenes that every configuration '
         f"finished: {escape(names)}. Error of a pixel is the root mean square error that the mean "
         "PSNR stands for, in percent of full range. The dashed line joins the configurations that "
-        "no other one beats in time and error.</p>"
+        f"no other one beats in time and error.{_sizes_differ(results, scenes)}</p>"
         + table
         + f'<div class="charts">{_means_charts(results, over)}</div>'
+    )
+
+
+def _sizes_differ(results: Sequence[Result], scenes: Sequence[str]) -> str:
+    """A warning where a scene's configurations were measured on pictures of different sizes."""
+    sizes: dict[str, set[str]] = {}
+    for r in results:
+        if r.ok and r.run.scene in scenes:
+            sizes.setdefault(r.run.scene, set()).add(row(r)["resolution"])
+    if all(len(found) < 2 for found in sizes.values()):
+        return ""
+    return (
+        " <strong>Configurations were measured on pictures of different sizes</strong> (each on "
+        "what it trains on): errors are smaller in smaller pictures, and such numbers do not say "
+        "which configuration is the better one."
     )
 
 

@@ -126,6 +126,23 @@ def test_the_page_shows_links_failures_and_seeds_and_asks_for_nothing():
     assert "as configured" in index_html(Batch([done("fox", "", 28.0)]))
 
 
+def test_the_page_says_where_sizes_of_pictures_differ():
+    """PSNR at 640 pixels and at 800 is no comparison; of scenes that differ it is one."""
+
+    def page(*runs: tuple[str, str, str]) -> str:
+        results = []
+        for scene, config, size in runs:
+            result = done(scene, config, 30.0)
+            result.metrics["protocol"] = result.metrics["protocol"] | {"resolution": [size]}
+            results.append(result)
+        return index_html(Batch(results))
+
+    said = "pictures of different sizes"
+    assert said in page(("fox", "fast", "64x48"), ("fox", "high", "80x60"))
+    alike = [("fox", "fast", "64x48"), ("cat", "fast", "80x60")]
+    assert said not in page(*alike, *((scene, "high", size) for scene, _, size in alike))
+
+
 def test_names_of_any_kind_do_no_harm():
     page = index_html(Batch([done("<b>&\"'", "fast", 20.0), done("a b", "fast", 21.0)]))
     assert "<b>&" not in page

@@ -141,11 +141,12 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
                       OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
                       OptionalTensor d_depth, bool absolute, int64_t per_pixel, int64_t threads) {
     Tensor slots = new_floats({entries.size(0), splat::kSlotFloats});
-    splat::blend_backward(records_from(records), pairs_from(entries, tile_begin),
-                          view_from(view, width, height, 0, false),
-                          {floats(color), floats(alpha), floats(depth), floats(d_color),
-                           floats(d_alpha), floats(d_depth), floats(background), absolute, per_pixel},
-                          block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
+    splat::blend_backward(
+        records_from(records), pairs_from(entries, tile_begin),
+        view_from(view, width, height, 0, false),
+        {floats(color), floats(alpha), floats(depth), floats(d_color), floats(d_alpha),
+         floats(d_depth), floats(background), absolute, per_pixel},
+        block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
     return slots;
 }
 

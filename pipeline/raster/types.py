@@ -43,8 +43,7 @@ class RasterOptions:
             scenes from photographs have an arbitrary scale: choose it well under the distance
             of the nearest thing worth drawing.
         gradients_per_pixel: a pixel's gradients go only to so many Gaussians, the first that it
-            draws (the ablation of Kerbl et al. 2023, sec. 7.3, "unlimited depth complexity of
-            splats that receive gradients"); 0: to all.
+            draws (the limit that Kerbl et al. 2023, sec. 7.3, compare with having none); 0: to all.
         threads: 0 for all. The result does not depend on it.
     """
 

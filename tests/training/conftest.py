@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,6 +15,7 @@ from PIL import Image
 from pipeline.config.schema import Density, Train
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training import trainer
 from pipeline.training.render import render_view
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
@@ -86,3 +90,21 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
     initial.sh.zero_()
     initial.opacity_logits.fill_(-1.0)
     return TinyScene(truth, initial, views, alpha_views, extent=3.3)
+
+
+@contextmanager
+def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
+    """What trains inside writes a checkpoint after every step, and dies in this one."""
+    original, calls = trainer.backward, 0
+
+    def dying(*args: Any, **kwargs: Any) -> Any:
+        nonlocal calls
+        calls += 1
+        if calls == step:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)
+
+    with patch.context() as inside, pytest.raises(KeyboardInterrupt):
+        inside.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+        inside.setattr(trainer, "backward", dying)
+        yield

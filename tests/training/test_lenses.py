@@ -10,10 +10,10 @@ import pytest
 import torch
 
 from pipeline.scene.model import Camera, Posed, Reconstruction, View
-from pipeline.training import trainer
 from pipeline.training.lenses import Lenses, changed_by, with_lenses
+from pipeline.training.render import raster_camera
 from pipeline.training.trainer import TrainResult, train
-from tests.training.conftest import TinyScene, tiny_config
+from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 STILL = ("means", "scales", "quats", "opacities", "sh0", "shN")
 # Logarithm of the focal length, principal point across and down in focal lengths.
@@ -66,21 +66,8 @@ def test_adjusted_lenses_survive_a_kill_to_the_bit(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = trained(scene, tmp_path / "whole", 100, refine_poses=True)
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
-    calls = 0
-    original = trainer.backward
-
-    def dying(*args: object, **kwargs: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == 61:
-            raise KeyboardInterrupt
-        return original(*args, **kwargs)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(trainer, "backward", dying)
-        with pytest.raises(KeyboardInterrupt):
-            trained(scene, tmp_path / "cut", 100, refine_poses=True)
+    with killed_in_step(monkeypatch, 61):
+        trained(scene, tmp_path / "cut", 100, refine_poses=True)
     resumed = trained(scene, tmp_path / "cut", 100, refine_poses=True)
     assert whole.lenses is not None and resumed.lenses is not None
     assert whole.poses is not None and resumed.poses is not None
@@ -98,9 +85,9 @@ def test_a_picture_of_another_size_has_the_same_change(scene: TinyScene) -> None
     lenses = Lenses.of([wrong(scene.views[0])])
     lenses.change[0] = -WRONG
     view = wrong(scene.views[0])
-    half = trainer.raster_camera(view, 2)
+    half = raster_camera(view, 2)
     found = lenses.camera(half, 0)
-    true = trainer.raster_camera(scene.views[0], 2)
+    true = raster_camera(scene.views[0], 2)
     for name in ("fx", "fy"):
         assert getattr(found, name) == pytest.approx(getattr(true, name), rel=1e-12)
     # The shift is in focal lengths of the lens as given, 3 % longer than the true one.

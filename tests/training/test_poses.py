@@ -12,10 +12,9 @@ from PIL import Image
 
 from pipeline.raster import RasterOptions
 from pipeline.scene.model import View
-from pipeline.training import trainer
 from pipeline.training.poses import fit_pose, followed, rigid
 from pipeline.training.trainer import TrainResult, train
-from tests.training.conftest import TinyScene, tiny_config
+from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 2e-4, 0.3, 3.0])
@@ -110,21 +109,8 @@ def test_moved_cameras_survive_a_kill_to_the_bit(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = trained(scene, tmp_path / "whole", threads=2, refine_poses=True)
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
-    calls = 0
-    original = trainer.backward
-
-    def dying(*args: object, **kwargs: object) -> object:
-        nonlocal calls
-        calls += 1
-        if calls == 137:
-            raise KeyboardInterrupt
-        return original(*args, **kwargs)  # type: ignore[arg-type]
-
-    with monkeypatch.context() as patch:
-        patch.setattr(trainer, "backward", dying)
-        with pytest.raises(KeyboardInterrupt):
-            trained(scene, tmp_path / "cut", refine_poses=True)
+    with killed_in_step(monkeypatch, 137):
+        trained(scene, tmp_path / "cut", refine_poses=True)
     resumed = trained(scene, tmp_path / "cut", refine_poses=True)
     assert whole.poses is not None and resumed.poses is not None
     for name, pose in whole.poses.items():

@@ -31,6 +31,7 @@ from pipeline.demo.scene import OBJECTS, shadow_maps
 from pipeline.demo.sensor import srgb, to_bytes
 from pipeline.metrics.image import psnr
 from pipeline.photos.load import load_rgb, resize_area
+from pipeline.raster import RasterOptions
 from pipeline.scene.model import Camera, Points, Posed, View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
@@ -137,7 +138,7 @@ def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> G
 
 def drawer(gaussians: Gaussians, near: float) -> Draw:
     def draw(view: View) -> Render:
-        return render_view(gaussians, view, near=near, threads=2)
+        return render_view(gaussians, view, RasterOptions(near=near, threads=2))
 
     return draw
 

@@ -21,7 +21,7 @@ from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
 from pipeline.splats.gaussians import Gaussians
-from pipeline.surface.depth import DepthMaps, Look, Pictures
+from pipeline.surface.depth import DepthMaps, Pictures
 from pipeline.surface.mesh import build_mesh
 
 
@@ -44,10 +44,10 @@ def main() -> int:
         split,
     )
     gaussians = Gaussians.load(options.results / "train" / "gaussians.npz")
-    look = Look(choose_protocol(views, split, train), train, options.threads)
+    drawn = choose_protocol(views, split, train).options(train, options.threads)
     start, cpu = time.monotonic(), time.process_time()
     with TemporaryDirectory() as folder:
-        pictures = Pictures(gaussians, views, look, Path(folder))
+        pictures = Pictures(gaussians, views, drawn, Path(folder))
         mesh, grid = build_mesh(DepthMaps(pictures), options.voxel, options.threads)
     seconds = {"wall": time.monotonic() - start, "cpu": time.process_time() - cpu}
     peak = peak_memory_mb()

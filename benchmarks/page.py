@@ -54,15 +54,7 @@ def main() -> int:
     picks = np.linspace(0, len(scene.views) - 1, CAMERAS + 2).round().astype(int)[1:-1]
     views = [scene.views[i] for i in picks]
     ours = [
-        to_bytes(
-            render_view(
-                gaussians,
-                view,
-                background=protocol.background,
-                antialias=scene.train.antialias,
-                near=protocol.near,
-            ).rgb
-        )
+        to_bytes(render_view(gaussians, view, protocol.options(scene.train, threads=0)).rgb)
         for view in views
     ]
     page = results / "report.html"

@@ -21,6 +21,7 @@ from pipeline.metrics.evaluate import (
     evaluate_views,
     to_bytes,
 )
+from pipeline.raster import RasterOptions
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
@@ -105,19 +106,17 @@ def render(
     if not all(posed.cameras[image.camera_id].is_pinhole for image in posed.images.values()):
         warnings.append(f"{cameras}: lens distortion is left out of the renders")
     # The near plane belongs to the scene, not to the views that are asked for.
-    near = near_plane(scene_extent(views))
+    options = RasterOptions(
+        background=WHITE if how.background == "white" else BLACK,
+        antialias=bool(how.antialias),
+        near=near_plane(scene_extent(views)),
+        threads=how.threads,
+    )
     chosen = choose_views(views, names, cameras) if names else views
     gaussians = read_gaussians(model, warnings)
     files: set[Path] = set()
     for view in track(chosen, "rendering", len(chosen), unit="views"):
-        picture = render_view(
-            gaussians,
-            view,
-            background=WHITE if how.background == "white" else BLACK,
-            antialias=bool(how.antialias),
-            near=near,
-            threads=how.threads,
-        )
+        picture = render_view(gaussians, view, options)
         file = _png(out, view.name, files)
         files.add(file)
         buffer = io.BytesIO()

@@ -122,7 +122,6 @@ def run(job: Job) -> None:
 def draw(job: Job, trained: Gaussians, views: list[View], up: NDArray[np.float64]) -> None:
     """What shows the Gaussians as they were trained, from the views they were trained on."""
     # Not for everybody, and heavy: marching cubes, video encoders.
-    from pipeline.surface.depth import Look
     from pipeline.surface.outputs import write_drawn
 
     config, train, split = job.section(Export), job.section(Train), job.section(Split)
@@ -131,7 +130,7 @@ def draw(job: Job, trained: Gaussians, views: list[View], up: NDArray[np.float64
         config.formats,
         trained,
         views,
-        Look(choose_protocol(views, split, train), train, job.threads),
+        choose_protocol(views, split, train).options(train, job.threads),
         up=up,
         mesh_voxel=config.mesh_voxel,
     )

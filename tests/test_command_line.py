@@ -15,6 +15,7 @@ from PIL import Image
 from pipeline.__main__ import main
 from pipeline.config.schema import Config
 from pipeline.metrics.evaluate import to_bytes
+from pipeline.raster import RasterOptions
 from pipeline.scene.cameras import camera_views
 from pipeline.scene.colmap import write_model
 from pipeline.scene.manifest import Manifest, Photo
@@ -58,7 +59,7 @@ def photograph(scene: Path, gaussians: Gaussians) -> None:
     (scene / "images").mkdir(parents=True, exist_ok=True)
     views = camera_views(cameras(), None)
     for view in views:
-        picture = render_view(gaussians, view, near=near_plane(scene_extent(views)))
+        picture = render_view(gaussians, view, RasterOptions(near=near_plane(scene_extent(views))))
         Image.fromarray(to_bytes(picture.rgb)).save(scene / "images" / view.name)
 
 

@@ -104,6 +104,7 @@ def _compare(
 ) -> dict[tuple[Name, Name], Likeness]:
     """Render the same views from all models, and compare each two."""
     from pipeline.metrics.image import psnr, ssim
+    from pipeline.raster import RasterOptions
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.render import near_plane, render_view
@@ -118,13 +119,14 @@ def _compare(
         gaussians = Gaussians.load(folder / "gaussians.npz")
         scale, turn, shift = _similarity(models[first], models[name])
         near = near_plane(scale * scene_extent(seen))
+        options = RasterOptions(near=near, threads=threads)
         found = []
         for rotation, centre in places:
             pose = np.eye(4)
             pose[:3, :3] = rotation @ turn.T
             pose[:3, 3] = -pose[:3, :3] @ (scale * turn @ centre + shift)
             view = replace(seen[0], world_to_camera=pose)
-            rendered = render_view(gaussians, view, near=near, threads=threads)
+            rendered = render_view(gaussians, view, options)
             found.append(rendered.rgb)
         pictures[name] = found
     likeness = {}

@@ -96,16 +96,10 @@ def measure_coverage(
         The content of ``coverage.json``.
     """
 
+    options = protocol.options(train, threads)
+
     def draw(view: View) -> Render:
-        return render_view(
-            gaussians,
-            view,
-            background=protocol.background,
-            sh_degree=train.sh_degree,
-            antialias=train.antialias,
-            near=protocol.near,
-            threads=threads,
-        )
+        return render_view(gaussians, view, options)
 
     training = _evenly([view for view in views if not view.is_test], MAX_PHOTOGRAPHS)
     eyes = [

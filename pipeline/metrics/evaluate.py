@@ -67,6 +67,16 @@ class Protocol:
     near: float
     extent: float
 
+    def options(self, train: Train, threads: int) -> RasterOptions:
+        """How its renders are drawn: as in training, over ``background``."""
+        return RasterOptions(
+            sh_degree=train.sh_degree,
+            background=self.background,
+            antialias=train.antialias,
+            near=self.near,
+            threads=threads,
+        )
+
 
 def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protocol:
     """The views to evaluate on (the held-out ones, else all) and the background.
@@ -121,32 +131,17 @@ def evaluate_views(
     progress = Progress("evaluating", len(protocol.views) + len(protocol.seen), "views")
     warnings: list[str] = []
     without: list[float] = []
+    options = protocol.options(train, threads)
 
     def compare(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view.image, view.mask, view.width, view.height)
         photo = reference(pixels, protocol.background)
         if train.refine_poses and view.is_test:
-            options = RasterOptions(
-                sh_degree=gaussians.sh_degree,
-                background=protocol.background,
-                antialias=train.antialias,
-                near=protocol.near,
-                threads=threads,
-            )
             gain, weight = gains.get(view.name), train.ssim_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )
-        rendered = render_view(
-            gaussians,
-            view,
-            background=protocol.background,
-            sh_degree=train.sh_degree,
-            antialias=train.antialias,
-            near=protocol.near,
-            threads=threads,
-        )
-        return rendered.rgb, photo, pixels.mask
+        return render_view(gaussians, view, options).rgb, photo, pixels.mask
 
     def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
         return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)

@@ -12,38 +12,18 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config.schema import Train
-from pipeline.metrics.evaluate import Protocol, to_bytes
+from pipeline.metrics.evaluate import to_bytes
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
+from pipeline.raster import RasterOptions
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.progress import track
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import Render, render_view
+from pipeline.training.render import render_view
 
 #: Pixels of less opacity have no depth.
 MIN_ALPHA = 0.5
-
-
-@dataclass(frozen=True)
-class Look:
-    """How views are drawn: as in training, over the evaluation's background."""
-
-    protocol: Protocol
-    train: Train
-    threads: int
-
-    def draw(self, gaussians: Gaussians, view: View) -> Render:
-        return render_view(
-            gaussians,
-            view,
-            background=self.protocol.background,
-            sh_degree=self.train.sh_degree,
-            antialias=self.train.antialias,
-            near=self.protocol.near,
-            threads=self.threads,
-        )
 
 
 @dataclass(frozen=True)
@@ -67,11 +47,13 @@ class Picture:
 class Pictures:
     """All views drawn, kept as files that are mapped when looked at: memory stays small."""
 
-    def __init__(self, gaussians: Gaussians, views: Sequence[View], look: Look, folder: Path):
+    def __init__(
+        self, gaussians: Gaussians, views: Sequence[View], options: RasterOptions, folder: Path
+    ):
         self.views, self._folder = list(views), folder
         folder.mkdir(parents=True, exist_ok=True)
         for i, view in enumerate(track(views, "drawing views", len(views), unit="views")):
-            drawn = look.draw(gaussians, view)
+            drawn = render_view(gaussians, view, options)
             known = drawn.alpha >= MIN_ALPHA
             depths = [
                 np.where(known, drawn.median_depth, 0),

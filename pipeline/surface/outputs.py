@@ -11,15 +11,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.metrics.evaluate import to_bytes
+from pipeline.raster import RasterOptions
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import track
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.surface.depth import DepthMaps, Look, Pictures, write_depths, write_renders
+from pipeline.surface.depth import DepthMaps, Pictures, write_depths, write_renders
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
 from pipeline.surface.video import write_video
+from pipeline.training.render import render_view
 
 DRAWN = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -39,7 +41,7 @@ def write_drawn(
     formats: Collection[str],
     gaussians: Gaussians,
     views: list[View],
-    look: Look,
+    options: RasterOptions,
     *,
     up: NDArray[np.float64],
     mesh_voxel: float | None,
@@ -49,24 +51,25 @@ def write_drawn(
 
     Args:
         views: all of them, at the size to draw.
+        options: how they are drawn (``Protocol.options``).
         up: (3,) the world's up.
         mesh_voxel: world unit; None chooses.
     """
     told = Told([], [])
     if not {"renders", "depths", "mesh"}.isdisjoint(formats):
         with TemporaryDirectory(prefix="drawn-") as folder:
-            pictures = Pictures(gaussians, views, look, Path(folder))
+            pictures = Pictures(gaussians, views, options, Path(folder))
             if "renders" in formats:
                 write_renders(out / "renders", pictures)
             if "depths" in formats:
                 write_depths(out / "depths", pictures)
             if "mesh" in formats:
-                _write_mesh(out, DepthMaps(pictures), up, mesh_voxel, look.threads, told)
+                _write_mesh(out, DepthMaps(pictures), up, mesh_voxel, options.threads, told)
     if "video" in formats:
-        path = camera_path(views, _typical_depth(gaussians, views, look), up)
+        path = camera_path(views, _typical_depth(gaussians, views, options), up)
         write_json(out / "path.json", describe_path(path))
         frames = [
-            to_bytes(look.draw(gaussians, view).rgb)
+            to_bytes(render_view(gaussians, view, options).rgb)
             for view in track(path, "drawing the video", len(path), unit="frames")
         ]
         write_video(out, frames, FPS)
@@ -97,13 +100,13 @@ def _write_mesh(
         )
 
 
-def _typical_depth(gaussians: Gaussians, views: list[View], look: Look) -> float:
+def _typical_depth(gaussians: Gaussians, views: list[View], options: RasterOptions) -> float:
     """Median over views of the median depth of the picture's middle."""
     found = []
     for i in np.unique(np.linspace(0, len(views) - 1, _PROBES).round().astype(int)):
-        depth = look.draw(gaussians, views[i]).median_depth
+        depth = render_view(gaussians, views[i], options).median_depth
         height, width = depth.shape
         middle = depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
         found.append(middle[middle > 0])
     values = np.concatenate(found)
-    return float(np.median(values)) if len(values) else 100 * look.protocol.near
+    return float(np.median(values)) if len(values) else 100 * options.near

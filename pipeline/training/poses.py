@@ -22,7 +22,7 @@ from pipeline.raster import CameraGradients, RasterCamera, RasterOptions, backwa
 from pipeline.scene.model import View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import raster_camera
+from pipeline.training.render import raster_camera, within
 from pipeline.training.rows import RowAdam
 
 Array = NDArray[np.float64]
@@ -169,6 +169,7 @@ def fit_pose(
         mask: (H, W), false where a pixel counts for nothing.
         gain: a factor for each channel of the render.
     """
+    options = within(options, gaussians)
     poses = Poses.of([view], gaussians, extent)
     camera = raster_camera(view)
     wanted = torch.from_numpy(np.ascontiguousarray(photo))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -52,31 +53,14 @@ def raster_camera(view: View, factor: int = 1) -> RasterCamera:
     )
 
 
-def render_view(
-    gaussians: Gaussians,
-    view: View,
-    *,
-    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
-    sh_degree: int | None = None,
-    antialias: bool = False,
-    near: float = 0.01,
-    threads: int = 1,
-) -> Render:
-    """Render ``gaussians`` as ``view`` sees them, at the view's size.
+def within(options: RasterOptions, gaussians: Gaussians) -> RasterOptions:
+    """The options with no higher degree of harmonics than the Gaussians have."""
+    return replace(options, sh_degree=min(options.sh_degree, gaussians.sh_degree))
 
-    Args:
-        sh_degree: higher bands are left out; None takes all there are.
-        antialias: as in training (``Train.antialias``).
-        near: in the world's unit, as in training (``near_plane``).
-    """
-    degree = gaussians.sh_degree if sh_degree is None else min(sh_degree, gaussians.sh_degree)
-    options = RasterOptions(
-        sh_degree=degree,
-        background=background,
-        antialias=antialias,
-        near=near,
-        threads=threads,
-    )
+
+def render_view(gaussians: Gaussians, view: View, options: RasterOptions | None = None) -> Render:
+    """Render ``gaussians`` as ``view`` sees them, at the view's size."""
+    options = within(options or RasterOptions(), gaussians)
     result = forward(*gaussians.parameters(), raster_camera(view), options)
     return Render(
         result.color.clamp(0.0, 1.0).numpy(),

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.metrics.evaluate import to_bytes
+from pipeline.raster import RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.scene.rotations import quat_to_rotation
@@ -112,7 +113,8 @@ class Page:
     """
 
     def __init__(self, source: Source, *, host: str, port: int, side: int, threads: int):
-        self.source, self.side, self.threads = source, side, threads
+        self.source, self.side = source, side
+        self.options = RasterOptions(near=source.near, threads=threads)
         self.room = Room(source.views)
         self.lock = threading.Lock()
         self.visitors: dict[int, _Visitor] = {}
@@ -157,9 +159,7 @@ class Page:
     def render_depth(self, view: View) -> float:
         """Typical depth in the middle of a view, in the world's unit."""
         with self.lock:
-            depth = render_view(
-                self.source.shown.gaussians, view, near=self.source.near, threads=self.threads
-            ).median_depth
+            depth = render_view(self.source.shown.gaussians, view, self.options).median_depth
         height, width = depth.shape
         middle = depth[height // 4 : -(height // 4) or None, width // 4 : -(width // 4) or None]
         seen = middle[middle > 0]
@@ -167,9 +167,7 @@ class Page:
 
     def render(self, view: View) -> NDArray[np.uint8]:
         with self.lock:
-            picture = render_view(
-                self.source.shown.gaussians, view, near=self.source.near, threads=self.threads
-            )
+            picture = render_view(self.source.shown.gaussians, view, self.options)
         return to_bytes(picture.rgb)
 
     def welcome(self, client: Any) -> None:

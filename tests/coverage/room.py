@@ -6,6 +6,7 @@ import numpy as np
 import torch
 
 from pipeline.coverage.sight import Draw
+from pipeline.raster import RasterOptions
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.render import Render, render_view
@@ -64,6 +65,6 @@ def _discs(means: np.ndarray, size: float, *, flat: bool = True) -> Gaussians:
 
 def drawer(gaussians: Gaussians, threads: int = 1) -> Draw:
     def draw(view: View) -> Render:
-        return render_view(gaussians, view, threads=threads)
+        return render_view(gaussians, view, RasterOptions(threads=threads))
 
     return draw

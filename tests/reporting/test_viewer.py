@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.page import FLAGS
+from pipeline.raster import RasterOptions
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
 from pipeline.splats.ply import write_splat_ply
@@ -130,9 +131,8 @@ def test_the_viewer_draws_what_we_draw(
     for view in scene.views[:3]:
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
         drawn = pixels(base64.b64decode(url.partition(",")[2]))
-        ours = render_view(
-            scene.gaussians, view, background=scene.background, antialias=antialias, near=scene.near
-        ).rgb
+        options = RasterOptions(background=scene.background, antialias=antialias, near=scene.near)
+        ours = render_view(scene.gaussians, view, options).rgb
         assert drawn.shape == ours.shape
         psnr = -10 * np.log10(np.mean((drawn / 255 - np.rint(ours * 255) / 255) ** 2))
         assert psnr >= 38

@@ -16,7 +16,7 @@ import pipeline.surface.video as video
 from pipeline.config.schema import Split, Train
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.splats.gaussians import Gaussians
-from pipeline.surface.depth import DepthMaps, Look, Pictures
+from pipeline.surface.depth import DepthMaps, Pictures
 from pipeline.surface.outputs import write_drawn
 from tests.surface.scenes import view_at
 
@@ -63,7 +63,7 @@ def views(tmp_path):
 
 def look(views):
     train = Train()
-    return Look(choose_protocol(views, Split(), train), train, threads=2)
+    return choose_protocol(views, Split(), train).options(train, threads=2)
 
 
 def test_depth_maps_and_renders_open_in_other_programs(tmp_path, ball, views):

@@ -13,6 +13,7 @@ import torch
 from PIL import Image
 
 from pipeline.config.schema import Train
+from pipeline.raster import RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
@@ -77,7 +78,7 @@ def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     assert result.gaussians.sh_degree == 1
     assert len(result.curve) == len(result.curve_seconds)
     view = scene.views[0]
-    rendered = render_view(result.gaussians, view, near=result.near).rgb
+    rendered = render_view(result.gaussians, view, RasterOptions(near=result.near)).rgb
     error = np.mean((rendered - np.asarray(Image.open(view.image)) / 255.0) ** 2)
     assert -10 * np.log10(error) > 25
 

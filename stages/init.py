@@ -49,7 +49,10 @@ def run(job: Job) -> None:
         job.warn(f"only {len(points)} sparse points: starting from random Gaussians instead")
         method = "random"
     if method == "random":
-        first = gaussians_random(train, config, 0, job.seed)
+        shown_alone = sum(photo.alpha for photo in manifest.photos) + sum(
+            bool(v.mask) for v in train
+        )
+        first = gaussians_random(train, config, 0, job.seed, alone=2 * shown_alone > len(train))
     else:
         import numpy as np
 

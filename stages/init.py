@@ -49,10 +49,9 @@ def run(job: Job) -> None:
         job.warn(f"only {len(points)} sparse points: starting from random Gaussians instead")
         method = "random"
     if method == "random":
-        shown_alone = sum(photo.alpha for photo in manifest.photos) + sum(
-            bool(v.mask) for v in train
-        )
-        first = gaussians_random(train, config, 0, job.seed, alone=2 * shown_alone > len(train))
+        alpha = {photo.name for photo in manifest.photos if photo.alpha}
+        num_alone = sum(view.mask is not None or view.name in alpha for view in train)
+        first = gaussians_random(train, config, 0, job.seed, alone=2 * num_alone > len(train))
     else:
         import numpy as np
 

@@ -49,9 +49,7 @@ def run(job: Job) -> None:
         job.warn(f"only {len(points)} sparse points: starting from random Gaussians instead")
         method = "random"
     if method == "random":
-        alpha = {photo.name for photo in manifest.photos if photo.alpha}
-        num_alone = sum(view.mask is not None or view.name in alpha for view in train)
-        first = gaussians_random(train, config, 0, job.seed, alone=2 * num_alone > len(train))
+        first = gaussians_random(train, config, 0, job.seed)
     else:
         import numpy as np
 

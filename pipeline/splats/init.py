@@ -29,9 +29,6 @@ LONE_ANGLE = 0.1  # of a single Gaussian
 # Points nearer to a camera than this share of the usual distance are SfM errors (a point at a
 # camera's centre is a known one); points farther than this many usual distances, too.
 TOO_NEAR, TOO_FAR = 0.01, 100.0
-# Random Gaussians stand no farther away than so many of the scene's sizes: nothing shows parallax
-# there.
-FARTHEST = 30.0
 # Thinning is part of the data's preparation, not of the run's randomness.
 THINNING_SEED = 0
 
@@ -107,16 +104,12 @@ def gaussians_from_points(
 
 
 def gaussians_random(
-    views: Sequence[View], config: Init, sh_degree: int, seed: int, *, alone: bool
+    views: Sequence[View], config: Init, sh_degree: int, seed: int
 ) -> InitGaussians:
     """``config.num_random`` Gaussians of random colour in the volume the cameras look at.
 
-    Where the cameras look at one place: a ball around it that all of them see whole, and as many
-    behind its middle, unless there is nothing to see (``alone``). Otherwise (cameras looking ahead,
-    or outward): random depths along the rays of random pixels.
-
-    Args:
-        alone: transparent ground, or masks, surround what the photographs show.
+    Where the cameras look at one place: a ball around it that all of them see whole. Otherwise
+    (cameras looking ahead, or outward): random depths along the rays of random pixels.
     """
     from scipy.spatial import cKDTree
 
@@ -126,16 +119,11 @@ def gaussians_random(
     ball = _common_ball(views, centres)
     if ball is not None:
         centre, radius = ball
-        inside = count if alone else (count + 1) // 2
-        direction = generator.normal(size=(inside, 3))
+        direction = generator.normal(size=(count, 3))
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
-        xyz = centre + radius * np.cbrt(generator.random((inside, 1))) * direction
-        away = float(np.median(np.linalg.norm(centres - centre, axis=1)))
-        around = _in_frustums(views, away, away * FARTHEST, count - inside, generator)
-        xyz = np.concatenate([xyz, around])
+        xyz = centre + radius * np.cbrt(generator.random((count, 1))) * direction
     else:
-        extent = scene_extent(list(views))
-        xyz = _in_frustums(views, 0.3 * extent, extent * FARTHEST, count, generator)
+        xyz = _in_frustums(views, scene_extent(list(views)), count, generator)
     distance = _nearest_distance(xyz, centres)
     k = min(NEIGHBOURS, count - 1)
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
@@ -166,12 +154,12 @@ def _common_ball(
 
 
 def _in_frustums(
-    views: Sequence[View], near: float, far: float, count: int, generator: np.random.Generator
+    views: Sequence[View], extent: float, count: int, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(count, 3) points on the rays of random pixels at log-uniform depths, world unit."""
+    """(count, 3) points at log-uniform depths, 0.3 to 30 times the scene's extent."""
     chosen = generator.integers(len(views), size=count)
     uv = generator.random((count, 2))
-    depth = near * (far / near) ** generator.random(count)
+    depth = extent * 10 ** generator.uniform(-0.5, 1.5, count)
     intrinsics = np.array([(v.width, v.height, v.fx, v.fy, v.cx, v.cy) for v in views])[chosen]
     width, height, fx, fy, cx, cy = intrinsics.T
     ray = np.stack([(uv[:, 0] * width - cx) / fx, (uv[:, 1] * height - cy) / fy, np.ones(count)], 1)

@@ -34,6 +34,7 @@ QUALITY = (
 )
 # Stages in which a choice of the plan shows; the others' time goes with them.
 POSES = ("decode", "features", "matches", "sfm", "undistort")
+WORK = (*POSES, "train")
 
 Row = dict[str, Any]
 
@@ -72,41 +73,70 @@ def each(rows: Sequence[Row]) -> list[str]:
 
 def against(rows: Sequence[Row], base: str) -> list[str]:
     """Each configuration beside ``base``, scene by scene and in the mean: the difference of PSNR
-    (dB) and SSIM, CPU seconds for the poses and of training, and Gaussians."""
-    by_run: dict[tuple[str, str], Row] = {}
-    for row in rows:
-        by_run.setdefault((row["scene"], row["config"]), row)
-    configs = list(dict.fromkeys(row["config"] for row in rows))
-    scenes = list(dict.fromkeys(row["scene"] for row in rows))
+    (dB), of SSIM and of CPU seconds for poses and training together; then these seconds apart, and
+    Gaussians. Of several seeds, compared seed by seed: the median, and half the range.
+    """
+    by_run = {(row["scene"], row["config"], row["seed"]): row for row in rows}
+    configs, scenes, seeds = (
+        list(dict.fromkeys(row[key] for row in rows)) for key in ("config", "scene", "seed")
+    )
     head = "| | " + " | ".join(scenes) + " | mean | CPU s: poses, training | Gaussians |"
     lines = [head, "|---" * (len(scenes) + 4) + "|"]
     for config in configs:
         cells: list[str] = []
         gains: list[float] = []
-        kept: list[Row] = []
+        kept: list[list[Row]] = []
         for scene in scenes:
-            found, other = by_run.get((scene, config)), by_run.get((scene, base))
-            if found is None or found["status"] != "ok":
-                state = "no run" if found is None else f"{found['status']}: {found['message']}"
-                cells.append(state)
+            found = [by_run[key] for seed in seeds if (key := (scene, config, seed)) in by_run]
+            done = [row for row in found if row["status"] == "ok"]
+            if not done:
+                states = [f"{row['status']}: {row['message']}" for row in found]
+                cells.append(states[0] if states else "no run")
                 continue
-            row = found
-            kept.append(row)
-            if config == base or other is None or other["psnr"] is None:
-                cells.append(f"{row['psnr']:.2f} dB, {_short(row['ssim'])}")
+            kept.append(done)
+            pairs = [
+                (row, other)
+                for row in done
+                if (other := by_run.get((scene, base, row["seed"]))) and other["status"] == "ok"
+            ]
+            if config == base or not pairs:
+                psnr = _spread([row["psnr"] for row in done], "{:.2f}")
+                ssim = _short(statistics.median(row["ssim"] for row in done))
+                seconds = _spread([_cpu(row, WORK) for row in done], "{:.0f}")
+                cells.append(f"{psnr} dB, {ssim}, {seconds} s")
                 continue
-            gains.append(row["psnr"] - other["psnr"])
-            cells.append(f"{gains[-1]:+.2f}, {_short(row['ssim'] - other['ssim'], '+')}")
+            more = [row["psnr"] - other["psnr"] for row, other in pairs]
+            gains.append(statistics.median(more))
+            ssim = _short(statistics.median(r["ssim"] - o["ssim"] for r, o in pairs), "+")
+            seconds = _spread(
+                [_cpu(row, WORK) - _cpu(other, WORK) for row, other in pairs], "{:+.0f}"
+            )
+            cells.append(f"{_spread(more, '{:+.2f}')}, {ssim}, {seconds} s")
         mean = f"{statistics.fmean(gains):+.2f} dB" if gains else ""
         cost = gaussians = ""
         if kept:
-            poses = statistics.fmean(_cpu(row, POSES) for row in kept)
-            training = statistics.fmean(_cpu(row, ("train",)) for row in kept)
+            poses, training, number = (
+                statistics.fmean(statistics.median(of(row) for row in done) for done in kept)
+                for of in (
+                    lambda row: _cpu(row, POSES),
+                    lambda row: _cpu(row, ("train",)),
+                    lambda row: row["num_gaussians"],
+                )
+            )
             cost = f"{poses:.0f}, {training:.0f}"
-            gaussians = f"{statistics.fmean(row['num_gaussians'] for row in kept) / 1e3:.0f}k"
+            gaussians = f"{number / 1e3:.0f}k"
         name = f"**{config}**" if config == base else config
         lines.append(f"| {name} | {' | '.join(cells)} | {mean} | {cost} | {gaussians} |")
     return lines
+
+
+def _spread(values: Sequence[float], form: str) -> str:
+    """The median, and of several values half their range."""
+    middle = form.format(statistics.median(values))
+    if len(values) == 1:
+        return middle
+    half = form.replace("+", "").format((max(values) - min(values)) / 2)
+    return f"{middle} ±{half}"
 
 
 def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:

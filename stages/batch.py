@@ -12,7 +12,7 @@ from PIL import Image
 from pipeline.config.runs import Run
 from pipeline.metrics.evaluate import reference
 from pipeline.photos.load import load_view
-from pipeline.reporting.batch import Result, as_csv, as_json
+from pipeline.reporting.batch import MACHINE, Result, as_csv, as_json
 from pipeline.reporting.data import ranked
 from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
 from pipeline.runtime.atomic import write_json, write_text
@@ -46,7 +46,7 @@ def result_of(outcome: dict[str, Any], results: Path) -> Result:
         "ok",
         metrics=read_json(folder / "metrics.json"),
         size_mb=round(ply.stat().st_size / 1e6, 3) if ply.is_file() else None,
-        machine={name: facts.get(name) for name in ("host", "threads", "commit")},
+        machine={name: facts.get(name) for name in MACHINE},
     )
 
 

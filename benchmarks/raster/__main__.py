@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import platform
 import sys
 from dataclasses import asdict
 from pathlib import Path
@@ -19,6 +18,7 @@ from benchmarks.raster.probe import OPERATORS, versus
 from benchmarks.raster.scenes import Scene, synthetic, trained
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import machine_facts
 
 COUNTS = [10_000, 50_000, 200_000, 1_000_000]
 SIZES = [(480, 270), (960, 540), (1920, 1080)]
@@ -120,8 +120,7 @@ def main() -> None:
             results.append(_measure(scene, threads, peak, args))
     if args.json:
         value = {
-            "machine": platform.processor() or platform.machine(),
-            "cpus": os.cpu_count(),
+            "machine": machine_facts(),
             "peak": [asdict(p) for p in peaks],
             "twin": ratios,
             "results": results,

@@ -32,6 +32,8 @@ MEASURES = (
     "peak_rss_mb",
 )
 _TIMES = ("wall_s", "cpu_s", "peak_rss_mb")
+# What a time means nothing without (``run.json``).
+MACHINE = ("host", "processor", "cores", "threads", "load_average", "commit")
 
 
 @dataclass(frozen=True)
@@ -45,7 +47,7 @@ class Result:
         message: why, for whatever is not ok.
         metrics: the content of its ``metrics.json`` where status is ok, else empty.
         size_mb: size of the exported Gaussians (PLY) in MB (10^6 bytes); None where there are none.
-        machine: host, threads and commit of its training.
+        machine: of its training: ``MACHINE``.
     """
 
     run: Run
@@ -106,7 +108,7 @@ def row(result: Result) -> dict[str, Any]:
     for stage in STAGES:
         for fact in _TIMES:
             line[f"{stage}_{fact}"] = ran[stage][fact] if stage in ran else None
-    return line | {name: result.machine.get(name) for name in ("host", "threads", "commit")}
+    return line | {name: result.machine.get(name) for name in MACHINE}
 
 
 def _sum(values: Iterable[float]) -> float | None:

@@ -136,7 +136,10 @@ def _lead(results: Sequence[Result]) -> str:
     done = sum(r.ok for r in results)
     seeds = sorted({r.run.seed for r in results if r.run.seed is not None})
     machines = dict.fromkeys(
-        f"{r.machine['host']} with {r.machine['threads']} threads" for r in results if r.machine
+        f"{r.machine['host']} ({r.machine['processor'] or 'unknown processor'}) with "
+        f"{r.machine['threads']} threads"
+        for r in results
+        if r.machine
     )
     parts = [f"{done} of {len(results)} runs finished"]
     if seeds:

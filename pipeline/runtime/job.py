@@ -5,7 +5,7 @@ when all is done, so that what exists is whole. Two sidecars stand beside the ou
 
 - ``stage.json``: the same for the same work. Key, digests of inputs and outputs, counters,
   decisions, warnings.
-- ``run.json``: how this run went. Versions, commit, host, wall and CPU time, peak memory.
+- ``run.json``: how this run went. Versions, commit, machine, wall and CPU time, peak memory.
 
 A stage whose key and inputs are those of its finished folder is not worked again: Snakemake
 deletes a job's declared outputs before it runs it, so a hidden copy of ``stage.json`` lets the
@@ -42,6 +42,7 @@ from pydantic import BaseModel
 
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import machine_facts
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.runtime.progress import Console, write_progress_to
 
@@ -363,7 +364,7 @@ def _write_sidecars(job: Job, inputs: dict[str, str], wall: float) -> None:
 
 
 def run_facts(job: Job, wall: float) -> dict[str, Any]:
-    """How a run went: times in seconds, memory in MiB, versions, commit, host."""
+    """How a run went: times in seconds, memory in MiB, versions, commit, machine."""
     own = resource.getrusage(resource.RUSAGE_SELF)
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
@@ -372,8 +373,7 @@ def run_facts(job: Job, wall: float) -> dict[str, Any]:
         "peak_rss_mb": round(peak_memory_mb(), 1),
         "threads": job.threads,
         "seed": job.key["seed"],
-        "host": platform.node(),
-        "platform": platform.platform(),
+        **machine_facts(),
         "versions": versions(),
         "commit": _commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import hashlib
 import os
-import platform
 import shutil
 import subprocess
 import tempfile
@@ -14,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import processor
 
 
 @dataclass(frozen=True)
@@ -57,7 +57,7 @@ class NativeLibrary:
         command = compiler()
         version = subprocess.run([*command, "--version"], capture_output=True, text=True).stdout
         parts = [self.source_hash(), " ".join(command), version, " ".join(self.flags)]
-        parts += [*self.facts, _processor()]
+        parts += [*self.facts, *processor()]
         return hashlib.sha256("\0".join(parts).encode()).hexdigest()[:20]
 
     def build(self) -> Path:
@@ -115,18 +115,3 @@ def compiler() -> list[str]:
             fix="install g++ (e.g. apt-get install g++) or set CXX",
         )
     return command
-
-
-def _processor() -> str:
-    """Model and instruction sets of this processor."""
-    lines = [platform.machine(), platform.processor()]
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            for line in file:
-                if not line.strip():
-                    break  # one core speaks for all
-                if line.startswith(("model name", "flags", "Features", "CPU part")):
-                    lines.append(line.strip())
-    except OSError:
-        pass
-    return "\n".join(lines)

@@ -35,10 +35,31 @@ def test_configurations_stand_beside_the_base() -> None:
         "plan",
     )
     assert lines[0].startswith("| | a | b | mean |")
-    assert lines[2] == "| **plan** | 30.00 dB, .750 | 20.00 dB, .500 |  | 50, 10 | 50k |"
-    assert lines[3] == "| other | +1.00, +.025 | +0.50, +.012 | +0.75 dB | 45, 40 | 50k |"
+    assert lines[2] == (
+        "| **plan** | 30.00 dB, .750, 60 s | 20.00 dB, .500, 60 s |  | 50, 10 | 50k |"
+    )
+    assert lines[3] == (
+        "| other | +1.00, +.025, +60 s | +0.50, +.012, -10 s | +0.75 dB | 45, 40 | 50k |"
+    )
     assert lines[4] == "| broken | no run | failed: no poses |  |  |  |"
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
+
+
+def test_several_seeds_give_medians_and_spreads() -> None:
+    """Seed by seed: what a seed does to both is no difference between them."""
+    lines = compare.against(
+        [
+            row("a", "plan", 30.0),
+            row("a", "plan", 31.0, seed=1, train_cpu_s=20.0),
+            row("a", "other", 30.5),
+            row("a", "other", 31.1, seed=1, train_cpu_s=30.0),
+            row("a", "late", 32.0, seed=1, train_cpu_s=10.0),
+        ],
+        "plan",
+    )
+    assert lines[2] == "| **plan** | 30.50 ±0.50 dB, .762, 65 ±5 s |  | 50, 15 | 50k |"
+    assert lines[3] == "| other | +0.30 ±0.20, +.008, +5 ±5 s | +0.30 dB | 50, 20 | 50k |"
+    assert lines[4] == "| late | +1.00, +.025, -10 s | +1.00 dB | 50, 10 | 50k |"
 
 
 def test_each_run_of_a_batch_is_a_row() -> None:

@@ -50,7 +50,7 @@ def metrics(psnr: float, seconds: float = 10.0, photos: int = 20, **more) -> dic
 
 
 def done(scene: str, config: str, psnr: float, seed: int | None = None, **more) -> Result:
-    machine = {"host": "box", "threads": 2, "commit": "abc"}
+    machine = {"host": "box", "processor": "fast one", "cores": 4, "threads": 2, "commit": "abc"}
     return Result(Run(scene, config, seed), "ok", "", "", metrics(psnr, **more), 1.5, machine)
 
 
@@ -77,6 +77,7 @@ def test_every_run_is_a_line_that_spreadsheets_read():
     assert float(first["psnr"]) == 28.0
     assert (first["train_wall_s"], first["decode_wall_s"], first["wall_s"]) == ("5", "", "10")
     assert (first["peak_rss_mb"], first["lpips"], first["threads"]) == ("500.0", "", "2")
+    assert (first["host"], first["processor"], first["cores"]) == ("box", "fast one", "4")
     assert lost["failed_stage"] == "matches"
     assert lost["message"] == "no <two> photographs match; what to do: take more"
     assert lost["psnr"] == "" and lost["seed"] == "1"

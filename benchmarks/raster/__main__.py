@@ -13,7 +13,14 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from benchmarks.raster.accuracy import accuracy, twin_ratio
-from benchmarks.raster.measure import Peak, Step, contributing_pairs, measured_peak
+from benchmarks.raster.measure import (
+    BLOCK_OPERATIONS,
+    Peak,
+    Step,
+    block_pairs,
+    contributing_pairs,
+    measured_peak,
+)
 from benchmarks.raster.probe import OPERATORS, versus
 from benchmarks.raster.scenes import Scene, synthetic, trained
 from pipeline.runtime.atomic import write_json
@@ -66,7 +73,7 @@ def _measure(scene: Scene, threads: int, peak: Peak, args: argparse.Namespace) -
         f"gradients {error.gradient:.1e} relative\n"
         f"{'':24} {'ms':>8} {'CPU ms':>8} {'Mpairs/s':>9} {'of peak':>8}"
     )
-    operators = {}
+    operators: dict[str, dict[str, Any]] = {}
     for name, timing in step.time(args.seconds).items():
         rate = pairs / timing.cpu / 1e3
         share = costs[name].seconds(peak) * 1e3 / timing.cpu if name in costs else None
@@ -75,9 +82,22 @@ def _measure(scene: Scene, threads: int, peak: Peak, args: argparse.Namespace) -
         }  # fmt: skip
         shown = "" if share is None else f"{share:8.2f}"
         print(f"{name:24} {timing.wall:8.2f} {timing.cpu:8.2f} {rate:9.1f} {shown}")
+    blocks = block_pairs(step)
+    least = {
+        name: 1e3 * n * blocks / peak.vector_operations for name, n in BLOCK_OPERATIONS.items()
+    }
+    over = {name: operators[name]["cpu_ms"] / ms for name, ms in least.items() if blocks}
+    for name, ratio in over.items():
+        operators[name]["of_bound"] = ratio
+    shown = ", ".join(f"{name} {ratio:.2f}x" for name, ratio in over.items())
+    print(
+        f"{blocks / 1e6:.3f}M (Gaussian, block of 16 pixels) pairs; to what their vector "
+        f"operations take alone: {shown}"
+    )
     result = {
         "scene": scene.name, "gaussians": scene.count, "size": list(step.state.size),
-        "threads": threads, "pairs": pairs, "tile_pairs": step.drawn.num_intersections,
+        "threads": threads, "pairs": pairs, "block_pairs": blocks,
+        "tile_pairs": step.drawn.num_intersections,
         "operators": operators, "error": asdict(error),
     }  # fmt: skip
     if args.probe:

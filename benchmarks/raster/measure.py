@@ -19,6 +19,10 @@ from pipeline.raster import RasterOptions, build, forward
 
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT = 0.2
+# Vector operations that one Gaussian over one block of 16 pixels takes at least: place 2, exponent
+# 2, 2^x 11, its bounds 3, transmittance 3; forward colour and what is left 4; backward place again
+# 2, transmittance 1, what the pixel asks 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
+BLOCK_OPERATIONS = {"blend": 25, "blend backward": 48}
 
 
 @dataclass(frozen=True)
@@ -28,6 +32,12 @@ class Peak:
     threads: int
     flops: float
     bytes: float
+
+    @property
+    def vector_operations(self) -> float:
+        """Of 16 lanes, a second: a multiply-add is one. A machine that starts more when not all
+        of them multiply is underrated."""
+        return self.flops / 32
 
 
 @dataclass(frozen=True)
@@ -175,6 +185,18 @@ class Step:
             )
             for name in samples[0]
         }
+
+
+def block_pairs(step: Step) -> int:
+    """How many (Gaussian, block of 16 pixels) pairs have to be looked at: those of the bins, up to
+    where a block's last pixel stops."""
+    state = step.state
+    counts = state.tile_begin.diff()
+    tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
+    rank = torch.arange(len(tile)) - state.tile_begin[:-1][tile]
+    ends = state.block_end.view(len(counts), 16)
+    blocks = state.entries[:, 2]
+    return sum(int(((blocks >> b & 1) * (rank < ends[tile, b])).sum()) for b in range(16))
 
 
 def contributing_pairs(step: Step) -> int:

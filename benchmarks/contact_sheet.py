@@ -1,0 +1,116 @@
+"""One held-out view of a scene under every configuration of a batch, side by side, as a PNG.
+
+    python -m benchmarks.contact_sheet results/benchmark.json --scene demo --out sheet.png
+
+Below each stand the configuration and the PSNR of this view. ``--configs`` takes some, in that
+order; ``--view`` another view than the one in the middle of the first configuration's PSNRs.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+
+from PIL import Image, ImageDraw, ImageFont
+
+from pipeline.config.runs import Run
+from pipeline.reporting.data import ranked
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.job import EXIT_USER_ERROR
+
+GAP, LABEL = 6, 20  # pixels
+
+
+def sheet(
+    batch: Path, scene: str, configs: Sequence[str], view: str | None, width: int, columns: int
+) -> Image.Image:
+    """The picture.
+
+    Args:
+        batch: ``benchmark.json`` beside the runs' folders.
+        configs: which, in order; all where empty.
+        view: its name; else the median one of the first configuration.
+        width: of one render, pixels.
+
+    Raises:
+        UserError: the batch has no such scene, configuration or view, or cannot be read.
+    """
+    try:
+        rows = json.loads(batch.read_text())["runs"]
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(f"expected a batch's benchmark.json: {error}", file=batch) from error
+    done: dict[str, Run] = {}  # the first seed of each
+    for row in rows:
+        if row["scene"] == scene and row["status"] == "ok":
+            done.setdefault(row["config"], Run(scene, row["config"], row["seed"]))
+    missing = [config for config in configs if config not in done]
+    if missing or not done:
+        raise UserError(
+            f"no finished run {', '.join(f'{scene}@{config}' for config in missing) or scene}",
+            file=batch,
+            fix="take of these: "
+            + ", ".join(f"{r['scene']}@{r['config']}" for r in rows if r["status"] == "ok"),
+        )
+    tiles = []
+    for config in configs or done:
+        # Without seeds of its own, a batch's folders name none.
+        named = batch.parent / done[config].name
+        folder = named if named.is_dir() else batch.parent / Run(scene, config, None).name
+        per_view = json.loads((folder / "metrics.json").read_text())["per_view"]
+        view = view or ranked(per_view, 1)[0][1]["name"]
+        found = next((v for v in per_view if v["name"] == view), None)
+        if found is None:
+            names = ", ".join(v["name"] for v in per_view)
+            raise UserError(f"no held-out view {view}", file=folder, fix=f"take of these: {names}")
+        with Image.open(folder / "evaluate" / "renders" / found["render"]) as opened:
+            height = round(opened.height * width / opened.width)
+            picture = opened.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+        tiles.append((f"{config}  {found['psnr']:.1f} dB", picture))
+    return _laid_out(tiles, min(columns, len(tiles)))
+
+
+def _laid_out(tiles: Sequence[tuple[str, Image.Image]], columns: int) -> Image.Image:
+    width = tiles[0][1].width + GAP
+    height = max(picture.height for _, picture in tiles) + LABEL + GAP
+    rows = -(-len(tiles) // columns)
+    whole = Image.new("RGB", (columns * width + GAP, rows * height + GAP), "white")
+    draw, font = ImageDraw.Draw(whole), ImageFont.load_default(13)
+    for i, (label, picture) in enumerate(tiles):
+        x, y = GAP + i % columns * width, GAP + i // columns * height
+        whole.paste(picture, (x, y))
+        draw.text((x + 2, y + picture.height + 2), label, "black", font)
+    return whole
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.contact_sheet",
+        description="One view under every configuration of a batch, as a PNG.",
+        formatter_class=argparse.ArgumentDefaultsHelpFormatter,
+    )
+    parser.add_argument("batch", type=Path, metavar="benchmark.json")
+    parser.add_argument("--scene", required=True)
+    parser.add_argument("--configs", nargs="+", default=[], help="which, in order (default: all)")
+    parser.add_argument("--view", help="name of a held-out view (default: the median one)")
+    parser.add_argument("--width", type=int, default=240, help="of a render, pixels")
+    parser.add_argument("--columns", type=int, default=4)
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    options = parser.parse_args()
+    try:
+        picture = sheet(
+            options.batch, options.scene, options.configs, options.view, options.width,
+            options.columns,
+        )  # fmt: skip
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return EXIT_USER_ERROR
+    options.out.parent.mkdir(parents=True, exist_ok=True)
+    picture.save(options.out, "PNG", optimize=True)
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,57 @@
+"""A view under every configuration, side by side."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from benchmarks.contact_sheet import GAP, LABEL, sheet
+from pipeline.runtime.errors import UserError
+
+
+def batch(folder: Path) -> Path:
+    """Two runs of a scene, of which each render has a colour of its own, and one that failed."""
+    rows = []
+    for i, config in enumerate(("plain", "other", "lost")):
+        status = "failed" if config == "lost" else "ok"
+        rows.append({"scene": "room", "config": config, "seed": 0, "status": status})
+        renders = folder / f"room@{config}" / "evaluate" / "renders"
+        renders.mkdir(parents=True)
+        views = []
+        for k in range(3):
+            shade = (100 * i, 80 * k, 255)
+            Image.new("RGB", (40, 30), shade).save(renders / f"{k}.png")
+            views.append({"name": f"view_{k}.png", "render": f"{k}.png", "psnr": 20.0 + k})
+        (renders.parents[1] / "metrics.json").write_text(json.dumps({"per_view": views}))
+    path = folder / "benchmark.json"
+    path.write_text(json.dumps({"runs": rows}))
+    return path
+
+
+def test_the_same_view_of_every_run_that_finished(tmp_path: Path) -> None:
+    picture = np.asarray(sheet(batch(tmp_path), "room", [], None, 20, 4))
+    assert picture.shape == (15 + LABEL + 2 * GAP, 2 * (20 + GAP) + GAP, 3)
+    # The median view of the first, and the same one of the other.
+    assert picture[GAP + 7, GAP + 10].tolist() == [0, 80, 255]
+    assert picture[GAP + 7, 2 * GAP + 30].tolist() == [100, 80, 255]
+    below = np.asarray(sheet(batch(tmp_path / "b"), "room", ["other"], "view_2.png", 20, 4))
+    assert below[GAP + 7, GAP + 10].tolist() == [100, 160, 255]
+
+
+@pytest.mark.parametrize(
+    ("scene", "configs", "view", "told"),
+    [
+        ("hall", [], None, "no finished run hall"),
+        ("room", ["lost"], None, "room@plain, room@other"),
+        ("room", [], "view_9.png", "view_0.png, view_1.png"),
+    ],
+)
+def test_what_is_not_there_is_named(
+    tmp_path: Path, scene: str, configs: list[str], view: str | None, told: str
+) -> None:
+    with pytest.raises(UserError, match=told):
+        sheet(batch(tmp_path), scene, configs, view, 20, 4)

@@ -135,6 +135,13 @@ MUTANTS: dict[str, Mutant] = {
         "the means' learning rate one step ahead",
         ("tests/training/test_schedule.py",),
     ),
+    "unseen_kept": Mutant(
+        "pipeline/training/trainer.py",
+        "seen = state.adam.last > before",
+        "seen = state.adam.last > before - 10**6",
+        "what no photograph saw kept",
+        ("tests/training/test_trainer.py",),
+    ),
     "late_reset": Mutant(
         "pipeline/training/schedule.py",
         "step + self.reset_interval <= self.refine_stop",

@@ -64,6 +64,8 @@ def run(job: Job) -> None:
             f"{result.steps} steps fitted into {minutes:g} minutes; how many do depends on the "
             "machine and its load, so another run gives other bits"
         )
+    if unseen := result.counters["unseen"]:
+        job.decide(f"{unseen} Gaussians that no training photograph sees are left out")
     result.gaussians.save(job.out / "gaussians.npz")
     if result.lenses is not None:
         model = with_lenses(model, result.lenses)

@@ -386,15 +386,15 @@ def adam_step(
     param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
 
 
-def sh_adam(sh: torch.Tensor, grad: torch.Tensor, visible: torch.Tensor, adam: ShAdam) -> None:
-    """Adam over the harmonics (N, K, 3) of the Gaussians in view, ``visible`` (N,) bool; all in
-    place, of sh's type but for ``adam.last``.
+def sh_adam(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:
+    """Adam over the harmonics (N, K, 3) of the Gaussians that the view asks of, ``asked`` (N,)
+    bool; all in place, of sh's type but for ``adam.last``.
 
     n steps without a gradient multiply the moments by beta1^n and beta2^n, and move the parameter
     by m / sqrt(v) times r + r^2 + ... + r^n, r = beta1 / sqrt(beta2); the bias corrections and
     rates of the present step are taken for all of them. What is left then is a usual step.
     """
-    rows = torch.nonzero(visible)[:, 0]
+    rows = torch.nonzero(asked)[:, 0]
     missed = (adam.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
     rates = torch.full(sh.shape[1:], adam.rate, dtype=sh.dtype)
     rates[0] = adam.rate0

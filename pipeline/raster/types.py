@@ -95,15 +95,15 @@ class Gradients:
 
 @dataclass(frozen=True)
 class ShAdam:
-    """Adam over the spherical harmonics of what is in view (``backward``'s ``sh_adam``).
+    """Adam over the spherical harmonics of what the view asks of (``backward``'s ``sh_adam``).
 
-    A Gaussian out of view for n steps gets, in the next step in view, what n steps without a
-    gradient would have done (``twin.sh_adam``): the same as dense Adam, but for the colour it is
-    drawn with in that one step.
+    A Gaussian of which n steps asked nothing, out of view or behind what is opaque, gets in the
+    next that does what n steps without a gradient would have done (``twin.sh_adam``): the same as
+    dense Adam, but for the colour it is drawn with in that one step.
 
     Attributes:
         exp_avg, exp_avg_sq: (N, K, 3) float32, moved in place.
-        last: (N,) int32, the step of each Gaussian's last update, 0 before the first; in place.
+        last: (N,) int32, the last step that asked of each Gaussian, 0 before the first; in place.
         rate0, rate: learning rates of the constant coefficient and of the others.
         step: from 1.
     """

@@ -35,7 +35,7 @@ class Adam:
 
     Attributes:
         first, second: by the name of the array, of its shape, float32.
-        last: (N,) int32, the step in which each row's harmonics were last moved.
+        last: (N,) int32, the last step whose view asked anything of each row.
     """
 
     def __init__(self, gaussians: Gaussians):

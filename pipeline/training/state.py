@@ -26,6 +26,7 @@ class Counters:
         max_gaussians: the most there ever were.
         num_dropped: Gaussians the rasterizer left out for numerical reasons, over all steps.
         blind_steps: steps whose view saw no Gaussian.
+        unseen: Gaussians left out in the end because no training view saw them.
     """
 
     changes: Changes = field(default_factory=Changes)
@@ -33,6 +34,7 @@ class Counters:
     max_gaussians: int = 0
     num_dropped: int = 0
     blind_steps: int = 0
+    unseen: int = 0
 
 
 @dataclass

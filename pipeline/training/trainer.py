@@ -40,7 +40,7 @@ from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
 # Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 6
+STATE_VERSION = 7
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -431,7 +431,21 @@ class _Run:
             Checkpoint(state.step, self.identity, state.arrays(), state.values()),
         )
 
+    def drop_unseen(self) -> None:
+        """Leave out what no photograph looked at in an epoch: training made it as it is by
+        chance, and before another camera it would stand as a floater. In photographs that were
+        trained on nothing changes."""
+        state = self.state
+        # A window this long holds an epoch whole, whatever their orders.
+        before = state.step - 2 * len(self.views) + 1
+        if before > 0:
+            seen = state.adam.last > before
+            state.counters.unseen = int((~seen).sum())
+            if seen.any():
+                state.gaussians = state.gaussians.select(torch.nonzero(seen)[:, 0])
+
     def result(self) -> TrainResult:
+        self.drop_unseen()
         state, lenses = self.state, self.state.cameras.lenses
         if state.counters.blind_steps:
             self.warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")

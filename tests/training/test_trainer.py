@@ -69,6 +69,31 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
     monkeypatch.setattr(trainer, "backward", dying)
 
 
+def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) -> None:
+    """One Gaussian is above all cameras, another inside an opaque ball of others. A run too short
+    for each photograph to have been looked at knows nothing."""
+    initial = scene.initial.select(torch.arange(len(scene.initial)))
+    initial.means[0] = torch.tensor([0.0, -50.0, 0.0])
+    initial.means[1] = 0.0
+    initial.log_scales[1] = -6.0
+    around = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.manual_seed(0)))
+    initial.means[2:42] = 0.3 * around
+    initial.log_scales[2:42] = -1.0
+    initial.opacity_logits[2:42] = 12.0
+    fixed = tiny_config(40, density={"stop_share": 0.0}, lr_means=0.0, lr_opacities=0.0)
+    planted = replace(scene, initial=initial)
+    result = run(planted, tmp_path / "a", fixed)
+    assert result.counters["unseen"] == len(initial) - len(result.gaussians) >= 2
+    places = result.gaussians.means
+    assert not (places == initial.means[0]).all(1).any()
+    assert not (places == initial.means[1]).all(1).any()
+    assert (places == initial.means[2]).all(1).any()
+    short = run(
+        planted, tmp_path / "b", fixed.model_copy(update={"steps": 2 * len(scene.views) - 1})
+    )
+    assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
+
+
 def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     result = run(scene, tmp_path, tiny_config(500))
     assert result.steps == 500

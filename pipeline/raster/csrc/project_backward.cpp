@@ -45,6 +45,14 @@ struct GroupMoments {
         for (int m = 0; m < 12; m++) moment[m] = sums[sum_lane(m)];
     }
 
+    // The lanes of which anything is asked: what is drawn behind opaque things is not.
+    SPLAT_INLINE uint32_t any() const {
+        const f32x16 zero = {};
+        f32x16 most = zero;
+        for (const f32x16& m : moment) most = max(most, abs(m));
+        return bits(lt(zero, most));
+    }
+
     // From the moments of y = (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2)
     // and y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
     SPLAT_INLINE ImageGradients half(int h) const {
@@ -147,6 +155,11 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
             return;
         }
         const GroupMoments asked(records + first, slots + first, slot_gradients, drawn);
+        drawn &= asked.any();
+        if (!drawn) {
+            write_zeros(out, first, group.count, sh_width);
+            return;
+        }
         ImageGradients image[2];
         InputGradients half[2];
         CameraCenter::Toward toward[2];

@@ -1,7 +1,7 @@
 // Adam for spherical harmonics inside the backward pass, where their gradients are still in
-// registers, and of the Gaussians in view alone: four fifths of a Gaussian are harmonics, and most
-// are out of most views. What an update out of view would have done, moments that decay and a drift
-// that fades with them, is made good at the next one in view.
+// registers, and of the Gaussians alone that the view asks of: four fifths of a Gaussian are
+// harmonics, and most are out of most views, or hidden. What updates without a gradient would have
+// done, moments that decay and a drift that fades with them, is made good at the next one with one.
 #pragma once
 
 #include <cmath>

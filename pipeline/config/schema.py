@@ -161,8 +161,10 @@ class Init(Section):
     method: Literal["auto", "points", "random"] = Field(
         "auto", description="auto: sparse points, triangulated if the poses came without any."
     )
-    num_random: Positive = Field(50_000, description="Gaussians of a random start.")
-    opacity: Share = Field(0.3, description="Opacity of a new Gaussian.")
+    num_random: Positive = Field(10_000, description="Gaussians of a random start.")
+    opacity: Share = Field(
+        0.3, description="Opacity of a new Gaussian; of a random start 0.1 at most."
+    )
     max_points: Positive = Field(
         200_000,
         description="More sparse points are thinned to this, or to "

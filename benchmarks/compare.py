@@ -18,6 +18,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from pipeline.config.runs import Run
 from pipeline.config.schema import Config
 from pipeline.runtime.job import EXIT_USER_ERROR
 
@@ -46,8 +47,9 @@ def each(rows: Sequence[Row]) -> list[str]:
         "| training s | in all s | most MB | |",
         "|---" * 12 + "|",
     ]
+    seeded = len({row["seed"] for row in rows}) > 1
     for row in rows:
-        name = f"{row['scene']}@{row['config']}"
+        name = Run(row["scene"], row["config"], row["seed"] if seeded else None).name
         if row["status"] != "ok":
             lines.append(f"| {name} | {row['status']}: {row['message']} {'| ' * 10}|")
             continue

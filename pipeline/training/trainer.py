@@ -435,6 +435,8 @@ class _Run:
         """Leave out what no photograph looked at in an epoch: training made it as it is by
         chance, and before another camera it would stand as a floater. In photographs that were
         trained on nothing changes."""
+        if self.config.gradients_per_pixel:
+            return  # then much that is seen has none
         state = self.state
         # A window this long holds an epoch whole, whatever their orders.
         before = state.step - 2 * len(self.views) + 1

@@ -136,9 +136,9 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/training/test_schedule.py",),
     ),
     "unseen_kept": Mutant(
-        "pipeline/training/trainer.py",
-        "seen = state.adam.last > before",
-        "seen = state.adam.last > before - 10**6",
+        "pipeline/training/state.py",
+        "seen = self.adam.last > before",
+        "seen = self.adam.last > before - 10**6",
         "what no photograph saw kept",
         ("tests/training/test_trainer.py",),
     ),

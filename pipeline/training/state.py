@@ -89,6 +89,17 @@ class TrainState:
         self.gaussians = self.gaussians.select(order)
         self.adam.select(order, torch.zeros(len(order), dtype=torch.bool))
 
+    def drop_unseen(self, views: int) -> None:
+        """Leave out, in the end, what none of the ``views`` photographs looked at in an epoch:
+        training made it as it is by chance, and before another camera it would stand as a floater.
+        In photographs that were trained on nothing changes."""
+        # A window this long holds an epoch whole, whatever their orders.
+        before = self.step - 2 * views + 1
+        seen = self.adam.last > before
+        if before > 0 and seen.any():
+            self.counters.unseen = int((~seen).sum())
+            self.gaussians = self.gaussians.select(torch.nonzero(seen)[:, 0])
+
     def arrays(self) -> dict[str, NDArray[Any]]:
         """All arrays, sharing memory."""
         result: dict[str, NDArray[Any]] = {"order": self.order}

@@ -431,24 +431,10 @@ class _Run:
             Checkpoint(state.step, self.identity, state.arrays(), state.values()),
         )
 
-    def drop_unseen(self) -> None:
-        """Leave out what no photograph looked at in an epoch: training made it as it is by
-        chance, and before another camera it would stand as a floater. In photographs that were
-        trained on nothing changes."""
-        if self.config.gradients_per_pixel:
-            return  # then much that is seen has none
-        state = self.state
-        # A window this long holds an epoch whole, whatever their orders.
-        before = state.step - 2 * len(self.views) + 1
-        if before > 0:
-            seen = state.adam.last > before
-            state.counters.unseen = int((~seen).sum())
-            if seen.any():
-                state.gaussians = state.gaussians.select(torch.nonzero(seen)[:, 0])
-
     def result(self) -> TrainResult:
-        self.drop_unseen()
         state, lenses = self.state, self.state.cameras.lenses
+        if not self.config.gradients_per_pixel:  # there much that is seen has no gradient
+            state.drop_unseen(len(self.views))
         if state.counters.blind_steps:
             self.warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
         return TrainResult(

@@ -11,6 +11,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from PIL import ExifTags, Image
 from pydantic import BaseModel, ConfigDict
 
@@ -67,7 +68,7 @@ def digest_of(path: Path) -> str:
 
 
 def read_facts(path: Path) -> FileFacts:
-    """Look at a photograph's header.
+    """Look at a photograph's header, and at its alpha where it has one.
 
     Raises:
         UserError: the file cannot be read, or is no picture of a kind this program reads.
@@ -87,7 +88,7 @@ def read_facts(path: Path) -> FileFacts:
                 digest=digest,
                 width=width,
                 height=height,
-                alpha="A" in image.mode or "transparency" in image.info,
+                alpha=_sees_through(image),
                 bits=_bits(image),
                 **_exif_facts(exif, width, height),
             )
@@ -128,6 +129,16 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
         facts["taken"] = stamp.isoformat()
     facts["lens"] = facts["lens"] or lens
     return FileFacts(digest=digest, width=width, height=height, raw=True, bits=16, **facts)
+
+
+def _sees_through(image: Image.Image) -> bool:
+    """Whether a pixel is less than opaque: a channel for it alone says nothing."""
+    if "A" not in image.mode:
+        return "transparency" in image.info
+    try:
+        return bool(np.asarray(image.getchannel("A")).min() < 255)
+    except (OSError, SyntaxError, ValueError):
+        return True  # what reads the pixels will say what is wrong with them
 
 
 def _bits(image: Image.Image) -> int:

@@ -345,6 +345,18 @@ def test_exif_facts(tmp_path):
     )
 
 
+def test_an_alpha_channel_that_hides_nothing_is_none(tmp_path):
+    """Else the scene would be trained and measured over other backgrounds than its copy in RGB."""
+    (tmp_path / "images").mkdir()
+    for i, (mode, least) in enumerate((("RGBA", 255), ("RGBA", 254), ("LA", 255), ("LA", 0))):
+        image = Image.new(mode, (64, 48), "gray")
+        alpha = Image.new("L", (64, 48), 255)
+        alpha.putpixel((63, 47), least)
+        image.putalpha(alpha)
+        image.save(tmp_path / "images" / f"{i}.png")
+    assert [photo.alpha for photo in look(tmp_path).photos] == [False, True, False, True]
+
+
 @pytest.mark.parametrize(
     "exif, focal",
     [
@@ -504,7 +516,7 @@ def test_cache_changes_nothing_and_may_fail(scene, tmp_path):
     plain = look(scene)
     assert look(scene, cache=cache) == plain == look(scene, cache=cache)
     assert cache.exists()
-    for broken in ("", "[]", '{"version": 1}', '{"version": 1, "files": {"photo:x": 3}}'):
+    for broken in ("", "[]", '{"version": 2}', '{"version": 2, "files": {"photo:x": 3}}'):
         cache.write_text(broken)
         assert look(scene, cache=cache) == plain
     (tmp_path / "file").write_text("")

@@ -89,6 +89,8 @@ class Step:
         target = torch.rand(size[1], size[0], 3, generator=gen)
         params = [g.clone() for g in s.inputs]
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
+        for k in (0, 2):  # of means and quaternions one for all
+            moments[k] = moments[k][0], torch.zeros(scene.count, 1)
         last = torch.zeros(scene.count, dtype=torch.int32)
         # Rates of 0, so that every repeat draws the same.
         rate = torch.zeros(1, dtype=torch.float64)
@@ -155,7 +157,8 @@ class Step:
             "projection, SH backward": Cost(
                 n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
             ),
-            "Adam": Cost(0, 7 * n * (row - sh)),
+            # Means and quaternions, 7 floats, have two second moments.
+            "Adam": Cost(0, 7 * n * (row - sh) - 2 * n * 4 * 5),
         }
 
     def once(self) -> dict[str, Timing]:

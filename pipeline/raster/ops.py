@@ -323,12 +323,18 @@ def adam_step(
 
     All four tensors: float32, contiguous, of one shape. ``lr`` may be several rates, which repeat
     over the elements: one for each element of a row, say.
+
+    Rows of 3 or 4 may share a second moment, that of their mean square: ``exp_avg_sq`` is (N, 1)
+    then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it.
     """
+    shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
     for tensor in (param, grad, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
             raise ValueError("adam_step: tensors must be float32 and contiguous")
-        if tensor.shape != param.shape:
+        if tensor.shape != param.shape and not (shared and tensor is exp_avg_sq):
             raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
+    if shared and not isinstance(lr, int | float):
+        raise ValueError(f"adam_step: rows that share a moment have one lr, found {lr}")
     rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
     if step < 1 or not len(rates) or not rates.isfinite().all():
         raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")

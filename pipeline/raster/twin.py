@@ -376,12 +376,15 @@ def adam_step(
     eps: float = 1e-15,
 ) -> None:
     """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
-    repeat over the elements."""
+    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment."""
     pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
     repeats = -(-param.numel() // len(pattern))
     rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
     exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
-    exp_avg_sq.mul_(beta2).addcmul_(grad, grad, value=1 - beta2)
+    squares = grad.square()
+    if exp_avg_sq.shape != grad.shape:
+        squares = squares.mean(1, keepdim=True)
+    exp_avg_sq.mul_(beta2).add_(squares, alpha=1 - beta2)
     denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
     param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
 

@@ -34,7 +34,8 @@ class Adam:
     """First and second moments beside a ``Gaussians``, row by row.
 
     Attributes:
-        first, second: by the name of the array, of its shape, float32.
+        first, second: by the name of the array, of its shape, float32; but (N, 1) the second of
+            means and quaternions, so that a turned world is trained as it was.
         last: (N,) int32, the last step whose view asked anything of each row.
     """
 
@@ -42,6 +43,8 @@ class Adam:
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
+        for name in ("means", "quats"):
+            self.second[name] = torch.zeros(len(gaussians), 1)
         self.last = torch.zeros(len(gaussians), dtype=torch.int32)
 
     def harmonics(self, rates: Rates, step: int) -> ShAdam:

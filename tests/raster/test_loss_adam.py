@@ -121,6 +121,36 @@ def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
     assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize(("rows", "columns"), [(1, 3), (16, 4), (37, 3), (1001, 4), (0, 3)])
+def test_rows_that_share_a_second_moment_step_as_the_twins(rows: int, columns: int) -> None:
+    gen = torch.Generator().manual_seed(5)
+    ours = torch.randn(rows, columns, generator=gen)
+    theirs = ours.double()
+    m, v = torch.zeros_like(ours), torch.zeros(rows, 1)
+    m64, v64 = m.double(), v.double()
+    for step in range(1, 20):
+        grad = torch.randn(rows, columns, generator=gen) * 10.0 ** (step % 5 - 3)
+        grad[:1] = 0
+        raster.adam_step(ours, grad, m, v, 1e-2, step)
+        twin.adam_step(theirs, grad.double(), m64, v64, 1e-2, step)
+    assert torch.allclose(ours.double(), theirs, rtol=0, atol=2e-6)
+    assert torch.allclose(v.double(), v64, rtol=1e-5, atol=0)
+
+
+def test_rows_that_share_a_second_moment_turn_with_their_space() -> None:
+    gen = torch.Generator().manual_seed(6)
+    turn = torch.linalg.qr(torch.randn(3, 3, generator=gen, dtype=torch.float64))[0]
+    rows = torch.randn(50, 3, generator=gen, dtype=torch.float64)
+    turned = (rows @ turn.T).float()
+    ours = rows.float()
+    moments = [(torch.zeros(50, 3), torch.zeros(50, 1)) for _ in range(2)]
+    for step in range(1, 10):
+        grad = torch.randn(50, 3, generator=gen, dtype=torch.float64)
+        raster.adam_step(ours, grad.float(), *moments[0], 1e-2, step)
+        raster.adam_step(turned, (grad @ turn.T).float(), *moments[1], 1e-2, step)
+    assert torch.allclose(turned.double(), ours.double() @ turn.T, rtol=0, atol=1e-5)
+
+
 def test_adam_refuses_what_it_cannot_update_in_place() -> None:
     a = torch.zeros(4, 4)
     with pytest.raises(ValueError, match="contiguous"):
@@ -129,6 +159,10 @@ def test_adam_refuses_what_it_cannot_update_in_place() -> None:
         raster.adam_step(a, torch.zeros(4), a, a, 0.1, 1)
     with pytest.raises(ValueError, match="step"):
         raster.adam_step(a, a, a, a, 0.1, 0)
+    with pytest.raises(ValueError, match="one lr"):
+        raster.adam_step(a, a, a, torch.zeros(4, 1), [0.1, 0.2], 1)
+    with pytest.raises(ValueError, match="shapes differ"):
+        raster.adam_step(*(torch.zeros(4, 5) for _ in range(3)), torch.zeros(4, 1), 0.1, 1)
 
 
 def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:

@@ -68,8 +68,8 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
     for name, tensor in result.tensors().items():
         assert tensor.is_contiguous()
         for moments in (adam.first, adam.second):
-            assert moments[name].shape == tensor.shape
-            per_row = moments[name].flatten(1) if tensor.ndim > 1 else moments[name][:, None]
+            assert len(moments[name]) == len(tensor)
+            per_row = moments[name].reshape(len(tensor), math.prod(moments[name].shape[1:]))
             assert (per_row == per_row[:, :1]).all()
     # Whoever has moments has its own; the new have none.
     for row, moment in zip(result.means, adam.first["opacity_logits"], strict=True):
@@ -179,7 +179,8 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
         assert len(result) == alive
         assert changes.pruned == count - alive
     for name, tensor in result.tensors().items():
-        assert adam.first[name].shape == adam.second[name].shape == tensor.shape
+        assert adam.first[name].shape == tensor.shape
+        assert len(adam.second[name]) == len(tensor)
         assert torch.isfinite(tensor).all()
     # Whoever stayed as it was has its own moments; whoever was shared out, and the new, have none.
     had = {row.numpy().tobytes(): i + 1 for i, row in enumerate(gaussians.means)}

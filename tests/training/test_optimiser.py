@@ -1,11 +1,11 @@
-"""Adam against torch's own, with a learning rate for each group."""
+"""Adam against torch's own, with a learning rate for each group; and against the twin's."""
 
 from __future__ import annotations
 
 import pytest
 import torch
 
-from pipeline.raster import RasterOptions, backward, forward
+from pipeline.raster import RasterOptions, backward, forward, twin
 from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import raster_camera
 from tests.training.conftest import ball, camera_at
@@ -18,7 +18,9 @@ def test_matches_torch_adam_with_parameter_groups(degree: int) -> None:
     gaussians = ball(37, 0).with_sh_degree(degree)
     adam = Adam(gaussians)
     leaves = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
-    groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh"]
+    shared = {"means": torch.zeros(37, 1), "quats": torch.zeros(37, 1)}
+    first = {name: torch.zeros_like(leaves[name]) for name in shared}
+    groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh" and n not in shared]
     dc, rest = leaves["sh"][:, :1].clone(), leaves["sh"][:, 1:].clone()
     groups += [(dc, RATES.sh0), (rest, RATES.shN)]
     reference = torch.optim.Adam([{"params": [p], "lr": lr} for p, lr in groups], eps=1e-15)
@@ -30,10 +32,13 @@ def test_matches_torch_adam_with_parameter_groups(degree: int) -> None:
         d_color = drawn.color - wanted
         gradients = backward(drawn, d_color)
         for name in leaves:
-            if name != "sh":
+            if name != "sh" and name not in shared:
                 leaves[name].grad = getattr(gradients, name)
         dc.grad, rest.grad = gradients.sh[:, :1], gradients.sh[:, 1:]
         reference.step()
+        for name, second in shared.items():
+            rate, gradient = getattr(RATES, name), getattr(gradients, name)
+            twin.adam_step(leaves[name], gradient, first[name], second, rate, step)
         backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
         adam.step(gaussians, gradients, RATES, step, 1)
     leaves["sh"] = torch.cat([dc, rest], 1)

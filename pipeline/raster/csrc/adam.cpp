@@ -3,10 +3,50 @@
 #include <cmath>
 #include <vector>
 
-#include "simd.h"
+#include "group.h"
 #include "threads.h"
 
 namespace splat {
+namespace {
+
+// What a step's rates are multiplied by, and a second moment's root.
+struct Corrections {
+    double to_rate;
+    float to_root;
+
+    explicit Corrections(const AdamSettings& s)
+        : to_rate(1 / (1 - std::pow(s.beta1, double(s.step)))),
+          to_root(float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))))) {}
+};
+
+template <int K>
+void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t rows,
+               const AdamSettings& s, int threads) {
+    const Corrections correct(s);
+    const float rate = float(s.rates[0] * correct.to_rate), eps = float(s.eps);
+    const float beta1 = float(s.beta1), beta2 = float(s.beta2);
+    const float rest1 = float(1 - s.beta1), rest2 = float((1 - s.beta2) / K);
+    parallel_for((rows + kGroup - 1) / kGroup, 256, threads, [&](int64_t number) {
+        const int64_t first = kGroup * number;
+        const int count = int(rows - first < kGroup ? rows - first : kGroup);
+        f32x16 p[K], g[K], m[K], squares = {};
+        read_rows(param + K * first, count, p);
+        read_rows(grad + K * first, count, g);
+        read_rows(exp_avg + K * first, count, m);
+        for (int k = 0; k < K; k++) squares += g[k] * g[k];
+        const f32x16 v = read_column(exp_avg_sq + first, count) * beta2 + squares * rest2;
+        const f32x16 far = rate / (sqrt(v) * correct.to_root + eps);
+        for (int k = 0; k < K; k++) {
+            m[k] = m[k] * beta1 + g[k] * rest1;
+            p[k] -= far * m[k];
+        }
+        write_rows(p, count, param + K * first);
+        write_rows(m, count, exp_avg + K * first);
+        write_column(v, count, exp_avg_sq + first);
+    });
+}
+
+}  // namespace
 
 void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t count,
                const AdamSettings& s, int threads) {
@@ -14,13 +54,14 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
     const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
     // Every pattern of rates starts anew after as many vectors as it has rates.
     std::vector<float> rates(16 * s.num_rates);
+    const Corrections correct(s);
     for (size_t i = 0; i < rates.size(); i++)
-        rates[i] = float(s.rates[i % s.num_rates] / (1 - std::pow(s.beta1, double(s.step))));
-    const float scale = float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))));
+        rates[i] = float(s.rates[i % s.num_rates] * correct.to_rate);
     const auto update = [&](int64_t k, f32x16& p, f32x16 g, f32x16& m, f32x16& v) {
         m = m * beta1 + g * rest1;
         v = v * beta2 + g * g * rest2;
-        p -= load<f32x16>(rates.data() + 16 * (k % s.num_rates)) * m / (sqrt(v) * scale + eps);
+        p -= load<f32x16>(rates.data() + 16 * (k % s.num_rates)) * m /
+             (sqrt(v) * correct.to_root + eps);
     };
     const int64_t vectors = count / 16;
     parallel_for(vectors, 1024, threads, [&](int64_t k) {
@@ -43,6 +84,12 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
     std::memcpy(param + done, &p, bytes);
     std::memcpy(exp_avg + done, &m, bytes);
     std::memcpy(exp_avg_sq + done, &v, bytes);
+}
+
+void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
+                    int64_t rows, int width, const AdamSettings& settings, int threads) {
+    (width == 3 ? adam_rows<3> : adam_rows<4>)(param, grad, exp_avg, exp_avg_sq, rows, settings,
+                                               threads);
 }
 
 }  // namespace splat

@@ -15,4 +15,8 @@ struct AdamSettings {
 void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t count,
                const AdamSettings& settings, int threads);
 
+// Rows of `width`, 3 or 4, floats that share a second moment, exp_avg_sq (rows); one rate.
+void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
+                    int64_t rows, int width, const AdamSettings& settings, int threads);
+
 }  // namespace splat

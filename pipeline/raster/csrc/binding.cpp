@@ -205,10 +205,15 @@ std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
                double beta2, double eps, int64_t threads) {
-    splat::adam_step(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
-                     mutable_floats(exp_avg_sq), param.numel(),
-                     {rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step},
-                     int(threads));
+    const splat::AdamSettings settings = {
+        rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step};
+    if (exp_avg_sq.numel() == param.numel())
+        splat::adam_step(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
+                         mutable_floats(exp_avg_sq), param.numel(), settings, int(threads));
+    else
+        splat::adam_step_rows(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
+                              mutable_floats(exp_avg_sq), param.size(0), int(param.size(1)),
+                              settings, int(threads));
 }
 
 }  // namespace

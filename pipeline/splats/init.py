@@ -15,12 +15,15 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Init
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import Points, View
+from pipeline.scene.rotations import rotation_to_quat
 from pipeline.scene.views import scene_extent
 
 # The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient.
 SH_C0 = 0.28209479177387814
 
 NEIGHBOURS = 3
+# As many with the point itself tell which way the surface there lies.
+PATCH = 12
 # A first Gaussian's standard deviation as seen from the nearest camera, radians: from a tenth of
 # a pixel (at a focal length of 1000) up to half a view. Less leaves bare walls, where points are
 # few, black for long; more is a stray point's haze over everything.
@@ -99,13 +102,14 @@ def gaussians_from_points(
         kept, distance = kept[chosen], distance[chosen]
 
     xyz = points.xyz[kept]
-    k = min(NEIGHBOURS, len(xyz) - 1)
-    if k:
-        spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1)
-    else:
-        spacing = np.full(1, LONE_ANGLE * usual)
+    found, near = cKDTree(xyz).query(xyz, min(PATCH, len(xyz)))
+    spacing = (
+        found[:, 1 : NEIGHBOURS + 1].mean(1) if len(xyz) > 1 else np.full(1, LONE_ANGLE * usual)
+    )
     colour = points.rgb[kept].astype(np.float64) / 255.0
     result = _spheres(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
+    if len(xyz) > NEIGHBOURS:
+        result.quats[:] = _lying(xyz, near)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
     return result
 
@@ -190,6 +194,15 @@ def _nearest_distance(
     if not len(xyz):
         return np.zeros(0)
     return np.asarray(cKDTree(centres).query(xyz)[0], np.float64)
+
+
+def _lying(xyz: NDArray[np.float64], near: NDArray[np.intp]) -> NDArray[np.float64]:
+    """(N, 4) wxyz, turned so that the first axis stands on the surface through each point's
+    neighbours (N, k): a sphere that becomes a disc need only shrink."""
+    patch = xyz[near] - xyz[near].mean(1, keepdims=True)
+    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))[1]
+    axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
+    return rotation_to_quat(axes)
 
 
 def _clamp(spacing: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 from pipeline.config.schema import Init
 from pipeline.runtime.errors import UserError
 from pipeline.scene.model import Points, View
+from pipeline.scene.rotations import quat_to_rotation
 from pipeline.splats.init import (
     MAX_ANGLE,
     SH_C0,
@@ -110,6 +111,23 @@ def test_thinning_keeps_the_number_asked_for_and_is_repeatable() -> None:
     assert len(first) == 50
     assert first.num_thinned == 450
     assert np.array_equal(first.means, again.means)
+
+
+def test_first_axes_stand_on_the_surface_and_turn_with_it() -> None:
+    """What is to be a disc on a wall need not turn first, however the world is turned."""
+    rng = np.random.default_rng(2)
+    wall = np.column_stack([rng.uniform(-1, 1, (200, 2)), 0.01 * rng.normal(size=200)])
+    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    turn *= np.sign(np.linalg.det(turn))
+    normals = []
+    for rotation in (np.eye(3), turn):
+        result = gaussians_from_points(points_at(wall @ rotation.T), CENTRES, Init(), 0)
+        axes = quat_to_rotation(result.quats.astype(np.float64))
+        assert np.allclose(np.linalg.det(axes), 1.0)
+        normals.append(axes[:, :, 0])
+    along = np.abs(np.einsum("ni,ni->n", normals[0] @ turn.T, normals[1]))
+    assert np.allclose(along, 1.0, atol=1e-6)
+    assert np.median(np.abs(normals[0][:, 2])) > 0.99
 
 
 def test_no_point_left_is_a_clear_error() -> None:

@@ -228,8 +228,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "spacing": Mutant(
         "pipeline/splats/init.py",
-        "spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1)\n    else:",
-        "spacing = cKDTree(xyz).query(xyz, k + 1)[0].mean(1)\n    else:",
+        "found[:, 1 : NEIGHBOURS + 1].mean(1)",
+        "found[:, :NEIGHBOURS].mean(1)",
         "a point counted among its own neighbours",
         ("tests/splats/test_init.py",),
     ),

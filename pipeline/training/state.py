@@ -92,7 +92,7 @@ class TrainState:
     def drop_unseen(self, views: int) -> None:
         """Leave out, in the end, what none of the ``views`` photographs looked at in an epoch:
         training made it as it is by chance, and before another camera it would stand as a floater.
-        In photographs that were trained on nothing changes."""
+        In photographs that were trained on next to nothing changes."""
         # A window this long holds an epoch whole, whatever their orders.
         before = self.step - 2 * views + 1
         seen = self.adam.last > before

@@ -16,7 +16,7 @@ from pipeline.scene.model import Reconstruction, View, with_poses
 from pipeline.scene.views import load_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
-from pipeline.training.depth import KnownDepths, point_depths
+from pipeline.training.depth import KnownDepths, point_depths, scene_scale
 from pipeline.training.depth_maps import add_maps
 from pipeline.training.lenses import changed_by, with_lenses
 from pipeline.training.poses import followed, moved_by
@@ -40,7 +40,10 @@ def run(job: Job) -> None:
     has_alpha = any(photo.alpha for photo in manifest.photos)
     gains = {} if has_alpha else choose_gains(job, views, model)
     training = [view for view in views if not view.is_test]
-    known = find_depths(job, training, manifest, model) if job.section(Train).depth_weight else None
+    points = point_depths(training, model)
+    wanted = job.section(Train).depth_weight
+    known = find_depths(job, training, manifest, points) if wanted else None
+    extent = scene_extent(views)
     start = time.perf_counter()
     result = train(
         training,
@@ -48,7 +51,8 @@ def run(job: Job) -> None:
         job.section(Train),
         seed=job.seed,
         threads=job.threads,
-        extent=scene_extent(views),
+        extent=extent,
+        scale=scene_scale(extent, points),
         gains=np.array([gains[view.name] for view in training]) if gains else None,
         depths=known,
         checkpoint_dir=job.scratch / "checkpoints",
@@ -87,10 +91,9 @@ def run(job: Job) -> None:
 
 
 def find_depths(
-    job: Job, views: list[View], manifest: Manifest, model: Reconstruction
+    job: Job, views: list[View], manifest: Manifest, points: list[KnownDepths]
 ) -> list[KnownDepths]:
     """Depths of the sparse points and of the user's depth maps, by view."""
-    points = point_depths(views, model)
     maps = {photo.name: photo.depth for photo in manifest.photos}
     known, kinds, refused = add_maps(views, points, [maps[view.name] for view in views])
     if kinds:

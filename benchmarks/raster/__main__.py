@@ -12,17 +12,19 @@ from typing import Any
 # torch's threads, which the twin runs on, must not spin: they would take our kernels' time.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from benchmarks.raster.accuracy import accuracy, twin_ratio
+from benchmarks.raster.accuracy import Accuracy, accuracy, twin_ratio
 from benchmarks.raster.measure import (
     BLOCK_OPERATIONS,
-    Peak,
+    Spread,
     Step,
+    Turn,
     block_pairs,
     contributing_pairs,
-    measured_peak,
+    take_turns,
 )
+from benchmarks.raster.peak import VECTOR_FLOPS, Calibration, Peak
 from benchmarks.raster.probe import OPERATORS, versus
-from benchmarks.raster.scenes import Scene, synthetic, trained
+from benchmarks.raster.scenes import synthetic, trained
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import machine_facts
@@ -50,7 +52,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--radius", type=float, default=5.0, help="mean 3-sigma radius, pixels")
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--seconds", type=float, default=2.0, help="spent on a scene's times")
+    parser.add_argument("--seconds", type=float, default=4.0, help="spent on a scene's times")
     parser.add_argument(
         "--model", type=Path, help="measure this export folder instead: point_cloud.ply, sparse/0"
     )
@@ -62,53 +64,79 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _measure(scene: Scene, threads: int, peak: Peak, args: argparse.Namespace) -> dict[str, Any]:
-    step = Step(scene, threads)
-    pairs, error = contributing_pairs(step), accuracy(step)
-    costs = step.costs(pairs)
+def _header(step: Step, pairs: int, error: Accuracy) -> None:
     print(
-        f"\n{scene.name}; {threads} threads; {pairs / 1e6:.3f}M contributing pairs, "
+        f"\n{step.scene.name}; {step.threads} threads; {pairs / 1e6:.3f}M contributing pairs, "
         f"{step.drawn.num_intersections} (Gaussian, tile) pairs\n"
         f"error against the float64 twin: colour {error.colour:.1e}, "
         f"gradients {error.gradient:.1e} relative\n"
-        f"{'':24} {'ms':>8} {'CPU ms':>8} {'Mpairs/s':>9} {'of peak':>8}"
+        f"{'':24} {'ms':>8} {'quartiles':>17} {'CPU ms':>8} {'Mpairs/s':>9} {'of peak':>8} "
+        f"{'of bound':>9} {'quartiles':>12}"
     )
+
+
+def _report(step: Step, turns: list[Turn], peak: Peak) -> dict[str, Any]:
+    """Prints one number of threads' table; the same as data."""
+    pairs, blocks, error = contributing_pairs(step), block_pairs(step), accuracy(step)
+    costs = step.costs(pairs)
+    _header(step, pairs, error)
     operators: dict[str, dict[str, Any]] = {}
-    for name, timing in step.time(args.seconds).items():
-        rate = pairs / timing.cpu / 1e3
-        share = costs[name].seconds(peak) * 1e3 / timing.cpu if name in costs else None
-        operators[name] = {
-            "ms": timing.wall, "cpu_ms": timing.cpu, "pairs_per_s": 1e6 * rate, "of_peak": share,
+    for name in turns[0].times:
+        wall = Spread.of([t.times[name].wall for t in turns])
+        cpu = Spread.of([t.times[name].cpu for t in turns])
+        found: dict[str, Any] = {
+            "ms": asdict(wall), "cpu_ms": asdict(cpu), "pairs_per_s": 1e3 * pairs / cpu.median,
         }  # fmt: skip
-        shown = "" if share is None else f"{share:8.2f}"
-        print(f"{name:24} {timing.wall:8.2f} {timing.cpu:8.2f} {rate:9.1f} {shown}")
-    blocks = block_pairs(step)
-    least = {
-        name: 1e3 * n * blocks / peak.vector_operations for name, n in BLOCK_OPERATIONS.items()
-    }
-    over = {name: operators[name]["cpu_ms"] / ms for name, ms in least.items() if blocks}
-    for name, ratio in over.items():
-        operators[name]["of_bound"] = ratio
-    shown = ", ".join(f"{name} {ratio:.2f}x" for name, ratio in over.items())
-    print(
-        f"{blocks / 1e6:.3f}M (Gaussian, block of 16 pixels) pairs; to what their vector "
-        f"operations take alone: {shown}"
-    )
-    result = {
-        "scene": scene.name, "gaussians": scene.count, "size": list(step.state.size),
-        "threads": threads, "pairs": pairs, "block_pairs": blocks,
-        "tile_pairs": step.drawn.num_intersections,
-        "operators": operators, "error": asdict(error),
-    }  # fmt: skip
-    if args.probe:
-        found = versus(step, args.probe, args.turns)
-        cells = [f"{n} {found.ours[n]:.2f} to {found.theirs[n]:.2f}" for n in OPERATORS]
-        print(
-            f"to the probe's, CPU ms: {', '.join(cells)}; all {found.ratio:.2f}x, "
-            f"our whole step {found.step_ratio:.2f}x"
+        line = (
+            f"{name:24} {wall.median:8.2f} {f'{wall.low:.2f} to {wall.high:.2f}':>17} "
+            f"{cpu.median:8.2f} {found['pairs_per_s'] / 1e6:9.1f}"
         )
-        result["probe"] = {**asdict(found), "ratio": found.ratio, "step_ratio": found.step_ratio}
-    return result
+        if name in costs:
+            found["of_peak"] = costs[name].seconds(peak) * 1e3 / cpu.median
+            line += f" {found['of_peak']:8.2f}"
+        if name in BLOCK_OPERATIONS and blocks:
+            least = 1e3 * BLOCK_OPERATIONS[name] * blocks  # ms, at one vector operation a second
+            over = Spread.of([t.times[name].cpu * t.flops / VECTOR_FLOPS / least for t in turns])
+            found["of_bound"] = asdict(over)
+            line += f" {over.median:8.2f}x {f'{over.low:.2f} to {over.high:.2f}':>12}"
+        operators[name] = found
+        print(line)
+    return {
+        "scene": step.scene.name, "gaussians": step.scene.count, "size": list(step.state.size),
+        "threads": step.threads, "turns": len(turns), "pairs": pairs, "block_pairs": blocks,
+        "tile_pairs": step.drawn.num_intersections, "operators": operators, "error": asdict(error),
+        "flops": asdict(Spread.of([t.flops for t in turns])),
+    }  # fmt: skip
+
+
+def _speedups(first: Step, turns: list[Turn], other: Step, others: list[Turn]) -> dict[str, Any]:
+    """Of more threads over fewer, turn by turn."""
+    found = {
+        name: Spread.of(
+            [a.times[name].wall / b.times[name].wall for a, b in zip(turns, others, strict=True)]
+        )
+        for name in turns[0].times
+    }
+    loop = Spread.of([b.flops / a.flops for a, b in zip(turns, others, strict=True)])
+    print(f"\n{first.threads} to {other.threads} threads, turn by turn (quartiles)")
+    for name, ratio in {**found, "the calibration loop": loop}.items():
+        print(f"{name:24} {ratio.median:8.2f}x {f'{ratio.low:.2f} to {ratio.high:.2f}':>16}")
+    return {
+        "scene": first.scene.name,
+        "threads": [first.threads, other.threads],
+        "operators": {name: asdict(ratio) for name, ratio in found.items()},
+        "calibration": asdict(loop),
+    }
+
+
+def _against_the_probe(step: Step, probe: Path, turns: int) -> dict[str, Any]:
+    found = versus(step, probe, turns)
+    cells = [f"{n} {found.ours[n]:.2f} to {found.theirs[n]:.2f}" for n in OPERATORS]
+    print(
+        f"to the probe's, CPU ms, {step.threads} threads: {', '.join(cells)}; "
+        f"all {found.ratio:.2f}x, our whole step {found.step_ratio:.2f}x"
+    )
+    return {**asdict(found), "ratio": found.ratio, "step_ratio": found.step_ratio}
 
 
 def main() -> None:
@@ -122,9 +150,10 @@ def main() -> None:
             for n in args.counts
         ]
     )
-    results, peaks, ratios = [], [], []
+    calibration = Calibration()
+    results, speedups, peaks, ratios = [], [], [], []
     for threads in args.threads:
-        peak = measured_peak(threads)
+        peak = calibration.peak(threads)
         peaks.append(peak)
         ratio = twin_ratio(threads)
         ratios.append({"threads": threads, **asdict(ratio)})
@@ -136,14 +165,22 @@ def main() -> None:
         )
     for make in scenes:
         scene = make()
-        for threads, peak in zip(args.threads, peaks, strict=True):
-            results.append(_measure(scene, threads, peak, args))
+        steps = [Step(scene, threads) for threads in args.threads]
+        taken = take_turns(steps, calibration, args.seconds)
+        for step, turns, peak in zip(steps, taken, peaks, strict=True):
+            result = _report(step, turns, peak)
+            if args.probe:
+                result["probe"] = _against_the_probe(step, args.probe, args.turns)
+            results.append(result)
+        for step, turns in zip(steps[1:], taken[1:], strict=True):
+            speedups.append(_speedups(steps[0], taken[0], step, turns))
     if args.json:
         value = {
             "machine": machine_facts(),
             "peak": [asdict(p) for p in peaks],
             "twin": ratios,
             "results": results,
+            "speedups": speedups,
         }
         write_json(args.json, value)
 

@@ -1,43 +1,26 @@
-"""Times of the operators of a training step, and what the machine could do at most."""
+"""Times of the operators of a training step, and the least that each has to do."""
 
 from __future__ import annotations
 
-import ctypes
 import statistics
-import subprocess
-import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 import torch
 
+from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import Scene
 from pipeline.raster import RasterOptions, build, forward
 
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT = 0.2
+MIN_TURNS = 5  # quartiles of fewer say nothing
 # Vector operations that one Gaussian over one block of 16 pixels takes at least: place 2, exponent
 # 2, 2^x 11, its bounds 3, transmittance 3; forward colour and what is left 4; backward place again
 # 2, transmittance 1, what the pixel asks 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
 BLOCK_OPERATIONS = {"blend": 25, "blend backward": 48}
-
-
-@dataclass(frozen=True)
-class Peak:
-    """Of ``threads`` threads: float32 operations and bytes moved, a second."""
-
-    threads: int
-    flops: float
-    bytes: float
-
-    @property
-    def vector_operations(self) -> float:
-        """Of 16 lanes, a second: a multiply-add is one. A machine that starts more when not all
-        of them multiply is underrated."""
-        return self.flops / 32
 
 
 @dataclass(frozen=True)
@@ -61,17 +44,27 @@ class Timing:
     cpu: float
 
 
-def measured_peak(threads: int) -> Peak:
-    """Runs the calibration loops of peak.cpp, compiled with the kernels' flags."""
-    with tempfile.TemporaryDirectory() as folder:
-        library = Path(folder) / "peak.so"
-        source = Path(__file__).with_name("peak.cpp")
-        flags = [*build.FLAGS, "-fopenmp", "-I", str(build.SOURCES), "-shared"]
-        subprocess.run([*build.compiler(), *flags, str(source), "-o", str(library)], check=True)
-        loaded = ctypes.CDLL(str(library))
-    for function in (loaded.peak_flops, loaded.peak_bytes):
-        function.restype = ctypes.c_double
-    return Peak(threads, loaded.peak_flops(threads), loaded.peak_bytes(threads))
+@dataclass(frozen=True)
+class Turn:
+    """One step: each operator's time, and the operations a second that the calibration loop had
+    reached just before."""
+
+    flops: float
+    times: dict[str, Timing]
+
+
+@dataclass(frozen=True)
+class Spread:
+    """Over turns: the median and the quartiles."""
+
+    median: float
+    low: float
+    high: float
+
+    @staticmethod
+    def of(values: Sequence[float]) -> Spread:
+        low, median, high = statistics.quantiles(values, n=4, method="inclusive")
+        return Spread(median, low, high)
 
 
 class Step:
@@ -174,20 +167,18 @@ class Step:
         )
         return times
 
-    def time(self, seconds: float) -> dict[str, Timing]:
-        """Medians over steps that take ``seconds`` in all."""
-        self.once()  # touches fresh memory
-        samples: list[dict[str, Timing]] = []
-        end = time.monotonic() + seconds
-        while time.monotonic() < end or len(samples) < 3:
-            samples.append(self.once())
-        return {
-            name: Timing(
-                statistics.median(s[name].wall for s in samples),
-                statistics.median(s[name].cpu for s in samples),
-            )
-            for name in samples[0]
-        }
+
+def take_turns(steps: Sequence[Step], calibration: Calibration, seconds: float) -> list[list[Turn]]:
+    """Every step once, again and again for ``seconds`` in all: a step's turns, in its place. What
+    is compared turn by turn has seen the same minutes of the machine."""
+    for step in steps:
+        step.once()  # touches fresh memory
+    taken: list[list[Turn]] = [[] for _ in steps]
+    end = time.monotonic() + seconds
+    while time.monotonic() < end or len(taken[0]) < MIN_TURNS:
+        for turns, step in zip(taken, steps, strict=True):
+            turns.append(Turn(calibration.flops(step.threads), step.once()))
+    return taken
 
 
 def block_pairs(step: Step) -> int:

@@ -194,7 +194,7 @@ class Density(Section):
     clone: bool = Field(True, description="gradient: without, the small split, too.")
     split: bool = Field(True, description="gradient: without, the large are cloned, too.")
     split_scale: Rate = Field(
-        0.01, description="Gaussians larger than this share of the scene's extent split."
+        0.01, description="Gaussians larger than this share of the scene's size split."
     )
     recycle: Share = Field(
         0.02,
@@ -204,7 +204,8 @@ class Density(Section):
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
     prune_scale: Rate = Field(
         0.1,
-        description="Larger ones (share of the extent) are removed after the first opacity reset.",
+        description="Larger ones (share of the scene's size) are removed after the first opacity "
+        "reset.",
     )
     opacity_reset_interval: Positive = Field(
         3000,
@@ -259,7 +260,7 @@ class Train(Section):
         "auto",
         description="Weight of the depths of the sparse points in the views that see them, and of "
         "depth maps in depths/ (mean error of the logarithm); 0: colours alone; auto: 0.3 with "
-        "depth maps, 0.03 for up to 20 photographs, else 0.",
+        "depth maps, 0.03 for up to 30 photographs, else 0.",
     )
     masked_opacity: Rate = Field(
         0.1,
@@ -299,7 +300,11 @@ class Train(Section):
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
-    lr_means: Rate = Field(1.6e-4, description="Times the scene's extent; at the start.")
+    lr_means: Rate = Field(
+        1.6e-4,
+        description="Times the scene's size (how far apart the cameras stand, at most half of the "
+        "median depth of the sparse points they see); at the start.",
+    )
     lr_means_final: Annotated[float, Field(gt=0)] = Field(
         1.6e-6, description="The same at the end (log-linear decay)."
     )

@@ -50,7 +50,7 @@ PIXELS_SEEN_PER_GAUSSIAN = 40
 GAUSSIANS_A_MINUTE = 50_000
 # Up to so many photographs, depths of sparse points are a help (docs/training.md): 7 training views
 # of a fountain gain 1.5 dB on views kept back, 8 of a door nothing, 38 of a fox lose 0.2 to 0.5 dB.
-FEW_PHOTOS, DEPTH_WEIGHT = 20, 0.03
+FEW_PHOTOS, DEPTH_WEIGHT = 30, 0.03
 MAP_WEIGHT = 0.3
 
 # Of training: the program with torch; a Gaussian.

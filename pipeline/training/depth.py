@@ -21,6 +21,8 @@ from pipeline.scene.model import Reconstruction, View
 TOLERANCE = 0.01
 #: Pixels more transparent than this have no depth yet.
 MIN_ALPHA = 0.1
+#: Of the middle of what views see, the most that lengths of a training are measured by.
+SCALE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
@@ -66,6 +68,17 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
         weight /= max(float(weight.mean()), 1e-6) if len(weight) else 1.0
         found.append(KnownDepths(xy[inside], z[inside].astype(np.float32), weight))
     return found
+
+
+def scene_scale(extent: float, known: Sequence[KnownDepths]) -> float:
+    """By what a training measures the means' steps and the sizes at which Gaussians split or go,
+    world unit: the extent, but at most half of the median depth that is known.
+
+    3DGS's measure is the extent, how far apart the cameras stand. Along a street that is many
+    times the distance of anything they see, and steps that are measured by it go through walls.
+    """
+    depths = np.concatenate([view.z for view in known]) if known else np.zeros(0)
+    return min(extent, SCALE_SHARE * float(np.median(depths))) if len(depths) else extent
 
 
 def depth_gradients(

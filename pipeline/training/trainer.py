@@ -6,8 +6,6 @@ checkpoints were written, or on how often the run was killed.
 
 from __future__ import annotations
 
-import hashlib
-import json
 import math
 import time
 from collections.abc import Callable, Sequence
@@ -31,6 +29,7 @@ from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
 from pipeline.training.depth import KnownDepths, depth_gradients
+from pipeline.training.identity import identity_of
 from pipeline.training.journal import Journal
 from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam, Rates
@@ -39,8 +38,6 @@ from pipeline.training.schedule import Schedule
 from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
-# Part of a checkpoint's identity: raise it when the state or its meaning changes.
-STATE_VERSION = 8
 CHECKPOINT_SECONDS = 30.0
 CURVE_RECORDS = 100
 # PSNR costs a pass over the picture; a sample of the steps is enough for a curve.
@@ -93,6 +90,7 @@ def train(
     threads: int,
     extent: float,
     checkpoint_dir: Path,
+    scale: float | None = None,
     gains: NDArray[np.float64] | None = None,
     depths: Sequence[KnownDepths] | None = None,
     journal: Path | None = None,
@@ -106,7 +104,10 @@ def train(
     Args:
         views: training views only.
         threads: of the native operators; torch itself runs on one, so that sums are the same.
-        extent: the scene's size in the world's unit (``scene.views.scene_extent``).
+        extent: how far apart the cameras stand, world unit (``scene.views.scene_extent``): the near
+            plane and the cameras' own steps are measured by it.
+        scale: by which the means' steps and the sizes of Gaussians are measured
+            (``training.depth.scene_scale``); None: the extent.
         gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
             (``photos.exposure``): renders are multiplied before they are compared. Only for
             views without alpha.
@@ -129,7 +130,17 @@ def train(
     torch.set_num_threads(1)
     try:
         run = _Run(
-            views, initial, config, seed, threads, extent, gains, depths, checkpoint_dir, on_log
+            views,
+            initial,
+            config,
+            seed,
+            threads,
+            extent,
+            scale,
+            gains,
+            depths,
+            checkpoint_dir,
+            on_log,
         )
         return run.train(journal)
     finally:
@@ -147,13 +158,15 @@ class _Run:
         seed: int,
         threads: int,
         extent: float,
+        scale: float | None,
         gains: NDArray[np.float64] | None,
         depths: Sequence[KnownDepths] | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
     ):
         self.views, self.config = list(views), config
-        self.threads, self.extent, self.near = threads, extent, near_plane(extent)
+        self.threads, self.near = threads, near_plane(extent)
+        self.scale = extent if scale is None else scale
         self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
@@ -162,7 +175,8 @@ class _Run:
         # auto is the plan's to settle; without one, nothing is known to be needed.
         self.depth_weight = 0.0 if config.depth_weight == "auto" else config.depth_weight
         self.depths = list(depths) if depths is not None and self.depth_weight else None
-        self.identity = _identity(views, initial, config, seed, extent, gains, self.depths)
+        sizes = (extent, self.scale)
+        self.identity = identity_of(views, initial, config, seed, sizes, gains, self.depths)
         self.targets = Targets(views, threads, config.salt_and_pepper, seed)
         self.drop_hidden_views()
         self.background = config.background
@@ -180,7 +194,7 @@ class _Run:
             chosen = np.sort(rng.permutation(len(gaussians))[:budget])
             gaussians = gaussians.select(torch.from_numpy(chosen))
         gaussians = in_morton_order(gaussians)
-        density = make_strategy(config.density, extent)
+        density = make_strategy(config.density, self.scale)
         density.start(len(gaussians))
         cameras = MovingCameras.of(self.views, gaussians, extent, config)
         order = rng.permutation(len(self.views))
@@ -360,7 +374,7 @@ class _Run:
         boost = schedule.lr_boost_of(self.run_length())
         factor = boost * schedule.lr_decay_at(state.clock)
         return Rates(
-            means=schedule.lr_means_at(state.clock) * boost * self.extent,
+            means=schedule.lr_means_at(state.clock) * boost * self.scale,
             log_scales=config.lr_scales * factor,
             quats=config.lr_quats * factor,
             opacity_logits=config.lr_opacities * factor,
@@ -456,33 +470,6 @@ class _Run:
         if poses is None:
             return None
         return dict(zip([view.name for view in self.views], poses.poses, strict=True))
-
-
-def _identity(
-    views: Sequence[View],
-    initial: Gaussians,
-    config: Train,
-    seed: int,
-    extent: float,
-    gains: NDArray[np.float64] | None,
-    depths: Sequence[KnownDepths] | None,
-) -> str:
-    """A digest of all that determines the result, apart from the pixels (whose stage's key names
-    the folder of checkpoints)."""
-    digest = hashlib.sha256()
-    described = [
-        (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
-        for v in views
-    ]
-    exposures = None if gains is None else gains.tolist()
-    text = json.dumps([STATE_VERSION, config.model_dump(), seed, extent, described, exposures])
-    digest.update(text.encode())
-    arrays: list[NDArray[Any]] = list(initial.arrays().values())
-    for known in depths or ():
-        arrays += [known.xy, known.z, known.weight]
-    for array in arrays:
-        digest.update(array.tobytes())
-    return digest.hexdigest()
 
 
 def _psnr(rendered: Tensor, wanted: Tensor, target: Target) -> float:

@@ -276,14 +276,14 @@ def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, bu
 
 
 @pytest.mark.parametrize(
-    "count, wanted, weight", [(20, "auto", 0.03), (21, "auto", 0.0), (21, 0.5, 0.5), (9, 0.0, 0.0)]
+    "count, wanted, weight", [(30, "auto", 0.03), (31, "auto", 0.0), (31, 0.5, 0.5), (9, 0.0, 0.0)]
 )
 def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
     config = Config.model_validate({"train": {"depth_weight": wanted}})
     plan = make_plan(many(tmp_path, count), config)
     assert plan.config.train.depth_weight == weight
     assert any("depths" in text for text in plan.stages["train"].decisions) == (
-        count != 21 or wanted != "auto"
+        count != 31 or wanted != "auto"
     )
 
 

@@ -32,7 +32,7 @@ def marked(count: int) -> tuple[Gaussians, Adam]:
 
 
 def strategy(count: int, **options: object) -> GradientDensity:
-    density = GradientDensity(Density(**options), extent=1.0)  # type: ignore[arg-type]
+    density = GradientDensity(Density(**options), scale=1.0)  # type: ignore[arg-type]
     density.start(count)
     density.seen += 1
     return density
@@ -158,7 +158,7 @@ def test_without_split_or_clone_the_other_is_done_to_all() -> None:
 
 
 def mcmc(**options: object) -> McmcDensity:
-    return McmcDensity(Density(strategy="mcmc", **options), extent=1.0)  # type: ignore[arg-type]
+    return McmcDensity(Density(strategy="mcmc", **options), scale=1.0)  # type: ignore[arg-type]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -238,7 +238,7 @@ def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) ->
         gaussians.log_scales += math.log(unit)
         gaussians.opacity_logits[:60] = -6.0
         config = Density(strategy=kind, split_scale=0.13, prune_scale=0.17)  # type: ignore[arg-type]
-        density = make_strategy(config, extent=1.5 * unit)
+        density = make_strategy(config, scale=1.5 * unit)
         density.start(200)
         if isinstance(density, GradientDensity):
             density.gradient_sum += torch.linspace(0, 4e-4, 200)

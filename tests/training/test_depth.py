@@ -16,7 +16,13 @@ from pipeline.config.schema import Density, Train
 from pipeline.raster import Forward
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction, View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.depth import TOLERANCE, KnownDepths, depth_gradients, point_depths
+from pipeline.training.depth import (
+    TOLERANCE,
+    KnownDepths,
+    depth_gradients,
+    point_depths,
+    scene_scale,
+)
 from pipeline.training.render import render_view
 from pipeline.training.trainer import train
 from tests.training.conftest import HEIGHT, WIDTH, camera_at
@@ -45,6 +51,21 @@ def test_the_depth_of_a_point_is_known_where_a_view_sees_it_and_nowhere_else():
     assert first.z[0] * np.sqrt(1 + x * x + y * y) == pytest.approx(away, rel=1e-6)
     assert second.weight.mean() == pytest.approx(1.0)
     assert second.weight[0] == pytest.approx(2 * second.weight[1])
+
+
+def depths(*values: float) -> KnownDepths:
+    n = len(values)
+    return KnownDepths(np.zeros((n, 2)), np.array(values, np.float32), np.ones(n, np.float32))
+
+
+@pytest.mark.parametrize("unit", [1.0, 1e-4])
+def test_a_street_is_measured_by_what_is_seen_and_a_walk_around_by_the_cameras(unit: float) -> None:
+    """Cameras 100 apart of which none sees farther than 8: steps measured by the 100 went through
+    the walls, and each camera got fog of its own."""
+    street = [depths(3 * unit, 4 * unit), depths(), depths(8 * unit)]
+    assert scene_scale(100 * unit, street) == pytest.approx(2 * unit)
+    assert scene_scale(1.5 * unit, street) == 1.5 * unit
+    assert scene_scale(3 * unit, [depths()]) == scene_scale(3 * unit, []) == 3 * unit
 
 
 def test_the_gradients_are_those_of_the_loss_they_are_said_to_be_of():

@@ -28,19 +28,20 @@ RATES = {
 
 def test_each_parameter_steps_as_far_as_its_own_rate_says(scene: TinyScene, tmp_path: Path) -> None:
     """Adam's first step is the rate itself, up or down, or a row's root mean square where the row
-    shares a second moment; the means' counts in extents."""
-    extent = 3.0
+    shares a second moment; the means' counts in the scene's scale."""
+    scale = 3.0
     result = train(
         scene.views,
         scene.initial,
         tiny_config(1, **RATES),
         seed=0,
         threads=1,
-        extent=extent,
+        extent=scene.extent,
+        scale=scale,
         checkpoint_dir=tmp_path,
     )
     expected = {
-        "means": RATES["lr_means"] * extent,
+        "means": RATES["lr_means"] * scale,
         "log_scales": RATES["lr_scales"],
         "quats": RATES["lr_quats"],
         "opacity_logits": RATES["lr_opacities"],

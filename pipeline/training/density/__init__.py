@@ -8,8 +8,8 @@ from pipeline.training.density.strategy import Changes, Strategy
 __all__ = ["Changes", "GradientDensity", "McmcDensity", "Strategy", "make_strategy"]
 
 
-def make_strategy(config: Density, extent: float) -> Strategy:
-    """What ``config.strategy`` names; ``extent`` is the scene's size in the world's unit."""
+def make_strategy(config: Density, scale: float) -> Strategy:
+    """What ``config.strategy`` names; ``scale`` is ``training.depth.scene_scale``."""
     if config.strategy == "mcmc":
-        return McmcDensity(config, extent)
-    return GradientDensity(config, extent)
+        return McmcDensity(config, scale)
+    return GradientDensity(config, scale)

@@ -34,14 +34,14 @@ class GradientDensity:
 
     Attributes:
         config: thresholds and the budget.
-        extent: the scene's size in the world's unit, for thresholds on scales.
+        scale: the scene's size (``training.depth.scene_scale``), for thresholds on scales.
         gradient_sum: (N,) float32, summed norms of the gradient of the projected mean, in
             normalised device coordinates (so that it doesn't depend on the resolution).
         seen: (N,) float32, number of steps in which the Gaussian was visible.
     """
 
     config: Density
-    extent: float
+    scale: float
     gradient_sum: Tensor = field(default_factory=lambda: torch.zeros(0))
     seen: Tensor = field(default_factory=lambda: torch.zeros(0))
 
@@ -116,14 +116,14 @@ class GradientDensity:
         """(N,) bool: too faint, too large (``prune_huge``), or no longer a number."""
         useless = torch.sigmoid(gaussians.opacity_logits) < self.config.prune_opacity
         if prune_huge:
-            useless |= self._longest(gaussians) > self.config.prune_scale * self.extent
+            useless |= self._longest(gaussians) > self.config.prune_scale * self.scale
         return useless | not_finite(gaussians)
 
     def _large(self, gaussians: Gaussians) -> Tensor:
         """(N,) bool: those that split rather than clone, where both are allowed."""
         if not (self.config.clone and self.config.split):
             return torch.full((len(gaussians),), self.config.split)
-        return self._longest(gaussians) > self.config.split_scale * self.extent
+        return self._longest(gaussians) > self.config.split_scale * self.scale
 
     def _recycled(self, gaussians: Gaussians, kept: Tensor, wanted: Tensor, budget: int) -> Tensor:
         """(N,) bool: the faintest, which make room where more are wanted than the budget has left.

@@ -35,12 +35,13 @@ MAX_OPACITY = 1 - 1e-6
 class McmcDensity:
     """Attributes:
     config: growth, threshold of the useless, weights of the regularisers.
-    extent: the scene's size in the world's unit. The paper's cost of scales and its noise count in
-        that unit; here they count in extents, so that the unit does not matter.
+    scale: the scene's size (``training.depth.scene_scale``). The paper's cost of scales and its
+        noise count in the world's unit; here they count in that size, so that the unit does not
+        matter.
     """
 
     config: Density
-    extent: float
+    scale: float
 
     def start(self, count: int) -> None:
         pass
@@ -53,7 +54,7 @@ class McmcDensity:
             weight = self.config.opacity_cost / len(gaussians)
             gradients.opacity_logits.add_(opacity * (1 - opacity), alpha=weight)
         if self.config.scale_cost:
-            weight = self.config.scale_cost / (self.extent * gaussians.log_scales.numel())
+            weight = self.config.scale_cost / (self.scale * gaussians.log_scales.numel())
             gradients.log_scales.add_(gaussians.log_scales.exp(), alpha=weight)
 
     def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
@@ -72,7 +73,7 @@ class McmcDensity:
         axes = rotations(gaussians.quats[moved])
         variances = (2 * gaussians.log_scales[moved]).exp()
         noise = torch.einsum("nij,nj,nkj,nk->ni", axes, variances, axes, draws)
-        gaussians.means[moved] += noise * (share * (NOISE * rate / self.extent**2))[:, None]
+        gaussians.means[moved] += noise * (share * (NOISE * rate / self.scale**2))[:, None]
 
     def refine(
         self,

@@ -117,8 +117,9 @@ class Step:
             )  # fmt: skip
 
         def adam() -> None:
-            for p, g, (m, v) in zip(params[:4], kept["gradients"], moments, strict=False):
-                kernels.adam_step(p, g, m, v, rate, 1, 0.9, 0.999, 1e-15, threads)
+            units = (s.inputs[1], None, None, None)  # means count in their own sizes
+            for p, g, (m, v), unit in zip(params, kept["gradients"], moments, units, strict=False):
+                kernels.adam_step(p, g, m, v, unit, rate, 1, 0.8, 0.999, 1e-15, threads)
 
         self.operators: dict[str, Callable[[], None]] = {
             "projection, SH": project,

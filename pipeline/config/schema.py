@@ -300,13 +300,18 @@ class Train(Section):
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
-    lr_means: Rate = Field(
-        1.6e-4,
-        description="Times the scene's size (how far apart the cameras stand, at most half of the "
-        "median depth of the sparse points they see); at the start.",
+    adam_beta1: Annotated[float, Field(ge=0, lt=1)] = Field(
+        0.8, description="How much of the steps before goes on in each (3DGS: 0.9)."
     )
+    lr_means_unit: Literal["size", "scene"] = Field(
+        "size",
+        description="What the means' rate is times: size: each Gaussian's own, the geometric mean "
+        "of its scales; scene: how far apart the cameras stand, but at most half of the median "
+        "depth of the sparse points they see (3DGS: how far apart alone, 1.6e-4 and 1.6e-6).",
+    )
+    lr_means: Rate = Field(0.06, description="At the start.")
     lr_means_final: Annotated[float, Field(gt=0)] = Field(
-        1.6e-6, description="The same at the end (log-linear decay)."
+        3e-4, description="At the end (log-linear decay)."
     )
     lr_boost: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
         "auto",
@@ -321,7 +326,7 @@ class Train(Section):
     )
     lr_scales: Rate = 5e-3
     lr_quats: Rate = 1e-3
-    lr_opacities: Rate = 5e-2
+    lr_opacities: Rate = Field(2.5e-2, description="3DGS: 5e-2.")
     lr_sh0: Rate = 2.5e-3
     lr_shN: Rate = Field(3e-4, description="Higher SH bands (3DGS: 1.25e-4).")
     density: Density = Field(default_factory=Density)

@@ -318,6 +318,7 @@ def adam_step(
     beta2: float = 0.999,
     eps: float = 1e-15,
     threads: int = 0,
+    log_units: torch.Tensor | None = None,
 ) -> None:
     """One step of Adam in place, as torch.optim.Adam takes it; ``step`` counts from 1.
 
@@ -325,7 +326,9 @@ def adam_step(
     over the elements: one for each element of a row, say.
 
     Rows of 3 or 4 may share a second moment, that of their mean square: ``exp_avg_sq`` is (N, 1)
-    then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it.
+    then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it. Such rows
+    may count in a unit of their own, e to the mean of ``log_units`` (N, 3): what is moved, and what
+    the moments are of, is the row over its unit, as it is in this step.
     """
     shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
     for tensor in (param, grad, exp_avg, exp_avg_sq):
@@ -333,12 +336,17 @@ def adam_step(
             raise ValueError("adam_step: tensors must be float32 and contiguous")
         if tensor.shape != param.shape and not (shared and tensor is exp_avg_sq):
             raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
+    if log_units is not None:
+        if not shared or log_units.shape != (len(param), 3):
+            raise ValueError(f"adam_step: units of rows are (N, 3), found {log_units.shape}")
+        if log_units.dtype != torch.float32 or not log_units.is_contiguous():
+            raise ValueError("adam_step: tensors must be float32 and contiguous")
     if shared and not isinstance(lr, int | float):
         raise ValueError(f"adam_step: rows that share a moment have one lr, found {lr}")
     rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
     if step < 1 or not len(rates) or not rates.isfinite().all():
         raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
     _ops().adam_step(
-        param.detach(), grad.detach(), exp_avg, exp_avg_sq, rates, step, beta1, beta2, eps,
-        _threads(threads),
+        param.detach(), grad.detach(), exp_avg, exp_avg_sq, log_units, rates, step, beta1, beta2,
+        eps, _threads(threads),
     )  # fmt: skip

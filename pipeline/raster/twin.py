@@ -374,9 +374,16 @@ def adam_step(
     beta1: float = 0.9,
     beta2: float = 0.999,
     eps: float = 1e-15,
+    log_units: torch.Tensor | None = None,
 ) -> None:
     """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
-    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment."""
+    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment. With
+    `log_units` (N, 3) a row x = u y, u = e to the mean of the three, is moved by way of y, whose
+    gradient is u times that of x."""
+    unit = torch.ones(1, dtype=param.dtype)
+    if log_units is not None:
+        unit = log_units.mean(1, keepdim=True).exp()
+    grad = grad * unit
     pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
     repeats = -(-param.numel() // len(pattern))
     rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
@@ -386,7 +393,7 @@ def adam_step(
         squares = squares.mean(1, keepdim=True)
     exp_avg_sq.mul_(beta2).add_(squares, alpha=1 - beta2)
     denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
-    param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
+    param.sub_(unit * rates / (1 - beta1**step) * exp_avg / denominator)
 
 
 def sh_adam(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:

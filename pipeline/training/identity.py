@@ -16,7 +16,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.depth import KnownDepths
 
 # Raise it when the state of a training or its meaning changes.
-STATE_VERSION = 9
+STATE_VERSION = 10
 
 
 def identity_of(

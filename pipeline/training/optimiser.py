@@ -13,15 +13,17 @@ from torch import Tensor
 from pipeline.raster import Gradients, ShAdam, adam_step
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
-BETA1, BETA2 = 0.9, 0.999
+BETA2 = 0.999
 # 3DGS's: gradients of a mean over all pixels are far below the usual 1e-8.
 EPSILON = 1e-15
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Learning rates of one step; ``means`` is in the world's unit."""
+    """Learning rates of one step; ``means`` counts in each Gaussian's own size, the geometric mean
+    of its three scales (``by_size``), or in the world's unit."""
 
+    by_size: bool
     means: float
     log_scales: float
     quats: float
@@ -34,12 +36,14 @@ class Adam:
     """First and second moments beside a ``Gaussians``, row by row.
 
     Attributes:
+        beta1: of the first moment.
         first, second: by the name of the array, of its shape, float32; but (N, 1) the second of
             means and quaternions, so that a turned world is trained as it was.
         last: (N,) int32, the last step whose view asked anything of each row.
     """
 
-    def __init__(self, gaussians: Gaussians):
+    def __init__(self, gaussians: Gaussians, beta1: float):
+        self.beta1 = beta1
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
@@ -51,7 +55,7 @@ class Adam:
         """For ``backward``, which moves ``sh``; ``step`` counts from 1."""
         return ShAdam(
             self.first["sh"], self.second["sh"], self.last, rates.sh0, rates.shN, step,
-            BETA1, BETA2, EPSILON,
+            self.beta1, BETA2, EPSILON,
         )  # fmt: skip
 
     def step(
@@ -68,10 +72,11 @@ class Adam:
                 self.second[name],
                 getattr(rates, name),
                 step,
-                BETA1,
+                self.beta1,
                 BETA2,
                 EPSILON,
                 threads,
+                gaussians.log_scales if name == "means" and rates.by_size else None,
             )
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:

@@ -42,7 +42,7 @@ class Schedule:
         refine_start, refine_stop, refine_interval: density control after steps of this range.
         reset_interval: steps between opacity resets.
         max_gaussians: the budget.
-        lr_means, lr_means_final: of the first and the last step, times the scene's extent.
+        lr_means, lr_means_final: of the first and the last step.
         lr_boost: all rates are multiplied by this (None: see ``PAPER_STEPS``).
         lr_decay_from, lr_final_share: from this share of the run on, all other rates fall to this
             share of themselves.
@@ -100,11 +100,15 @@ class Schedule:
         return min(self.sh_degree, step // self.sh_interval)
 
     def lr_means_at(self, step: int) -> float:
-        """Log-linear between the first and the last step; to be multiplied by the extent."""
-        if not self.lr_means or not self.lr_means_final:
-            return self.lr_means
+        """Log-linear between the first and the last step."""
+        return self.lr_means * self.lr_means_left_at(step)
+
+    def lr_means_left_at(self, step: int) -> float:
+        """What is left of the means' first rate."""
+        if not self.lr_means:
+            return 1.0
         t = (step - 1) / max(1, self.steps - 1)
-        return self.lr_means ** (1 - t) * self.lr_means_final**t
+        return float((self.lr_means_final / self.lr_means) ** t)
 
     def camera_step_at(self, step: int, looks: float) -> float:
         """How far a camera goes in a look, as a share of all that it can: falls log-linearly to

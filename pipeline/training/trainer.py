@@ -198,7 +198,8 @@ class _Run:
         density.start(len(gaussians))
         cameras = MovingCameras.of(self.views, gaussians, extent, config)
         order = rng.permutation(len(self.views))
-        self.state = TrainState(gaussians, Adam(gaussians), density, cameras, rng, order)
+        adam = Adam(gaussians, config.adam_beta1)
+        self.state = TrainState(gaussians, adam, density, cameras, rng, order)
 
     def drop_hidden_views(self) -> None:
         """A view that its mask hides asks for nothing, and would only feed Adam zeros."""
@@ -303,7 +304,9 @@ class _Run:
         state.density.regularise(state.gaussians, gradients)
         state.adam.step(state.gaussians, gradients, rates, step, self.threads)
         if state.clock <= self.schedule.refine_stop:
-            state.density.explore(state.gaussians, rates.means, state.rng)
+            left = self.schedule.lr_means_left_at(state.clock)
+            pace = left * self.schedule.lr_boost_of(self.run_length())
+            state.density.explore(state.gaussians, pace, state.rng)
 
         state.window.loss += float(loss.loss)
         state.window.steps += 1
@@ -373,8 +376,10 @@ class _Run:
         config, schedule, state = self.config, self.schedule, self.state
         boost = schedule.lr_boost_of(self.run_length())
         factor = boost * schedule.lr_decay_at(state.clock)
+        by_size = config.lr_means_unit == "size"
         return Rates(
-            means=schedule.lr_means_at(state.clock) * boost * self.scale,
+            by_size=by_size,
+            means=schedule.lr_means_at(state.clock) * boost * (1.0 if by_size else self.scale),
             log_scales=config.lr_scales * factor,
             quats=config.lr_quats * factor,
             opacity_logits=config.lr_opacities * factor,

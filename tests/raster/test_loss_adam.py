@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import pytest
 import torch
@@ -121,20 +122,39 @@ def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
     assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
 
 
+@pytest.mark.parametrize("own_units", [False, True])
 @pytest.mark.parametrize(("rows", "columns"), [(1, 3), (16, 4), (37, 3), (1001, 4), (0, 3)])
-def test_rows_that_share_a_second_moment_step_as_the_twins(rows: int, columns: int) -> None:
+def test_rows_that_share_a_second_moment_step_as_the_twins(
+    rows: int, columns: int, own_units: bool
+) -> None:
     gen = torch.Generator().manual_seed(5)
     ours = torch.randn(rows, columns, generator=gen)
+    units = torch.randn(rows, 3, generator=gen) if own_units else None
     theirs = ours.double()
     m, v = torch.zeros_like(ours), torch.zeros(rows, 1)
     m64, v64 = m.double(), v.double()
     for step in range(1, 20):
         grad = torch.randn(rows, columns, generator=gen) * 10.0 ** (step % 5 - 3)
         grad[:1] = 0
-        raster.adam_step(ours, grad, m, v, 1e-2, step)
-        twin.adam_step(theirs, grad.double(), m64, v64, 1e-2, step)
-    assert torch.allclose(ours.double(), theirs, rtol=0, atol=2e-6)
+        raster.adam_step(ours, grad, m, v, 1e-2, step, log_units=units)
+        units64 = None if units is None else units.double()
+        twin.adam_step(theirs, grad.double(), m64, v64, 1e-2, step, log_units=units64)
+    assert torch.allclose(ours.double(), theirs, rtol=0, atol=4e-6)
     assert torch.allclose(v.double(), v64, rtol=1e-5, atol=0)
+
+
+def test_a_step_in_a_rows_own_unit_grows_with_it() -> None:
+    """A row that is 2^k times as large as another, and pulled at as much less, goes 2^k times as
+    far: what lies far away moves as many pixels as what lies near. Also where squares overflow."""
+    powers = torch.tensor([0.0, 3.0, -5.0, 39.0, -39.0, 100.0])
+    grad = torch.tensor([[1.0, -2.0, 0.5]]) / torch.exp2(powers)[:, None]
+    moved = torch.zeros(6, 3)
+    log_units = (powers * math.log(2))[:, None].repeat(1, 3).contiguous()
+    m, v = torch.zeros(6, 3), torch.zeros(6, 1)
+    raster.adam_step(moved, grad, m, v, 1e-2, 1, log_units=log_units)
+    steps = moved / torch.exp2(powers)[:, None]
+    assert torch.allclose(steps[:5], steps[:1].expand(5, 3), rtol=1e-4)
+    assert moved.isfinite().all()
 
 
 def test_rows_that_share_a_second_moment_turn_with_their_space() -> None:
@@ -163,6 +183,11 @@ def test_adam_refuses_what_it_cannot_update_in_place() -> None:
         raster.adam_step(a, a, a, torch.zeros(4, 1), [0.1, 0.2], 1)
     with pytest.raises(ValueError, match="shapes differ"):
         raster.adam_step(*(torch.zeros(4, 5) for _ in range(3)), torch.zeros(4, 1), 0.1, 1)
+    rows = [torch.zeros(4, 3) for _ in range(3)]
+    with pytest.raises(ValueError, match="units"):
+        raster.adam_step(*rows, torch.zeros(4, 1), 0.1, 1, log_units=torch.zeros(4))
+    with pytest.raises(ValueError, match="units"):
+        raster.adam_step(*rows, torch.zeros(4, 3), 0.1, 1, log_units=torch.zeros(4, 3))
 
 
 def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:

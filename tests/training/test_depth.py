@@ -119,7 +119,8 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
     known = KnownDepths(xy, np.full(len(xy), 3.0, np.float32), np.ones(len(xy), np.float32))
     config = Train(
         steps=200, sh_degree=0, coarse_until=0.0, depth_weight=weight, lr_means=0.02,
-        lr_means_final=0.02, lr_boost=1.0, density=Density(max_gaussians=120),
+        lr_means_final=0.02, lr_means_unit="scene", lr_boost=1.0,
+        density=Density(max_gaussians=120),
     )  # fmt: skip
     result = train(
         [view], initial, config, seed=0, threads=1, extent=1.0,

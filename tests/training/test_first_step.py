@@ -26,14 +26,17 @@ RATES = {
 }
 
 
-def test_each_parameter_steps_as_far_as_its_own_rate_says(scene: TinyScene, tmp_path: Path) -> None:
+@pytest.mark.parametrize("unit", ["size", "scene"])
+def test_each_parameter_steps_as_far_as_its_own_rate_says(
+    scene: TinyScene, tmp_path: Path, unit: str
+) -> None:
     """Adam's first step is the rate itself, up or down, or a row's root mean square where the row
-    shares a second moment; the means' counts in the scene's scale."""
+    shares a second moment; the means' counts in each Gaussian's size, or in the scene's."""
     scale = 3.0
     result = train(
         scene.views,
         scene.initial,
-        tiny_config(1, **RATES),
+        tiny_config(1, **RATES, lr_means_unit=unit),
         seed=0,
         threads=1,
         extent=scene.extent,
@@ -41,7 +44,7 @@ def test_each_parameter_steps_as_far_as_its_own_rate_says(scene: TinyScene, tmp_
         checkpoint_dir=tmp_path,
     )
     expected = {
-        "means": RATES["lr_means"] * scale,
+        "means": RATES["lr_means"],
         "log_scales": RATES["lr_scales"],
         "quats": RATES["lr_quats"],
         "opacity_logits": RATES["lr_opacities"],
@@ -51,6 +54,9 @@ def test_each_parameter_steps_as_far_as_its_own_rate_says(scene: TinyScene, tmp_
         first = in_morton_order(scene.initial).with_sh_degree(result.gaussians.sh_degree)
         before = first.tensors()[name]
         steps = tensor - before
+        if name == "means":
+            sizes = first.log_scales.mean(1, keepdim=True).exp()
+            steps /= sizes if unit == "size" else scale
         if name in ("means", "quats"):
             steps = steps.square().mean(1).sqrt()
         moved = float(steps.abs().max())

@@ -10,20 +10,24 @@ from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import raster_camera
 from tests.training.conftest import ball, camera_at
 
-RATES = Rates(means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=2e-2, shN=1e-3)
+RATES = Rates(
+    by_size=True, means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=2e-2, shN=1e-3
+)
 
 
 @pytest.mark.parametrize("degree", [0, 1])
 def test_matches_torch_adam_with_parameter_groups(degree: int) -> None:
     gaussians = ball(37, 0).with_sh_degree(degree)
-    adam = Adam(gaussians)
+    adam = Adam(gaussians, beta1=0.8)
     leaves = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
     shared = {"means": torch.zeros(37, 1), "quats": torch.zeros(37, 1)}
     first = {name: torch.zeros_like(leaves[name]) for name in shared}
     groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh" and n not in shared]
     dc, rest = leaves["sh"][:, :1].clone(), leaves["sh"][:, 1:].clone()
     groups += [(dc, RATES.sh0), (rest, RATES.shN)]
-    reference = torch.optim.Adam([{"params": [p], "lr": lr} for p, lr in groups], eps=1e-15)
+    reference = torch.optim.Adam(
+        [{"params": [p], "lr": lr} for p, lr in groups], betas=(0.8, 0.999), eps=1e-15
+    )
     camera, options = raster_camera(camera_at(0.3)), RasterOptions(sh_degree=degree)
     wanted = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0))
     for step in range(1, 8):
@@ -31,6 +35,7 @@ def test_matches_torch_adam_with_parameter_groups(degree: int) -> None:
         assert (drawn.radii > 0).all()  # what is out of view waits
         d_color = drawn.color - wanted
         gradients = backward(drawn, d_color)
+        sizes = leaves["log_scales"].clone()
         for name in leaves:
             if name != "sh" and name not in shared:
                 leaves[name].grad = getattr(gradients, name)
@@ -38,7 +43,10 @@ def test_matches_torch_adam_with_parameter_groups(degree: int) -> None:
         reference.step()
         for name, second in shared.items():
             rate, gradient = getattr(RATES, name), getattr(gradients, name)
-            twin.adam_step(leaves[name], gradient, first[name], second, rate, step)
+            twin.adam_step(
+                leaves[name], gradient, first[name], second, rate, step, 0.8,
+                log_units=sizes if name == "means" else None,
+            )  # fmt: skip
         backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
         adam.step(gaussians, gradients, RATES, step, 1)
     leaves["sh"] = torch.cat([dc, rest], 1)

@@ -74,7 +74,7 @@ def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object)
     return train(
         [off(view, number) for number, view in enumerate(scene.views)],
         scene.truth,
-        tiny_config(300, lr_means=1.6e-5, **options),
+        tiny_config(300, lr_means=5e-3, **options),
         seed=3,
         threads=threads,
         extent=scene.extent,

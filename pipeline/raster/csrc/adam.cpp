@@ -19,9 +19,24 @@ struct Corrections {
           to_root(float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))))) {}
 };
 
+// Powers of two beyond this are taken for overflow: squares of gradients in such units stay finite.
+constexpr float kLog2UnitMax = 40.0f;
+
+// e to the mean of three logarithms a row.
+SPLAT_INLINE f32x16 units(const float* logs, int count) {
+    constexpr float kLog2E = 1.4426950408889634f;
+    f32x16 log[3];
+    read_rows(logs, count, log);
+    const f32x16 mean = (log[0] + log[1] + log[2]) * (kLog2E / 3.0f);
+    const f32x16 power[1] = {min(max(mean, splat16(-kLog2UnitMax)), splat16(kLog2UnitMax))};
+    f32x16 unit[1];
+    exp2(power, unit);
+    return unit[0];
+}
+
 template <int K>
-void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t rows,
-               const AdamSettings& s, int threads) {
+void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
+               const float* log_units, int64_t rows, const AdamSettings& s, int threads) {
     const Corrections correct(s);
     const float rate = float(s.rates[0] * correct.to_rate), eps = float(s.eps);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2);
@@ -33,9 +48,11 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         read_rows(param + K * first, count, p);
         read_rows(grad + K * first, count, g);
         read_rows(exp_avg + K * first, count, m);
+        const f32x16 unit = log_units ? units(log_units + 3 * first, count) : splat16(1.0f);
+        for (int k = 0; k < K; k++) g[k] *= unit;
         for (int k = 0; k < K; k++) squares += g[k] * g[k];
         const f32x16 v = read_column(exp_avg_sq + first, count) * beta2 + squares * rest2;
-        const f32x16 far = rate / (sqrt(v) * correct.to_root + eps);
+        const f32x16 far = rate * unit / (sqrt(v) * correct.to_root + eps);
         for (int k = 0; k < K; k++) {
             m[k] = m[k] * beta1 + g[k] * rest1;
             p[k] -= far * m[k];
@@ -87,9 +104,10 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
 }
 
 void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
-                    int64_t rows, int width, const AdamSettings& settings, int threads) {
-    (width == 3 ? adam_rows<3> : adam_rows<4>)(param, grad, exp_avg, exp_avg_sq, rows, settings,
-                                               threads);
+                    const float* log_units, int64_t rows, int width, const AdamSettings& settings,
+                    int threads) {
+    (width == 3 ? adam_rows<3> : adam_rows<4>)(param, grad, exp_avg, exp_avg_sq, log_units, rows,
+                                               settings, threads);
 }
 
 }  // namespace splat

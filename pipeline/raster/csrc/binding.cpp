@@ -203,8 +203,9 @@ std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const
 }
 
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
-               const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
-               double beta2, double eps, int64_t threads) {
+               const Tensor& exp_avg_sq, const std::optional<Tensor>& log_units,
+               const Tensor& rates, int64_t step, double beta1, double beta2, double eps,
+               int64_t threads) {
     const splat::AdamSettings settings = {
         rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step};
     if (exp_avg_sq.numel() == param.numel())
@@ -212,8 +213,8 @@ void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                          mutable_floats(exp_avg_sq), param.numel(), settings, int(threads));
     else
         splat::adam_step_rows(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
-                              mutable_floats(exp_avg_sq), param.size(0), int(param.size(1)),
-                              settings, int(threads));
+                              mutable_floats(exp_avg_sq), log_units ? floats(*log_units) : nullptr,
+                              param.size(0), int(param.size(1)), settings, int(threads));
 }
 
 }  // namespace
@@ -249,7 +250,8 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "(float, float, float, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
-        "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
+        "Tensor? log_units, Tensor rates, int step, float beta1, float beta2, float eps, "
+        "int threads) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {

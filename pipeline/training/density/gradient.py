@@ -60,7 +60,7 @@ class GradientDensity:
         self.gradient_sum += torch.hypot(pull[:, 0] * (0.5 * width), pull[:, 1] * (0.5 * height))
         self.seen += forward.radii > 0
 
-    def explore(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+    def explore(self, gaussians: Gaussians, pace: float, rng: np.random.Generator) -> None:
         """Nothing: chance has a part in splits alone."""
 
     def refine(

@@ -28,6 +28,7 @@ MAX_COPIES = 51
 FAINT, FAINT_SLOPE, STILL = 0.005, 100.0, 0.1
 # The noise's size over the means' learning rate (the paper's).
 NOISE = 5e5
+LR_MEANS = 1.6e-4  # the rate of the means that it is times, in scene's sizes
 MAX_OPACITY = 1 - 1e-6
 
 
@@ -60,7 +61,7 @@ class McmcDensity:
     def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
         pass
 
-    def explore(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+    def explore(self, gaussians: Gaussians, pace: float, rng: np.random.Generator) -> None:
         """The paper's equation 8: noise shaped by the Gaussian's covariance, for the faint."""
         if not self.config.noise:
             return
@@ -73,7 +74,7 @@ class McmcDensity:
         axes = rotations(gaussians.quats[moved])
         variances = (2 * gaussians.log_scales[moved]).exp()
         noise = torch.einsum("nij,nj,nkj,nk->ni", axes, variances, axes, draws)
-        gaussians.means[moved] += noise * (share * (NOISE * rate / self.scale**2))[:, None]
+        gaussians.means[moved] += noise * (share * (NOISE * LR_MEANS * pace / self.scale))[:, None]
 
     def refine(
         self,

@@ -49,8 +49,9 @@ class Strategy(Protocol):
     def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
         """Take note of one step's view of ``width`` x ``height`` pixels."""
 
-    def explore(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
-        """After a step: move Gaussians at random, in place; ``rate`` is the means' of the step."""
+    def explore(self, gaussians: Gaussians, pace: float, rng: np.random.Generator) -> None:
+        """After a step: move Gaussians at random, in place; ``pace`` is what the means' rate of the
+        step is of the first one's, times the run's boost."""
 
     def refine(
         self,

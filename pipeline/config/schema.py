@@ -309,7 +309,7 @@ class Train(Section):
         "of its scales; scene: how far apart the cameras stand, but at most half of the median "
         "depth of the sparse points they see (3DGS: how far apart alone, 1.6e-4 and 1.6e-6).",
     )
-    lr_means: Rate = Field(0.06, description="At the start.")
+    lr_means: Rate = Field(0.04, description="At the start.")
     lr_means_final: Annotated[float, Field(gt=0)] = Field(
         3e-4, description="At the end (log-linear decay)."
     )

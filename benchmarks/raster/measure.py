@@ -152,7 +152,8 @@ class Step:
                 n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
             ),
             # Means and quaternions, 7 floats, have two second moments.
-            "Adam": Cost(0, 7 * n * (row - sh) - 2 * n * 4 * 5),
+            # Means read their sizes as well.
+            "Adam": Cost(0, 7 * n * (row - sh) - 2 * n * 4 * 5 + 12 * n),
         }
 
     def once(self) -> dict[str, Timing]:
@@ -178,7 +179,9 @@ def take_turns(steps: Sequence[Step], calibration: Calibration, seconds: float) 
     end = time.monotonic() + seconds
     while time.monotonic() < end or len(taken[0]) < MIN_TURNS:
         for turns, step in zip(taken, steps, strict=True):
-            turns.append(Turn(calibration.flops(step.threads), step.once()))
+            flops = calibration.flops(step.threads)
+            step.once()  # in training a step follows a step: threads are awake
+            turns.append(Turn(flops, step.once()))
     return taken
 
 

@@ -151,8 +151,7 @@ class Step:
             "projection, SH backward": Cost(
                 n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
             ),
-            # Means and quaternions, 7 floats, have two second moments.
-            # Means read their sizes as well.
+            # Means and quaternions, 7 floats, have two second moments; means read sizes as well.
             "Adam": Cost(0, 7 * n * (row - sh) - 2 * n * 4 * 5 + 12 * n),
         }
 

@@ -100,6 +100,13 @@ MUTANTS: dict[str, Mutant] = {
         "Adam's bias correction one step late",
         _LOSS,
     ),
+    "unit_lost": Mutant(
+        f"{_CSRC}/adam.cpp",
+        "rate * unit / (sqrt(v)",
+        "rate / (sqrt(v)",
+        "a mean's step in the world's unit instead of its Gaussian's size",
+        _LOSS,
+    ),
     "no_drift": Mutant(
         f"{_CSRC}/sh_adam.h",
         "if (missed) p -= rate * past.drift * m * inverse_root(v);",

@@ -149,6 +149,13 @@ MUTANTS: dict[str, Mutant] = {
         "what no photograph saw kept",
         ("tests/training/test_trainer.py",),
     ),
+    "scene_by_cameras": Mutant(
+        "stages/train.py",
+        "scale=scene_scale(extent, points)",
+        "scale=extent",
+        "a scene as large as its cameras stand apart",
+        ("tests/e2e/test_regression.py",),
+    ),
     "late_reset": Mutant(
         "pipeline/training/schedule.py",
         "step + self.reset_interval <= self.refine_stop",

@@ -79,6 +79,7 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
     from pipeline.splats.init import gaussians_from_points
+    from pipeline.training.depth import point_depths, scene_scale
     from pipeline.training.trainer import train
 
     pinhole = folder / "pinhole"
@@ -87,13 +88,15 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     model = read_model(pinhole / "sparse" / "0")
     views = load_views(report.manifest, model, config.views, config.split)
     first = gaussians_from_points(model.points, np.array([v.centre for v in views]), config.init, 0)
+    extent = scene_extent(views)
     result = train(
         views,
         Gaussians.from_arrays(first),
         config.train,
         seed=config.seed,
         threads=threads,
-        extent=scene_extent(views),
+        extent=extent,
+        scale=scene_scale(extent, point_depths(views, model)),
         checkpoint_dir=folder / "checkpoints",
     )
     result.gaussians.save(folder / "gaussians.npz")

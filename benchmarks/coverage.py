@@ -36,6 +36,7 @@ from pipeline.scene.model import Camera, Points, Posed, View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
+from pipeline.training.inputs import Inputs
 from pipeline.training.render import Render, near_plane, render_view
 from pipeline.training.trainer import train
 
@@ -126,12 +127,10 @@ def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> G
     first = gaussians_from_points(studio.sparse(views), centres, Init(), config.sh_degree)
     with TemporaryDirectory() as folder:
         return train(
-            views,
-            Gaussians.from_arrays(first),
+            Inputs(views, Gaussians.from_arrays(first), extent),
             config,
             seed=0,
             threads=2,
-            extent=extent,
             checkpoint_dir=Path(folder),
         ).gaussians
 

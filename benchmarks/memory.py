@@ -25,6 +25,7 @@ from pipeline.scene.plan import memory_mb
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import trainer
+from pipeline.training.inputs import Inputs
 from pipeline.training.trainer import train
 
 PIXELS_ACROSS = 3.0  # of a Gaussian's 3-sigma radius
@@ -79,12 +80,10 @@ def main() -> int:
         folder = Path(name)
         views = made_views(args.views, width, height, folder)
         result = train(
-            views,
-            made_gaussians(args.gaussians, views[0].fx),
+            Inputs(views, made_gaussians(args.gaussians, views[0].fx), scene_extent(views)),
             Train(steps=args.steps, density=Density(max_gaussians=args.gaussians)),
             seed=0,
             threads=args.threads,
-            extent=scene_extent(views),
             checkpoint_dir=folder / "checkpoints",
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))

@@ -18,6 +18,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths, scene_scale
 from pipeline.training.depth_maps import add_maps
+from pipeline.training.inputs import Inputs
 from pipeline.training.lenses import changed_by, with_lenses
 from pipeline.training.poses import followed, moved_by
 from pipeline.training.trainer import train
@@ -46,15 +47,17 @@ def run(job: Job) -> None:
     extent = scene_extent(views)
     start = time.perf_counter()
     result = train(
-        training,
-        Gaussians.load(job.inputs["init"] / "gaussians.npz"),
+        Inputs(
+            views=training,
+            initial=Gaussians.load(job.inputs["init"] / "gaussians.npz"),
+            extent=extent,
+            scale=scene_scale(extent, points),
+            gains=np.array([gains[view.name] for view in training]) if gains else None,
+            depths=known,
+        ),
         job.section(Train),
         seed=job.seed,
         threads=job.threads,
-        extent=extent,
-        scale=scene_scale(extent, points),
-        gains=np.array([gains[view.name] for view in training]) if gains else None,
-        depths=known,
         checkpoint_dir=job.scratch / "checkpoints",
         journal=job.logs / journal.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),

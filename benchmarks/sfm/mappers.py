@@ -80,6 +80,7 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     from pipeline.splats.gaussians import Gaussians
     from pipeline.splats.init import gaussians_from_points
     from pipeline.training.depth import point_depths, scene_scale
+    from pipeline.training.inputs import Inputs
     from pipeline.training.trainer import train
 
     pinhole = folder / "pinhole"
@@ -90,13 +91,15 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     first = gaussians_from_points(model.points, np.array([v.centre for v in views]), config.init, 0)
     extent = scene_extent(views)
     result = train(
-        views,
-        Gaussians.from_arrays(first),
+        Inputs(
+            views=views,
+            initial=Gaussians.from_arrays(first),
+            extent=extent,
+            scale=scene_scale(extent, point_depths(views, model)),
+        ),
         config.train,
         seed=config.seed,
         threads=threads,
-        extent=extent,
-        scale=scene_scale(extent, point_depths(views, model)),
         checkpoint_dir=folder / "checkpoints",
     )
     result.gaussians.save(folder / "gaussians.npz")

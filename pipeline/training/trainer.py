@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -28,8 +28,9 @@ from pipeline.splats.order import in_morton_order
 from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
-from pipeline.training.depth import KnownDepths, depth_gradients
+from pipeline.training.depth import depth_gradients
 from pipeline.training.identity import identity_of
+from pipeline.training.inputs import Inputs
 from pipeline.training.journal import Journal
 from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam, Rates
@@ -82,37 +83,22 @@ class TrainResult:
 
 
 def train(
-    views: Sequence[View],
-    initial: Gaussians,
+    inputs: Inputs,
     config: Train,
     *,
     seed: int,
     threads: int,
-    extent: float,
     checkpoint_dir: Path,
-    scale: float | None = None,
-    gains: NDArray[np.float64] | None = None,
-    depths: Sequence[KnownDepths] | None = None,
     journal: Path | None = None,
     on_log: Callable[[str], None] | None = None,
 ) -> TrainResult:
-    """Optimise ``initial`` until its renders look like ``views``.
+    """Optimise the first Gaussians until their renders look like the views.
 
     Goes on from the last checkpoint in ``checkpoint_dir`` if there is one of this very run; the
     caller deletes the folder when the result is safe.
 
     Args:
-        views: training views only.
         threads: of the native operators; torch itself runs on one, so that sums are the same.
-        extent: how far apart the cameras stand, world unit (``scene.views.scene_extent``): the near
-            plane and the cameras' own steps are measured by it.
-        scale: by which the means' steps and the sizes of Gaussians are measured
-            (``training.depth.scene_scale``); None: the extent.
-        gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
-            (``photos.exposure``): renders are multiplied before they are compared. Only for
-            views without alpha.
-        depths: what is known beforehand of each view's depths (``training.depth``), to which
-            renders are held with ``Train.depth_weight``.
         journal: file for how it goes, second by second (``training.journal``).
         on_log: called with one line for each warning.
 
@@ -120,29 +106,16 @@ def train(
         UserError: no views or no Gaussians, unreadable pictures, no view sees a Gaussian, the
             loss is not a number, or every Gaussian died.
     """
-    if not views or not len(initial):
+    if not inputs.views or not len(inputs.initial):
         raise UserError(
-            f"expected views and Gaussians to train; found {len(views)} views and "
-            f"{len(initial)} Gaussians",
+            f"expected views and Gaussians to train; found {len(inputs.views)} views and "
+            f"{len(inputs.initial)} Gaussians",
             fix="check the split and the initialisation",
         )
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        run = _Run(
-            views,
-            initial,
-            config,
-            seed,
-            threads,
-            extent,
-            scale,
-            gains,
-            depths,
-            checkpoint_dir,
-            on_log,
-        )
-        return run.train(journal)
+        return _Run(inputs, config, seed, threads, checkpoint_dir, on_log).train(journal)
     finally:
         torch.set_num_threads(torch_threads)
 
@@ -152,38 +125,33 @@ class _Run:
 
     def __init__(
         self,
-        views: Sequence[View],
-        initial: Gaussians,
+        inputs: Inputs,
         config: Train,
         seed: int,
         threads: int,
-        extent: float,
-        scale: float | None,
-        gains: NDArray[np.float64] | None,
-        depths: Sequence[KnownDepths] | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
     ):
-        self.views, self.config = list(views), config
-        self.threads, self.near = threads, near_plane(extent)
-        self.scale = extent if scale is None else scale
+        self.config, self.threads = config, threads
         self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
+        self.near = near_plane(inputs.extent)
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
-        self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
         # auto is the plan's to settle; without one, nothing is known to be needed.
         self.depth_weight = 0.0 if config.depth_weight == "auto" else config.depth_weight
-        self.depths = list(depths) if depths is not None and self.depth_weight else None
-        sizes = (extent, self.scale)
-        self.identity = identity_of(views, initial, config, seed, sizes, gains, self.depths)
-        self.targets = Targets(views, threads, config.salt_and_pepper, seed)
-        self.drop_hidden_views()
+        if not self.depth_weight:
+            inputs = replace(inputs, depths=None)
+        self.identity = identity_of(inputs, config, seed)
+        self.targets = Targets(inputs.views, threads, config.salt_and_pepper, seed)
+        self.inputs = self.without_hidden_views(inputs)
+        gains = self.inputs.gains
+        self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
         self.background = config.background
         if self.background == "auto":
             self.background = "random" if self.targets.have_alpha else "black"
 
-        gaussians = initial.with_sh_degree(0).clone()
+        gaussians = inputs.initial.with_sh_degree(0).clone()
         rng = np.random.Generator(np.random.PCG64(seed))
         budget = config.density.max_gaussians
         if len(gaussians) > budget:
@@ -194,26 +162,28 @@ class _Run:
             chosen = np.sort(rng.permutation(len(gaussians))[:budget])
             gaussians = gaussians.select(torch.from_numpy(chosen))
         gaussians = in_morton_order(gaussians)
-        density = make_strategy(config.density, self.scale)
+        density = make_strategy(config.density, inputs.size)
         density.start(len(gaussians))
-        cameras = MovingCameras.of(self.views, gaussians, extent, config)
+        cameras = MovingCameras.of(self.views, gaussians, inputs.extent, config)
         order = rng.permutation(len(self.views))
         adam = Adam(gaussians, config.adam_beta1)
         self.state = TrainState(gaussians, adam, density, cameras, rng, order)
 
-    def drop_hidden_views(self) -> None:
+    @property
+    def views(self) -> Sequence[View]:
+        return self.inputs.views
+
+    def without_hidden_views(self, inputs: Inputs) -> Inputs:
         """A view that its mask hides asks for nothing, and would only feed Adam zeros."""
         hidden = self.targets.hidden()
-        if len(hidden) == len(self.views):
+        if len(hidden) == len(inputs.views):
             raise UserError("the masks leave no pixel of any view to train on", fix="check masks/")
-        if hidden:
-            names = ", ".join(self.views[i].name for i in hidden[:5])
-            self.warn(f"views that their masks hide whole are left out ({len(hidden)}): {names}")
-            self.targets.drop(hidden)
-            kept = [index for index in range(len(self.views)) if index not in hidden]
-            self.views = [self.views[index] for index in kept]
-            self.gains = None if self.gains is None else self.gains[kept]
-            self.depths = None if self.depths is None else [self.depths[i] for i in kept]
+        if not hidden:
+            return inputs
+        names = ", ".join(inputs.views[i].name for i in hidden[:5])
+        self.warn(f"views that their masks hide whole are left out ({len(hidden)}): {names}")
+        self.targets.drop(hidden)
+        return inputs.without(hidden)
 
     def warn(self, message: str) -> None:
         self.warnings.append(message)
@@ -321,10 +291,11 @@ class _Run:
         """(d_alpha, d_depth) of what is asked for beside colours: emptiness where a mask hides the
         photograph, and in some steps the known depths."""
         empty = target.thinning(self.config.masked_opacity)
-        if self.depths is None or self.state.step % DEPTH_EVERY or not len(self.depths[index]):
+        known = None if self.inputs.depths is None else self.inputs.depths[index]
+        if not known or self.state.step % DEPTH_EVERY:
             return empty, None
         weight = self.depth_weight * DEPTH_EVERY
-        d_alpha, d_depth = depth_gradients(rendered, self.depths[index], self.views[index], weight)
+        d_alpha, d_depth = depth_gradients(rendered, known, self.views[index], weight)
         return d_alpha if empty is None else d_alpha + empty, d_depth
 
     def control_density(self, places: range) -> None:
@@ -377,9 +348,10 @@ class _Run:
         boost = schedule.lr_boost_of(self.run_length())
         factor = boost * schedule.lr_decay_at(state.clock)
         by_size = config.lr_means_unit == "size"
+        unit = 1.0 if by_size else self.inputs.size
         return Rates(
             by_size=by_size,
-            means=schedule.lr_means_at(state.clock) * boost * (1.0 if by_size else self.scale),
+            means=schedule.lr_means_at(state.clock) * boost * unit,
             log_scales=config.lr_scales * factor,
             quats=config.lr_quats * factor,
             opacity_logits=config.lr_opacities * factor,

@@ -23,6 +23,7 @@ from pipeline.training.depth import (
     point_depths,
     scene_scale,
 )
+from pipeline.training.inputs import Inputs
 from pipeline.training.render import render_view
 from pipeline.training.trainer import train
 from tests.training.conftest import HEIGHT, WIDTH, camera_at
@@ -123,9 +124,12 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
         density=Density(max_gaussians=120),
     )  # fmt: skip
     result = train(
-        [view], initial, config, seed=0, threads=1, extent=1.0,
-        checkpoint_dir=tmp_path / "checkpoints", depths=[known],
-    )  # fmt: skip
+        Inputs([view], initial, extent=1.0, depths=[known]),
+        config,
+        seed=0,
+        threads=1,
+        checkpoint_dir=tmp_path / "checkpoints",
+    )
     render = render_view(result.gaussians, view)
     depth = float(np.median((render.depth / render.alpha)[8:-8, 8:-8]))
     assert depth == pytest.approx(3.0, abs=0.1) if weight else depth < 2.5

@@ -12,6 +12,7 @@ import torch
 from pipeline.raster import l1_ssim
 from pipeline.splats.order import in_morton_order
 from pipeline.training import trainer
+from pipeline.training.inputs import Inputs
 from pipeline.training.trainer import train
 from tests.training.conftest import TinyScene, tiny_config
 
@@ -34,13 +35,10 @@ def test_each_parameter_steps_as_far_as_its_own_rate_says(
     shares a second moment; the means' counts in each Gaussian's size, or in the scene's."""
     scale = 3.0
     result = train(
-        scene.views,
-        scene.initial,
+        Inputs(scene.views, scene.initial, scene.extent, scale),
         tiny_config(1, **RATES, lr_means_unit=unit),
         seed=0,
         threads=1,
-        extent=scene.extent,
-        scale=scale,
         checkpoint_dir=tmp_path,
     )
     expected = {
@@ -82,13 +80,10 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
     monkeypatch.setattr(trainer, "l1_ssim", watched_loss)
     gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
     train(
-        scene.views,
-        scene.initial,
+        Inputs(scene.views, scene.initial, scene.extent, gains=gains),
         tiny_config(1),
         seed=0,
         threads=1,
-        extent=scene.extent,
-        gains=gains,
         checkpoint_dir=tmp_path,
     )
     gain = torch.tensor(gains[0], dtype=torch.float32)

@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from pipeline.scene.model import Camera, Posed, Reconstruction, View
+from pipeline.training.inputs import Inputs
 from pipeline.training.lenses import Lenses, changed_by, with_lenses
 from pipeline.training.render import raster_camera
 from pipeline.training.trainer import TrainResult, train
@@ -42,12 +43,10 @@ def trained(scene: TinyScene, folder: Path, steps: int, **options: object) -> Tr
         | {"refine_intrinsics": True, "intrinsics_reach": 0.08}
     )
     return train(
-        views,
-        scene.truth,
+        Inputs(views, scene.truth, scene.extent),
         config,
         seed=3,
         threads=1,
-        extent=scene.extent,
         checkpoint_dir=folder,
     )
 

@@ -12,6 +12,7 @@ from PIL import Image
 
 from pipeline.raster import RasterOptions
 from pipeline.scene.model import View
+from pipeline.training.inputs import Inputs
 from pipeline.training.poses import fit_pose, followed, rigid
 from pipeline.training.trainer import TrainResult, train
 from tests.training.conftest import TinyScene, killed_in_step, tiny_config
@@ -72,12 +73,14 @@ def test_cameras_that_were_not_moved_follow_the_others(scene: TinyScene) -> None
 
 def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object) -> TrainResult:
     return train(
-        [off(view, number) for number, view in enumerate(scene.views)],
-        scene.truth,
+        Inputs(
+            [off(view, number) for number, view in enumerate(scene.views)],
+            scene.truth,
+            scene.extent,
+        ),
         tiny_config(300, lr_means=5e-3, **options),
         seed=3,
         threads=threads,
-        extent=scene.extent,
         checkpoint_dir=folder,
     )
 
@@ -91,12 +94,10 @@ def test_training_moves_a_camera_that_disagrees_with_the_others(
     config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, refine_poses=True)
     config = config.model_copy(update={f"lr_{name}": 0.0 for name in still} | {"pose_reach": 0.05})
     result = train(
-        views,
-        scene.truth,
+        Inputs(views, scene.truth, scene.extent),
         config,
         seed=3,
         threads=1,
-        extent=scene.extent,
         checkpoint_dir=tmp_path,
     )
     assert result.poses is not None and list(result.poses) == [view.name for view in views]

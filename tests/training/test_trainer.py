@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.config.schema import Train
@@ -19,6 +20,7 @@ from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal, targets, trainer
 from pipeline.training.checkpoint import PATTERN
+from pipeline.training.inputs import Inputs
 from pipeline.training.render import render_view
 from pipeline.training.trainer import TrainResult, train
 from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
@@ -35,12 +37,10 @@ def run(
     journal: Path | None = None,
 ) -> TrainResult:
     return train(
-        scene.views if views is None else views,
-        scene.initial,
+        Inputs(scene.views if views is None else views, scene.initial, scene.extent),
         config or tiny_config(),
         seed=seed,
         threads=threads,
-        extent=scene.extent,
         checkpoint_dir=folder,
         journal=journal,
         on_log=None if said is None else said.append,
@@ -191,10 +191,9 @@ def test_minutes_pass_through_the_whole_schedule(
 def test_isotropic_gaussians_stay_spheres(scene: TinyScene, tmp_path: Path) -> None:
     start = scene.initial.clone()
     start.log_scales[:] = start.log_scales[:, :1]
-    common = {"seed": 0, "threads": 1, "extent": scene.extent, "checkpoint_dir": tmp_path}
-    scales = train(
-        scene.views, start, tiny_config(60, isotropic=True), **common
-    ).gaussians.log_scales
+    inputs = Inputs(scene.views, start, scene.extent)
+    config = tiny_config(60, isotropic=True)
+    scales = train(inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path).gaussians.log_scales
     assert torch.equal(scales, scales[:, :1].expand(-1, 3))
     assert (scales[:5] != start.log_scales[:5]).all()
 
@@ -291,11 +290,12 @@ def test_gains_explain_photographs_that_are_exposed_differently(
         Image.fromarray(picture).save(tmp_path / f"{index}.png")
         views.append(replace(view, image=str(tmp_path / f"{index}.png")))
     config = tiny_config(150)
-    common = {"seed": 0, "threads": 1, "extent": scene.extent}
-    with_gains = train(
-        views, scene.initial, config, checkpoint_dir=tmp_path / "a", gains=gains, **common
-    )
-    without = train(views, scene.initial, config, checkpoint_dir=tmp_path / "b", **common)
+
+    def trained(name: str, gains: NDArray[np.float64] | None) -> TrainResult:
+        inputs = Inputs(views, scene.initial, scene.extent, gains=gains)
+        return train(inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path / name)
+
+    with_gains, without = trained("a", gains), trained("b", None)
     assert with_gains.curve[-1]["psnr"] > without.curve[-1]["psnr"] + 3
     # The scene itself is the brighter photographs', as if there had been no other.
     plain = run(scene, tmp_path / "c", config)
@@ -321,12 +321,10 @@ def test_alpha_with_random_background_leaves_the_empty_empty(
     start.opacity_logits.fill_(1.0)
     start.log_scales += 0.7
     result = train(
-        scene.alpha_views,
-        start,
+        Inputs(scene.alpha_views, start, scene.extent),
         tiny_config(500),
         seed=0,
         threads=1,
-        extent=scene.extent,
         checkpoint_dir=tmp_path,
     )
     assert result.background == "random"
@@ -360,12 +358,10 @@ def test_gaussians_that_no_camera_sees_are_a_clear_error(scene: TinyScene, tmp_p
     far.means += 1000.0
     with pytest.raises(UserError, match="no camera sees"):
         train(
-            scene.views,
-            far,
+            Inputs(scene.views, far, scene.extent),
             tiny_config(),
             seed=0,
             threads=1,
-            extent=scene.extent,
             checkpoint_dir=tmp_path,
         )
 

@@ -1,0 +1,54 @@
+"""What training starts from."""
+
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.scene.model import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.depth import KnownDepths
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """A scene before training.
+
+    Attributes:
+        views: training views only.
+        initial: the first Gaussians.
+        extent: how far apart the cameras stand, world unit (``scene.views.scene_extent``): the near
+            plane and the cameras' own steps are measured by it.
+        scale: by which the means' steps and the sizes of Gaussians are measured
+            (``training.depth.scene_scale``); None: the extent.
+        gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
+            (``photos.exposure``): renders are multiplied before they are compared. Only for
+            views without alpha.
+        depths: what is known beforehand of each view's depths (``training.depth``), to which
+            renders are held with ``Train.depth_weight``.
+    """
+
+    views: Sequence[View]
+    initial: Gaussians
+    extent: float
+    scale: float | None = None
+    gains: NDArray[np.float64] | None = None
+    depths: Sequence[KnownDepths] | None = None
+
+    @property
+    def size(self) -> float:
+        """The scale, or the extent where there is none."""
+        return self.extent if self.scale is None else self.scale
+
+    def without(self, views: Collection[int]) -> Inputs:
+        """Without the views of these indices."""
+        kept = [index for index in range(len(self.views)) if index not in views]
+        return replace(
+            self,
+            views=[self.views[index] for index in kept],
+            gains=None if self.gains is None else self.gains[kept],
+            depths=None if self.depths is None else [self.depths[index] for index in kept],
+        )

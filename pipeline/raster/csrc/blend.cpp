@@ -104,6 +104,8 @@ void blend(const Record* records, const Pairs& pairs, const View& view, const fl
     const int64_t tiles = view.tiles();
     parallel_for(tiles, 4, threads, [&](int64_t index) {
         const Tile tile(index, view);
+        tile.expect<3>(view.width, color);
+        tile.expect<1>(view.width, alpha);
         f32x16 transmittance[kBlocks];
         Color sums[kBlocks];
         composite(records, pairs, view, index, tile, transmittance, sums,
@@ -124,6 +126,8 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
     const int64_t tiles = view.tiles();
     parallel_for(tiles, 4, threads, [&](int64_t index) {
         const Tile tile(index, view);
+        tile.expect<1>(view.width, depth);
+        tile.expect<1>(view.width, median);
         f32x16 transmittance[kBlocks];
         Depth sums[kBlocks];
         int32_t block_end[kBlocks];

@@ -55,6 +55,14 @@ struct Tile {
                  });
         to_channels(pixels, channels);
     }
+    // Asks for a tile's lines of an image of K floats a pixel that will be written: rows lie far
+    // apart, and each line that is written would wait for its first bytes.
+    template <int K>
+    SPLAT_INLINE void expect(int64_t width, const float* image) const {
+        for (int row = 0; row < rows; row++)
+            for (int line = 0; line < K; line++)
+                __builtin_prefetch(image + K * ((y + row) * width + x) + 16 * line, 1);
+    }
     template <int K>
     SPLAT_INLINE void write(int block, const f32x16 (&channels)[K], int64_t width,
                             float* image) const {

@@ -82,11 +82,10 @@ class Step:
         target = torch.rand(size[1], size[0], 3, generator=gen)
         params = [g.clone() for g in s.inputs]
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
-        for k in (0, 2):  # of means and quaternions one for all
-            moments[k] = moments[k][0], torch.zeros(scene.count, 1)
+        turns = torch.zeros(scene.count, 3), torch.zeros(scene.count, 3)
         last = torch.zeros(scene.count, dtype=torch.int32)
         # Rates of 0, so that every repeat draws the same.
-        rate = torch.zeros(1, dtype=torch.float64)
+        rate, rates = torch.zeros(1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
         sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
         self.d_color = kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)[3]
         kept: dict[str, Any] = {}
@@ -117,9 +116,14 @@ class Step:
             )  # fmt: skip
 
         def adam() -> None:
-            units = (s.inputs[1], None, None, None)  # means count in their own sizes
-            for p, g, (m, v), unit in zip(params, kept["gradients"], moments, units, strict=False):
-                kernels.adam_step(p, g, m, v, unit, rate, 1, 0.8, 0.999, 1e-15, threads)
+            betas = 0.8, 0.999, 1e-15
+            d_means, d_log_scales, d_quats, d_opacity_logits = kept["gradients"][:4]
+            kernels.frame_adam(
+                params[0], params[2], params[1], d_means, d_quats, *moments[0], *turns, rates, 1,
+                *betas, threads,
+            )  # fmt: skip
+            for k, grad in ((1, d_log_scales), (3, d_opacity_logits)):
+                kernels.adam_step(params[k], grad, *moments[k], rate, 1, *betas, threads)
 
         self.operators: dict[str, Callable[[], None]] = {
             "projection, SH": project,
@@ -151,8 +155,8 @@ class Step:
             "projection, SH backward": Cost(
                 n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
             ),
-            # Means and quaternions, 7 floats, have two second moments; means read sizes as well.
-            "Adam": Cost(0, 7 * n * (row - sh) - 2 * n * 4 * 5 + 12 * n),
+            # Quaternions have moments of 3 floats; the scales are read once more.
+            "Adam": Cost(0, 7 * n * (row - sh) - 4 * 4 * n + 3 * 4 * n),
         }
 
     def once(self) -> dict[str, Timing]:

@@ -305,13 +305,14 @@ class Train(Section):
     )
     lr_means_unit: Literal["size", "scene"] = Field(
         "size",
-        description="What the means' rate is times: size: each Gaussian's own, the geometric mean "
-        "of its scales; scene: how far apart the cameras stand, but at most half of the median "
-        "depth of the sparse points they see (3DGS: how far apart alone, 1.6e-4 and 1.6e-6).",
+        description="What the means' rate is times: size: along each of a Gaussian's own axes its "
+        "scale there, and it is turned about these axes; scene: how far apart the cameras stand, "
+        "but at most half of the median depth of the sparse points they see (3DGS: how far apart "
+        "alone, 1.6e-4 and 1.6e-6).",
     )
     lr_means: Rate = Field(0.04, description="At the start.")
     lr_means_final: Annotated[float, Field(gt=0)] = Field(
-        3e-4, description="At the end (log-linear decay)."
+        4e-3, description="At the end (log-linear decay)."
     )
     lr_boost: Annotated[float, Field(gt=0)] | Literal["auto"] = Field(
         "auto",
@@ -319,13 +320,13 @@ class Train(Section):
         "4, in runs shorter than the papers' 30 000 steps.",
     )
     lr_decay_from: Annotated[float, Field(ge=0, lt=1)] = Field(
-        0.5, description="From this share of the run on, the rates below fall (log-linearly)"
+        0.7, description="From this share of the run on, the rates below fall (log-linearly)"
     )
     lr_final_share: Annotated[float, Field(gt=0, le=1)] = Field(
         0.1, description="to this share of themselves."
     )
     lr_scales: Rate = 5e-3
-    lr_quats: Rate = 1e-3
+    lr_quats: Rate = Field(2e-3, description="Half the angle of a turn, in radians (3DGS: 1e-3).")
     lr_opacities: Rate = Field(2.5e-2, description="3DGS: 5e-2.")
     lr_sh0: Rate = 2.5e-3
     lr_shN: Rate = Field(3e-4, description="Higher SH bands (3DGS: 1.25e-4).")

@@ -1,7 +1,7 @@
 """The differentiable rasterizer for 3D Gaussians: C++ kernels, their Python face, a torch twin.
 
-``forward``, ``backward``, ``l1_ssim`` and ``adam_step`` are what a trainer calls; ``render`` wraps
-the first two in autograd. The kernels are compiled at first use, or beforehand by
+``forward``, ``backward``, ``l1_ssim``, ``adam_step`` and ``frame_adam`` are what a trainer calls;
+``render`` wraps the first two in autograd. The kernels are compiled at first use, or beforehand by
 ``python -m pipeline.raster.build``. ``pipeline.raster.twin`` holds the method in readable torch.
 Importing this package imports no torch.
 """
@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.raster.types import (
     CameraGradients,
+    FrameAdam,
     Gradients,
     LossResult,
     RasterCamera,
@@ -22,11 +23,20 @@ from pipeline.raster.types import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.raster.ops import Forward, adam_step, backward, forward, l1_ssim, render
+    from pipeline.raster.ops import (
+        Forward,
+        adam_step,
+        backward,
+        forward,
+        frame_adam,
+        l1_ssim,
+        render,
+    )
 
 __all__ = [
     "CameraGradients",
     "Forward",
+    "FrameAdam",
     "Gradients",
     "LossResult",
     "RasterCamera",
@@ -36,6 +46,7 @@ __all__ = [
     "adam_step",
     "backward",
     "forward",
+    "frame_adam",
     "l1_ssim",
     "render",
 ]

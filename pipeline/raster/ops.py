@@ -12,6 +12,7 @@ import torch
 from pipeline.raster import build
 from pipeline.raster.types import (
     CameraGradients,
+    FrameAdam,
     Gradients,
     LossResult,
     RasterCamera,
@@ -318,7 +319,6 @@ def adam_step(
     beta2: float = 0.999,
     eps: float = 1e-15,
     threads: int = 0,
-    log_units: torch.Tensor | None = None,
 ) -> None:
     """One step of Adam in place, as torch.optim.Adam takes it; ``step`` counts from 1.
 
@@ -326,9 +326,7 @@ def adam_step(
     over the elements: one for each element of a row, say.
 
     Rows of 3 or 4 may share a second moment, that of their mean square: ``exp_avg_sq`` is (N, 1)
-    then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it. Such rows
-    may count in a unit of their own, e to the mean of ``log_units`` (N, 3): what is moved, and what
-    the moments are of, is the row over its unit, as it is in this step.
+    then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it.
     """
     shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
     for tensor in (param, grad, exp_avg, exp_avg_sq):
@@ -336,17 +334,47 @@ def adam_step(
             raise ValueError("adam_step: tensors must be float32 and contiguous")
         if tensor.shape != param.shape and not (shared and tensor is exp_avg_sq):
             raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
-    if log_units is not None:
-        if not shared or log_units.shape != (len(param), 3):
-            raise ValueError(f"adam_step: units of rows are (N, 3), found {log_units.shape}")
-        if log_units.dtype != torch.float32 or not log_units.is_contiguous():
-            raise ValueError("adam_step: tensors must be float32 and contiguous")
     if shared and not isinstance(lr, int | float):
         raise ValueError(f"adam_step: rows that share a moment have one lr, found {lr}")
     rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
     if step < 1 or not len(rates) or not rates.isfinite().all():
         raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
     _ops().adam_step(
-        param.detach(), grad.detach(), exp_avg, exp_avg_sq, log_units, rates, step, beta1, beta2,
-        eps, _threads(threads),
+        param.detach(), grad.detach(), exp_avg, exp_avg_sq, rates, step, beta1, beta2, eps,
+        _threads(threads),
+    )  # fmt: skip
+
+
+def frame_adam(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    d_means: torch.Tensor,
+    d_quats: torch.Tensor,
+    adam: FrameAdam,
+    threads: int = 0,
+) -> None:
+    """One step of Adam over ``means`` (N, 3) and ``quats`` (N, 4) in place, along and about each
+    Gaussian's own axes (``twin.frame_adam``). float32, contiguous.
+
+    A mean goes as many of the scales along each axis as Adam says, so a flat Gaussian slides in its
+    plane, and stays in it; where the world is turned or grows, the steps turn and grow with it. A
+    quaternion of no direction is not turned. Axes and scales are those before the step.
+    """
+    moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
+    fours = (quats, d_quats)
+    for tensor in (means, log_scales, d_means, *moments, *fours):
+        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise ValueError("frame_adam: tensors must be float32 and contiguous")
+        width = 4 if any(tensor is four for four in fours) else 3
+        if tensor.shape != (len(means), width):
+            raise ValueError(
+                f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
+            )
+    rates = torch.tensor([adam.mean_rate, adam.turn_rate], dtype=torch.float64)
+    if adam.step < 1 or not rates.isfinite().all():
+        raise ValueError(f"frame_adam: step {adam.step} must be at least 1 and rates finite")
+    _ops().frame_adam(
+        means.detach(), quats.detach(), log_scales.detach(), d_means.detach(), d_quats.detach(),
+        *moments, rates, adam.step, adam.beta1, adam.beta2, adam.eps, _threads(threads),
     )  # fmt: skip

@@ -18,7 +18,7 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from pipeline.raster.types import RasterCamera, RasterOptions, RenderOutput, ShAdam
+from pipeline.raster.types import FrameAdam, RasterCamera, RasterOptions, RenderOutput, ShAdam
 
 # The same numbers, with their reasons, are in csrc/constants.h.
 DILATION = 0.3
@@ -374,16 +374,9 @@ def adam_step(
     beta1: float = 0.9,
     beta2: float = 0.999,
     eps: float = 1e-15,
-    log_units: torch.Tensor | None = None,
 ) -> None:
     """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
-    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment. With
-    `log_units` (N, 3) a row x = u y, u = e to the mean of the three, is moved by way of y, whose
-    gradient is u times that of x."""
-    unit = torch.ones(1, dtype=param.dtype)
-    if log_units is not None:
-        unit = log_units.mean(1, keepdim=True).exp()
-    grad = grad * unit
+    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment."""
     pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
     repeats = -(-param.numel() // len(pattern))
     rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
@@ -393,7 +386,44 @@ def adam_step(
         squares = squares.mean(1, keepdim=True)
     exp_avg_sq.mul_(beta2).add_(squares, alpha=1 - beta2)
     denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
-    param.sub_(unit * rates / (1 - beta1**step) * exp_avg / denominator)
+    param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
+
+
+def frame_adam(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    d_means: torch.Tensor,
+    d_quats: torch.Tensor,
+    adam: FrameAdam,
+) -> None:
+    """Adam over means (N, 3) and quaternions (N, 4) in each Gaussian's own frame; all in place, of
+    one float type.
+
+    A mean is moved by way of y, mean = R S y with S = diag(scales), whose gradient is
+    S R^T dL/dmean: the mean of N(mean, R S S R^T) has the identity for Fisher information there
+    (the metric of Amari 1998). A quaternion q is moved by way of t, q (1 + t_x i + t_y j + t_z k),
+    half the angles about the axes. R, S and q are those before the step."""
+    norm = quats.norm(dim=1, keepdim=True)
+    turns = norm.square() >= QUAT_NORM2_MIN
+    plain = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    unit = torch.where(turns, quats / norm.where(turns, torch.ones_like(norm)), plain)
+    frame = rotation_from_quat(unit) * log_scales.exp()[:, None, :]
+    w, x, y, z = unit.unbind(1)
+    tangents = torch.stack(
+        [torch.stack(t, 1) for t in ((-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))], 2
+    )  # (N, 4, 3): q i, q j, q k
+    tangents = torch.where(turns[..., None], tangents * norm[..., None], 0.0)
+    for param, grad, axes, exp_avg, exp_avg_sq, rate in (
+        (means, d_means, frame, adam.mean_avg, adam.mean_avg_sq, adam.mean_rate),
+        (quats, d_quats, tangents, adam.turn_avg, adam.turn_avg_sq, adam.turn_rate),
+    ):
+        own = torch.zeros_like(exp_avg)
+        own_grad = torch.einsum("nij,ni->nj", axes, grad)
+        adam_step(
+            own, own_grad, exp_avg, exp_avg_sq, rate, adam.step, adam.beta1, adam.beta2, adam.eps
+        )
+        param.add_(torch.einsum("nij,nj->ni", axes, own))
 
 
 def sh_adam(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:

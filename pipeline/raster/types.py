@@ -120,6 +120,31 @@ class ShAdam:
 
 
 @dataclass(frozen=True)
+class FrameAdam:
+    """Adam over means and rotations, in each Gaussian's own frame (``frame_adam``).
+
+    Attributes:
+        mean_avg, mean_avg_sq: (N, 3) float32, moments of a mean along the three axes, each in
+            units of the scale there; moved in place.
+        turn_avg, turn_avg_sq: (N, 3) float32, moments of a turn about the three axes; in place.
+        mean_rate: learning rate of the means, in scales.
+        turn_rate: of the rotations, in steps of a quaternion of length 1: half the angle.
+        step: from 1.
+    """
+
+    mean_avg: torch.Tensor
+    mean_avg_sq: torch.Tensor
+    turn_avg: torch.Tensor
+    turn_avg_sq: torch.Tensor
+    mean_rate: float
+    turn_rate: float
+    step: int
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
+
+
+@dataclass(frozen=True)
 class RenderOutput:
     """A drawn view; color, alpha and depth carry gradients.
 

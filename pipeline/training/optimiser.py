@@ -1,6 +1,7 @@
 """Adam over the five arrays of Gaussians, whose rows come and go.
 
 The harmonics, four fifths of a Gaussian, are moved inside the backward pass and in view alone.
+Means and rotations move along and about each Gaussian's own axes, or as 3DGS moves them.
 """
 
 from __future__ import annotations
@@ -10,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipeline.raster import Gradients, ShAdam, adam_step
+from pipeline.raster import FrameAdam, Gradients, ShAdam, adam_step, frame_adam
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
@@ -20,10 +21,9 @@ EPSILON = 1e-15
 
 @dataclass(frozen=True)
 class Rates:
-    """Learning rates of one step; ``means`` counts in each Gaussian's own size, the geometric mean
-    of its three scales (``by_size``), or in the world's unit."""
+    """Learning rates of one step; ``means`` counts in each Gaussian's own scales where Adam has
+    ``own_frames``, else in the world's unit."""
 
-    by_size: bool
     means: float
     log_scales: float
     quats: float
@@ -37,19 +37,26 @@ class Adam:
 
     Attributes:
         beta1: of the first moment.
-        first, second: by the name of the array, of its shape, float32; but (N, 1) the second of
-            means and quaternions, so that a turned world is trained as it was.
+        own_frames: means and rotations are moved along and about each Gaussian's own axes.
+        first, second: by the name of the array, of its shape, float32. But with ``own_frames``
+            those of quaternions are (N, 3), about the axes; and without, the second of means and
+            of quaternions (N, 1): a turned world is trained as it was, either way.
         last: (N,) int32, the last step whose view asked anything of each row.
     """
 
-    def __init__(self, gaussians: Gaussians, beta1: float):
-        self.beta1 = beta1
+    def __init__(self, gaussians: Gaussians, beta1: float, own_frames: bool):
+        self.beta1, self.own_frames = beta1, own_frames
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
-        for name in ("means", "quats"):
-            self.second[name] = torch.zeros(len(gaussians), 1)
-        self.last = torch.zeros(len(gaussians), dtype=torch.int32)
+        count = len(gaussians)
+        if own_frames:
+            self.first["quats"] = torch.zeros(count, 3)
+            self.second["quats"] = torch.zeros(count, 3)
+        else:
+            self.second["means"] = torch.zeros(count, 1)
+            self.second["quats"] = torch.zeros(count, 1)
+        self.last = torch.zeros(count, dtype=torch.int32)
 
     def harmonics(self, rates: Rates, step: int) -> ShAdam:
         """For ``backward``, which moves ``sh``; ``step`` counts from 1."""
@@ -62,22 +69,26 @@ class Adam:
         self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
     ) -> None:
         """Move all of ``gaussians`` but ``sh``, in place; ``step`` counts from 1."""
+        moved = {"sh"}
+        if self.own_frames:
+            moved |= {"means", "quats"}
+            frame_adam(
+                gaussians.means, gaussians.quats, gaussians.log_scales, gradients.means,
+                gradients.quats, self.frames(rates, step), threads,
+            )  # fmt: skip
         for name, parameter in gaussians.tensors().items():
-            if name == "sh":
+            if name in moved:
                 continue
             adam_step(
-                parameter,
-                getattr(gradients, name),
-                self.first[name],
-                self.second[name],
-                getattr(rates, name),
-                step,
-                self.beta1,
-                BETA2,
-                EPSILON,
-                threads,
-                gaussians.log_scales if name == "means" and rates.by_size else None,
-            )
+                parameter, getattr(gradients, name), self.first[name], self.second[name],
+                getattr(rates, name), step, self.beta1, BETA2, EPSILON, threads,
+            )  # fmt: skip
+
+    def frames(self, rates: Rates, step: int) -> FrameAdam:
+        return FrameAdam(
+            self.first["means"], self.second["means"], self.first["quats"], self.second["quats"],
+            rates.means, rates.quats, step, self.beta1, BETA2, EPSILON,
+        )  # fmt: skip
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""

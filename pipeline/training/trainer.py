@@ -166,7 +166,7 @@ class _Run:
         density.start(len(gaussians))
         cameras = MovingCameras.of(self.views, gaussians, inputs.extent, config)
         order = rng.permutation(len(self.views))
-        adam = Adam(gaussians, config.adam_beta1)
+        adam = Adam(gaussians, config.adam_beta1, self.own_frames)
         self.state = TrainState(gaussians, adam, density, cameras, rng, order)
 
     @property
@@ -347,10 +347,8 @@ class _Run:
         config, schedule, state = self.config, self.schedule, self.state
         boost = schedule.lr_boost_of(self.run_length())
         factor = boost * schedule.lr_decay_at(state.clock)
-        by_size = config.lr_means_unit == "size"
-        unit = 1.0 if by_size else self.inputs.size
+        unit = 1.0 if self.own_frames else self.inputs.size
         return Rates(
-            by_size=by_size,
             means=schedule.lr_means_at(state.clock) * boost * unit,
             log_scales=config.lr_scales * factor,
             quats=config.lr_quats * factor,
@@ -358,6 +356,10 @@ class _Run:
             sh0=config.lr_sh0 * factor,
             shN=config.lr_shN * factor,
         )
+
+    @property
+    def own_frames(self) -> bool:
+        return self.config.lr_means_unit == "size"
 
     def run_length(self) -> float:
         """Steps in all; where the run has minutes: if they go on as until now."""

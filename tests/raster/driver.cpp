@@ -143,12 +143,25 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     const double rate = 1e-2;
     adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
-    // A NaN that was given stays one: what is not drawn is not moved.
-    Array<float>* results[] = {&color,    &alpha,   &depth,     &median, &d_color,   &d_means,
-                               &d_scales, &d_quats, &d_opacity, &d_sh,   &d_means2d, &param};
-    const char* names[] = {"color",    "alpha",   "depth",     "median", "d_color",   "d_means",
-                           "d_scales", "d_quats", "d_opacity", "d_sh",   "d_means2d", "param"};
-    for (int i = 0; i < 12; i++) {
+    // From the origin, and from no direction where a quaternion has none: a NaN that was given
+    // stays one, what is not drawn is not moved.
+    Array<float> moved(3 * n), turned(4 * n),
+        frame[4] = {Array<float>(3 * n), Array<float>(3 * n), Array<float>(3 * n),
+                    Array<float>(3 * n)};
+    for (size_t i = 0; i < turned.size; i++)
+        turned[i] = std::isfinite(s.quats[i]) ? s.quats[i] : 0.0f;
+    const double rates[] = {1e-2, 1e-3};
+    frame_adam(moved.get(), turned.get(), s.log_scales.get(), d_means.get(), d_quats.get(),
+               {frame[0].get(), frame[1].get(), frame[2].get(), frame[3].get()}, n,
+               {rates, 2, 0.9, 0.999, 1e-15, 1}, threads);
+    for (Array<float>& moments : frame) expect_finite(moments, "frame moments");
+    Array<float>* results[] = {&color,     &alpha,    &depth,   &median,    &d_color,
+                               &d_means,   &d_scales, &d_quats, &d_opacity, &d_sh,
+                               &d_means2d, &param,    &moved,   &turned};
+    const char* names[] = {"color",     "alpha",    "depth",   "median",    "d_color",
+                           "d_means",   "d_scales", "d_quats", "d_opacity", "d_sh",
+                           "d_means2d", "param",    "moved",   "turned"};
+    for (int i = 0; i < 14; i++) {
         expect_finite(*results[i], names[i]);
         if (out) std::fwrite(results[i]->get(), sizeof(float), results[i]->size, out);
     }

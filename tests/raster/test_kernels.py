@@ -190,10 +190,14 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
             loss = raster.l1_ssim(fwd.color, d_color.abs(), 0.2, threads=threads)
             param, m, v = scene[4].clone(), torch.zeros_like(scene[4]), torch.ones_like(scene[4])
             raster.adam_step(param, g.sh, m, v, 1e-2, 3, threads=threads)
+            means, quats, frames = scene[0].clone(), scene[2].clone(), torch.ones(4, *g.means.shape)
+            adam = raster.FrameAdam(*frames, 1e-2, 1e-3, 3)
+            raster.frame_adam(means, quats, scene[1], g.means, g.quats, adam, threads)
             runs.append([
                 fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii, g.means,
                 g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d, g.means2d_abs,
                 loss.grad, torch.tensor([loss.loss, loss.l1, loss.ssim]), param, m, v,
+                means, quats, frames,
             ])  # fmt: skip
         for other in runs[1:]:
             assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))

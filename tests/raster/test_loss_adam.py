@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from dataclasses import replace
+from typing import NamedTuple
 
 import pytest
 import torch
 
 from pipeline import raster
-from pipeline.raster import RasterCamera, RasterOptions, ShAdam, twin
+from pipeline.raster import FrameAdam, RasterCamera, RasterOptions, ShAdam, twin
 from tests.raster.scenes import Scene, camera, random_scene, relative
 
 
@@ -122,39 +124,109 @@ def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
     assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
 
 
-@pytest.mark.parametrize("own_units", [False, True])
 @pytest.mark.parametrize(("rows", "columns"), [(1, 3), (16, 4), (37, 3), (1001, 4), (0, 3)])
-def test_rows_that_share_a_second_moment_step_as_the_twins(
-    rows: int, columns: int, own_units: bool
-) -> None:
+def test_rows_that_share_a_second_moment_step_as_the_twins(rows: int, columns: int) -> None:
     gen = torch.Generator().manual_seed(5)
     ours = torch.randn(rows, columns, generator=gen)
-    units = torch.randn(rows, 3, generator=gen) if own_units else None
     theirs = ours.double()
     m, v = torch.zeros_like(ours), torch.zeros(rows, 1)
     m64, v64 = m.double(), v.double()
     for step in range(1, 20):
         grad = torch.randn(rows, columns, generator=gen) * 10.0 ** (step % 5 - 3)
         grad[:1] = 0
-        raster.adam_step(ours, grad, m, v, 1e-2, step, log_units=units)
-        units64 = None if units is None else units.double()
-        twin.adam_step(theirs, grad.double(), m64, v64, 1e-2, step, log_units=units64)
+        raster.adam_step(ours, grad, m, v, 1e-2, step)
+        twin.adam_step(theirs, grad.double(), m64, v64, 1e-2, step)
     assert torch.allclose(ours.double(), theirs, rtol=0, atol=4e-6)
     assert torch.allclose(v.double(), v64, rtol=1e-5, atol=0)
 
 
-def test_a_step_in_a_rows_own_unit_grows_with_it() -> None:
-    """A row that is 2^k times as large as another, and pulled at as much less, goes 2^k times as
-    far: what lies far away moves as many pixels as what lies near. Also where squares overflow."""
-    powers = torch.tensor([0.0, 3.0, -5.0, 39.0, -39.0, 100.0])
-    grad = torch.tensor([[1.0, -2.0, 0.5]]) / torch.exp2(powers)[:, None]
-    moved = torch.zeros(6, 3)
-    log_units = (powers * math.log(2))[:, None].repeat(1, 3).contiguous()
-    m, v = torch.zeros(6, 3), torch.zeros(6, 1)
-    raster.adam_step(moved, grad, m, v, 1e-2, 1, log_units=log_units)
-    steps = moved / torch.exp2(powers)[:, None]
-    assert torch.allclose(steps[:5], steps[:1].expand(5, 3), rtol=1e-4)
-    assert moved.isfinite().all()
+class Framed(NamedTuple):
+    """What ``frame_adam`` moves and by what."""
+
+    means: torch.Tensor
+    quats: torch.Tensor
+    log_scales: torch.Tensor
+    adam: FrameAdam
+
+    @staticmethod
+    def of(means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor) -> Framed:
+        moments = torch.zeros(4, *means.shape, dtype=means.dtype)
+        adam = FrameAdam(*moments, 1e-2, 3e-3, 1)
+        return Framed(means.clone(), quats.clone(), log_scales.clone(), adam)
+
+    @staticmethod
+    def random(rows: int, seed: int) -> Framed:
+        gen = torch.Generator().manual_seed(seed)
+        means, log_scales = (torch.randn(rows, 3, generator=gen) for _ in range(2))
+        return Framed.of(means, 3 * torch.randn(rows, 4, generator=gen), log_scales)
+
+    def double(self) -> Framed:
+        return Framed.of(self.means.double(), self.quats.double(), self.log_scales.double())
+
+    def step(self, number: int, d_means: torch.Tensor, d_quats: torch.Tensor) -> None:
+        move = raster.frame_adam if self.means.dtype == torch.float32 else twin.frame_adam
+        adam = replace(self.adam, step=number)
+        move(self.means, self.quats, self.log_scales, d_means, d_quats, adam)
+
+
+@pytest.mark.parametrize("rows", [1, 16, 37, 1001, 0])
+def test_steps_in_own_frames_are_the_twins(rows: int) -> None:
+    ours = Framed.random(rows, 5)
+    ours.quats[:1] = 0  # of no direction: not turned
+    theirs = ours.double()
+    before = ours.quats.clone()
+    gen = torch.Generator().manual_seed(6)
+    for step in range(1, 20):
+        scale = 10.0 ** (step % 5 - 3)
+        d_means = torch.randn(rows, 3, generator=gen) * scale
+        d_quats = torch.randn(rows, 4, generator=gen) * scale
+        d_means[1:2] = 0
+        ours.step(step, d_means, d_quats)
+        theirs.step(step, d_means.double(), d_quats.double())
+    assert torch.allclose(ours.means.double(), theirs.means, rtol=1e-5, atol=1e-5)
+    assert torch.allclose(ours.quats.double(), theirs.quats, rtol=1e-5, atol=1e-5)
+    for a, b in ((ours.adam.mean_avg_sq, theirs.adam.mean_avg_sq),
+                 (ours.adam.turn_avg_sq, theirs.adam.turn_avg_sq)):  # fmt: skip
+        assert torch.allclose(a.double(), b, rtol=1e-3, atol=1e-6)
+    assert torch.equal(ours.quats[:1], before[:1])
+
+
+def test_steps_in_own_frames_turn_and_grow_with_the_world() -> None:
+    """x -> c T x: gradients of means go with T / c, quaternions are multiplied from the left."""
+    gen = torch.Generator().manual_seed(7)
+    plain = Framed.random(50, 8)
+    turn = torch.randn(4, generator=gen, dtype=torch.float64)
+    turn /= turn.norm()
+    matrix, size = twin.rotation_from_quat(turn[None])[0], 7.0
+    w, x, y, z = turn.tolist()
+    left = torch.tensor(
+        [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64
+    )
+    world = Framed.of(
+        (size * plain.means.double() @ matrix.T).float(),
+        (plain.quats.double() @ left.T).float(),
+        plain.log_scales + math.log(size),
+    )
+    for step in range(1, 10):
+        d_means = torch.randn(50, 3, generator=gen, dtype=torch.float64)
+        d_quats = torch.randn(50, 4, generator=gen, dtype=torch.float64)
+        plain.step(step, d_means.float(), d_quats.float())
+        world.step(step, (d_means @ matrix.T / size).float(), (d_quats @ left.T).float())
+    means = size * plain.means.double() @ matrix.T
+    assert torch.allclose(world.means.double(), means, rtol=0, atol=size * 1e-5)
+    assert torch.allclose(world.quats.double(), plain.quats.double() @ left.T, rtol=0, atol=1e-5)
+
+
+def test_a_flat_gaussian_slides_in_its_plane() -> None:
+    """As many scales along every axis; also where scales or gradients leave float32."""
+    log_scales = torch.tensor([[0.0, -3.0, 2.0], [-200.0, 200.0, torch.nan], [0.0, 0.0, 0.0]])
+    quats = torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [torch.inf, torch.nan, 1e30, 0]])
+    scene = Framed.of(torch.zeros(3, 3), quats, log_scales)
+    d_means = torch.tensor([[1.0, -2.0, 0.5], [1e30, 1e30, 1e30], [1.0, 1.0, 1.0]])
+    scene.step(1, d_means, torch.zeros(3, 4))
+    assert torch.allclose(scene.means[0], -d_means[0].sign() * 1e-2 * log_scales[0].exp())
+    assert scene.means.isfinite().all()
+    assert all(moment.isfinite().all() for moment in (scene.adam.mean_avg, scene.adam.mean_avg_sq))
 
 
 def test_rows_that_share_a_second_moment_turn_with_their_space() -> None:
@@ -183,11 +255,15 @@ def test_adam_refuses_what_it_cannot_update_in_place() -> None:
         raster.adam_step(a, a, a, torch.zeros(4, 1), [0.1, 0.2], 1)
     with pytest.raises(ValueError, match="shapes differ"):
         raster.adam_step(*(torch.zeros(4, 5) for _ in range(3)), torch.zeros(4, 1), 0.1, 1)
-    rows = [torch.zeros(4, 3) for _ in range(3)]
-    with pytest.raises(ValueError, match="units"):
-        raster.adam_step(*rows, torch.zeros(4, 1), 0.1, 1, log_units=torch.zeros(4))
-    with pytest.raises(ValueError, match="units"):
-        raster.adam_step(*rows, torch.zeros(4, 3), 0.1, 1, log_units=torch.zeros(4, 3))
+    framed = Framed.random(4, 0)
+    with pytest.raises(ValueError, match="expected"):
+        framed.step(1, torch.zeros(4, 3), torch.zeros(4, 3))
+    with pytest.raises(ValueError, match="expected"):
+        framed.step(1, torch.zeros(5, 3), torch.zeros(4, 4))
+    with pytest.raises(ValueError, match="contiguous"):
+        framed.step(1, torch.zeros(3, 4).T, torch.zeros(4, 4))
+    with pytest.raises(ValueError, match="step"):
+        framed.step(0, torch.zeros(4, 3), torch.zeros(4, 4))
 
 
 def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +13,7 @@ import torch
 from pipeline.raster import l1_ssim
 from pipeline.splats.order import in_morton_order
 from pipeline.training import trainer
+from pipeline.training.density.strategy import rotations
 from pipeline.training.inputs import Inputs
 from pipeline.training.trainer import train
 from tests.training.conftest import TinyScene, tiny_config
@@ -31,8 +33,9 @@ RATES = {
 def test_each_parameter_steps_as_far_as_its_own_rate_says(
     scene: TinyScene, tmp_path: Path, unit: str
 ) -> None:
-    """Adam's first step is the rate itself, up or down, or a row's root mean square where the row
-    shares a second moment; the means' counts in each Gaussian's size, or in the scene's."""
+    """Adam's first step is the rate itself, up or down: along and about each Gaussian's own axes,
+    the means' in its scales; or a row's root mean square where the row shares a second moment, the
+    means' in the scene's size."""
     scale = 3.0
     result = train(
         Inputs(scene.views, scene.initial, scene.extent, scale),
@@ -52,11 +55,15 @@ def test_each_parameter_steps_as_far_as_its_own_rate_says(
         first = in_morton_order(scene.initial).with_sh_degree(result.gaussians.sh_degree)
         before = first.tensors()[name]
         steps = tensor - before
-        if name == "means":
-            sizes = first.log_scales.mean(1, keepdim=True).exp()
-            steps /= sizes if unit == "size" else scale
-        if name in ("means", "quats"):
+        if name == "means" and unit == "size":
+            axes = rotations(first.quats)
+            steps = torch.einsum("nij,ni->nj", axes, steps) / first.log_scales.exp()
+        elif name == "means":
+            steps = steps.square().mean(1).sqrt() / scale
+        elif name == "quats":
             steps = steps.square().mean(1).sqrt()
+            if unit == "size":  # three ways to turn a quaternion of length 1
+                steps *= math.sqrt(4 / 3) / before.norm(dim=1)
         moved = float(steps.abs().max())
         assert moved == pytest.approx(2.0 * expected[name], rel=1e-3), name
 

@@ -3,11 +3,23 @@
 #include <cmath>
 #include <vector>
 
+#include "constants.h"
 #include "group.h"
 #include "threads.h"
 
 namespace splat {
 namespace {
+
+// Scales beyond e to the plus or minus this, 1e-12 and 1e12, count as that, NaN as the least.
+constexpr float kLnUnitMax = 28.0f;
+
+// Gradients beyond this count as that: their squares stay in float32.
+constexpr float kGradientMax = 1e18f;
+
+constexpr float kLog2E = 1.4426950408889634f;
+
+// Squared length of a quaternion beyond which the square of a component may leave float32.
+constexpr float kNorm2Max = 1e37f;
 
 // What a step's rates are multiplied by, and a second moment's root.
 struct Corrections {
@@ -19,24 +31,9 @@ struct Corrections {
           to_root(float(1 / std::sqrt(1 - std::pow(s.beta2, double(s.step))))) {}
 };
 
-// Powers of two beyond this are taken for overflow: squares of gradients in such units stay finite.
-constexpr float kLog2UnitMax = 40.0f;
-
-// e to the mean of three logarithms a row.
-SPLAT_INLINE f32x16 units(const float* logs, int count) {
-    constexpr float kLog2E = 1.4426950408889634f;
-    f32x16 log[3];
-    read_rows(logs, count, log);
-    const f32x16 mean = (log[0] + log[1] + log[2]) * (kLog2E / 3.0f);
-    const f32x16 power[1] = {min(max(mean, splat16(-kLog2UnitMax)), splat16(kLog2UnitMax))};
-    f32x16 unit[1];
-    exp2(power, unit);
-    return unit[0];
-}
-
 template <int K>
-void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
-               const float* log_units, int64_t rows, const AdamSettings& s, int threads) {
+void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq, int64_t rows,
+               const AdamSettings& s, int threads) {
     const Corrections correct(s);
     const float rate = float(s.rates[0] * correct.to_rate), eps = float(s.eps);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2);
@@ -48,11 +45,9 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         read_rows(param + K * first, count, p);
         read_rows(grad + K * first, count, g);
         read_rows(exp_avg + K * first, count, m);
-        const f32x16 unit = log_units ? units(log_units + 3 * first, count) : splat16(1.0f);
-        for (int k = 0; k < K; k++) g[k] *= unit;
         for (int k = 0; k < K; k++) squares += g[k] * g[k];
         const f32x16 v = read_column(exp_avg_sq + first, count) * beta2 + squares * rest2;
-        const f32x16 far = rate * unit / (sqrt(v) * correct.to_root + eps);
+        const f32x16 far = rate / (sqrt(v) * correct.to_root + eps);
         for (int k = 0; k < K; k++) {
             m[k] = m[k] * beta1 + g[k] * rest1;
             p[k] -= far * m[k];
@@ -104,10 +99,87 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
 }
 
 void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,
-                    const float* log_units, int64_t rows, int width, const AdamSettings& settings,
-                    int threads) {
-    (width == 3 ? adam_rows<3> : adam_rows<4>)(param, grad, exp_avg, exp_avg_sq, log_units, rows,
-                                               settings, threads);
+                    int64_t rows, int width, const AdamSettings& settings, int threads) {
+    (width == 3 ? adam_rows<3> : adam_rows<4>)(param, grad, exp_avg, exp_avg_sq, rows, settings,
+                                               threads);
+}
+
+void frame_adam(float* means, float* quats, const float* log_scales, const float* d_means,
+                const float* d_quats, const FrameMoments& moments, int64_t rows,
+                const AdamSettings& s, int threads) {
+    const Corrections correct(s);
+    const float mean_rate = float(s.rates[0] * correct.to_rate);
+    const float turn_rate = float(s.rates[1] * correct.to_rate);
+    const float beta1 = float(s.beta1), beta2 = float(s.beta2), eps = float(s.eps);
+    const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
+    // From gradients to Adam's normalised steps, in place; moments as rows of 3.
+    const auto normalised = [=](f32x16(&g)[3], float* exp_avg, float* exp_avg_sq, int count) {
+        f32x16 m[3], v[3];
+        read_rows(exp_avg, count, m);
+        read_rows(exp_avg_sq, count, v);
+        for (int k = 0; k < 3; k++) {
+            g[k] = min(max(g[k], splat16(-kGradientMax)), splat16(kGradientMax));
+            m[k] = m[k] * beta1 + g[k] * rest1;
+            v[k] = v[k] * beta2 + g[k] * g[k] * rest2;
+            g[k] = m[k] / (sqrt(v[k]) * correct.to_root + eps);
+        }
+        write_rows(m, count, exp_avg);
+        write_rows(v, count, exp_avg_sq);
+    };
+    parallel_for((rows + kGroup - 1) / kGroup, 256, threads, [&](int64_t number) {
+        const int64_t first = kGroup * number;
+        const int count = int(rows - first < kGroup ? rows - first : kGroup);
+        f32x16 mean[3], d_mean[3], q[4], d_quat[4], log2_scale[3], scale[3];
+        read_rows(means + 3 * first, count, mean);
+        read_rows(d_means + 3 * first, count, d_mean);
+        read_rows(quats + 4 * first, count, q);
+        read_rows(d_quats + 4 * first, count, d_quat);
+        read_rows(log_scales + 3 * first, count, log2_scale);
+        for (f32x16& power : log2_scale)
+            power = min(select(ge(power, splat16(-kLnUnitMax)), power, splat16(-kLnUnitMax)),
+                        splat16(kLnUnitMax)) *
+                    kLog2E;
+        exp2(log2_scale, scale);
+
+        // A quaternion of no direction has the world's axes, and is not turned.
+        const f32x16 norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
+        const Mask16 turns = ge(norm2, splat16(kQuatNorm2Min)) & lt(norm2, splat16(kNorm2Max));
+        const f32x16 norm = sqrt(select(turns, norm2, splat16(1.0f))), inverse = 1.0f / norm;
+        f32x16 unit[4];
+        for (int i = 0; i < 4; i++)
+            unit[i] = select(turns, q[i] * inverse, splat16(i ? 0.0f : 1.0f));
+        const f32x16 w = unit[0], x = unit[1], y = unit[2], z = unit[3];
+
+        // Columns of R: the axes.
+        const f32x16 axes[3][3] = {
+            {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y + w * z), 2.0f * (x * z - w * y)},
+            {2.0f * (x * y - w * z), 1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z + w * x)},
+            {2.0f * (x * z + w * y), 2.0f * (y * z - w * x), 1.0f - 2.0f * (x * x + y * y)}};
+        f32x16 along[3];
+        for (int k = 0; k < 3; k++)
+            along[k] = scale[k] *
+                       (axes[k][0] * d_mean[0] + axes[k][1] * d_mean[1] + axes[k][2] * d_mean[2]);
+        normalised(along, moments.mean + 3 * first, moments.mean_sq + 3 * first, count);
+        for (int k = 0; k < 3; k++) along[k] *= mean_rate * scale[k];
+        for (int i = 0; i < 3; i++)
+            mean[i] -= axes[0][i] * along[0] + axes[1][i] * along[1] + axes[2][i] * along[2];
+
+        // q times i, j and k: where it goes when turned about its own axes.
+        const f32x16 tangents[3][4] = {{-x, w, z, -y}, {-y, -z, w, x}, {-z, y, -x, w}};
+        f32x16 about[3];
+        for (int k = 0; k < 3; k++) {
+            const f32x16(&t)[4] = tangents[k];
+            about[k] = keep(turns, norm * (t[0] * d_quat[0] + t[1] * d_quat[1] + t[2] * d_quat[2] +
+                                           t[3] * d_quat[3]));
+        }
+        normalised(about, moments.turn + 3 * first, moments.turn_sq + 3 * first, count);
+        for (int k = 0; k < 3; k++) about[k] = keep(turns, turn_rate * norm * about[k]);
+        for (int i = 0; i < 4; i++)
+            q[i] -=
+                tangents[0][i] * about[0] + tangents[1][i] * about[1] + tangents[2][i] * about[2];
+        write_rows(mean, count, means + 3 * first);
+        write_rows(q, count, quats + 4 * first);
+    });
 }
 
 }  // namespace splat

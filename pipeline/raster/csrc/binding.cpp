@@ -203,9 +203,8 @@ std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const
 }
 
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
-               const Tensor& exp_avg_sq, const std::optional<Tensor>& log_units,
-               const Tensor& rates, int64_t step, double beta1, double beta2, double eps,
-               int64_t threads) {
+               const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
+               double beta2, double eps, int64_t threads) {
     const splat::AdamSettings settings = {
         rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step};
     if (exp_avg_sq.numel() == param.numel())
@@ -213,8 +212,21 @@ void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                          mutable_floats(exp_avg_sq), param.numel(), settings, int(threads));
     else
         splat::adam_step_rows(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
-                              mutable_floats(exp_avg_sq), log_units ? floats(*log_units) : nullptr,
-                              param.size(0), int(param.size(1)), settings, int(threads));
+                              mutable_floats(exp_avg_sq), param.size(0), int(param.size(1)),
+                              settings, int(threads));
+}
+
+void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scales,
+                const Tensor& d_means, const Tensor& d_quats, const Tensor& mean_avg,
+                const Tensor& mean_avg_sq, const Tensor& turn_avg, const Tensor& turn_avg_sq,
+                const Tensor& rates, int64_t step, double beta1, double beta2, double eps,
+                int64_t threads) {
+    splat::frame_adam(mutable_floats(means), mutable_floats(quats), floats(log_scales),
+                      floats(d_means), floats(d_quats),
+                      {mutable_floats(mean_avg), mutable_floats(mean_avg_sq),
+                       mutable_floats(turn_avg), mutable_floats(turn_avg_sq)},
+                      means.size(0), {rates.const_data_ptr<double>(), 2, beta1, beta2, eps, step},
+                      int(threads));
 }
 
 }  // namespace
@@ -250,7 +262,11 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "(float, float, float, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
-        "Tensor? log_units, Tensor rates, int step, float beta1, float beta2, float eps, "
+        "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
+    m.def(
+        "frame_adam(Tensor(a!) means, Tensor(b!) quats, Tensor log_scales, Tensor d_means, "
+        "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) turn_avg, "
+        "Tensor(f!) turn_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
         "int threads) -> ()");
 }
 
@@ -263,4 +279,5 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("project_backward", TORCH_BOX(&project_backward));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
     m.impl("adam_step", TORCH_BOX(&adam_step));
+    m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }

@@ -177,7 +177,7 @@ class Density(Section):
 
     strategy: Literal["gradient", "mcmc"] = Field(
         "gradient",
-        description="gradient: clone, split and prune (Kerbl et al. 2023, section 5.2); mcmc: "
+        description="gradient: split, clone and prune (Kerbl et al. 2023, section 5.2); mcmc: "
         "relocate, grow and shake (Kheradmand et al. 2024).",
     )
     start_step: int = Field(500, description="First densification.")
@@ -191,10 +191,18 @@ class Density(Section):
         description="Sum the absolute values of each pixel's gradient (AbsGS), so that pulls in "
         "opposite directions don't cancel; wants a larger grad_threshold.",
     )
-    clone: bool = Field(True, description="gradient: without, the small split, too.")
-    split: bool = Field(True, description="gradient: without, the large are cloned, too.")
+    clone: bool = Field(
+        False, description="gradient: the small are cloned (3DGS); without, they split, too."
+    )
+    split: bool = Field(True, description="gradient: without, all are cloned.")
+    split_kind: Literal["long_axis", "sampled"] = Field(
+        "long_axis",
+        description="How one becomes two: long_axis: side by side along its longest axis (after "
+        "Deng et al. 2025); sampled: at random places in it, each 1.6 times as small (3DGS).",
+    )
     split_scale: Rate = Field(
-        0.01, description="Gaussians larger than this share of the scene's size split."
+        0.01,
+        description="With `clone`: Gaussians larger than this share of the scene's size split.",
     )
     recycle: Share = Field(
         0.02,
@@ -329,7 +337,7 @@ class Train(Section):
     lr_quats: Rate = Field(2e-3, description="Half the angle of a turn, in radians (3DGS: 1e-3).")
     lr_opacities: Rate = Field(2.5e-2, description="3DGS: 5e-2.")
     lr_sh0: Rate = 2.5e-3
-    lr_shN: Rate = Field(3e-4, description="Higher SH bands (3DGS: 1.25e-4).")
+    lr_shN: Rate = Field(6e-4, description="Higher SH bands (3DGS: 1.25e-4).")
     density: Density = Field(default_factory=Density)
 
 

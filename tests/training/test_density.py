@@ -14,7 +14,13 @@ from hypothesis import strategies as st
 from pipeline.config.schema import Density
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density import make_strategy
-from pipeline.training.density.gradient import SPLIT_SHRINK, GradientDensity
+from pipeline.training.density.gradient import (
+    HALVES_OPACITY,
+    LONG_AXIS,
+    OTHER_AXES,
+    SPLIT_SHRINK,
+    GradientDensity,
+)
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.strategy import rotations
 from pipeline.training.optimiser import Adam
@@ -32,7 +38,9 @@ def marked(count: int) -> tuple[Gaussians, Adam]:
 
 
 def strategy(count: int, **options: object) -> GradientDensity:
-    density = GradientDensity(Density(**options), scale=1.0)  # type: ignore[arg-type]
+    """As 3DGS does it, where nothing else is said."""
+    paper: dict[str, object] = {"clone": True, "split_kind": "sampled"}
+    density = GradientDensity(Density(**paper | options), scale=1.0)  # type: ignore[arg-type]
     density.start(count)
     density.seen += 1
     return density
@@ -114,6 +122,32 @@ def test_a_split_keeps_the_mean_and_shrinks() -> None:
     axes = rotations(one.quats)[0].double() * one.log_scales.exp().double()
     wanted = axes @ axes.T
     assert torch.allclose(offset.T @ offset / len(offset), wanted, atol=0.03 * sigma**2)
+
+
+def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
+    """Both as they should be, about the middle, and as far out along the axis as before."""
+    gaussians, adam = marked(5)
+    gaussians.log_scales += torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    density = strategy(5, clone=False, split_kind="long_axis")
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    assert len(result) == 10
+    middle = (result.means[:5] + result.means[5:]) / 2
+    assert torch.allclose(middle, gaussians.means, atol=1e-6)
+    for k in range(5):
+        longest = int(gaussians.log_scales[k].argmax())
+        scales = gaussians.log_scales[k].exp()
+        offset = rotations(gaussians.quats[k : k + 1])[0].T @ (result.means[k] - middle[k])
+        for half in (result.log_scales[k].exp(), result.log_scales[k + 5].exp()):
+            ratio = torch.full((3,), OTHER_AXES)
+            ratio[longest] = LONG_AXIS
+            assert torch.allclose(half / scales, ratio)
+            variance = half[longest] ** 2 + offset[longest] ** 2
+            assert torch.allclose(variance, scales[longest] ** 2, rtol=1e-4)
+        assert offset.abs().argmax() == longest
+        assert torch.allclose(offset.abs().sum(), offset[longest].abs(), atol=1e-5)
+    opacity = torch.sigmoid(gaussians.opacity_logits).repeat(2)
+    assert torch.allclose(torch.sigmoid(result.opacity_logits), HALVES_OPACITY * opacity)
 
 
 def test_clones_are_copies() -> None:

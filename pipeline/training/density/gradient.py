@@ -1,6 +1,6 @@
 """Adaptive density control after Kerbl et al. 2023, section 5.2, under a budget.
 
-Gaussians whose image position the loss pulls at are cloned or split; faint and huge ones go.
+Gaussians whose image position the loss pulls at are split or cloned; faint and huge ones go.
 """
 
 from __future__ import annotations
@@ -20,8 +20,12 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.strategy import Changes, not_finite, rotations
 from pipeline.training.optimiser import Adam
 
-# A split makes two, each this much smaller: 0.8 N with N = 2 (3DGS).
+# A sampled split makes two, each this much smaller: 0.8 N with N = 2 (3DGS).
 SPLIT_SHRINK = 1.6
+# A split along the longest axis (after Deng et al. 2025): what is left of the scale along it, of
+# the others, and of the opacity. Two stand so far from the middle that the variance along it stays.
+LONG_AXIS, OTHER_AXES, HALVES_OPACITY = 0.5, 0.85, 0.8
+LONG_OFFSET = math.sqrt(1 - LONG_AXIS**2)
 RESET_OPACITY = 0.01
 # What shows less than this may make room for others.
 RECYCLED_OPACITY = 0.1
@@ -29,8 +33,8 @@ RECYCLED_OPACITY = 0.1
 
 @dataclass
 class GradientDensity:
-    """Clone small and split large Gaussians whose image position the loss pulls at; remove
-    faint and huge ones.
+    """Split, and where it is asked for clone the small of, Gaussians whose image position the loss
+    pulls at; remove faint and huge ones.
 
     Attributes:
         config: thresholds and the budget.
@@ -73,7 +77,7 @@ class GradientDensity:
         prune_huge: bool,
         budget: int,
     ) -> tuple[Gaussians, Changes]:
-        """Prune, then (``densify``) clone the small and split the large."""
+        """Prune, then (``densify``) split and clone."""
         kept = ~self._useless(gaussians, prune_huge)
         grow = torch.zeros_like(kept)
         if densify:
@@ -95,8 +99,11 @@ class GradientDensity:
         adam.select(rows, fresh)
         if len(split):
             children = slice(len(stay) + len(cloned), None)
-            result.means[children] += _offsets(result, children, rng)
-            result.log_scales[children] -= math.log(SPLIT_SHRINK)
+            if self.config.split_kind == "long_axis":
+                _halve(result, children)
+            else:
+                result.means[children] += _offsets(result, children, rng)
+                result.log_scales[children] -= math.log(SPLIT_SHRINK)
         self.start(len(result))
         return result, changes
 
@@ -148,6 +155,22 @@ def most(score: Tensor, among: Tensor, count: int) -> Tensor:
         order = torch.argsort(score.where(among, lowest), descending=True, stable=True)
         chosen[order[:count]] = True
     return chosen
+
+
+def _halve(gaussians: Gaussians, rows: slice) -> None:
+    """Set ``rows`` (2 M), M Gaussians and the same again, side by side along their longest axes, in
+    place."""
+    log_scales = gaussians.log_scales[rows]
+    each, longest = torch.arange(len(log_scales)), log_scales.argmax(1)
+    axis = rotations(gaussians.quats[rows])[each, :, longest]
+    far = LONG_OFFSET * log_scales[each, longest].exp()
+    far[len(far) // 2 :] *= -1
+    gaussians.means[rows] += far[:, None] * axis
+    log_scales = log_scales + math.log(OTHER_AXES)
+    log_scales[each, longest] += math.log(LONG_AXIS / OTHER_AXES)
+    gaussians.log_scales[rows] = log_scales
+    opacity = HALVES_OPACITY * torch.sigmoid(gaussians.opacity_logits[rows])
+    gaussians.opacity_logits[rows] = torch.logit(opacity)
 
 
 def _offsets(gaussians: Gaussians, rows: slice, rng: np.random.Generator) -> Tensor:

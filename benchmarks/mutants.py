@@ -102,9 +102,16 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "unit_lost": Mutant(
         f"{_CSRC}/adam.cpp",
-        "rate * unit / (sqrt(v)",
-        "rate / (sqrt(v)",
-        "a mean's step in the world's unit instead of its Gaussian's size",
+        "along[k] *= mean_rate * scale[k];",
+        "along[k] *= mean_rate;",
+        "a mean's step in the world's unit instead of its Gaussian's scales",
+        _LOSS,
+    ),
+    "world_turns": Mutant(
+        f"{_CSRC}/adam.cpp",
+        "{{-x, w, z, -y}, {-y, -z, w, x}, {-z, y, -x, w}}",
+        "{{-x, w, -z, y}, {-y, z, w, -x}, {-z, -y, x, w}}",
+        "quaternions turned about the world's axes instead of their own",
         _LOSS,
     ),
     "no_drift": Mutant(
@@ -154,7 +161,7 @@ MUTANTS: dict[str, Mutant] = {
         "scale=scene_scale(extent, points)",
         "scale=extent",
         "a scene as large as its cameras stand apart",
-        ("tests/e2e/test_regression.py",),
+        ("tests/stages/test_train.py",),
     ),
     "late_reset": Mutant(
         "pipeline/training/schedule.py",
@@ -168,6 +175,13 @@ MUTANTS: dict[str, Mutant] = {
         "result.log_scales[children] -= math.log(SPLIT_SHRINK)",
         "result.log_scales[children] += math.log(SPLIT_SHRINK)",
         "halves of a split larger than the whole",
+        ("tests/training/test_density.py",),
+    ),
+    "halves_together": Mutant(
+        "pipeline/training/density/gradient.py",
+        "far[len(far) // 2 :] *= -1",
+        "",
+        "both halves of a split on one side",
         ("tests/training/test_density.py",),
     ),
     "ndc": Mutant(

@@ -1,0 +1,59 @@
+"""What the train stage tells training."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any, cast
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Train
+from pipeline.runtime.job import Job
+from pipeline.scene.manifest import Manifest
+from pipeline.training.depth import SCALE_SHARE, KnownDepths
+from pipeline.training.inputs import Inputs
+from stages import train as stage
+from tests.training.conftest import ball, camera_at
+
+
+class Told(Exception):
+    """Training would begin."""
+
+
+def test_the_scene_is_as_large_as_what_is_seen(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Not as its cameras stand apart, along a street say; and held-out views are kept from it."""
+    views = [replace(camera_at(k), name=str(k), is_test=k == 0) for k in range(3)]
+    known = KnownDepths(np.zeros((1, 2)), np.full(1, 4.0, np.float32), np.ones(1, np.float32))
+    told: list[Inputs] = []
+
+    def train(inputs: Inputs, *_: Any, **__: Any) -> None:
+        told.append(inputs)
+        raise Told
+
+    def always(value: object) -> Callable[..., object]:
+        return lambda *_, **__: value
+
+    monkeypatch.setattr(stage, "train", train)
+    monkeypatch.setattr(stage, "load_views", always(views))
+    monkeypatch.setattr(stage, "read_model", always(None))
+    monkeypatch.setattr(stage, "choose_gains", always({}))
+    monkeypatch.setattr(stage, "scene_extent", always(50.0))
+    monkeypatch.setattr(stage, "point_depths", lambda training, _: [known] * len(training))
+    monkeypatch.setattr(Manifest, "read", always(Manifest(scene="street", photos=())))
+    ball(5, 0).save(tmp_path / "gaussians.npz")
+    job = SimpleNamespace(
+        inputs={"views": tmp_path, "model": tmp_path, "init": tmp_path},
+        section=lambda model: Train(depth_weight=0.0) if model is Train else model(),
+        seed=0, threads=1, scratch=tmp_path, logs=tmp_path,
+    )  # fmt: skip
+    with pytest.raises(Told):
+        stage.run(cast(Job, job))
+    assert [view.name for view in told[0].views] == ["1", "2"]
+    assert told[0].extent == 50.0
+    assert told[0].size == pytest.approx(SCALE_SHARE * 4.0)

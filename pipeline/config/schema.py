@@ -198,7 +198,8 @@ class Density(Section):
     split_kind: Literal["long_axis", "sampled"] = Field(
         "long_axis",
         description="How one becomes two: long_axis: side by side along its longest axis (after "
-        "Deng et al. 2025); sampled: at random places in it, each 1.6 times as small (3DGS).",
+        "Deng et al. 2025); sampled: at random places in it, each 1.6 times as small (3DGS), as "
+        "spheres (`isotropic`) always do.",
     )
     split_scale: Rate = Field(
         0.01,

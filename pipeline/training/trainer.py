@@ -162,7 +162,10 @@ class _Run:
             chosen = np.sort(rng.permutation(len(gaussians))[:budget])
             gaussians = gaussians.select(torch.from_numpy(chosen))
         gaussians = in_morton_order(gaussians)
-        density = make_strategy(config.density, inputs.size)
+        how = config.density
+        if config.isotropic:  # a sphere has no longest axis
+            how = how.model_copy(update={"split_kind": "sampled"})
+        density = make_strategy(how, inputs.size)
         density.start(len(gaussians))
         cameras = MovingCameras.of(self.views, gaussians, inputs.extent, config)
         order = rng.permutation(len(self.views))

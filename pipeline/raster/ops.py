@@ -358,8 +358,8 @@ def frame_adam(
     Gaussian's own axes (``twin.frame_adam``). float32, contiguous.
 
     A mean goes as many of the scales along each axis as Adam says, so a flat Gaussian slides in its
-    plane, and stays in it; where the world is turned or grows, the steps turn and grow with it. A
-    quaternion of no direction is not turned. Axes and scales are those before the step.
+    plane, and hardly leaves it; where the world is turned or grows, the steps turn and grow with
+    it. A quaternion of no direction is not turned. Axes and scales are those before the step.
     """
     moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
     fours = (quats, d_quats)

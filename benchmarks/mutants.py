@@ -88,9 +88,9 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "loss_scale": Mutant(
         f"{_CSRC}/loss.cpp",
-        "const double l1_scale = (1 - ssim_weight) / double(count);",
-        "const double l1_scale = 0.5 * (1 - ssim_weight) / double(count);",
-        "the gradient of L1 halved",
+        "error_scale_(float((1 - weights.ssim) / double(count))),",
+        "error_scale_(float(0.5 * (1 - weights.ssim) / double(count))),",
+        "the gradient of the plain error halved",
         _LOSS,
     ),
     "adam_bias": Mutant(

@@ -15,7 +15,7 @@ from benchmarks.raster.scenes import Scene
 from pipeline.raster import RasterOptions, build, forward
 
 BACKGROUND = (0.1, 0.2, 0.3)
-SSIM_WEIGHT = 0.2
+SSIM_WEIGHT, SQUARE_WEIGHT = 0.3, 2.5  # training's
 MIN_TURNS = 5  # quartiles of fewer say nothing
 # Vector operations that one Gaussian over one block of 16 pixels takes at least: place 2, exponent
 # 2, 2^x 11, its bounds 3, transmittance 3; forward colour and what is left 4; backward place again
@@ -87,7 +87,8 @@ class Step:
         # Rates of 0, so that every repeat draws the same.
         rate, rates = torch.zeros(1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
         sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
-        self.d_color = kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)[3]
+        loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARE_WEIGHT, threads)
+        self.d_color = kernels.l1_ssim(*loss_of)[3]
         kept: dict[str, Any] = {}
 
         def project() -> None:
@@ -100,7 +101,7 @@ class Step:
             kernels.blend(s.records, s.entries, s.tile_begin, view, *size, s.background, threads)
 
         def loss() -> None:
-            kernels.l1_ssim(self.drawn.color, target, None, SSIM_WEIGHT, threads)
+            kernels.l1_ssim(*loss_of)
 
         def blend_backward() -> None:
             kept["slots"] = kernels.blend_backward(

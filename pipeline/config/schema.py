@@ -225,10 +225,10 @@ class Density(Section):
     noise: bool = Field(True, description="mcmc: faint Gaussians move at random.")
     opacity_cost: Rate = Field(0.01, description="mcmc: weight of the mean opacity in the loss.")
     scale_cost: Rate = Field(0.01, description="mcmc: weight of the mean scale in the loss.")
-    pixels_per_gaussian: Annotated[float, Field(gt=0)] = Field(
-        2.0,
+    pixels_per_gaussian: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
+        "auto",
         description="Budget: a view's pixels over this, or fewer where there are few photographs "
-        "or `budget_minutes`.",
+        "or `budget_minutes`. auto: 2, or 1 with `budget_minutes`, which limit the budget anyway.",
     )
     max_gaussians: Positive = Field(
         1_000_000, description="Budget: never more Gaussians than this, whatever the pixels."
@@ -250,11 +250,18 @@ class Train(Section):
     )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
-    ssim_weight: Share = Field(0.2, description="Weight of D-SSIM; L1 has the rest.")
+    ssim_weight: Share = Field(
+        0.3, description="Weight of D-SSIM (3DGS: 0.2); the pixels' errors have the rest."
+    )
+    square_weight: Rate = Field(
+        2.5,
+        description="Weight of the squared error beside L1's 1, so that what is far off counts for "
+        "more, as it does in PSNR (3DGS: 0).",
+    )
     coarse_until: Literal["auto"] | Annotated[float, Field(ge=0, lt=1)] = Field(
         "auto",
         description="Share of the steps, or of `budget_minutes`, trained at reduced resolution "
-        "(1/4, then 1/2). auto: 0.15 of the steps or 0.3 of the minutes.",
+        "(1/4, then 1/2). auto: 0.15 of the steps; 0.3 of `budget_minutes`, at most 1.2 minutes.",
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."

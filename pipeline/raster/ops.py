@@ -282,9 +282,11 @@ def l1_ssim(
     target: torch.Tensor,
     ssim_weight: float,
     mask: torch.Tensor | None = None,
+    square_weight: float = 0.0,
     threads: int = 0,
 ) -> LossResult:
-    """3DGS's loss (1 - w) L1 + w (1 - SSIM), and its gradient on the render.
+    """The loss (1 - w) E + w (1 - SSIM), and its gradient on the render. E is the mean of
+    |d| + k d^2 over the differences d: with k = 0, 3DGS's L1.
 
     Args:
         rendered: (H, W, 3) float32 in [0, 1] or thereabouts.
@@ -292,6 +294,7 @@ def l1_ssim(
         ssim_weight: w in [0, 1].
         mask: (H, W) bool or uint8, not zero where a pixel is left out: the render is replaced
             by the target there, and both means are over the other pixels.
+        square_weight: k >= 0.
     """
     rendered = _plain("rendered", rendered, (None, None, 3))
     size = tuple(rendered.shape)
@@ -305,7 +308,9 @@ def l1_ssim(
                 f"mask: expected bool or uint8 {size[:2]}, found {mask.dtype} {tuple(mask.shape)}"
             )
         mask = mask.contiguous().view(torch.uint8)
-    return LossResult(*_ops().l1_ssim(rendered, target, mask, ssim_weight, _threads(threads)))
+    return LossResult(
+        *_ops().l1_ssim(rendered, target, mask, ssim_weight, square_weight, _threads(threads))
+    )
 
 
 def adam_step(

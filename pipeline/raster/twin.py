@@ -326,8 +326,10 @@ def l1_ssim(
     target: torch.Tensor,
     ssim_weight: float,
     mask: torch.Tensor | None = None,
+    square_weight: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """3DGS's loss: (1 - w) L1 + w (1 - SSIM) -> (loss, l1, ssim), scalars.
+    """(1 - w) E + w (1 - SSIM) -> (loss, E, ssim), scalars. E is the mean of |d| + k d^2: with
+    k = 0, as in 3DGS, L1. Squares make what is far off, a highlight say, count for more.
 
     SSIM (Wang et al. 2004, eq. 13) in an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the
     image, its mean over pixels and channels. Values in [0, 1]. With a mask (true = left out), the
@@ -359,9 +361,10 @@ def l1_ssim(
     ssim_map = ((2 * mu_x * mu_y + SSIM_C1) * (2 * cov + SSIM_C2)) / (
         (mu_x**2 + mu_y**2 + SSIM_C1) * (var_x + var_y + SSIM_C2)
     )
-    l1 = ((rendered - goal).abs() * keep.unsqueeze(-1)).sum() / count
+    d = rendered - goal
+    error = ((d.abs() + square_weight * d * d) * keep.unsqueeze(-1)).sum() / count
     ssim = (ssim_map * keep.unsqueeze(-1)).sum() / count
-    return (1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim
+    return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
 
 
 def adam_step(

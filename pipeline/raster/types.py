@@ -170,9 +170,9 @@ class RenderOutput:
 
 @dataclass(frozen=True)
 class LossResult:
-    """loss = (1 - w) l1 + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
+    """loss = (1 - w) error + w (1 - ssim), its parts, and dL/d(rendered) (H, W, 3) float32."""
 
     loss: float
-    l1: float
+    error: float
     ssim: float
     grad: torch.Tensor

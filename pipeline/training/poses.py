@@ -178,7 +178,9 @@ def fit_pose(
     best, least = poses.poses[0].copy(), math.inf
     for number in range(FIT_STEPS):
         rendered = forward(*gaussians.parameters(), poses.camera(camera, 0), options)
-        loss = l1_ssim(rendered.color * factor, wanted, ssim_weight, ignored, options.threads)
+        loss = l1_ssim(
+            rendered.color * factor, wanted, ssim_weight, ignored, threads=options.threads
+        )
         if loss.loss < least:
             best, least = poses.poses[0].copy(), loss.loss
         found = backward(rendered, loss.grad * factor, means2d_abs=False, camera=True).camera

@@ -109,9 +109,9 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     Array<uint8_t> mask(pixels);
     for (size_t i = 0; i < 3 * pixels; i++) target[i] = float(i % 97) / 97;
     for (size_t i = 0; i < pixels; i++) mask[i] = i % 5 == 0;
-    l1_ssim({width, height, color.get(), target.get(), nullptr, mask.get()}, 0.2, threads,
+    l1_ssim({width, height, color.get(), target.get(), nullptr, mask.get()}, {0.2, 2.5}, threads,
             d_color.get());
-    l1_ssim({width, height, color.get(), target.get(), nullptr, nullptr}, 0.2, threads,
+    l1_ssim({width, height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
             d_color.get());
     Array<float> slot_gradients(entries.size * kSlotFloats);
     Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);

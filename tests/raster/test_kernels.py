@@ -196,7 +196,7 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
             runs.append([
                 fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii, g.means,
                 g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d, g.means2d_abs,
-                loss.grad, torch.tensor([loss.loss, loss.l1, loss.ssim]), param, m, v,
+                loss.grad, torch.tensor([loss.loss, loss.error, loss.ssim]), param, m, v,
                 means, quats, frames,
             ])  # fmt: skip
         for other in runs[1:]:

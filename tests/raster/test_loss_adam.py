@@ -24,18 +24,19 @@ def images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.
 
 @pytest.mark.parametrize("size", [(40, 53), (1, 1), (3, 200), (17, 5)])
 @pytest.mark.parametrize("kind", ["float", "bytes", "masked", "byte mask"])
-def test_loss_matches_the_twin(size: tuple[int, int], kind: str) -> None:
+@pytest.mark.parametrize("square", [0.0, 2.5])
+def test_loss_matches_the_twin(size: tuple[int, int], kind: str, square: float) -> None:
     rendered, target = images(*size)
     mask = torch.rand(*size, generator=torch.Generator().manual_seed(5)) > 0.7
     if kind != "float":
         target = (target * 255).round().byte()
     use = {"masked": mask, "byte mask": mask.byte() * 7}.get(kind)
-    found = raster.l1_ssim(rendered, target, 0.2, use)
+    found = raster.l1_ssim(rendered, target, 0.2, use, square)
     leaf = rendered.double().requires_grad_()
-    loss, l1, ssim = twin.l1_ssim(leaf, target, 0.2, None if use is None else mask)
+    loss, error, ssim = twin.l1_ssim(leaf, target, 0.2, None if use is None else mask, square)
     (grad,) = torch.autograd.grad(loss, leaf)
     assert found.loss == pytest.approx(loss.item(), abs=1e-6)
-    assert found.l1 == pytest.approx(l1.item(), abs=1e-6)
+    assert found.error == pytest.approx(error.item(), abs=1e-6)
     assert found.ssim == pytest.approx(ssim.item(), abs=1e-6)
     assert relative(found.grad, grad) <= 1e-5
     if use is not None:

@@ -86,7 +86,7 @@ def test_loss_has_the_right_gradient(masked: bool) -> None:
     target = torch.rand(7, 6, 3, generator=gen, dtype=torch.float64)
     mask = torch.rand(7, 6, generator=gen) > 0.7 if masked else None
     assert torch.autograd.gradcheck(
-        lambda r: twin.l1_ssim(r, target, 0.2, mask)[0], [rendered], eps=1e-6, atol=1e-9
+        lambda r: twin.l1_ssim(r, target, 0.2, mask, 1.5)[0], [rendered], eps=1e-6, atol=1e-9
     )
 
 

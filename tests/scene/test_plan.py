@@ -303,6 +303,13 @@ def test_a_run_of_minutes_gets_no_more_gaussians_than_it_can_train(tmp_path):
     assert text in plan.stages["train"].decisions
 
 
+@pytest.mark.parametrize("minutes, budget", [(None, 200_000), (4, 200_000), (15, 400_000)])
+def test_a_run_of_many_minutes_gets_a_gaussian_for_each_pixel(tmp_path, minutes, budget):
+    scan = many(tmp_path, 100, width=lambda i: 800, height=lambda i: 500)
+    plan = make_plan(scan, Config.model_validate({"train": {"budget_minutes": minutes}}))
+    assert plan.config.train.density.max_gaussians == budget
+
+
 def test_training_says_what_memory_it_takes(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}

@@ -79,9 +79,9 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
         seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
         return backward(rendered, d_color, *rest, **options)
 
-    def watched_loss(picture: Any, wanted: Any, weight: float, *rest: Any) -> Any:
-        seen["wanted"], seen["weight"] = wanted, weight
-        return loss(picture, wanted, weight, *rest)
+    def watched_loss(picture: Any, *rest: Any) -> Any:
+        seen["wanted_and_weights"] = rest
+        return loss(picture, *rest)
 
     monkeypatch.setattr(trainer, "backward", watched_backward)
     monkeypatch.setattr(trainer, "l1_ssim", watched_loss)
@@ -96,7 +96,7 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
     gain = torch.tensor(gains[0], dtype=torch.float32)
 
     def measured(picture: torch.Tensor) -> float:
-        return l1_ssim(picture * gain, seen["wanted"], seen["weight"]).loss
+        return l1_ssim(picture * gain, *seen["wanted_and_weights"]).loss
 
     for channel in range(3):
         step = torch.zeros_like(seen["color"])

@@ -76,6 +76,8 @@ def test_a_run_of_minutes_is_coarse_for_longer() -> None:
     assert by_steps.coarse_steps == 150
     assert by_minutes.coarse_steps / by_minutes.steps == pytest.approx(0.3)
     assert Schedule.of(Train(steps=1000, coarse_until=0.0)).coarse_steps == 0
+    long = Schedule.of(Train(budget_minutes=12))  # many minutes want detail, too
+    assert long.coarse_steps / long.steps == pytest.approx(0.1, abs=1e-3)
 
 
 @pytest.mark.parametrize(("steps", "views"), [(4000, 50), (1500, 3)])

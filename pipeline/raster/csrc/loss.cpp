@@ -83,12 +83,14 @@ struct Ring {
 // more on each side: what the blur of a blur looks at.
 class Strip {
   public:
-    Strip(const LossImages& in, const Window& window, double l1_scale, double ssim_scale,
+    // `count`: the values that the means are over.
+    Strip(const LossImages& in, const Window& window, const LossWeights& weights, int64_t count,
           int64_t begin, int64_t end)
         : in_(in),
           window_(window),
-          l1_scale_(float(l1_scale)),
-          ssim_scale_(float(ssim_scale)),
+          square_(float(weights.square)),
+          error_scale_(float((1 - weights.ssim) / double(count))),
+          ssim_scale_(float(-weights.ssim / double(count))),
           begin_(begin),
           end_(end),
           values_(3 * in.width),
@@ -105,7 +107,7 @@ class Strip {
     }
 
     // Rows [first, last) of the gradient, and their sums.
-    void walk(int64_t first, int64_t last, float* grad, double* row_l1, double* row_ssim) {
+    void walk(int64_t first, int64_t last, float* grad, double* row_error, double* row_ssim) {
         for (int64_t y = first - 2 * kRadius; y < last + 2 * kRadius; y += 2) {
             read(y);
             read(y + 1);
@@ -115,7 +117,7 @@ class Strip {
                 for (int64_t row = middle; row < middle + 2; row++) {
                     const Sums sums = differentiate(row, line_[row - middle]);
                     if (row >= first && row < last)
-                        row_l1[row] = sums.l1, row_ssim[row] = sums.ssim;
+                        row_error[row] = sums.error, row_ssim[row] = sums.ssim;
                 }
             }
             if (done >= first) {
@@ -128,7 +130,7 @@ class Strip {
 
   private:
     struct Sums {
-        double l1, ssim;
+        double error, ssim;
     };
 
     // Row y of the images, zeros beyond them and, in both, nothing to tell where a mask hides them.
@@ -195,7 +197,7 @@ class Strip {
         const float *x = x_.row(y), *target = y_.row(y);
         float *to_m = d_m_.row(y), *to_2 = d_2_.row(y), *to_xy = d_xy_.row(y);
         const float* keep = keep_.row(y);
-        f32x16 l1 = {}, ssim = {};
+        f32x16 error = {}, ssim = {};
         for (int64_t i = kReach; i < stride_ - kReach; i += 16) {
             const f32x16 m_x = blur_across(line[0] + i, window_);
             const f32x16 m_y = blur_across(line[1] + i, window_);
@@ -211,8 +213,8 @@ class Strip {
             const f32x16 over_b1 = value * b2 * inverse, over_b2 = value * b1 * inverse;
             const f32x16 weight = load<f32x16>(keep + i);
             if (i >= 2 * kReach && i < 2 * kReach + own_) {
-                const f32x16 a = load<f32x16>(x + i), b = load<f32x16>(target + i);
-                l1 += weight * abs(a - b);
+                const f32x16 d = load<f32x16>(x + i) - load<f32x16>(target + i);
+                error += weight * (abs(d) + square_ * d * d);
                 ssim += weight * value;
             }
             const f32x16 d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
@@ -221,7 +223,7 @@ class Strip {
             store(to_xy + i, weight * 2.0f * a1 * inverse);
         }
         Sums sums = {};
-        for (int lane = 0; lane < 16; lane++) sums.l1 += l1[lane], sums.ssim += ssim[lane];
+        for (int lane = 0; lane < 16; lane++) sums.error += error[lane], sums.ssim += ssim[lane];
         return sums;
     }
 
@@ -250,8 +252,8 @@ class Strip {
                                 b * blur_across(line[2] + i, window_);
             const f32x16 sign =
                 select(lt(b, a), splat16(1), splat16(0)) - select(lt(a, b), splat16(1), splat16(0));
-            const f32x16 out =
-                load<f32x16>(keep_.row(y) + i) * (l1_scale_ * sign + ssim_scale_ * ssim);
+            const f32x16 out = load<f32x16>(keep_.row(y) + i) *
+                               (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
             std::memcpy(grad + y * values_ + column, &out,
                         std::min(end_ - column, int64_t(16)) * sizeof(float));
@@ -260,7 +262,7 @@ class Strip {
 
     const LossImages& in_;
     const Window& window_;
-    const float l1_scale_, ssim_scale_;
+    const float square_, error_scale_, ssim_scale_;
     const int64_t begin_, end_, values_;
     const int64_t own_, stride_;  // floats of the strip in whole vectors; of a buffer's row
     const Scratch<float> memory_;
@@ -279,34 +281,32 @@ int64_t count_values(const LossImages& in) {
 
 }  // namespace
 
-LossValues l1_ssim(const LossImages& in, double ssim_weight, int threads, float* grad) {
+LossValues l1_ssim(const LossImages& in, const LossWeights& weights, int threads, float* grad) {
     const Window window;
     const int64_t values = 3 * in.width, height = in.height, count = count_values(in);
     if (count == 0) {
         std::memset(grad, 0, height * values * sizeof(float));
         return {0, 0, 1};
     }
-    const double l1_scale = (1 - ssim_weight) / double(count);
-    const double ssim_scale = -ssim_weight / double(count);
     // Strips follow from the image alone, so that sums do not depend on the threads; every row is
     // found in the same way in whatever band it lies.
     const int64_t strips = (values + kStripFloats - 1) / kStripFloats;
     const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
     const int64_t bands = std::max(std::min(int64_t(threads), height / kBandRows), int64_t(1));
-    std::vector<double> row_l1(strips * height), row_ssim(strips * height);
+    std::vector<double> row_error(strips * height), row_ssim(strips * height);
     parallel_for(strips * bands, 1, threads, [&](int64_t unit) {
         const int64_t number = unit / bands, band = unit % bands, begin = number * across;
         if (begin >= values) return;
-        Strip strip(in, window, l1_scale, ssim_scale, begin, std::min(begin + across, values));
+        Strip strip(in, window, weights, count, begin, std::min(begin + across, values));
         strip.walk(height * band / bands, height * (band + 1) / bands, grad,
-                   row_l1.data() + number * height, row_ssim.data() + number * height);
+                   row_error.data() + number * height, row_ssim.data() + number * height);
     });
-    double l1 = 0, ssim = 0;
-    for (double sum : row_l1) l1 += sum;
+    double error = 0, ssim = 0;
+    for (double sum : row_error) error += sum;
     for (double sum : row_ssim) ssim += sum;
-    l1 /= double(count);
+    error /= double(count);
     ssim /= double(count);
-    return {(1 - ssim_weight) * l1 + ssim_weight * (1 - ssim), l1, ssim};
+    return {(1 - weights.ssim) * error + weights.ssim * (1 - ssim), error, ssim};
 }
 
 }  // namespace splat

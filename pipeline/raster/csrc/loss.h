@@ -1,4 +1,5 @@
-// 3DGS's loss, (1 - w) L1 + w (1 - SSIM), with its gradient.
+// 3DGS's loss, (1 - w) E + w (1 - SSIM), with its gradient. Its E is L1; here k squared errors
+// may join: |d| + k d^2.
 #pragma once
 
 #include <cstdint>
@@ -13,12 +14,16 @@ struct LossImages {
     const uint8_t* mask;          // (H, W), not 0: left out; may be null
 };
 
+struct LossWeights {
+    double ssim, square;  // w, k
+};
+
 struct LossValues {
-    double loss, l1, ssim;
+    double loss, error, ssim;
 };
 
 // SSIM of Wang et al. 2004 in an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the image;
 // means over the pixels that the mask leaves and the three channels. Writes grad (H, W, 3).
-LossValues l1_ssim(const LossImages& images, double ssim_weight, int threads, float* grad);
+LossValues l1_ssim(const LossImages& images, const LossWeights& weights, int threads, float* grad);
 
 }  // namespace splat

@@ -79,6 +79,13 @@ MUTANTS: dict[str, Mutant] = {
         "what lies behind a Gaussian counted with the wrong sign",
         _KERNELS,
     ),
+    "black_for_good": Mutant(
+        f"{_CSRC}/project_backward.cpp",
+        "select(lt(zero, asked.rgb[c]), d, min(d, zero))",
+        "keep(lt(zero, asked.rgb[c]), d)",
+        "a colour that fell to zero never comes back",
+        _KERNELS,
+    ),
     "ssim_constant": Mutant(
         f"{_CSRC}/loss.cpp",
         "kC1 = 1e-4f, kC2 = 9e-4f",

@@ -202,18 +202,36 @@ def sh_basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
     return torch.stack(terms, -1)
 
 
+class _NotNegative(torch.autograd.Function):
+    """max(0, x), whose gradient under 0 is not lost if a step against it would raise x. 3DGS drops
+    it: what has once become black in all views stays so."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(x)
+        return x.clamp(min=0)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        return torch.where(x > 0, grad, grad.clamp(max=0))
+
+
 def sh_colors(
     means: torch.Tensor, sh: torch.Tensor, camera: RasterCamera, degree: int
 ) -> torch.Tensor:
     """(V, 3) RGB seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
 
     The direction runs from the camera's centre to the Gaussian's; its dependence on the mean is
-    part of the gradient. Where the clamp holds, the gradient is zero.
+    part of the gradient. Where the clamp holds, only a gradient that would raise the colour passes
+    (``_NotNegative``).
     """
     pose = camera.world_to_camera.to(means.dtype)
     center = -pose[:3, :3].T @ pose[:3, 3]
     basis = sh_basis(F.normalize(means - center, dim=-1, eps=1e-30), degree)
-    return ((basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5).clamp(min=0)
+    colors = (basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5
+    clamped: torch.Tensor = _NotNegative.apply(colors)
+    return clamped
 
 
 @dataclass(frozen=True)

@@ -203,6 +203,22 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
             assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
 
 
+def test_what_is_black_may_become_brighter_but_not_darker() -> None:
+    """A colour clamped at zero keeps the gradient that would raise it, and no other."""
+    cam, sh = camera(20, 20), torch.zeros(1, 1, 3)
+    sh[..., 0], sh[..., 1], sh[..., 2] = -5.0, -5.0, 0.5  # red and green under zero
+    scene = (
+        torch.tensor([[0.0, 0.0, 4.0]]), torch.full((1, 3), -1.0), torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([2.0]), sh,
+    )  # fmt: skip
+    fwd = raster.forward(*scene, cam, RasterOptions(sh_degree=0))
+    assert fwd.color[..., :2].max() == 0 and fwd.color[..., 2].max() > 0.5
+    d_color = torch.ones(20, 20, 3) * torch.tensor([-1.0, 1.0, 1.0])  # brighter, darker, darker
+    found = raster.backward(fwd, d_color).sh[0, 0]
+    assert found[0] < 0 and found[1] == 0 and found[2] > 0
+    assert found[0] == -found[2]
+
+
 def test_autograd_face_gives_the_same_gradients() -> None:
     scene, cam = random_scene(11, 150), camera(40, 30)
     leaves = [t.clone().requires_grad_() for t in scene]

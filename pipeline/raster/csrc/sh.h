@@ -112,8 +112,8 @@ SPLAT_INLINE uint32_t sh_colors(const Directions& d, int degree, const ShBlock& 
     return bits(sane);
 }
 
-// Given dL/d(rgb), already zero where the clamp held: replaces the coefficients by their
-// gradients, and gives the view direction's share of dL/d(mean).
+// Given dL/d(rgb), already zero where the clamp holds the colour: replaces the coefficients by
+// their gradients, and gives the view direction's share of dL/d(mean).
 SPLAT_INLINE void sh_backward(const Directions& d, int degree, const f32x16 (&d_rgb)[3],
                               ShBlock& sh, f32x16 (&d_mean)[3]) {
     f32x16 basis[16], dx[16], dy[16], dz[16];

@@ -12,10 +12,11 @@ import torch
 
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import Scene
+from pipeline.config.schema import Train
 from pipeline.raster import RasterOptions, build, forward
 
 BACKGROUND = (0.1, 0.2, 0.3)
-SSIM_WEIGHT, SQUARE_WEIGHT = 0.3, 2.5  # training's
+SSIM_WEIGHT, SQUARE_WEIGHT = Train().ssim_weight, Train().square_weight
 MIN_TURNS = 5  # quartiles of fewer say nothing
 # Vector operations that one Gaussian over one block of 16 pixels takes at least: place 2, exponent
 # 2, 2^x 11, its bounds 3, transmittance 3; forward colour and what is left 4; backward place again

@@ -289,7 +289,7 @@ def _budget(scan: Scan, config: Config) -> tuple[int, str]:
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_clock)))
     if wanted >= density.max_gaussians:
         return density.max_gaussians, f"at most {density.max_gaussians} Gaussians, as configured"
-    why = f"one for each {pixels:g} pixels of a view"
+    why = f"one for {pixels:g} px of a view"
     if by_scene < by_view:
         why = f"one for each {PIXELS_SEEN_PER_GAUSSIAN} pixels of these few photographs"
     if by_clock < min(by_view, by_scene):

@@ -20,8 +20,8 @@ NOMINAL_STEPS = 7000
 MIN_REFINE_INTERVAL = 10
 COARSE_FACTORS = (4, 2)
 # Shares of a run. A coarse step costs a third of a full one: 0.3 of the minutes are half of the
-# steps. bonsai in 4 minutes: 28.5 dB with 0.3, 28.3 dB with 0.15; but in as many as 12 are, at half
-# the size, 31.30 dB / .9367 with 0.3 and 31.31 / .9389 with 0.1: so many minutes at most.
+# steps. bonsai in 4 minutes: 28.5 dB with 0.3, 28.3 dB with 0.15; but at half the size, in 6
+# minutes on one core, 31.30 dB / .937 with 0.3 and 31.31 / .939 with 0.1: so many minutes at most.
 COARSE_STEPS, COARSE_MINUTES, MOST_COARSE_MINUTES = 0.15, 0.3, 1.2
 # The papers' length of a run, for which the configured learning rates are right. The noise of one
 # view a step asks that a run of fewer goes farther in each: by the root, as for batches. At 3000

@@ -257,8 +257,9 @@ class _Run:
         wanted = target.over(background)
         gain = None if self.gains is None else self.gains[index]
         seen = rendered.color if gain is None else rendered.color * gain
-        weights = config.ssim_weight, target.ignored, config.square_weight
-        loss = l1_ssim(seen, wanted, *weights, self.threads)
+        loss = l1_ssim(
+            seen, wanted, config.ssim_weight, target.ignored, config.square_weight, self.threads
+        )
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
         rates = self.rates()

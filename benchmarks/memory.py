@@ -20,8 +20,8 @@ from pipeline.config.schema import Density, Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.memory import peak_memory_mb
+from pipeline.scene.memory import memory_mb
 from pipeline.scene.model import View
-from pipeline.scene.plan import memory_mb
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training import trainer
@@ -71,6 +71,7 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=200)
     parser.add_argument("--size", type=int, nargs=2, default=[1600, 1067], metavar=("W", "H"))
     parser.add_argument("--steps", type=int, default=40)
+    parser.add_argument("--memory-mb", type=int, help="train.memory_mb: pictures from disk")
     parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
     parser.add_argument("--json", type=Path, help="write the figures as data")
     args = parser.parse_args()
@@ -81,12 +82,17 @@ def main() -> int:
         views = made_views(args.views, width, height, folder)
         result = train(
             Inputs(views, made_gaussians(args.gaussians, views[0].fx), scene_extent(views)),
-            Train(steps=args.steps, density=Density(max_gaussians=args.gaussians)),
+            Train(
+                steps=args.steps,
+                memory_mb=args.memory_mb,
+                density=Density(max_gaussians=args.gaussians),
+            ),
             seed=0,
             threads=args.threads,
             checkpoint_dir=folder / "checkpoints",
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))
+    planned = memory_mb(args.views * width * height, args.gaussians)
     figures = {
         "gaussians": len(result.gaussians),
         "most_gaussians": result.counters["max_gaussians"],
@@ -95,7 +101,7 @@ def main() -> int:
         "height": height,
         "seconds_a_step": round(result.seconds / result.steps, 3),
         "checkpoints_mb": round(saved / 1e6),
-        "planned_mb": memory_mb(args.views * width * height, args.gaussians),
+        "planned_mb": min(planned, args.memory_mb or planned),
         "peak_mb": round(peak_memory_mb() * 2**20 / 1e6),
     }
     for key, value in figures.items():

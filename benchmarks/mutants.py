@@ -81,8 +81,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "black_for_good": Mutant(
         f"{_CSRC}/project_backward.cpp",
-        "select(lt(zero, asked.rgb[c]), d, min(d, zero))",
-        "keep(lt(zero, asked.rgb[c]), d)",
+        "view.black_stays ? zero : min(d, zero)",
+        "zero",
         "a colour that fell to zero never comes back",
         _KERNELS,
     ),
@@ -302,6 +302,13 @@ MUTANTS: dict[str, Mutant] = {
         "return scale, rotation, mean_target - rotation @ mean_source",
         "the scale left out of an alignment's shift",
         ("tests/metrics/test_pose.py",),
+    ),
+    "one_place": Mutant(
+        "pipeline/training/shelf.py",
+        "begin = self._end\n",
+        "begin = 0\n",
+        "pictures on disk written over one another",
+        ("tests/training/test_targets.py",),
     ),
     "judge": Mutant(
         "pipeline/sfm/judge.py",

@@ -90,8 +90,10 @@ class SnakemakeProject:
         return lambda wildcards: stage_key(stage, *self._plan(wildcards.scene))
 
     def training_memory(self, wildcards: Any) -> int:
-        """Resources function: MB to ask a cluster for, half more than the plan's rough estimate."""
-        return round(1.5 * self._plan(wildcards.scene)[0].facts["training_memory_mb"])
+        """Resources function: MB to ask a cluster for, what is configured, or half more than the
+        plan's rough estimate."""
+        plan = self._plan(wildcards.scene)[0]
+        return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
 
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""

@@ -27,6 +27,8 @@ from stages.command import main
 # Standard deviation in stops from which photographs are taken for differently exposed: cameras that
 # hold their exposure show 0 to 0.1, collections from the internet 0.5.
 EXPOSURES_DIFFER = 0.2
+# Looks at each photograph, on average, below which no scene has come out sharp.
+FEW_LOOKS = 3.0
 FITS = {
     "factor": "depths in a unit of their own",
     "depth": "depths up to factor and shift",
@@ -66,6 +68,8 @@ def run(job: Job) -> None:
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
     job.warnings += result.warnings
     minutes = job.section(Train).budget_minutes
+    if few := too_few_looks(result.steps, len(training), result.seconds, minutes):
+        job.warn(few)
     if minutes is not None:
         job.decide(
             f"{result.steps} steps fitted into {minutes:g} minutes; how many do depends on the "
@@ -109,6 +113,20 @@ def find_depths(
         )
     job.counters["depth_maps"] = sum(kinds.values())
     return known
+
+
+def too_few_looks(steps: int, views: int, seconds: float, minutes: float | None) -> str | None:
+    """What to say of a training that was too short to look at its photographs; None: it was not."""
+    if steps >= FEW_LOOKS * views:
+        return None
+    looks = f"{steps} steps are {steps / views:.1f} looks at each of {views} photographs"
+    if minutes is None:
+        return f"{looks}, too few for a sharp scene: raise train.steps"
+    return (
+        f"{looks}, too few for a sharp scene: all that this machine did in {minutes:g} minutes, "
+        f"{seconds / steps:.2g} s a step; raise train.budget_minutes or lower "
+        "views.max_long_side_px, and see that nothing else keeps the machine busy"
+    )
 
 
 def choose_gains(job: Job, views: list[View], model: Reconstruction) -> dict[str, list[float]]:

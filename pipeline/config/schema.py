@@ -248,6 +248,13 @@ class Train(Section):
         description="Instead of steps: train for so many minutes by the clock, as well as that "
         "allows. How many steps fit depends on the machine and its load, so two runs differ.",
     )
+    memory_mb: Positive | None = Field(
+        None,
+        description="Most memory that training may take, in MB: no more Gaussians are trained than "
+        "fit, and pictures that do not fit beside them are read from disk as they are needed. "
+        "Without it they are where training would take over three quarters of the memory that the "
+        "machine, or its container, has; that changes no result.",
+    )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")
     ssim_weight: Share = Field(
@@ -261,7 +268,7 @@ class Train(Section):
     coarse_until: Literal["auto"] | Annotated[float, Field(ge=0, lt=1)] = Field(
         "auto",
         description="Share of the steps, or of `budget_minutes`, trained at reduced resolution "
-        "(1/4, then 1/2). auto: 0.15 of the steps; 0.3 of `budget_minutes`, at most 1.2 minutes.",
+        "(1/4, then 1/2). auto: 0.15 of the steps; 0.1 of `budget_minutes`, at most 1.2 minutes.",
     )
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto", description="auto: random where images have alpha, else black."
@@ -308,6 +315,10 @@ class Train(Section):
         0.0,
         description="An experiment: this share of the training pixels is black or white at random. "
         "Held-out views stay as they are.",
+    )
+    black_stays: bool = Field(
+        False,
+        description="A colour clamped at 0 learns nothing, as in 3DGS; otherwise it may come back.",
     )
     gradients_per_pixel: Annotated[int, Field(ge=0)] = Field(
         0,

@@ -217,7 +217,8 @@ def backward(
     )  # fmt: skip
     d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_camera = ops.project_backward(
         *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias, s.records,
-        fwd.radii, s.slots, slot_gradients, means2d_abs, camera, *_moments(sh_adam, s.inputs[4]),
+        fwd.radii, s.slots, slot_gradients, s.options.black_stays, means2d_abs, camera,
+        *_moments(sh_adam, s.inputs[4]),
         threads,
     )  # fmt: skip
     parts = d_camera.split([3, 3, 2, 2]) if camera else None

@@ -204,7 +204,7 @@ def sh_basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
 
 class _NotNegative(torch.autograd.Function):
     """max(0, x), whose gradient under 0 is not lost if a step against it would raise x. 3DGS drops
-    it: what has once become black in all views stays so."""
+    it (``RasterOptions.black_stays``): what has once become black in all views stays so."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
@@ -218,18 +218,20 @@ class _NotNegative(torch.autograd.Function):
 
 
 def sh_colors(
-    means: torch.Tensor, sh: torch.Tensor, camera: RasterCamera, degree: int
+    means: torch.Tensor, sh: torch.Tensor, camera: RasterCamera, degree: int, stays: bool = False
 ) -> torch.Tensor:
     """(V, 3) RGB seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
 
     The direction runs from the camera's centre to the Gaussian's; its dependence on the mean is
     part of the gradient. Where the clamp holds, only a gradient that would raise the colour passes
-    (``_NotNegative``).
+    (``_NotNegative``); with ``stays`` none.
     """
     pose = camera.world_to_camera.to(means.dtype)
     center = -pose[:3, :3].T @ pose[:3, 3]
     basis = sh_basis(F.normalize(means - center, dim=-1, eps=1e-30), degree)
     colors = (basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5
+    if stays:
+        return torch.relu(colors)
     clamped: torch.Tensor = _NotNegative.apply(colors)
     return clamped
 
@@ -327,7 +329,13 @@ def render(
 ) -> RenderOutput:
     """Draw a view, differentiably. Same signature as ``pipeline.raster.render``."""
     projection = project(means, log_scales, quats, opacity_logits, sh, camera, options)
-    colors = sh_colors(means[projection.index], sh[projection.index], camera, options.sh_degree)
+    colors = sh_colors(
+        means[projection.index],
+        sh[projection.index],
+        camera,
+        options.sh_degree,
+        options.black_stays,
+    )
     image = blend(projection, colors, camera, options)
     return RenderOutput(
         image.color, image.alpha, image.depth, image.median_depth, projection.radii,

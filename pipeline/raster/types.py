@@ -42,6 +42,8 @@ class RasterOptions:
         near: Gaussians whose centre has camera z <= near are not drawn. In scene units, and
             scenes from photographs have an arbitrary scale: choose it well under the distance
             of the nearest thing worth drawing.
+        black_stays: a colour that is clamped at 0 has no gradient (3DGS); otherwise one that would
+            raise it passes.
         gradients_per_pixel: a pixel's gradients go only to so many Gaussians, the first that it
             draws (the limit that Kerbl et al. 2023, sec. 7.3, compare with having none); 0: to all.
         threads: 0 for all. The result does not depend on it.
@@ -51,6 +53,7 @@ class RasterOptions:
     background: tuple[float, float, float] | None = None
     antialias: bool = False
     near: float = 0.01
+    black_stays: bool = False
     gradients_per_pixel: int = 0
     threads: int = 0
 

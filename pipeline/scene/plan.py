@@ -14,6 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
+from pipeline.scene.budget import gaussian_budget, memory_line, training_memory_mb
 from pipeline.scene.posefiles import GivenPoses
 from pipeline.scene.scan import Scan
 from pipeline.scene.views import view_size
@@ -41,24 +42,10 @@ SPATIAL_SHARE = 0.9
 MIXED_BODIES = 3
 MIXED_GROUP_SHARE = 0.5
 
-# Of a view. Twice as many give bonsai 0.5 dB in the steps of the default, at 1.3 times the time:
-# for those who say how long they will wait.
-PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_BY_CLOCK = 2.0, 1.0
-# Fewer Gaussians than this make no picture; and each wants to be seen in so many pixels of all
-# photographs together, or it learns single pictures by heart.
-MIN_GAUSSIANS = 20_000
-PIXELS_SEEN_PER_GAUSSIAN = 40
-# And each wants its share of a run by the clock: fox in one minute on two cores, 28.9 dB with
-# 205 000, 30.9 dB with 50 000.
-GAUSSIANS_A_MINUTE = 50_000
 # Up to so many photographs, depths of sparse points are a help (docs/training.md): 7 training views
 # of a fountain gain 1.5 dB on views kept back, 8 of a door nothing, 38 of a fox lose 0.2 to 0.5 dB.
 FEW_PHOTOS, DEPTH_WEIGHT = 30, 0.03
 MAP_WEIGHT = 0.3
-
-# Of training: the program with torch; a Gaussian.
-PROGRAM_MB = 400
-GAUSSIAN_BYTES = 2500
 
 # A plan is for people, and travels on a command line.
 FACTS_SHOWN = 20
@@ -101,7 +88,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
     camera_model, model_reason = _camera_model(scan, config)
     sharing, sharing_reason = _share_cameras(scan, config)
     background, background_reason = _background(scan, config)
-    budget, budget_reason = _budget(scan, config)
+    budget, budget_reason = gaussian_budget(scan, config)
     depth_weight, depth_reason = _depth_weight(scan, config)
     settled = _settled(
         config,
@@ -148,7 +135,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
                 background_reason,
                 *([depth_reason] if depth_reason else []),
                 *_mask_lines(scan, config),
-                f"about {training_memory_mb(scan, settled) / 1000:.1f} GB of memory",
+                memory_line(scan, settled),
             ],
         ),
         "evaluate": StagePlan(run=True, reason=_split(settled), decisions=_truth(scan)),
@@ -275,30 +262,6 @@ def _background(scan: Scan, config: Config) -> Choice:
     return "black", f"black background: {few}"
 
 
-def _budget(scan: Scan, config: Config) -> tuple[int, str]:
-    """How many Gaussians the scene gets: as many as its pictures can tell apart and its minutes
-    can train."""
-    density = config.train.density
-    width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
-    minutes, pixels = config.train.budget_minutes, density.pixels_per_gaussian
-    if pixels == "auto":
-        pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_BY_CLOCK
-    by_view = width * height / pixels
-    by_scene = width * height * len(scan.photos) / PIXELS_SEEN_PER_GAUSSIAN
-    by_clock = math.inf if minutes is None else GAUSSIANS_A_MINUTE * minutes
-    wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_clock)))
-    if wanted >= density.max_gaussians:
-        return density.max_gaussians, f"at most {density.max_gaussians} Gaussians, as configured"
-    why = f"one for {pixels:g} px of a view"
-    if by_scene < by_view:
-        why = f"one for each {PIXELS_SEEN_PER_GAUSSIAN} pixels of these few photographs"
-    if by_clock < min(by_view, by_scene):
-        why = f"{GAUSSIANS_A_MINUTE} for each of {minutes:g} minutes"
-    if wanted == MIN_GAUSSIANS:
-        why = "the least"
-    return wanted, f"at most {wanted} Gaussians: {why}"
-
-
 def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:
     """Whether renders are held to sparse points' depths: many photographs settle them alone."""
     wanted = config.train.depth_weight
@@ -380,20 +343,6 @@ def _init(scan: Scan, config: Config) -> StagePlan:
         reason="Gaussians from points triangulated at the given poses, which came without any",
         decisions=["pairs of cameras that stand close and look alike"],
     )
-
-
-def memory_mb(pixels: int, gaussians: int) -> int:
-    """What training takes at most, roughly, in MB: the program, every view's 8-bit pixels (and a
-    quarter more while they are coarse), and each Gaussian's parameters, moments, gradients and
-    what it writes while a view is drawn. Measured on scenes of 60 000 to 213 000 Gaussians."""
-    return round(PROGRAM_MB + (1.25 * 3 * pixels + GAUSSIAN_BYTES * gaussians) / 1e6)
-
-
-def training_memory_mb(scan: Scan, config: Config) -> int:
-    """``memory_mb`` of the scene's views and its budget."""
-    sizes = [view_size(p.width, p.height, config.views.max_long_side_px) for p in scan.photos]
-    pixels = sum(width * height for width, height in sizes)
-    return memory_mb(pixels, config.train.density.max_gaussians)
 
 
 def _length(config: Config) -> str:

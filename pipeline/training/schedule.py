@@ -19,10 +19,11 @@ NOMINAL_STEPS = 7000
 # Fewer steps than this between two densifications say too little about a gradient's mean.
 MIN_REFINE_INTERVAL = 10
 COARSE_FACTORS = (4, 2)
-# Shares of a run. A coarse step costs a third of a full one: 0.3 of the minutes are half of the
-# steps. bonsai in 4 minutes: 28.5 dB with 0.3, 28.3 dB with 0.15; but at half the size, in 6
-# minutes on one core, 31.30 dB / .937 with 0.3 and 31.31 / .939 with 0.1: so many minutes at most.
-COARSE_STEPS, COARSE_MINUTES, MOST_COARSE_MINUTES = 0.15, 0.3, 1.2
+# Shares of a run. A coarse step costs a third of a full one, or a ninth, so 0.15 of the steps are
+# 0.03 of the time. Of the minutes 0.1: in as much time as 500 to 1000 full steps bonsai gains 0.2
+# to 0.5 dB over 0.3, and 0.2 to 0.3 over 0.05 and 0; of 300 it loses 0.1 (docs/training.md; with an
+# older training 0.15 lost 0.2 in 4 minutes). Many minutes want small pictures for no longer.
+COARSE_STEPS, COARSE_MINUTES, MOST_COARSE_MINUTES = 0.15, 0.1, 1.2
 # The papers' length of a run, for which the configured learning rates are right. The noise of one
 # view a step asks that a run of fewer goes farther in each: by the root, as for batches. At 3000
 # steps three times the rates were best and five times worse than three: four is the most.

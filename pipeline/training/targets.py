@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
@@ -16,6 +16,7 @@ from torch import Tensor
 from pipeline.photos.load import ViewPixels, load_view, resize_area
 from pipeline.runtime.progress import track
 from pipeline.scene.model import View
+from pipeline.training.shelf import MemoryShelf, Planes, Shelf
 
 # Below this (pixels on the shorter side) SSIM's window of 11 sees little but borders.
 MIN_SHORT_SIDE = 64
@@ -54,39 +55,45 @@ class Target:
 
 
 class Targets:
-    """All views' pixels in memory; those of a reduced resolution are made once, when first asked
-    for, and only one reduced resolution is kept.
+    """All views' pixels; those of a reduced resolution are made once, when first asked for, and
+    only one reduced resolution is kept.
 
     Args:
         noise: share of the pixels that are made black or white, the same for the same ``seed``
             and name.
+        shelf: where the pixels are kept; None: in memory. It changes no bit.
     """
 
-    def __init__(self, views: Sequence[View], threads: int, noise: float = 0.0, seed: int = 0):
-        def load(view: View) -> Target:
+    def __init__(
+        self,
+        views: Sequence[View],
+        threads: int,
+        noise: float = 0.0,
+        seed: int = 0,
+        shelf: Shelf | None = None,
+    ):
+        self._shelf = MemoryShelf() if shelf is None else shelf
+
+        def load(view: View) -> _Kept:
             pixels = load_view(view.image, view.mask, view.width, view.height)
             if noise:
                 _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
-            return _target(pixels)
+            return _Kept(_target(pixels), self._shelf)
 
         with ThreadPoolExecutor(max(1, threads)) as pool:
             self._full = list(
                 track(pool.map(load, views), "reading views", len(views), unit="views")
             )
         self._factor = 1
-        self._reduced: dict[int, Target] = {}
+        self._reduced: dict[int, _Kept] = {}
 
     @property
     def have_alpha(self) -> bool:
-        return any(target.alpha is not None for target in self._full)
+        return any(kept.has_alpha for kept in self._full)
 
     def hidden(self) -> list[int]:
         """Indices of the views of which no pixel counts."""
-        return [
-            index
-            for index, target in enumerate(self._full)
-            if target.ignored is not None and bool(target.ignored.all())
-        ]
+        return [index for index, kept in enumerate(self._full) if kept.hidden]
 
     def drop(self, indices: Sequence[int]) -> None:
         """Forget these views; the others move up."""
@@ -94,15 +101,29 @@ class Targets:
 
     def get(self, index: int, factor: int) -> Target:
         """View ``index`` at 1 / ``factor`` of its size (see ``reduced_size``)."""
-        full = self._full[index]
         if factor == 1:
             self._reduced.clear()
-            return full
+            return self._full[index].get()
         if factor != self._factor:
             self._factor, self._reduced = factor, {}
         if index not in self._reduced:
-            self._reduced[index] = _reduce(full, factor)
-        return self._reduced[index]
+            reduced = _reduce(self._full[index].get(), factor)
+            self._reduced[index] = _Kept(reduced, self._shelf)
+        return self._reduced[index].get()
+
+
+class _Kept:
+    """A target on a shelf, and what is asked of it without a look."""
+
+    def __init__(self, target: Target, shelf: Shelf):
+        self.has_alpha = target.alpha is not None
+        self.hidden = target.ignored is not None and bool(target.ignored.all())
+        self._take: Callable[[], Planes] = shelf.put((target.rgb, target.alpha, target.ignored))
+
+    def get(self) -> Target:
+        rgb, alpha, ignored = self._take()
+        assert rgb is not None
+        return Target(rgb, alpha, ignored)
 
 
 def reduced_size(view: View, factor: int) -> tuple[int, int]:

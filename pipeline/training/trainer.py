@@ -22,6 +22,7 @@ from pipeline.config.schema import Train
 from pipeline.raster import Forward, RasterCamera, RasterOptions, backward, forward, l1_ssim
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
+from pipeline.scene.memory import machine_mb, memory_mb
 from pipeline.scene.model import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.order import in_morton_order
@@ -36,6 +37,7 @@ from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam, Rates
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
+from pipeline.training.shelf import DiskShelf, MemoryShelf, Shelf
 from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
@@ -120,6 +122,14 @@ def train(
         torch.set_num_threads(torch_threads)
 
 
+def shelf_for(views: Sequence[View], config: Train) -> Shelf:
+    """Memory for the views' pixels where they fit beside the Gaussians, else a file."""
+    pixels = sum(view.width * view.height for view in views)
+    limit = machine_mb() if config.memory_mb is None else config.memory_mb
+    fits = memory_mb(pixels, config.density.max_gaussians) <= limit
+    return MemoryShelf() if fits else DiskShelf()
+
+
 class _Run:
     """One call of ``train``: what does not change during it, and the state that does."""
 
@@ -143,7 +153,9 @@ class _Run:
         if not self.depth_weight:
             inputs = replace(inputs, depths=None)
         self.identity = identity_of(inputs, config, seed)
-        self.targets = Targets(inputs.views, threads, config.salt_and_pepper, seed)
+        self.targets = Targets(
+            inputs.views, threads, config.salt_and_pepper, seed, shelf_for(inputs.views, config)
+        )
         self.inputs = self.without_hidden_views(inputs)
         gains = self.inputs.gains
         self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
@@ -250,6 +262,7 @@ class _Run:
             background=background,
             antialias=config.antialias,
             near=self.near,
+            black_stays=config.black_stays,
             gradients_per_pixel=config.gradients_per_pixel,
             threads=self.threads,
         )

@@ -100,11 +100,28 @@ def test_uncommented_defaults_are_the_defaults():
     assert Config.model_validate(values) == Config()
 
 
+def batch(file: str) -> dict[str, Config]:
+    raw = yaml.safe_load((Path(__file__).parents[2] / "config" / f"{file}.yaml").read_text())
+    return {name: scene_config(raw, "fox", name) for name in raw["configs"]}
+
+
+def test_the_original_is_the_same_in_all_batches():
+    """Of any length: its budget and when density control ends are all that differ."""
+    quality = batch("quality")
+    wanted = batch("ablations")["original"]
+    assert len(set(map(Config.model_dump_json, quality.values()))) == len(quality)
+    for name, steps in [("original_7k", 7000), ("original_30k", 30_000)]:
+        assert quality[name].train.steps == steps
+        density = wanted.train.density.model_dump(exclude={"stop_share"})
+        density |= {"pixels_per_gaussian": 0.1, "max_gaussians": 3_000_000}
+        assert quality[name].train.density.model_dump(exclude={"stop_share"}) == density
+        same = {"train": {"steps", "density"}}
+        assert quality[name].model_dump(exclude=same) == wanted.model_dump(exclude=same)
+
+
 @pytest.mark.parametrize(("file", "base"), [("ablations", "balanced"), ("skipping", "plan")])
 def test_every_configuration_of_a_batch_differs_from_the_default(file, base):
-    path = Path(__file__).parents[2] / "config" / f"{file}.yaml"
-    raw = yaml.safe_load(path.read_text())
-    found = {name: scene_config(raw, "fox", name) for name in raw["configs"]}
+    found = batch(file)
     assert found.pop(base) == Config()
     assert all(config != Config() for config in found.values())
     assert len(set(map(Config.model_dump_json, found.values()))) == len(found)

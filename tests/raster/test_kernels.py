@@ -204,7 +204,8 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
 
 
 def test_what_is_black_may_become_brighter_but_not_darker() -> None:
-    """A colour clamped at zero keeps the gradient that would raise it, and no other."""
+    """A colour clamped at zero keeps the gradient that would raise it, and no other; with
+    ``black_stays`` none, which is 3DGS's way."""
     cam, sh = camera(20, 20), torch.zeros(1, 1, 3)
     sh[..., 0], sh[..., 1], sh[..., 2] = -5.0, -5.0, 0.5  # red and green under zero
     scene = (
@@ -217,6 +218,13 @@ def test_what_is_black_may_become_brighter_but_not_darker() -> None:
     found = raster.backward(fwd, d_color).sh[0, 0]
     assert found[0] < 0 and found[1] == 0 and found[2] > 0
     assert found[0] == -found[2]
+    options = RasterOptions(sh_degree=0, black_stays=True)
+    stayed = raster.backward(raster.forward(*scene, cam, options), d_color).sh[0, 0]
+    assert stayed[0] == stayed[1] == 0 and stayed[2] == found[2]
+    leaf = sh.clone().requires_grad_()
+    (twin.render(*scene[:4], leaf, cam, options).color * d_color).sum().backward()
+    assert leaf.grad is not None
+    torch.testing.assert_close(stayed, leaf.grad[0, 0], rtol=1e-5, atol=1e-6)
 
 
 def test_autograd_face_gives_the_same_gradients() -> None:

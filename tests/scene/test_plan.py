@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Config
+from pipeline.runtime.errors import UserError
 from pipeline.scene.plan import STAGES, Plan, describe, make_plan
 from pipeline.scene.scan import Scan, scan
 from tests.scene.pictures import photos, picture
@@ -317,3 +318,30 @@ def test_training_says_what_memory_it_takes(tmp_path):
     plan = make_plan(many(tmp_path, 200, **size), config)
     assert plan.facts["training_memory_mb"] == 400 + 300 + 2500
     assert "about 3.2 GB of memory" in plan.stages["train"].decisions
+
+
+def test_memory_that_is_given_limits_gaussians_and_sends_pictures_to_disk(tmp_path):
+    """200 views of 300 MB in all and at most 1 000 000 Gaussians of 2500 MB."""
+    size = {"width": lambda i: 800, "height": lambda i: 500}
+    scan = many(tmp_path, 200, **size)
+    density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
+
+    def planned(megabytes: int) -> Plan:
+        train = {"memory_mb": megabytes, "density": density}
+        return make_plan(scan, Config.model_validate({"train": train}))
+
+    roomy, tight, small = planned(3200), planned(3199), planned(1400)
+    assert "about 3.2 GB of memory" in roomy.stages["train"].decisions
+    from_disk = "3.2 GB of memory, as configured: pictures are read from disk"
+    assert from_disk in tight.stages["train"].decisions
+    assert tight.config.train.density.max_gaussians == 1_000_000
+    assert small.config.train.density.max_gaussians == 400_000
+    held = "at most 400000 Gaussians: what 1400 MB of memory hold"
+    assert held in small.stages["train"].decisions
+    assert [plan.facts["training_memory_mb"] for plan in (roomy, tight, small)] == [
+        3200,
+        3199,
+        1400,
+    ]
+    with pytest.raises(UserError, match=r"train.memory_mb: 449 MB .* at least 450 are needed"):
+        planned(449)

@@ -57,3 +57,13 @@ def test_the_scene_is_as_large_as_what_is_seen(
     assert [view.name for view in told[0].views] == ["1", "2"]
     assert told[0].extent == 50.0
     assert told[0].size == pytest.approx(SCALE_SHARE * 4.0)
+
+
+def test_a_training_too_short_to_look_at_its_photographs_says_so() -> None:
+    assert stage.too_few_looks(600, 200, 60.0, None) is None
+    by_steps = stage.too_few_looks(150, 200, 60.0, None)
+    assert by_steps is not None and "150 steps are 0.8 looks at each of 200 photographs" in by_steps
+    assert by_steps.endswith("raise train.steps")
+    by_clock = stage.too_few_looks(100, 200, 240.0, 4.0)
+    assert by_clock is not None and "did in 4 minutes, 2.4 s a step" in by_clock
+    assert "raise train.budget_minutes" in by_clock

@@ -6,6 +6,7 @@ from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 from PIL import Image
 
@@ -13,6 +14,7 @@ from pipeline.photos.load import resize_area
 from pipeline.raster import RasterOptions, forward
 from pipeline.scene.model import View
 from pipeline.training.render import raster_camera
+from pipeline.training.shelf import DiskShelf, MemoryShelf
 from pipeline.training.targets import Targets, reduced_size, usable_factor
 from tests.training.conftest import TinyScene
 
@@ -99,3 +101,33 @@ def test_salt_and_pepper_is_the_share_asked_for_and_the_same_for_a_seed(tmp_path
     assert (noisy[0] == noisy[1]).all() and (noisy[0] != noisy[2]).any()
     assert abs((noisy[0] == 0).all(2).mean() - 0.1) < 0.015
     assert abs((noisy[0] == 255).all(2).mean() - 0.1) < 0.015
+
+
+def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
+    """Of every kind, at every size, read by any thread, as often as they are asked for."""
+    rng = np.random.default_rng(0)
+    views = []
+    for number, channels in enumerate((3, 4, 3)):
+        picture = rng.integers(0, 255, (140 + number, 150, channels), np.uint8)
+        mask = (rng.random(picture.shape[:2]) > 0.4).astype(np.uint8) * 255 if number else None
+        views.append(view_of(tmp_path / f"{number}.png", picture, mask))
+    in_memory = Targets(views, 3, shelf=MemoryShelf())
+    on_disk = Targets(views, 3, shelf=DiskShelf())
+    assert on_disk.have_alpha and not on_disk.hidden()
+    for factor, index in [(4, 0), (4, 2), (4, 0), (2, 1), (2, 2), (1, 2), (1, 1), (1, 0), (1, 2)]:
+        wanted, found = in_memory.get(index, factor), on_disk.get(index, factor)
+        for name in ("rgb", "alpha", "ignored"):
+            one, other = getattr(wanted, name), getattr(found, name)
+            assert (one is None) == (other is None), name
+            assert one is None or (one.dtype == other.dtype and torch.equal(one, other)), name
+
+
+def test_a_disk_shelf_holds_nothing_in_memory_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    take = DiskShelf().put((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
+    first, second = take(), take()
+    assert first[0] is not None and second[0] is not None and first[1] is None
+    assert torch.equal(first[0], second[0]) and first[0].data_ptr() != second[0].data_ptr()
+    assert not list(tmp_path.iterdir())

@@ -22,6 +22,7 @@ from pipeline.training import journal, targets, trainer
 from pipeline.training.checkpoint import PATTERN
 from pipeline.training.inputs import Inputs
 from pipeline.training.render import render_view
+from pipeline.training.shelf import DiskShelf, MemoryShelf
 from pipeline.training.trainer import TrainResult, train
 from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
 
@@ -92,6 +93,14 @@ def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) ->
         planted, tmp_path / "b", fixed.model_copy(update={"steps": 2 * len(scene.views) - 1})
     )
     assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
+
+
+def test_pictures_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
+    config = tiny_config(coarse_until=0.3)
+    little = config.model_copy(update={"memory_mb": 1})
+    assert isinstance(trainer.shelf_for(scene.views, config), MemoryShelf)
+    assert isinstance(trainer.shelf_for(scene.views, little), DiskShelf)
+    assert_same(run(scene, tmp_path / "a", config), run(scene, tmp_path / "b", little))
 
 
 def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:

@@ -157,7 +157,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
     int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool absolute, bool camera,
+    const Tensor& slots, const Tensor& slot_gradients, bool black_stays, bool absolute, bool camera,
     OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last, OptionalTensor sh_adam,
     int64_t threads) {
     const int64_t n = means.size(0);
@@ -175,10 +175,12 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     Tensor d_means2d = new_floats({n, 2}), d_abs = new_floats({absolute ? n : 0, 2});
     Tensor d_camera =
         new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
+    splat::View seen = view_from(view, width, height, sh_degree, antialias);
+    seen.black_stays = black_stays;
     splat::project_view_backward(
-        gaussians_from(means, log_scales, quats, opacity_logits, sh),
-        view_from(view, width, height, sh_degree, antialias), int(threads), records_from(records),
-        floats(radii), reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
+        gaussians_from(means, log_scales, quats, opacity_logits, sh), seen, int(threads),
+        records_from(records), floats(radii),
+        reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
         floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
          mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
@@ -253,7 +255,8 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
         "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
-        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool absolute, "
+        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool black_stays, "
+        "bool absolute, "
         "bool camera, Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? "
         "sh_adam, "
         "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");

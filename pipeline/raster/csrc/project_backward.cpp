@@ -172,15 +172,16 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         GroupGradients g(half, image);
 
         // Colour: where it was clamped to zero it does not fall further, but may come back. 3DGS
-        // has it stand still: a sixth of bonsai's Gaussians were black in every view then, for
-        // good.
+        // has it stand still (view.black_stays): a sixth of bonsai's Gaussians were black in every
+        // view then, for good.
         Mask16 sound = mask(drawn);  // every gradient fits into float32
         const f32x16 zero = {}, most = splat16(1e37f);
         const auto check = [&](f32x16& v) { sound = sound & ge(most, abs(v)); };
         f32x16 d_rgb[3], d_mean[3];
         for (int c = 0; c < 3; c++) {
             const f32x16 d = asked.moment[kRed + c];
-            d_rgb[c] = select(lt(zero, asked.rgb[c]), d, min(d, zero));
+            const f32x16 rising = view.black_stays ? zero : min(d, zero);
+            d_rgb[c] = select(lt(zero, asked.rgb[c]), d, rising);
             check(d_rgb[c]);
         }
         ShBlock sh;

@@ -19,6 +19,7 @@ struct View {
     double near;
     bool antialias;
     int sh_degree;
+    bool black_stays = false;  // a colour clamped to 0 has no gradient at all (3DGS)
 
     int64_t tiles_x() const { return (width + kTile - 1) / kTile; }
     int64_t tiles_y() const { return (height + kTile - 1) / kTile; }

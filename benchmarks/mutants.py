@@ -310,6 +310,13 @@ MUTANTS: dict[str, Mutant] = {
         "pictures on disk written over one another",
         ("tests/training/test_targets.py",),
     ),
+    "two_views": Mutant(
+        "pipeline/training/floaters.py",
+        "(most > ONE_VIEW * total)",
+        "(most > 0.0 * total)",
+        "what two views agree on taken for a floater",
+        ("tests/training/test_floaters.py",),
+    ),
     "judge": Mutant(
         "pipeline/sfm/judge.py",
         "e.parallax < MIN_PARALLAX[which],",

@@ -18,6 +18,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training import journal
 from pipeline.training.depth import KnownDepths, point_depths, scene_scale
 from pipeline.training.depth_maps import add_maps
+from pipeline.training.floaters import air_depths
 from pipeline.training.inputs import Inputs
 from pipeline.training.lenses import changed_by, with_lenses
 from pipeline.training.poses import followed, moved_by
@@ -56,6 +57,7 @@ def run(job: Job) -> None:
             scale=scene_scale(extent, points),
             gains=np.array([gains[view.name] for view in training]) if gains else None,
             depths=known,
+            air=air_depths(points),
         ),
         job.section(Train),
         seed=job.seed,
@@ -77,6 +79,8 @@ def run(job: Job) -> None:
         )
     if unseen := result.counters["unseen"]:
         job.decide(f"{unseen} Gaussians that no training photograph sees are left out")
+    if hung := result.counters["floaters"]:
+        job.decide(f"{hung} Gaussians that hung in the air before one camera were taken away")
     result.gaussians.save(job.out / "gaussians.npz")
     if result.lenses is not None:
         model = with_lenses(model, result.lenses)

@@ -205,6 +205,12 @@ class Density(Section):
         0.01,
         description="With `clone`: Gaussians larger than this share of the scene's size split.",
     )
+    clear_air: bool = Field(
+        True,
+        description="Late in the run, Gaussians are removed that hang before one camera: one view "
+        "has most of their weight, and the nearest sparse points it sees are more than twice as "
+        "far. Only in runs of 7 looks and more at each photograph.",
+    )
     recycle: Share = Field(
         0.02,
         description="gradient: where the budget is used up, up to this share of it is taken each "

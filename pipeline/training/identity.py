@@ -12,7 +12,7 @@ from pipeline.config.schema import Train
 from pipeline.training.inputs import Inputs
 
 # Raise it when the state of a training or its meaning changes.
-STATE_VERSION = 13
+STATE_VERSION = 14
 
 
 def identity_of(inputs: Inputs, config: Train, seed: int) -> str:
@@ -25,7 +25,8 @@ def identity_of(inputs: Inputs, config: Train, seed: int) -> str:
     ]
     sizes = (inputs.extent, inputs.size)
     gains = None if inputs.gains is None else inputs.gains.tolist()
-    text = json.dumps([STATE_VERSION, config.model_dump(), seed, sizes, views, gains])
+    air = None if inputs.air is None else inputs.air.tolist()
+    text = json.dumps([STATE_VERSION, config.model_dump(), seed, sizes, views, gains, air])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
     for known in inputs.depths or ():

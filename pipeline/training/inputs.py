@@ -29,6 +29,8 @@ class Inputs:
             views without alpha.
         depths: what is known beforehand of each view's depths (``training.depth``), to which
             renders are held with ``Train.depth_weight``.
+        air: (V,) camera z, world unit, up to which each view sees nothing
+            (``training.floaters.air_depths``); 0 where that is not known.
     """
 
     views: Sequence[View]
@@ -37,6 +39,7 @@ class Inputs:
     scale: float | None = None
     gains: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
+    air: NDArray[np.float64] | None = None
 
     @property
     def size(self) -> float:
@@ -51,4 +54,5 @@ class Inputs:
             views=[self.views[index] for index in kept],
             gains=None if self.gains is None else self.gains[kept],
             depths=None if self.depths is None else [self.depths[index] for index in kept],
+            air=None if self.air is None else self.air[kept],
         )

@@ -27,6 +27,7 @@ class Counters:
         num_dropped: Gaussians the rasterizer left out for numerical reasons, over all steps.
         blind_steps: steps whose view saw no Gaussian.
         unseen: Gaussians left out in the end because no training view saw them.
+        floaters: those that hung before one camera and were taken away.
     """
 
     changes: Changes = field(default_factory=Changes)
@@ -35,6 +36,7 @@ class Counters:
     num_dropped: int = 0
     blind_steps: int = 0
     unseen: int = 0
+    floaters: int = 0
 
 
 @dataclass

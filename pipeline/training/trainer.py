@@ -30,6 +30,7 @@ from pipeline.training import checkpoint
 from pipeline.training.checkpoint import Checkpoint
 from pipeline.training.density import make_strategy
 from pipeline.training.depth import depth_gradients
+from pipeline.training.floaters import fade_floaters
 from pipeline.training.identity import identity_of
 from pipeline.training.inputs import Inputs
 from pipeline.training.journal import Journal
@@ -47,6 +48,9 @@ CURVE_RECORDS = 100
 PSNR_EVERY = 10
 # Drawing depths and their gradients costs a step half as much again; depths change slowly.
 DEPTH_EVERY = 4
+# Floaters are looked for in all views, at a quarter of their size: as much as a third of a look at
+# each. Runs of fewer looks than this, which have made none yet, do without.
+CLEAR_AIR_FACTOR, CLEAR_AIR_LOOKS = 4, 7
 
 Colour = tuple[float, float, float]
 BACKGROUNDS: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
@@ -320,7 +324,8 @@ class _Run:
         """Do what is due at these places of the schedule."""
         state, schedule = self.state, self.schedule
         densify = any(map(schedule.refines_after, places))
-        if densify or any(map(schedule.prunes_after, places)):
+        clear = any(map(schedule.clears_air_after, places)) and self.clear_air()
+        if densify or clear or any(map(schedule.prunes_after, places)):
             state.gaussians, changes = state.density.refine(
                 state.gaussians,
                 state.adam,
@@ -342,6 +347,21 @@ class _Run:
             state.density.reset_opacity(state.gaussians, state.adam)
             state.counters.opacity_resets += 1
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
+
+    def clear_air(self) -> bool:
+        """Make floaters too faint for density control to keep; whether there are any."""
+        state, air = self.state, self.inputs.air
+        short = self.run_length() < CLEAR_AIR_LOOKS * len(self.views)
+        if air is None or short or not self.config.density.clear_air:
+            return False
+        factor = usable_factor(self.views, CLEAR_AIR_FACTOR)
+        cameras = [self.camera(index, factor) for index in range(len(self.views))]
+        options = RasterOptions(
+            antialias=self.config.antialias, near=self.near, threads=self.threads
+        )
+        found = fade_floaters(state.gaussians, cameras, air, options, pixel=factor**2)
+        state.counters.floaters += found
+        return found > 0
 
     def raise_sh_degree(self) -> None:
         """Bands that are not in use yet are not there at all: they would only cost time."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
@@ -52,6 +53,15 @@ class Target:
             return None
         counted = self.ignored.numel() - int(self.ignored.sum())
         return self.ignored * (weight / max(1, counted))
+
+    def psnr(self, rendered: Tensor, wanted: Tensor) -> float:
+        """PSNR in dB over the pixels that count, of (H, W, 3) against ``over``'s picture."""
+        scale = 1 / 255.0 if wanted.dtype == torch.uint8 else 1.0
+        difference = rendered - wanted.to(torch.float32) * scale
+        if self.ignored is not None:
+            difference = difference[~self.ignored]
+        error = float(difference.square().mean()) if difference.numel() else 0.0
+        return -10 * math.log10(max(error, 1e-10))
 
 
 class Targets:

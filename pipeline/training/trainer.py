@@ -36,6 +36,7 @@ from pipeline.training.inputs import Inputs
 from pipeline.training.journal import Journal
 from pipeline.training.moving import MovingCameras
 from pipeline.training.optimiser import Adam, Rates
+from pipeline.training.pace import GAUSSIANS_A_STEP, Pace
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
 from pipeline.training.shelf import DiskShelf, MemoryShelf, Shelf
@@ -150,6 +151,8 @@ class _Run:
         self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
+        minutes = config.budget_minutes
+        self.pace = None if minutes is None else Pace(60 * minutes)
         self.near = near_plane(inputs.extent)
         self.cameras: dict[tuple[int, int], RasterCamera] = {}
         # auto is the plan's to settle; without one, nothing is known to be needed.
@@ -220,7 +223,7 @@ class _Run:
             state.restore(found.step, found.arrays, found.values)
         started = saved = time.monotonic()
         seconds_before = state.seconds
-        progress = Progress("training", steps, unit="steps" if self.counts_steps else "parts")
+        progress = Progress("training", steps, unit="steps" if self.pace is None else "parts")
         progress.start_at(state.clock)
         journal = Journal(journal_file, state.step)
         records = max(1, steps // CURVE_RECORDS)
@@ -238,18 +241,16 @@ class _Run:
             journal.write(state, steps, self.factor(), progress.seconds_left())
         return self.result()
 
-    @property
-    def counts_steps(self) -> bool:
-        return self.config.budget_minutes is None
-
     def advance(self) -> range:
         """Begin a step; the places in the schedule that it passes."""
         state = self.state
         state.step += 1
         before, state.clock = state.clock, state.step
-        minutes, steps = self.config.budget_minutes, self.schedule.steps
-        if minutes is not None:
-            state.clock = max(1, before, min(steps, int(steps * state.seconds / (60 * minutes))))
+        if self.pace is not None:
+            steps = self.schedule.steps
+            passed = int(steps * state.seconds / self.pace.budget)
+            state.clock = max(1, before, min(steps, passed))
+            self.pace.passes(state.step - 1, state.seconds, self.factor())
         return range(before + 1, state.clock + 1)
 
     def step(self) -> None:
@@ -303,7 +304,7 @@ class _Run:
         state.window.loss += float(loss.loss)
         state.window.steps += 1
         if (step - 1) % min(PSNR_EVERY, max(1, self.schedule.steps // CURVE_RECORDS)) == 0:
-            state.window.psnr += _psnr(seen, wanted, target)
+            state.window.psnr += target.psnr(seen, wanted)
             state.window.samples += 1
         self.control_density(places)
 
@@ -332,7 +333,7 @@ class _Run:
                 state.rng,
                 densify=densify,
                 prune_huge=any(map(schedule.prunes_huge_after, places)),
-                budget=schedule.budget_at(state.clock),
+                budget=self.budget(),
             )
             state.counters.changes.add(changes)
             state.reorder()
@@ -400,9 +401,16 @@ class _Run:
         return self.config.lr_means_unit == "size"
 
     def run_length(self) -> float:
-        """Steps in all; where the run has minutes: if they go on as until now."""
+        """Steps in all; where the run has minutes: if they go on as they do."""
         state, steps = self.state, self.schedule.steps
-        return steps if self.counts_steps else state.step * steps / state.clock
+        return steps if self.pace is None else self.pace.steps(state.step, state.seconds, steps)
+
+    def budget(self) -> int:
+        """Most Gaussians now; where the run has minutes, no more than its steps can train."""
+        limit = self.schedule.budget_at(self.state.clock)
+        if self.pace is None:
+            return limit
+        return min(limit, round(GAUSSIANS_A_STEP * self.run_length()))
 
     def camera(self, index: int, factor: int) -> RasterCamera:
         if (index, factor) not in self.cameras:
@@ -487,13 +495,3 @@ class _Run:
         if poses is None:
             return None
         return dict(zip([view.name for view in self.views], poses.poses, strict=True))
-
-
-def _psnr(rendered: Tensor, wanted: Tensor, target: Target) -> float:
-    """PSNR in dB over the pixels that count."""
-    scale = 1 / 255.0 if wanted.dtype == torch.uint8 else 1.0
-    difference = rendered - wanted.to(torch.float32) * scale
-    if target.ignored is not None:
-        difference = difference[~target.ignored]
-    error = float(difference.square().mean()) if difference.numel() else 0.0
-    return -10 * math.log10(max(error, 1e-10))

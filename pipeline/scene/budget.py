@@ -17,12 +17,10 @@ PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_BY_CLOCK = 2.0, 0.5
 # photographs together, or it learns single pictures by heart.
 MIN_GAUSSIANS = 20_000
 PIXELS_SEEN_PER_GAUSSIAN = 40
-# And each wants its share of a run by the clock: fox in one minute on two slow cores, 28.9 dB with
-# 205 000, 30.9 dB with 50 000. This is for a fast machine, and for what memory may be needed; what
-# the machine at hand does, training sees (``training.pace``), but it cannot start with fewer than
-# it is given.
-GAUSSIANS_A_MINUTE = 100_000
-FIRST_SHARE, FIRST_SHARE_BY_CLOCK = 2, 4
+# And each wants its share of a run by the clock: fox in one minute on two cores, 28.9 dB with
+# 205 000, 30.9 dB with 50 000; on faster ones, views kept back, 33.1 with 100 000 and 33.9 with
+# 50 000. Where that are too many for the machine at hand, training sees it (``training.pace``).
+GAUSSIANS_A_MINUTE = 50_000
 
 
 def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
@@ -50,12 +48,6 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     if wanted == MIN_GAUSSIANS:
         why = "the least"
     return wanted, f"at most {wanted} Gaussians: {why}"
-
-
-def first_gaussians(budget: int, config: Config) -> int:
-    """Most of the budget that a training may start with: density control places the rest."""
-    by_clock = config.train.budget_minutes is not None
-    return max(1, budget // (FIRST_SHARE_BY_CLOCK if by_clock else FIRST_SHARE))
 
 
 def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:

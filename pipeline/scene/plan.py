@@ -14,7 +14,7 @@ from typing import Any
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
-from pipeline.scene.budget import first_gaussians, gaussian_budget, memory_line, training_memory_mb
+from pipeline.scene.budget import gaussian_budget, memory_line, training_memory_mb
 from pipeline.scene.posefiles import GivenPoses
 from pipeline.scene.scan import Scan
 from pipeline.scene.views import view_size
@@ -98,7 +98,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             "sfm": {"mapper": mapper, "camera_model": camera_model, "share_cameras": sharing},
             "init": {
                 "method": "points" if config.init.method == "auto" else config.init.method,
-                "max_points": min(config.init.max_points, first_gaussians(budget, config)),
+                "max_points": min(config.init.max_points, max(1, budget // 2)),
             },
             "train": {
                 "background": background,

@@ -401,16 +401,19 @@ class _Run:
         return self.config.lr_means_unit == "size"
 
     def run_length(self) -> float:
-        """Steps in all; where the run has minutes: if they go on as they do."""
+        """Steps in all, for rates; where the run has minutes: if they went on as until now. Those
+        at small sizes are many, so that rates begin low: fox, views kept back, in one minute
+        34.5 dB, and 33.9 with ``Pace.steps``, which foresees that full ones are fewer."""
         state, steps = self.state, self.schedule.steps
-        return steps if self.pace is None else self.pace.steps(state.step, state.seconds, steps)
+        return steps if self.pace is None else state.step * steps / state.clock
 
     def budget(self) -> int:
         """Most Gaussians now; where the run has minutes, no more than its steps can train."""
         limit = self.schedule.budget_at(self.state.clock)
         if self.pace is None:
             return limit
-        return min(limit, round(GAUSSIANS_A_STEP * self.run_length()))
+        steps = self.pace.steps(self.state.step, self.state.seconds, self.run_length())
+        return min(limit, round(GAUSSIANS_A_STEP * steps))
 
     def camera(self, index: int, factor: int) -> RasterCamera:
         if (index, factor) not in self.cameras:

@@ -234,7 +234,7 @@ class Density(Section):
     pixels_per_gaussian: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
         "auto",
         description="Budget: a view's pixels over this, or fewer where there are few photographs "
-        "or `budget_minutes`. auto: 2, or 0.5 with `budget_minutes`, which limit the budget anyway.",
+        "or `budget_minutes`. auto: 2, or 0.5 with `budget_minutes`, which limit the budget, too.",
     )
     max_gaussians: Positive = Field(
         1_000_000, description="Budget: never more Gaussians than this, whatever the pixels."

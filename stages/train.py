@@ -27,7 +27,7 @@ from stages.command import main
 
 # Standard deviation in stops from which photographs are taken for differently exposed: cameras that
 # hold their exposure show 0 to 0.1, collections from the internet 0.5.
-EXPOSURES_DIFFER = 0.2
+EXPOSURES_DIFFER = 0.15
 # Looks at each photograph, on average, below which no scene has come out sharp.
 FEW_LOOKS = 3.0
 FITS = {

@@ -283,7 +283,7 @@ class Train(Section):
         "auto",
         description="on: each photograph's brightness and white balance, measured at the sparse "
         "points, are laid over the render before it is compared; auto: where they differ between "
-        "photographs by over 0.15 stops (standard deviation).",
+        "photographs by over 0.2 stops (standard deviation).",
     )
     depth_weight: Rate | Literal["auto"] = Field(
         "auto",

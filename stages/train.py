@@ -26,8 +26,8 @@ from pipeline.training.trainer import train
 from stages.command import main
 
 # Standard deviation in stops from which photographs are taken for differently exposed: cameras that
-# hold their exposure show 0 to 0.1, collections from the internet 0.5. bonsai's, whose sun comes and
-# goes, show 0.18 and are left as they are, so that its metrics stay comparable to the literature's.
+# hold their exposure show 0 to 0.1, collections from the internet 0.5. bonsai's, under a sun that
+# comes and goes, show 0.18 and are left alone: its metrics stay comparable to the literature's.
 EXPOSURES_DIFFER = 0.2
 # Looks at each photograph, on average, below which no scene has come out sharp.
 FEW_LOOKS = 3.0

@@ -29,8 +29,8 @@ COARSE_STEPS, COARSE_MINUTES, MOST_COARSE_MINUTES = 0.15, 0.1, 1.2
 # steps three times the rates were best and five times worse than three: four is the most.
 PAPER_STEPS = 30_000
 MAX_BOOST = 4.0
-# Floaters go once, after this share of a run.
-CLEAR_AIR = 0.9
+# Floaters go after these shares of a run: what early ones would grow into, others must explain.
+CLEAR_AIR = 0.3, 0.5, 0.7, 0.9
 # A camera's last step over its first: the means' rates fall as far.
 POSE_FALL = 0.01
 
@@ -147,8 +147,8 @@ class Schedule:
         return self.refine_stop < step <= 0.9 * self.steps and step % self.refine_interval == 0
 
     def clears_air_after(self, step: int) -> bool:
-        """Take floaters away: late, where all there will be are there, with time left to mend."""
-        return step == round(CLEAR_AIR * self.steps)
+        """Take floaters away; the last time with some left to mend what that leaves bare."""
+        return step in [round(share * self.steps) for share in CLEAR_AIR]
 
     def resets_opacity_after(self, step: int) -> bool:
         """Only where a whole interval of density control follows to recover in."""

@@ -49,9 +49,9 @@ CURVE_RECORDS = 100
 PSNR_EVERY = 10
 # Drawing depths and their gradients costs a step half as much again; depths change slowly.
 DEPTH_EVERY = 4
-# Floaters are looked for in all views, at a quarter of their size: as much as a third of a look at
-# each. Runs of fewer looks than this, which have made none yet, do without.
-CLEAR_AIR_FACTOR, CLEAR_AIR_LOOKS = 4, 7
+# Floaters are looked for in all views, at a quarter of their size, four times in a run: as much as
+# two looks at each. Runs of fewer looks than this, which make hardly any, do without.
+CLEAR_AIR_FACTOR, CLEAR_AIR_LOOKS = 4, 50
 
 Colour = tuple[float, float, float]
 BACKGROUNDS: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}

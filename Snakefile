@@ -173,6 +173,24 @@ rule sfm:
         RUN
 
 
+rule refine:
+    input:
+        unpack(project.inputs("refine")),
+    output:
+        "results/{scene}/refine/stage.json",
+    log:
+        "results/{scene}/logs/refine.log",
+    threads: THREADS
+    resources:
+        mem_mb=4000,
+    params:
+        key=project.key("refine"),
+        inputs=project.folders("refine"),
+        publish=[],
+    shell:
+        RUN
+
+
 rule undistort:
     input:
         unpack(project.inputs("undistort")),

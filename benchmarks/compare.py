@@ -34,7 +34,7 @@ QUALITY = (
     "centre_error_share",
 )
 # Stages in which a choice of the plan shows; the others' time goes with them.
-POSES = ("decode", "features", "matches", "sfm", "undistort")
+POSES = ("decode", "features", "matches", "sfm", "refine", "undistort")
 WORK = (*POSES, "train")
 
 Row = dict[str, Any]

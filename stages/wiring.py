@@ -17,7 +17,8 @@ from pipeline.scene.plan import Plan
 
 _PHOTOS = ("decode", "inspect")
 _VIEWS = ("undistort", "decode", "inspect")
-_POSES = ("sfm", "decode", "inspect")
+_GIVEN = ("decode", "inspect")
+_POSES = ("sfm", "refine", *_GIVEN)
 _MODEL = ("undistort", *_POSES)
 
 # stage -> role -> stages that can fill it; the first one that the plan runs does.
@@ -27,6 +28,7 @@ ROLES: dict[str, dict[str, tuple[str, ...]]] = {
     "features": {"photos": _PHOTOS},
     "matches": {"photos": _PHOTOS, "features": ("features",)},
     "sfm": {"photos": _PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
+    "refine": {"model": _GIVEN},
     "undistort": {"photos": _PHOTOS, "model": _POSES},
     "init": {"views": _VIEWS, "model": _MODEL},
     "train": {"views": _VIEWS, "model": _MODEL, "init": ("init",)},
@@ -56,6 +58,7 @@ SECTIONS: dict[str, tuple[str, ...]] = {
     "features": ("features",),
     "matches": ("matches", "sfm"),
     "sfm": ("sfm",),
+    "refine": ("sfm",),
     "undistort": ("undistort", "views"),
     "init": ("init", "views", "split", "features", "matches"),
     "train": ("train", "views", "split"),
@@ -70,6 +73,7 @@ PACKAGES: dict[str, tuple[str, ...]] = {
     "features": ("opencv-contrib-python-headless", "pycolmap"),
     "matches": ("pycolmap",),
     "sfm": ("pycolmap", "numpy", "scipy"),
+    "refine": ("pycolmap", "numpy", "scipy"),
     "undistort": ("opencv-contrib-python-headless",),
     "init": ("pycolmap", "scipy", "opencv-contrib-python-headless"),
     "train": ("torch", "numpy", "opencv-contrib-python-headless"),

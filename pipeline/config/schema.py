@@ -125,7 +125,8 @@ class Sfm(Section):
     )
     refine_principal_point: Literal["auto", "yes", "no"] = Field(
         "auto",
-        description="auto: in a last bundle adjustment, kept where the geometry carries it.",
+        description="auto: in a last bundle adjustment, kept where the geometry carries it; of "
+        "given poses, where it stands exactly in the middle.",
     )
     min_registered_share: Share = Field(
         0.5, description="A model with fewer of the photographs registered is a failure."
@@ -427,8 +428,11 @@ class Config(Section):
     preset: Literal["fast", "balanced", "high"] = Field(
         "balanced", description="Starting values; single options override it."
     )
-    poses: Literal["auto", "ignore"] = Field(
-        "auto", description="ignore: reconstruct poses though the scene brings some."
+    poses: Literal["auto", "keep", "ignore"] = Field(
+        "auto",
+        description="Poses that the scene brings. auto: used, and adjusted to their own tracks "
+        "where the principal points were only assumed; keep: used as they are; ignore: poses are "
+        "reconstructed all the same.",
     )
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
     inspect: Inspect = Field(default_factory=Inspect)

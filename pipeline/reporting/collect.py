@@ -45,7 +45,7 @@ def collect_metrics(
             warnings += [f"{name}: {text}" for text in record["warnings"] if text not in known]
             run = json.loads((folder / name / "run.json").read_text())
         stages[name] = _timing(run) | {"skipped": False, "reason": step["reason"]}
-    sfm = counters.get("sfm", {})
+    sfm, refined = counters.get("sfm", {}), counters.get("refine", {})
     photos = counters["inspect"]["photos"]
     return {
         "scene": scene,
@@ -60,7 +60,7 @@ def collect_metrics(
         "num_gaussians": counters["train"]["num_gaussians"],
         "registered_images": sfm.get("registered", counters["inspect"].get("given_poses")),
         "total_images": photos + counters["inspect"]["left_out"],
-        "reprojection_error_px": sfm.get("mean_reprojection_error_px"),
+        "reprojection_error_px": sfm.get("mean_reprojection_error_px", refined.get("error_px")),
         "sfm_verdict": sfm.get("verdict"),
         "georeference": sfm.get("georeference"),
         "pose_error": evaluation["pose_error"],

@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.runtime.atomic import write_text
 
 # Raise it when what is remembered about a file changes.
-_VERSION = 2
+_VERSION = 3
 
 
 class FactCache:

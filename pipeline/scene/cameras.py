@@ -22,7 +22,7 @@ from pipeline.scene.views import load_views, view_size
 
 # Folders of a finished scene, those nearest to training first.
 _WITH_PHOTOS = ("undistort", "decode", "inspect")
-_WITH_MODEL = ("train", "undistort", "sfm", "decode", "inspect")
+_WITH_MODEL = ("train", "undistort", "sfm", "refine", "decode", "inspect")
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ STAGES = (
     "features",
     "matches",
     "sfm",
+    "refine",
     "undistort",
     "init",
     "train",
@@ -46,6 +47,9 @@ MIXED_GROUP_SHARE = 0.5
 # of a fountain gain 1.5 dB on views kept back, 8 of a door nothing, 38 of a fox lose 0.2 to 0.5 dB.
 FEW_PHOTOS, DEPTH_WEIGHT = 30, 0.03
 MAP_WEIGHT = 0.3
+
+# A photograph with fewer known points is left behind when the others are adjusted to theirs.
+MIN_TRACKED = 20
 
 # A plan is for people, and travels on a command line.
 FACTS_SHOWN = 20
@@ -124,6 +128,7 @@ def make_plan(scan: Scan, config: Config) -> Plan:
             _why_sfm(config),
             [mapper_reason, model_reason, sharing_reason, _frame(scan, config)],
         ),
+        "refine": _refine(scan, config),
         "undistort": _undistort(scan, settled),
         "init": _init(scan, settled),
         "train": StagePlan(
@@ -315,6 +320,29 @@ def _why_sfm(config: Config) -> str:
     ignored = config.poses == "ignore"
     return (
         "poses are found anew, as configured (poses: ignore)" if ignored else "no poses are given"
+    )
+
+
+def _refine(scan: Scan, config: Config) -> StagePlan:
+    """Whether given poses are adjusted to their own tracks."""
+    poses, freed = scan.poses, config.sfm.refine_principal_point
+    if poses is None:
+        return StagePlan(run=False, reason="no poses are given; sfm adjusts its own")
+    if config.poses == "keep":
+        return StagePlan(run=False, reason="the given poses are kept, as configured (poses: keep)")
+    if freed == "no":
+        return StagePlan(run=False, reason="principal points are held, as configured")
+    if poses.tracked < MIN_TRACKED:
+        few = f"a photograph with {poses.tracked} tracked points" if poses.tracked else "no tracks"
+        return StagePlan(run=False, reason=f"the given poses come with {few} to adjust them to")
+    if not poses.centred and freed != "yes":
+        return StagePlan(run=False, reason="the given principal points were looked for already")
+    return StagePlan(
+        run=True,
+        reason="the given principal points stand in the middle, where nobody looked for them"
+        if poses.centred
+        else "principal points are freed, as configured",
+        decisions=["poses, points and lenses adjusted to the given tracks, where that pays"],
     )
 
 

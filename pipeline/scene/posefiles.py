@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import os
+from collections import Counter
 from functools import partial
 from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.runtime.errors import UserError
@@ -14,6 +16,7 @@ from pipeline.scene.cache import FactCache
 from pipeline.scene.colmap import has_model, read_model
 from pipeline.scene.folders import PhotoFolder
 from pipeline.scene.llff import read_rows
+from pipeline.scene.model import Camera, Reconstruction
 from pipeline.scene.names import PHOTO_SUFFIXES, NameIndex, suffix_of
 from pipeline.scene.photofile import digest_of
 from pipeline.scene.transforms import find_transforms, frame_camera_model, read_frames
@@ -21,6 +24,8 @@ from pipeline.scene.transforms import find_transforms, frame_camera_model, read_
 _COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 _MODEL_FILES = [(stem, end) for stem in ("cameras", "images") for end in ("bin", "txt")]
 _LLFF_FILE = "poses_bounds.npy"
+# A camera of fewer photographs cannot carry more than a focal length and one radial term.
+SHARED_BY = 5
 
 
 class GivenPoses(BaseModel):
@@ -29,7 +34,10 @@ class GivenPoses(BaseModel):
     ``path`` is relative to the scene folder: the model's folder, the json or npy file, or "."
     for several transforms files. ``names`` are the photographs as the pose files name them
     (empty for LLFF, which goes by order). ``models`` are the camera models in use; ``pinhole``
-    says that none of the cameras distorts. ``num_points`` counts sparse points.
+    says that none of the cameras distorts. ``num_points`` counts sparse points, ``tracked`` the
+    points of the photograph that sees the fewest, where the pixels that it sees them at are known.
+    ``centred`` says that a camera of ``SHARED_BY`` photographs or more has its principal point
+    exactly in the middle, where programs put it that do not look for it.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -41,6 +49,8 @@ class GivenPoses(BaseModel):
     models: tuple[str, ...]
     pinhole: bool
     num_points: int
+    tracked: int
+    centred: bool
 
 
 def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
@@ -149,7 +159,25 @@ def _colmap(folder: Path, path: str) -> dict[str, Any]:
         "models": sorted({camera.model for camera in used}),
         "pinhole": all(camera.is_pinhole for camera in used),
         "num_points": len(model.points),
+        "tracked": _tracked(model),
+        "centred": any(_is_centred(model.cameras[i]) for i in _shared(model)),
     }
+
+
+def _tracked(model: Reconstruction) -> int:
+    known = ~np.isnan(model.points.track_xy[:, 0])
+    seen = Counter(model.points.track_image_id[known].tolist())
+    return min((seen[number] for number in model.images), default=0)
+
+
+def _shared(model: Reconstruction) -> list[int]:
+    """Ids of the cameras of ``SHARED_BY`` images or more."""
+    used = Counter(image.camera_id for image in model.images.values())
+    return [number for number, count in used.items() if count >= SHARED_BY]
+
+
+def _is_centred(camera: Camera) -> bool:
+    return camera.pinhole[2:] == (camera.width / 2, camera.height / 2)
 
 
 def _transforms(folder: Path, path: str) -> dict[str, Any]:
@@ -161,6 +189,8 @@ def _transforms(folder: Path, path: str) -> dict[str, Any]:
         "models": models,
         "pinhole": models == ["PINHOLE"],
         "num_points": 0,
+        "tracked": 0,
+        "centred": False,
     }
 
 
@@ -171,4 +201,6 @@ def _llff(folder: Path, path: str) -> dict[str, Any]:
         "models": ["SIMPLE_PINHOLE"],
         "pinhole": True,
         "num_points": 0,
+        "tracked": 0,
+        "centred": False,
     }

@@ -130,7 +130,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     facts_cache = FactCache(cache)
     warnings: list[str] = []
     poses = None
-    if config.poses == "auto":
+    if config.poses != "ignore":
         poses = find_poses(folder, facts_cache)
         warnings += half_models(folder)
 

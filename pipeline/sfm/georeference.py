@@ -147,7 +147,7 @@ def from_gps(cameras: Cameras, positions: dict[str, tuple[float, float, float]])
     enu = to_enu(geodetic, origin)
     centres = cameras.centres[known]
     weight = np.array([1.0, 1.0, 1.0 / ALTITUDE_RATIO])
-    found = _robust(centres, enu, weight, GPS_FLOOR_M)
+    found = robust_similarity(centres, enu, weight, GPS_FLOOR_M)
     tilt = np.inf if found is None else _tilt(enu, found[1], found[2])
     warnings: list[str] = []
     if found is None or tilt > MAX_TILT_RAD:
@@ -214,7 +214,7 @@ def from_gcp(
         target = places - origin
         names = ("x", "y", "z")
     source = np.array([at for _, at in placed])
-    fitted = _robust(source, target, np.ones(3), GCP_FLOOR_M)
+    fitted = robust_similarity(source, target, np.ones(3), GCP_FLOOR_M)
     spread = np.linalg.svd(_centred(target), compute_uv=False)
     if fitted is None or spread[1] < 0.02 * spread[0]:
         return "the ground control points lie on a line"
@@ -264,7 +264,7 @@ Fit = tuple[Similarity, NDArray[np.bool_], float]
 """A similarity, the positions it rests on, and their standard deviation on the ground."""
 
 
-def _robust(source: Array, target: Array, weight: Array, floor: float) -> Fit | None:
+def robust_similarity(source: Array, target: Array, weight: Array, floor: float) -> Fit | None:
     """The similarity of least median residual over triples (Rousseeuw 1984), then reweighted least
     squares on the inliers; None where the sources determine none.
 

@@ -123,12 +123,13 @@ def reconstruct(
             raise _failure(attempt, attempts)
         model, evidence = attempt.models[0], attempt.evidence
         if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
-            model, refined = refine(
+            refined = refine(
                 model,
                 radial=config.refine_radial == "auto",
                 principal_point=config.refine_principal_point,
             )
-            decisions += refined
+            model = refined.model
+            decisions += refined.decisions
             # What the reader is told is of the model that is written.
             evidence = gather(model, attempt.database, total)
         else:

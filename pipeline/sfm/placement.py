@@ -63,11 +63,11 @@ def place(
             refused.append(f"not georeferenced by GPS: {frame}")
     found = frame if isinstance(frame, Frame) else level(cameras)
     found.warnings[:0] = refused
-    _apply(model, found.similarity)
+    apply(model, found.similarity)
     return found
 
 
-def _apply(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+def apply(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
     model.transform(
         pycolmap.Sim3d(
             similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation

@@ -2,24 +2,39 @@
 
 from __future__ import annotations
 
+from collections.abc import Set
+from dataclasses import dataclass
 from typing import cast
 
 import numpy as np
 import pycolmap
+
+from pipeline.scene.posefiles import SHARED_BY
 
 # A freed parameter is kept where the robust cost falls by this share at least. On real sets with
 # known cameras the ones that are there gain 0.5% to 8%, the ones that are not 0.01% to 0.1%.
 MIN_GAIN = 0.004
 # Lenses are centred to a few per cent of the picture; beyond this the fit bends to something else.
 MAX_SHIFT = 0.06
-# Cameras with fewer images cannot carry more than a focal length and one radial term.
-MIN_IMAGES = 5
+# Tracks that fit better than this, in pixels, were made by these very cameras.
+EXACT_PX = 0.01
 FUNCTION_TOLERANCE = 1e-5
 
 
-def refine(
-    model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
-) -> tuple[pycolmap.Reconstruction, list[str]]:
+@dataclass(frozen=True)
+class Refined:
+    """Attributes:
+    model: adjusted.
+    freed: more of its cameras is free than before.
+    decisions: for people.
+    """
+
+    model: pycolmap.Reconstruction
+    freed: bool
+    decisions: list[str]
+
+
+def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str) -> Refined:
     """Adjust all of the model once more, robustly, and free more of its cameras step by step as
     long as that pays: a second radial term, then the principal point.
 
@@ -27,27 +42,26 @@ def refine(
         model: not changed.
         radial: cameras may turn from SIMPLE_RADIAL to RADIAL.
         principal_point: "yes", "no", or "auto" (where it pays).
-
-    Returns:
-        the refined model and the decisions taken.
     """
     rich = _rich_cameras(model)
     best = pycolmap.Reconstruction(model)
-    cost = _adjust(best, set())
+    cost = adjust(best)
+    # Ceres halves the squares.
+    if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
+        return Refined(best, False, ["the tracks fit exactly: there is nothing to free"])
     decisions: list[str] = []
+    freed = False
     if not rich:
         if principal_point == "yes":
             rich = set(model.cameras)
         else:
-            return best, [
-                f"no camera has {MIN_IMAGES} photographs: its distortion model and principal "
-                "point stay"
-            ]
+            text = f"no camera has {SHARED_BY} photographs: distortion and principal points stay"
+            return Refined(best, False, [text])
     if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in rich):
         freer = pycolmap.Reconstruction(best)
         for camera_id in rich:
             _make_radial(freer.camera(camera_id))
-        freer_cost = _adjust(freer, set())
+        freer_cost = adjust(freer)
         gain = 1 - freer_cost / max(cost, 1e-12)
         kept = gain >= MIN_GAIN
         decisions.append(
@@ -55,10 +69,10 @@ def refine(
             f"the cost by {gain:.2%}"
         )
         if kept:
-            best, cost = freer, freer_cost
+            best, cost, freed = freer, freer_cost, True
     if principal_point != "no":
         freer = pycolmap.Reconstruction(best)
-        freer_cost = _adjust(freer, rich)
+        freer_cost = adjust(freer, rich)
         gain, shift = 1 - freer_cost / max(cost, 1e-12), _largest_shift(best, freer, rich)
         kept = principal_point == "yes" or (gain >= MIN_GAIN and shift <= MAX_SHIFT)
         decisions.append(
@@ -66,18 +80,27 @@ def refine(
             f"{gain:.2%} and moves it by {shift:.1%} of the longer side"
         )
         if kept:
-            best = freer
-    return best, decisions
+            best, freed = freer, True
+    return Refined(best, freed, decisions)
 
 
-def _adjust(model: pycolmap.Reconstruction, free_principal_point: set[int]) -> float:
-    """Robust bundle adjustment of everything, with the principal points of those cameras;
-    returns the final cost.
+def adjust(
+    model: pycolmap.Reconstruction,
+    free_principal_point: Set[int] = frozenset(),
+    *,
+    points_only: bool = False,
+) -> float:
+    """Robust bundle adjustment of everything, with the principal points of those cameras, or of the
+    points between cameras that stay; returns the final cost.
 
     On one thread: on more, Ceres sums the residuals in the order they come.
     """
     options = pycolmap.BundleAdjustmentOptions(
-        refine_principal_point=bool(free_principal_point), print_summary=False
+        refine_principal_point=bool(free_principal_point),
+        refine_focal_length=not points_only,
+        refine_extra_params=not points_only,
+        refine_rig_from_world=not points_only,
+        print_summary=False,
     )
     ceres = options.ceres
     ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
@@ -100,7 +123,7 @@ def _adjust(model: pycolmap.Reconstruction, free_principal_point: set[int]) -> f
 def _rich_cameras(model: pycolmap.Reconstruction) -> set[int]:
     """Ids of the cameras with enough registered images."""
     used = [model.image(i).camera_id for i in model.reg_image_ids()]
-    return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES}
+    return {camera_id for camera_id in used if used.count(camera_id) >= SHARED_BY}
 
 
 def _make_radial(camera: pycolmap.Camera) -> None:

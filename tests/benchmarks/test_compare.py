@@ -17,6 +17,7 @@ def row(scene: str, config: str, psnr: float, **changes: Any) -> dict[str, Any]:
     return {
         **quality,
         **{f"{stage}_cpu_s": 10.0 for stage in stages},
+        "refine_cpu_s": None,
         **{"scene": scene, "config": config, "seed": 0, "status": "ok", "psnr": psnr},
         **{"ssim": psnr / 40, "num_gaussians": 50_000, "wall_s": 30.0, "cpu_s": 60.0},
         **changes,
@@ -65,7 +66,10 @@ def test_several_seeds_give_medians_and_spreads() -> None:
 def test_each_run_of_a_batch_is_a_row() -> None:
     """Stages that a scene did not need count as no time; a truth that is not known stays blank."""
     stages = ("decode", "features", "matches", "sfm", "undistort", "train")
-    times = {f"{stage}_wall_s": 5.0 for stage in stages} | {"decode_wall_s": None}
+    times = {f"{stage}_wall_s": 5.0 for stage in stages} | {
+        "decode_wall_s": None,
+        "refine_wall_s": None,
+    }
     more = {"total_images": 12, "registered_images": 11, "peak_rss_mb": 512.4, "warnings": 2}
     lines = compare.each(
         [

@@ -25,10 +25,14 @@ def project(tmp_path_factory):
     ("scene", "options", "expected"),
     [
         ("raw", ("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
-        ("raw_posed", ("--format", "dng", "--poses", "colmap", *PINHOLE), ALWAYS | {"decode"}),
+        (
+            "raw_posed",
+            ("--format", "dng", "--poses", "colmap", *PINHOLE),
+            ALWAYS | {"decode", "refine"},
+        ),
         ("bare", ("--poses", "transforms", "--no-points", *PINHOLE), ALWAYS),
-        ("lens", ("--poses", "colmap", "--distortion", "opencv"), ALWAYS | {"undistort"}),
-        ("masked", ("--poses", "colmap", "--masks", *PINHOLE), ALWAYS),
+        ("lens", ("--poses", "colmap", "--distortion", "opencv"), ALWAYS | {"refine", "undistort"}),
+        ("masked", ("--poses", "colmap", "--masks", *PINHOLE), ALWAYS | {"refine"}),
         ("alpha", ("--poses", "transforms", "--format", "png", "--alpha", *PINHOLE), ALWAYS),
     ],
 )

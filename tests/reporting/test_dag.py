@@ -54,7 +54,7 @@ def test_arrows_are_what_feeds_what_and_no_more():
     boxes, root = drawn(plan())
     assert boxes["evaluate"][0] == boxes["export"][0]
     heads = [p for p in root.iter(f"{SVG}path") if p.get("class") == "head"]
-    assert len(heads) == len(STAGES)  # ten of the chain, one more around export
+    assert len(heads) == len(STAGES)  # ten of the chain, one around export, one to refine
     assert len([p for p in drawn(plan("decode"))[1].iter(f"{SVG}path")]) == 2 * (len(STAGES) - 1)
 
 

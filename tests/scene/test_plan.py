@@ -9,6 +9,8 @@ import pytest
 
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
+from pipeline.scene.colmap import read_model, write_model
+from pipeline.scene.model import Points, Reconstruction
 from pipeline.scene.plan import STAGES, Plan, describe, make_plan
 from pipeline.scene.scan import Scan, scan
 from tests.scene.pictures import photos, picture
@@ -50,14 +52,14 @@ def test_photographs_alone_need_everything_but_raw(tmp_path):
     photos(tmp_path / "images", 3)
     plan = plan_of(tmp_path)
     assert tuple(plan.stages) == STAGES
-    assert skipped(plan) == ["decode"]
+    assert skipped(plan) == ["decode", "refine"]
     assert all(stage.reason for stage in plan.stages.values())
 
 
 def test_raw_needs_decode(tmp_path):
     for i in range(2):
         write_dng(tmp_path / f"{i}.dng")
-    assert skipped(plan_of(tmp_path)) == []
+    assert skipped(plan_of(tmp_path)) == ["refine"]
 
 
 @pytest.mark.parametrize("model, undistort", [("PINHOLE", []), ("SIMPLE_RADIAL", ["undistort"])])
@@ -70,7 +72,61 @@ def test_given_colmap_poses(tmp_path, model, undistort):
     assert "3 cameras" in plan.stages["sfm"].reason and model in plan.stages["undistort"].reason
     assert "1 sparse points" in plan.stages["init"].reason
     ignoring = plan_of(tmp_path, poses="ignore")
-    assert skipped(ignoring) == ["decode"] and "ignore" in ignoring.stages["sfm"].reason
+    assert skipped(ignoring) == ["decode", "refine"] and "ignore" in ignoring.stages["sfm"].reason
+
+
+def posed(folder: Path, *, tracks: int, size: tuple[int, int] = (64, 48), count: int = 5) -> Path:
+    """Photographs of 64 x 48 pixels, and a model for ``size`` with so many points in each."""
+    names = [path.name for path in photos(folder / "images", count)]
+    sparse = folder / "sparse" / "0"
+    write_sparse(sparse, names, size)
+    model = read_model(sparse)
+    points = Points(
+        np.zeros((tracks, 3)),
+        np.zeros((tracks, 3), np.uint8),
+        np.zeros(tracks),
+        np.arange(tracks + 1) * count,
+        np.tile(model.points.track_image_id, tracks),
+        np.tile(model.points.track_xy, (tracks, 1)),
+    )
+    write_model(sparse, Reconstruction(model.cameras, model.images, points))
+    return folder
+
+
+def moved_centre(folder: Path) -> Path:
+    """A principal point that somebody looked for."""
+    sparse = folder / "sparse" / "0"
+    model = read_model(sparse)
+    model.cameras[1].params[2] += 0.25
+    write_model(sparse, model)
+    return folder
+
+
+def test_given_poses_with_tracks_and_a_centre_that_nobody_looked_for_are_refined(tmp_path):
+    plan = plan_of(posed(tmp_path, tracks=20, size=(128, 96)))
+    assert skipped(plan) == ["decode", "features", "matches", "sfm", "undistort"]
+    assert "middle" in plan.stages["refine"].reason
+
+
+@pytest.mark.parametrize(
+    "change, options, why",
+    [
+        ({"tracks": 20}, {"poses": "keep"}, "poses: keep"),
+        ({"tracks": 20}, {"sfm": {"refine_principal_point": "no"}}, "held"),
+        ({"tracks": 19}, {}, "19 tracked points"),
+        ({"tracks": 0}, {}, "no tracks"),
+        ({"tracks": 20, "count": 4}, {}, "looked for already"),
+    ],
+)
+def test_given_poses_that_gain_nothing_are_not_refined(tmp_path, change, options, why):
+    plan = plan_of(posed(tmp_path, **change), **options)
+    assert not plan.runs("refine") and why in plan.stages["refine"].reason
+
+
+def test_a_calibrated_lens_is_refined_on_demand_alone(tmp_path):
+    scene = moved_centre(posed(tmp_path, tracks=20))
+    assert "looked for already" in plan_of(scene).stages["refine"].reason
+    assert plan_of(scene, sfm={"refine_principal_point": "yes"}).runs("refine")
 
 
 def test_given_poses_without_points_are_triangulated(tmp_path):
@@ -79,7 +135,7 @@ def test_given_poses_without_points_are_triangulated(tmp_path):
     frames = [frame(path=f"./train/{name}") for name in "ab"]
     write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, "transforms_train.json")
     plan = plan_of(tmp_path)
-    assert skipped(plan) == ["decode", "features", "matches", "sfm", "undistort"]
+    assert skipped(plan) == ["decode", "features", "matches", "sfm", "refine", "undistort"]
     assert "triangulated" in plan.stages["init"].reason
     assert plan.config.train.background == "random"
     assert "random" in plan_of(tmp_path, init={"method": "random"}).stages["init"].reason
@@ -88,7 +144,14 @@ def test_given_poses_without_points_are_triangulated(tmp_path):
 def test_llff(tmp_path):
     photos(tmp_path / "images", 2)
     np.save(tmp_path / "poses_bounds.npy", [llff_row(np.eye(3), np.zeros(3), 48, 64, 50.0)] * 2)
-    assert skipped(plan_of(tmp_path)) == ["decode", "features", "matches", "sfm", "undistort"]
+    assert skipped(plan_of(tmp_path)) == [
+        "decode",
+        "features",
+        "matches",
+        "sfm",
+        "refine",
+        "undistort",
+    ]
 
 
 @pytest.mark.parametrize("model, runs", [("PINHOLE", False), ("auto", True), ("OPENCV", True)])

@@ -22,12 +22,18 @@ def look(name: str) -> Scan:
 @pytest.mark.parametrize(
     "name, count, skipped, pairs, share",
     [
-        ("fox", 50, ["decode"], "retrieval", "group"),
-        ("lund_door", 12, ["decode"], "exhaustive", "group"),
-        ("liberty", 135, ["decode"], "retrieval", "image"),
-        ("reichstag", 74, ["decode"], "retrieval", "image"),
+        ("fox", 50, ["decode", "refine"], "retrieval", "group"),
+        ("lund_door", 12, ["decode", "refine"], "exhaustive", "group"),
+        ("liberty", 135, ["decode", "refine"], "retrieval", "image"),
+        ("reichstag", 74, ["decode", "refine"], "retrieval", "image"),
         ("mip360_bonsai", 292, ["decode", "features", "matches", "sfm"], None, None),
-        ("nerf_lego", 100, ["decode", "features", "matches", "sfm", "undistort"], None, None),
+        (
+            "nerf_lego",
+            100,
+            ["decode", "features", "matches", "sfm", "refine", "undistort"],
+            None,
+            None,
+        ),
     ],
 )
 def test_plans(name, count, skipped, pairs, share):

@@ -312,10 +312,17 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "two_views": Mutant(
         "pipeline/training/floaters.py",
-        "(most > ONE_VIEW * total)",
-        "(most > 0.0 * total)",
+        "(found > MOST * total)",
+        "(found > 0.0 * total)",
         "what two views agree on taken for a floater",
         ("tests/training/test_floaters.py",),
+    ),
+    "given_world": Mutant(
+        "pipeline/sfm/given.py",
+        "        apply(model, fitted[0])",
+        "        pass",
+        "adjusted poses in a world turned from the given one",
+        ("tests/sfm/test_refine.py",),
     ),
     "judge": Mutant(
         "pipeline/sfm/judge.py",

@@ -26,11 +26,13 @@ class Refined:
     """Attributes:
     model: adjusted.
     freed: more of its cameras is free than before.
+    centres: ids of the cameras whose principal points are free.
     decisions: for people.
     """
 
     model: pycolmap.Reconstruction
     freed: bool
+    centres: Set[int]
     decisions: list[str]
 
 
@@ -48,15 +50,15 @@ def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
     cost = adjust(best)
     # Ceres halves the squares.
     if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
-        return Refined(best, False, ["the tracks fit exactly: there is nothing to free"])
+        return Refined(best, False, set(), ["the tracks fit exactly: there is nothing to free"])
     decisions: list[str] = []
-    freed = False
+    freed, centres = False, set[int]()
     if not rich:
         if principal_point == "yes":
             rich = set(model.cameras)
         else:
             text = f"no camera has {SHARED_BY} photographs: distortion and principal points stay"
-            return Refined(best, False, [text])
+            return Refined(best, False, set(), [text])
     if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in rich):
         freer = pycolmap.Reconstruction(best)
         for camera_id in rich:
@@ -80,8 +82,8 @@ def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
             f"{gain:.2%} and moves it by {shift:.1%} of the longer side"
         )
         if kept:
-            best, freed = freer, True
-    return Refined(best, freed, decisions)
+            best, freed, centres = freer, True, rich
+    return Refined(best, freed, centres, decisions)
 
 
 def adjust(
@@ -89,9 +91,12 @@ def adjust(
     free_principal_point: Set[int] = frozenset(),
     *,
     points_only: bool = False,
+    loss_px: float = 1.0,
 ) -> float:
     """Robust bundle adjustment of everything, with the principal points of those cameras, or of the
     points between cameras that stay; returns the final cost.
+
+    Residuals beyond ``loss_px`` pixels count less (Cauchy's loss).
 
     On one thread: on more, Ceres sums the residuals in the order they come.
     """
@@ -104,6 +109,7 @@ def adjust(
     )
     ceres = options.ceres
     ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    ceres.loss_function_scale = loss_px
     ceres.solver_options.num_threads = 1
     ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
     config = pycolmap.BundleAdjustmentConfig()

@@ -12,6 +12,7 @@ import torch
 from pipeline.config.schema import Train
 from pipeline.raster import RasterOptions
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training import floaters as floaters_module
 from pipeline.training import trainer
 from pipeline.training.depth import KnownDepths
 from pipeline.training.floaters import LEAST_POINTS, air_depths, floaters
@@ -64,6 +65,20 @@ def test_what_two_views_see_alike_is_no_floater(scene: TinyScene) -> None:
     """However near it is: they agree on it."""
     twice = replace(scene, views=[*scene.views, scene.views[0]])
     assert found(twice, with_speck(scene, 0.4), AIR) == []
+
+
+def test_what_a_hundredth_of_the_views_see_is_a_floater_all_the_same(
+    scene: TinyScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neighbours with the same light agree on a fog."""
+    monkeypatch.setattr(floaters_module, "ONE_IN", len(scene.views) // 2)
+    last, other = len(scene.initial), scene.views[1:]
+    twice = replace(scene, views=[*other, *[scene.views[0]] * 2])
+    assert found(twice, with_speck(scene, 0.4), AIR) == [last]
+    assert found(twice, with_speck(scene, 1.1), AIR) == []
+    # Two of four have no more than half of it.
+    often = replace(scene, views=[*other[2:], *[scene.views[0]] * 4])
+    assert found(often, with_speck(scene, 0.4), AIR) == []
 
 
 def test_what_hides_behind_others_and_shows_nowhere_is_left_alone(scene: TinyScene) -> None:

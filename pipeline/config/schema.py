@@ -208,9 +208,9 @@ class Density(Section):
     )
     clear_air: bool = Field(
         True,
-        description="Now and then Gaussians are removed that hang before one camera: one view "
-        "has most of their weight, and the nearest sparse points it sees are more than twice as "
-        "far. Only in runs of 50 looks and more at each photograph.",
+        description="Now and then Gaussians are removed that hang before one camera or very few: "
+        "one view, or a hundredth of them, has most of their weight, and the nearest sparse points "
+        "it sees are more than twice as far. Only in runs of 50 looks and more at each photograph.",
     )
     recycle: Share = Field(
         0.02,

@@ -25,8 +25,8 @@ from pipeline.sfm.placement import apply
 from pipeline.sfm.quiet import quiet_colmap
 from pipeline.sfm.refine import Refined, adjust, refine
 
-# Poses and lenses are found from the longest tracks, so many a photograph: a bonsai's 292
-# photographs with 2300 points each take a third of the time, and its poses turn by 0.05 pixels.
+# Poses and lenses are found from the longest tracks, so many a photograph: 292 photographs with
+# 2300 points each take two thirds of the time, and train as well (docs/sfm.md).
 TRACKS_PER_IMAGE = 1000
 # In the end residuals beyond this many pixels count less: given tracks are mostly better than that,
 # and the rest worse (bonsai: median 0.29, a tenth beyond 0.96).
@@ -64,12 +64,13 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
         radial=config.refine_radial == "auto",
         principal_point=config.refine_principal_point,
     )
+    if found.freed:
+        adjust(found.model, found.centres, loss_px=LOSS_PX)
     if not found.freed or not _is_finite(found.model):
         out.mkdir(parents=True, exist_ok=True)
         for file in pose_files(sparse):
             shutil.copy(file, out)
         return GivenReport(False, before, before, [*found.decisions, "poses stay as given"])
-    adjust(found.model, found.centres, loss_px=LOSS_PX)
     given = _anchors(model)
     _take_over(model, found)
     _lay_over(model, given)

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
 from pipeline.scene.budget import gaussian_budget, memory_line, training_memory_mb
-from pipeline.scene.posefiles import GivenPoses
+from pipeline.scene.posefiles import SHARED_BY, GivenPoses
 from pipeline.scene.scan import Scan
 from pipeline.scene.views import view_size
 
@@ -336,7 +336,8 @@ def _refine(scan: Scan, config: Config) -> StagePlan:
         few = f"a photograph with {poses.tracked} tracked points" if poses.tracked else "no tracks"
         return StagePlan(run=False, reason=f"the given poses come with {few} to adjust them to")
     if not poses.centred and freed != "yes":
-        return StagePlan(run=False, reason="the given principal points were looked for already")
+        text = f"no camera of {SHARED_BY} photographs has its principal point exactly in the middle"
+        return StagePlan(run=False, reason=text)
     return StagePlan(
         run=True,
         reason="the given principal points stand in the middle, where nobody looked for them"

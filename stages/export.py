@@ -59,6 +59,9 @@ FULL_SIZE = Views(max_long_side_px=2**31)
 # Of Gaussians that a format cannot hold: some specks are always lost.
 TOLERATED_SHARE = 0.05
 
+# Formats that cannot say that opacities are to be compensated.
+SILENT = ("ply", "splat", "gltf")
+
 # format -> the file or folder, and what writes it.
 WRITERS: dict[str, tuple[str, Callable[[Path, Scene], None]]] = {
     "ply": ("point_cloud.ply", lambda path, s: write_splat_ply(path, s.gaussians)),
@@ -102,6 +105,13 @@ def run(job: Job) -> None:
             f"point_cloud.spz: {lost} of {len(scene.gaussians)} Gaussians are too small or too "
             "large for SPZ's numbers in the unit of the poses; take point_cloud.ply, or give the "
             "poses in a unit in which the scene measures about 1 to 100"
+        )
+    silent = [WRITERS[name][0] for name in SILENT if name in config.formats]
+    if train.antialias and silent:
+        job.warn(
+            f"{' and '.join(silent)} cannot say that the Gaussians were trained with "
+            "train.antialias, and a viewer without Mip-Splatting's compensation draws them far too "
+            "thick: switch it on there, take point_cloud.spz, which says so, or train without"
         )
     protocol = choose_protocol(scene.views, split, train)
     up = scene_up(scene.views, manifest)

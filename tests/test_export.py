@@ -54,10 +54,10 @@ def scene(tmp_path: Path) -> Path:
     return scene
 
 
-def export(scene: Path, **options) -> tuple[Path, Job]:
+def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
     config = Config().model_dump(mode="json")
     config["export"] |= options
-    config["train"]["background"] = "random"
+    config["train"] |= {"background": "random", "antialias": antialias}
     out = scene / ".scratch" / "out"
     job = Job(
         stage="export",
@@ -103,6 +103,13 @@ def test_what_is_drawn_is_drawn_on_demand(scene):
     # Fifty scattered Gaussians have no surface, or a poor one: either way it is said.
     assert (out / "mesh.ply").is_file() == any("mesh" in text for text in job.decisions)
     assert any("mesh" in text for text in (*job.decisions, *job.warnings))
+
+
+def test_files_that_cannot_say_how_they_want_to_be_drawn_are_named(scene):
+    """Drawn without the compensation that they were trained with, lego lost 10 dB."""
+    out, job = export(scene, antialias=True, formats=["ply", "spz"])
+    assert [text.split()[0] for text in job.warnings] == ["point_cloud.ply"]
+    assert json.loads((out / "frame.json").read_text())["render"]["antialias"]
 
 
 def test_transforms_name_the_pictures_from_where_they_end_up(scene):

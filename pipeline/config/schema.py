@@ -185,7 +185,9 @@ class Density(Section):
     stop_share: Share = Field(0.7, description="Densify until this share of the steps.")
     interval: Positive = Field(100, description="Steps between densifications.")
     grad_threshold: Rate = Field(
-        2e-4, description="Mean view-space positional gradient (in NDC) that densifies."
+        1e-5,
+        description="Gaussians with a larger mean view-space positional gradient (in NDC) are "
+        "split, the largest first, as far as the budget allows (3DGS: 2e-4).",
     )
     absolute_gradient: bool = Field(
         False,
@@ -215,7 +217,7 @@ class Density(Section):
     recycle: Share = Field(
         0.02,
         description="gradient: where the budget is used up, up to this share of it is taken each "
-        "time from the faintest Gaussians for those most wanted.",
+        "time, for the Gaussians most wanted, from the faintest of those that nothing pulls at.",
     )
     prune_opacity: Share = Field(0.005, description="Fainter Gaussians are removed.")
     prune_scale: Rate = Field(
@@ -333,7 +335,11 @@ class Train(Section):
         "that it draws; 0: to all.",
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
-    antialias: bool = Field(False, description="Mip-Splatting's opacity compensation.")
+    antialias: bool = Field(
+        False,
+        description="Mip-Splatting's opacity compensation: truer where Gaussians are smaller than "
+        "pixels, but only viewers that compensate, too, draw such a scene as it was trained.",
+    )
     adam_beta1: Annotated[float, Field(ge=0, lt=1)] = Field(
         0.8, description="How much of the steps before goes on in each (3DGS: 0.9)."
     )

@@ -27,8 +27,9 @@ SPLIT_SHRINK = 1.6
 LONG_AXIS, OTHER_AXES, HALVES_OPACITY = 0.5, 0.85, 0.8
 LONG_OFFSET = math.sqrt(1 - LONG_AXIS**2)
 RESET_OPACITY = 0.01
-# What shows less than this may make room for others.
-RECYCLED_OPACITY = 0.1
+# What shows less than this may make room for others, if it is of this share that is pulled at
+# least: what is faint because it is new is pulled at (docs/training.md).
+RECYCLED_OPACITY, IDLE_SHARE = 0.1, 0.1
 
 
 @dataclass
@@ -83,9 +84,9 @@ class GradientDensity:
         if densify:
             pull = self.gradient_sum / self.seen.clamp(min=1.0)
             wanted = kept & (pull > self.config.grad_threshold)
-            kept = kept & ~self._recycled(gaussians, kept, wanted, budget)
+            kept = kept & ~self._recycled(gaussians, kept, pull, wanted, budget)
             # Each adds one Gaussian, cloned or split.
-            grow = most(pull, wanted, max(0, budget - int(kept.sum())))
+            grow = most(pull, wanted & kept, max(0, budget - int(kept.sum())))
         changes = Changes(pruned=len(gaussians) - int(kept.sum()))
         large = self._large(gaussians)
         cloned = torch.nonzero(grow & ~large)[:, 0]
@@ -132,13 +133,17 @@ class GradientDensity:
             return torch.full((len(gaussians),), self.config.split)
         return self._longest(gaussians) > self.config.split_scale * self.scale
 
-    def _recycled(self, gaussians: Gaussians, kept: Tensor, wanted: Tensor, budget: int) -> Tensor:
-        """(N,) bool: the faintest, which make room where more are wanted than the budget has left.
-        Otherwise the first details would keep the budget, and what is bare would stay bare."""
+    def _recycled(
+        self, gaussians: Gaussians, kept: Tensor, pull: Tensor, wanted: Tensor, budget: int
+    ) -> Tensor:
+        """(N,) bool: the faintest of the idle, which make room where more are wanted than the
+        budget has left. Otherwise the first details would keep the budget, and what is bare would
+        stay bare."""
         short = int(wanted.sum()) - max(0, budget - int(kept.sum()))
         limit = min(short, round(self.config.recycle * budget))
+        idle = most(-pull, kept, round(IDLE_SHARE * int(kept.sum())))
         opacity = torch.sigmoid(gaussians.opacity_logits)
-        return most(-opacity, kept & ~wanted & (opacity < RECYCLED_OPACITY), limit)
+        return most(-opacity, idle & (opacity < RECYCLED_OPACITY), limit)
 
     @staticmethod
     def _longest(gaussians: Gaussians) -> Tensor:

@@ -280,7 +280,12 @@ class Train(Section):
         "(1/4, then 1/2). auto: 0.15 of the steps; 0.1 of `budget_minutes`, at most 1.2 minutes.",
     )
     background: Literal["auto", "black", "white", "random"] = Field(
-        "auto", description="auto: random where images have alpha, else black."
+        "auto", description="auto: white where images have alpha, else black."
+    )
+    alpha_weight: Rate = Field(
+        0.15,
+        description="Weight of the error of what the render covers (its alpha) where images have "
+        "alpha, beside L1's 1, so that nothing hides against `background` (3DGS: 0).",
     )
     exposure: Literal["auto", "on", "off"] = Field(
         "auto",

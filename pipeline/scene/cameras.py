@@ -136,7 +136,7 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
     model = load_given(found).model
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
-    train = Train(background="random" if found.num_alpha else "black")
+    train = Train(background="white" if found.num_alpha else "black")
     return PosedScene(views, split, train, None, found.warnings)
 
 

@@ -262,7 +262,7 @@ def _background(scan: Scan, config: Config) -> Choice:
     if wanted != "auto":
         return wanted, f"{wanted} background, as configured"
     if 2 * scan.num_alpha > len(scan.photos):
-        return "random", f"random background: {scan.num_alpha} photographs have alpha"
+        return "white", f"white background: {scan.num_alpha} photographs have alpha"
     few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
     return "black", f"black background: {few}"
 

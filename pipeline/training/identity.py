@@ -12,7 +12,7 @@ from pipeline.config.schema import Train
 from pipeline.training.inputs import Inputs
 
 # Raise it when the state of a training or its meaning changes.
-STATE_VERSION = 14
+STATE_VERSION = 15
 
 
 def identity_of(inputs: Inputs, config: Train, seed: int) -> str:

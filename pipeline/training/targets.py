@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.config.schema import Train
 from pipeline.photos.load import ViewPixels, load_view, resize_area
 from pipeline.runtime.progress import track
 from pipeline.scene.model import View
@@ -45,6 +46,15 @@ class Target:
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
+    def alpha_gradient(self, alpha: Tensor, config: Train) -> Tensor | None:
+        """(H, W) float32 dL/d(alpha) of what is asked of the rendered ``alpha`` (H, W) itself: to
+        vanish where a mask hides the photograph, and elsewhere to be the photograph's."""
+        hidden = self.thinning(config.masked_opacity)
+        shown = self.covering(alpha, config.alpha_weight, config.square_weight)
+        if hidden is None or shown is None:
+            return shown if hidden is None else hidden
+        return hidden + shown
+
     def thinning(self, weight: float) -> Tensor | None:
         """(H, W) float32 dL/d(alpha) by which what is drawn on ignored pixels grows thin, None
         where nothing is asked of them. ``weight``: of such a pixel's alpha beside the mean error
@@ -53,6 +63,20 @@ class Target:
             return None
         counted = self.ignored.numel() - int(self.ignored.sum())
         return self.ignored * (weight / max(1, counted))
+
+    def covering(self, alpha: Tensor, weight: float, square_weight: float) -> Tensor | None:
+        """(H, W) float32 dL/d(alpha) of ``weight`` times the mean error, L1 and ``square_weight``
+        times its square, of the rendered ``alpha`` over the pixels that count, None where the view
+        is opaque or nothing is asked. It says with every background what random ones say on
+        average, and adds none of their noise."""
+        if self.alpha is None or not weight:
+            return None
+        error = alpha - self.alpha.to(torch.float32) / 255.0
+        counted = error.numel()
+        if self.ignored is not None:
+            error = error.masked_fill(self.ignored, 0.0)
+            counted -= int(self.ignored.sum())
+        return (weight / max(1, counted)) * (error.sign() + 2 * square_weight * error)
 
     def psnr(self, rendered: Tensor, wanted: Tensor) -> float:
         """PSNR in dB over the pixels that count, of (H, W, 3) against ``over``'s picture."""

@@ -168,7 +168,7 @@ class _Run:
         self.gains = None if gains is None else torch.from_numpy(gains.astype(np.float32))
         self.background = config.background
         if self.background == "auto":
-            self.background = "random" if self.targets.have_alpha else "black"
+            self.background = "white" if self.targets.have_alpha else "black"
 
         gaussians = inputs.initial.with_sh_degree(0).clone()
         rng = np.random.Generator(np.random.PCG64(seed))
@@ -311,15 +311,15 @@ class _Run:
     def further_gradients(
         self, rendered: Forward, target: Target, index: int
     ) -> tuple[Tensor | None, Tensor | None]:
-        """(d_alpha, d_depth) of what is asked for beside colours: emptiness where a mask hides the
-        photograph, and in some steps the known depths."""
-        empty = target.thinning(self.config.masked_opacity)
+        """(d_alpha, d_depth) of what is asked for beside colours: the photograph's alpha, emptiness
+        where a mask hides it, and in some steps the known depths."""
+        asked = target.alpha_gradient(rendered.alpha, self.config)
         known = None if self.inputs.depths is None else self.inputs.depths[index]
         if not known or self.state.step % DEPTH_EVERY:
-            return empty, None
+            return asked, None
         weight = self.depth_weight * DEPTH_EVERY
         d_alpha, d_depth = depth_gradients(rendered, known, self.views[index], weight)
-        return d_alpha if empty is None else d_alpha + empty, d_depth
+        return d_alpha if asked is None else d_alpha + asked, d_depth
 
     def control_density(self, places: range) -> None:
         """Do what is due at these places of the schedule."""

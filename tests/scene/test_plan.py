@@ -137,7 +137,7 @@ def test_given_poses_without_points_are_triangulated(tmp_path):
     plan = plan_of(tmp_path)
     assert skipped(plan) == ["decode", "features", "matches", "sfm", "refine", "undistort"]
     assert "triangulated" in plan.stages["init"].reason
-    assert plan.config.train.background == "random"
+    assert plan.config.train.background == "white"
     assert "random" in plan_of(tmp_path, init={"method": "random"}).stages["init"].reason
 
 

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.config.schema import Train
 from pipeline.photos.load import resize_area
 from pipeline.raster import RasterOptions, forward
 from pipeline.scene.model import View
@@ -69,6 +70,26 @@ def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None
     thinning = targets.get(0, 1).thinning(0.5)
     assert thinning is not None and targets.get(0, 1).thinning(0.0) is None
     np.testing.assert_allclose(thinning, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+
+
+def test_what_is_asked_of_alpha_is_the_gradient_of_its_error_where_pixels_count(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
+    mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
+    target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
+    config = Train(alpha_weight=0.4, square_weight=2.5, masked_opacity=0.3)
+    alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
+    counts = torch.from_numpy(mask > 0)
+    error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
+    wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
+    (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
+    asked = target.alpha_gradient(alpha.detach(), config)
+    assert asked is not None and alpha.grad is not None
+    torch.testing.assert_close(asked, alpha.grad)
+    nothing = Train(alpha_weight=0.0, masked_opacity=0.0)
+    assert target.alpha_gradient(alpha.detach(), nothing) is None
 
 
 def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:

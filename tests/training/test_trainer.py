@@ -323,9 +323,7 @@ def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
         run(scene, tmp_path / "c", views=[hidden])
 
 
-def test_alpha_with_random_background_leaves_the_empty_empty(
-    scene: TinyScene, tmp_path: Path
-) -> None:
+def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
     start = scene.initial.clone()
     start.opacity_logits.fill_(1.0)
     start.log_scales += 0.7
@@ -336,7 +334,7 @@ def test_alpha_with_random_background_leaves_the_empty_empty(
         threads=1,
         checkpoint_dir=tmp_path,
     )
-    assert result.background == "random"
+    assert result.background == "white"
     for view in scene.alpha_views[:2]:
         alpha = np.asarray(Image.open(view.image))[..., 3]
         empty = alpha == 0

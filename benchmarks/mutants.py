@@ -191,6 +191,20 @@ MUTANTS: dict[str, Mutant] = {
         "both halves of a split on one side",
         ("tests/training/test_density.py",),
     ),
+    "pulled_at_go": Mutant(
+        "pipeline/training/density/gradient.py",
+        "idle & (opacity < RECYCLED_OPACITY)",
+        "kept & (opacity < RECYCLED_OPACITY)",
+        "what is faint recycled though the loss pulls at it",
+        ("tests/training/test_density.py",),
+    ),
+    "alpha_unasked": Mutant(
+        "pipeline/training/trainer.py",
+        "return asked, None",
+        "return None, None",
+        "what alpha and masks ask for left out of the steps",
+        ("tests/training/test_trainer.py",),
+    ),
     "ndc": Mutant(
         "pipeline/training/density/gradient.py",
         "pull[:, 0] * (0.5 * width)",

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import argparse
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import EXIT_USER_ERROR, as_user_error
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.machine import usable_cores
 
 MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
 EXAMPLES = """examples:
@@ -236,7 +235,7 @@ def _add_rendering(parser: argparse.ArgumentParser, background: str, antialias: 
         "--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this"
     )
     parser.add_argument(
-        "--threads", type=_positive, default=os.cpu_count() or 1, help="(default: all cores)"
+        "--threads", type=_positive, default=usable_cores(), help="(default: all cores)"
     )
 
 

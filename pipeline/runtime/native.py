@@ -192,7 +192,7 @@ class NativeLibrary:
             "flags": self.flags_for(variant),
             "sources": self.source_hash(),
             "system": [sys.platform, variant.target.architecture],
-            **self.facts,
+            "facts": dict(self.facts),
         }
         if variant.target.name == "native":
             identity["processor"] = hashlib.sha256("\0".join(processor()).encode()).hexdigest()

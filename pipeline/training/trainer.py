@@ -234,11 +234,11 @@ class _Run:
         records = max(1, steps // CURVE_RECORDS)
         timer = StepTimer(self.built, self.threads, steps - state.clock)
         while state.clock < steps:
-            before, factor = state.clock, self.factor()
+            before = state.clock
             self.step()
             now = time.monotonic()
             state.seconds = seconds_before + now - started
-            if text := timer.passes(state.seconds, factor):
+            if text := timer.passes(state.seconds, self.factor()):
                 self.log(text)
             if state.clock // records > before // records or state.clock == steps:
                 self.record()

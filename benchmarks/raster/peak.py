@@ -31,7 +31,7 @@ class Calibration:
         with tempfile.TemporaryDirectory() as folder:
             library = Path(folder) / "peak.so"
             source = Path(__file__).with_name("peak.cpp")
-            flags = [*build.FLAGS, "-fopenmp", "-I", str(build.SOURCES), "-shared"]
+            flags = [*build.flags(), "-fopenmp", "-I", str(build.SOURCES), "-shared"]
             subprocess.run([*build.compiler(), *flags, str(source), "-o", str(library)], check=True)
             self._loaded = ctypes.CDLL(str(library))
         for function in (self._loaded.peak_flops, self._loaded.peak_bytes):

@@ -45,8 +45,8 @@ class Scene:
 def synthetic(count: int, width: int, height: int, radius: float, in_view: float = 1.0) -> Scene:
     """Gaussians spread evenly over an image, as seen from the front; seeded by ``count``.
 
-    All of them are in view, or a share of ``in_view``: then they are spread over a larger
-    rectangle around the image's centre.
+    A share of ``in_view`` lies in the image, the others around it, as in a scene that no view shows
+    whole.
 
     On the image: 3-sigma radius log-normal with mean ``radius`` pixels and sigma 0.5, minor axis
     0.3 to 1 of the major one, any direction; depth 1 to 10; opacity logits normal with sigma 1.5.
@@ -94,7 +94,7 @@ def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
     width, height = size or (lens.width, lens.height)
     step = max(1, len(posed) // MOST_VIEWS)
     views = [
-        _resized(model.cameras[image.camera_id], image.world_to_camera, width, height)
+        _view(model.cameras[image.camera_id].resized(width, height), image.world_to_camera)
         for image in posed[::step][:MOST_VIEWS]
     ]
     fields = (arrays.means, arrays.log_scales, arrays.quats, arrays.opacity_logits, arrays.sh)
@@ -103,9 +103,5 @@ def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
     return Scene(name, gaussians, tuple(views))  # type: ignore[arg-type]
 
 
-def _resized(camera: Camera, pose: np.ndarray, width: int, height: int) -> RasterCamera:
-    across, down = width / camera.width, height / camera.height
-    fx, fy, cx, cy = camera.pinhole
-    return RasterCamera(
-        width, height, fx * across, fy * down, cx * across, cy * down, torch.from_numpy(pose)
-    )
+def _view(camera: Camera, pose: np.ndarray) -> RasterCamera:
+    return RasterCamera(camera.width, camera.height, *camera.pinhole, torch.from_numpy(pose))

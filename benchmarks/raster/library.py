@@ -2,46 +2,33 @@
 
 from __future__ import annotations
 
-import subprocess
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.raster import build
 from pipeline.runtime.machine import machine_facts
 
-# The compiler's macro of each instruction set, best first, and float32 lanes of its registers.
-INSTRUCTION_SETS = (
-    ("__AVX512F__", "AVX-512", 16),
-    ("__AVX2__", "AVX2", 8),
-    ("__AVX__", "AVX", 8),
-    ("__SSE4_2__", "SSE4.2", 4),
-    ("__SSE2__", "SSE2", 4),
-    ("__ARM_NEON", "NEON", 4),
-)
+LANES = {"x86-64-v4": 16, "x86-64-v3": 8, "x86-64-v2": 4, "aarch64": 4}
 
 
 @dataclass(frozen=True)
 class Library:
     """Attributes:
-    target: the compiler's flag that chose it.
-    instruction_set: the widest that the kernels may use.
+    target: the instruction set that the kernels are compiled for.
     lanes: float32 lanes of its registers.
     compiler: name and version.
     """
 
     target: str
-    instruction_set: str
     lanes: int
     compiler: str
 
 
 def measured_library() -> Library:
     """Of the kernels that this process loads."""
-    command, flags = build.compiler(), build.FLAGS
-    macros = _output([*command, *flags, "-x", "c++", "-dM", "-E", "/dev/null"]).split()
-    _, name, lanes = next(found for found in INSTRUCTION_SETS if found[0] in macros)
-    target = next(flag.partition("=")[2] for flag in flags if flag.startswith(("-march", "-mcpu")))
-    return Library(target, name, lanes, _output([*command, "--version"]).partition("\n")[0])
+    built = build.load()
+    target = built.target.partition("+")[0]
+    return Library(target, LANES.get(target, 4), built.compiler)
 
 
 def measured_on(library: Library) -> dict[str, Any]:
@@ -49,7 +36,6 @@ def measured_on(library: Library) -> dict[str, Any]:
     return {
         "machine": machine_facts(),
         "target": library.target,
-        "instruction_set": library.instruction_set,
         "compiler": library.compiler,
     }
 
@@ -59,9 +45,6 @@ def heading(library: Library) -> str:
     facts = machine_facts()
     return (
         f"{facts['processor']}, {facts['cores']} cores; kernels for {library.target} "
-        f"({library.instruction_set}) by {library.compiler}"
+        f"by {library.compiler}"
     )
 
-
-def _output(command: list[str]) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout

@@ -51,7 +51,7 @@ template <int K, int N, int... kColumns>
 SPLAT_INLINE void deinterleave(const float* from, Vector<float, N>* to,
                                std::integer_sequence<int, kColumns...>) {
     Vector<float, N> rows[K];
-    std::memcpy(rows, from, sizeof(rows));
+    for (int k = 0; k < K; k++) rows[k] = load<Vector<float, N>>(from + N * k);
     ((to[kColumns] = column_of<K, kColumns>(rows, LaneSequence<N>{})), ...);
 }
 template <int K, int N, int... kParts>

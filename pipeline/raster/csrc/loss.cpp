@@ -273,8 +273,11 @@ class Strip {
             const Lanes out = load<Lanes>(keep_.row(y) + i) *
                                (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
-            std::memcpy(grad + y * values_ + column, &out,
-                        std::min(end_ - column, int64_t(kLanes)) * sizeof(float));
+            float* const to = grad + y * values_ + column;
+            if (column + kLanes <= end_)
+                store(to, out);
+            else
+                std::memcpy(to, &out, (end_ - column) * sizeof(float));
         }
     }
 

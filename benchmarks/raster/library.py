@@ -23,7 +23,7 @@ INSTRUCTION_SETS = (
 @dataclass(frozen=True)
 class Library:
     """Attributes:
-    target: the compiler's flag that chose it.
+    target: one of ``pipeline.runtime.targets``.
     instruction_set: the widest that the kernels may use.
     lanes: float32 lanes of its registers.
     compiler: name and version.
@@ -37,11 +37,12 @@ class Library:
 
 def measured_library() -> Library:
     """Of the kernels that this process loads."""
-    command, flags = build.compiler(), build.FLAGS
-    macros = _output([*command, *flags, "-x", "c++", "-dM", "-E", "/dev/null"]).split()
+    built = build.load()
+    command = [*build.compiler(), *build.flags(built.target), "-x", "c++", "-dM", "-E", "/dev/null"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    macros = done.stdout.split()
     _, name, lanes = next(found for found in INSTRUCTION_SETS if found[0] in macros)
-    target = next(flag.partition("=")[2] for flag in flags if flag.startswith(("-march", "-mcpu")))
-    return Library(target, name, lanes, _output([*command, "--version"]).partition("\n")[0])
+    return Library(built.target, name, lanes, built.compiler)
 
 
 def measured_on(library: Library) -> dict[str, Any]:
@@ -61,7 +62,3 @@ def heading(library: Library) -> str:
         f"{facts['processor']}, {facts['cores']} cores; kernels for {library.target} "
         f"({library.instruction_set}) by {library.compiler}"
     )
-
-
-def _output(command: list[str]) -> str:
-    return subprocess.run(command, capture_output=True, text=True, check=True).stdout

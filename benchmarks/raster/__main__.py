@@ -19,12 +19,12 @@ from benchmarks.raster.accuracy import Accuracy, accuracy, twin_ratio
 from benchmarks.raster.drawing import report_drawings
 from benchmarks.raster.library import Library, heading, measured_library, measured_on
 from benchmarks.raster.measure import (
-    BLOCK_LANES,
     BLOCK_OPERATIONS,
     Spread,
     Step,
     Turn,
     block_pairs,
+    block_pixels,
     contributing_pairs,
     take_turns,
 )
@@ -115,8 +115,8 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
             found["of_peak"] = costs[name].seconds(peak) * 1e3 / cpu.median
             line += f" {found['of_peak']:8.2f}"
         if name in BLOCK_OPERATIONS and blocks:
-            # An operation on a block is as many instructions as registers hold its lanes.
-            least = 1e3 * BLOCK_OPERATIONS[name] * blocks * (BLOCK_LANES / library.lanes)
+            instructions = BLOCK_OPERATIONS[name] * block_pixels(step) / library.lanes
+            least = 1e3 * instructions * blocks  # ms, at one instruction a second
             over = Spread.of(
                 [t.times[name].cpu * peak.instructions(t.flops) / least for t in turns]
             )
@@ -127,6 +127,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
     return {
         "scene": step.scene.name, "gaussians": step.scene.count, "size": list(step.state.size),
         "threads": step.threads, "turns": len(turns), "pairs": pairs, "block_pairs": blocks,
+        "block_pixels": block_pixels(step),
         "tile_pairs": step.drawn.num_intersections, "operators": operators, "error": asdict(error),
         "flops": asdict(Spread.of([t.flops for t in turns])),
     }  # fmt: skip

@@ -2,24 +2,35 @@
 
 from __future__ import annotations
 
+import subprocess
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.raster import build
 from pipeline.runtime.machine import machine_facts
 
-LANES = {"x86-64-v4": 16, "x86-64-v3": 8, "x86-64-v2": 4, "aarch64": 4}
+# The compiler's macro of each instruction set, best first, and float32 lanes of its registers.
+INSTRUCTION_SETS = (
+    ("__AVX512F__", "AVX-512", 16),
+    ("__AVX2__", "AVX2", 8),
+    ("__AVX__", "AVX", 8),
+    ("__SSE4_2__", "SSE4.2", 4),
+    ("__SSE2__", "SSE2", 4),
+    ("__ARM_NEON", "NEON", 4),
+)
 
 
 @dataclass(frozen=True)
 class Library:
     """Attributes:
-    target: the instruction set that the kernels are compiled for.
+    target: one of ``pipeline.runtime.targets``.
+    instruction_set: the widest that the kernels may use.
     lanes: float32 lanes of its registers.
     compiler: name and version.
     """
 
     target: str
+    instruction_set: str
     lanes: int
     compiler: str
 
@@ -27,8 +38,11 @@ class Library:
 def measured_library() -> Library:
     """Of the kernels that this process loads."""
     built = build.load()
-    target = built.target.partition("+")[0]
-    return Library(target, LANES.get(target, 4), built.compiler)
+    command = [*build.compiler(), *build.flags(built.target), "-x", "c++", "-dM", "-E", "/dev/null"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    macros = done.stdout.split()
+    _, name, lanes = next(found for found in INSTRUCTION_SETS if found[0] in macros)
+    return Library(built.target, name, lanes, built.compiler)
 
 
 def measured_on(library: Library) -> dict[str, Any]:
@@ -36,6 +50,7 @@ def measured_on(library: Library) -> dict[str, Any]:
     return {
         "machine": machine_facts(),
         "target": library.target,
+        "instruction_set": library.instruction_set,
         "compiler": library.compiler,
     }
 
@@ -45,6 +60,5 @@ def heading(library: Library) -> str:
     facts = machine_facts()
     return (
         f"{facts['processor']}, {facts['cores']} cores; kernels for {library.target} "
-        f"by {library.compiler}"
+        f"({library.instruction_set}) by {library.compiler}"
     )
-

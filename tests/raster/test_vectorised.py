@@ -17,16 +17,11 @@ from pathlib import Path
 import pytest
 
 from pipeline.raster import build
+from pipeline.runtime.targets import TARGETS
 from tests.raster.disassembly import Loop, innermost_loops
 
 KERNELS = ("blend", "blend_backward", "loss", "project", "project_backward", "adam")
 X86 = platform.machine().lower() in ("x86_64", "amd64")
-TARGETS = {
-    "x86-64-v2": "-march=x86-64-v2",
-    "x86-64-v3": "-march=x86-64-v3",
-    "x86-64-v4": "-march=x86-64-v4",
-    "aarch64": "-march=armv8-a",
-}
 LANES = 16
 MOST_SCALAR, MOST_SCALAR_SHARE = 4 * LANES, 0.15
 MOST_MOVES, MOST_MOVES_SHARE = 6 * LANES, 0.2
@@ -47,10 +42,6 @@ def _tools(target: str) -> tuple[list[str], str]:
     return compiler, objdump
 
 
-def _flags(target: str) -> list[str]:
-    return [TARGETS[target], *(flag for flag in build.FLAGS if not flag.startswith("-march"))]
-
-
 def _fault(loop: Loop) -> str | None:
     counts = f"{loop.packed} packed, {loop.scalar} scalar, {loop.lane_moves} moves of a lane"
     where = f"in an inner loop of {loop.function[:160]}: {counts}"
@@ -61,14 +52,14 @@ def _fault(loop: Loop) -> str | None:
     return None
 
 
-@pytest.mark.parametrize("target", TARGETS)
+@pytest.mark.parametrize("target", [target.name for target in TARGETS])
 def test_inner_loops_are_vector_code(target: str, tmp_path: Path) -> None:
     compiler, objdump = _tools(target)
 
     def loops(kernel: str) -> list[Loop]:
         out = tmp_path / f"{kernel}.o"
         source = build.SOURCES / f"{kernel}.cpp"
-        command = [*compiler, *_flags(target), "-c", str(source), "-o", str(out)]
+        command = [*compiler, *build.flags(target), "-c", str(source), "-o", str(out)]
         done = subprocess.run(command, capture_output=True, text=True)
         assert done.returncode == 0, done.stderr
         return innermost_loops(objdump, out)

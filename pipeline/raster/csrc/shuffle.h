@@ -108,7 +108,9 @@ class PixelRows {
   private:
     template <int kChannel, int... kLanes>
     SPLAT_INLINE f32x16 channel(std::integer_sequence<int, kLanes...>) const {
-        constexpr auto at = [](int lane) { return 16 * (lane / 4 % 2) + K * (lane % 4) + kChannel; };
+        constexpr auto at = [](int lane) {
+            return 16 * (lane / 4 % 2) + K * (lane % 4) + kChannel;
+        };
         return shuffle<(kLanes < 8 ? kLanes : 16 + kLanes)...>(
             shuffle<at(kLanes)...>(rows_[0], rows_[1]), shuffle<at(kLanes)...>(rows_[2], rows_[3]));
     }
@@ -129,8 +131,7 @@ class PixelRows {
         ((channels[kChannels] = channel<kChannels>(LaneSequence<16>{})), ...);
     }
     template <int... kEach>
-    SPLAT_INLINE void from_channels(const f32x16* channels,
-                                    std::integer_sequence<int, kEach...>) {
+    SPLAT_INLINE void from_channels(const f32x16* channels, std::integer_sequence<int, kEach...>) {
         ((rows_[kEach] = pixels<kEach>(channels, LaneSequence<16>{})), ...);
     }
 

@@ -73,20 +73,13 @@ SPLAT_INLINE u32x16 blocks_hit(const Window& window) {
     // Column c has the pixels 4 c + [0, 3].
     const f32x16 first = ceil((middle - half - 3.0f) * 0.25f);
     const f32x16 last = floor((middle + half) * 0.25f);
-    return any_of<kBlockRows>(bit_range(inside, first, last));
+    const uint32_t here = ~0u >> (kColumns - (window.columns + 3) / 4 * 4);
+    return any_of<kBlockRows>(bit_range(inside, first, last)) & here;
 }
 
 // Bits of a tile's blocks, and of those in a row of cells.
 constexpr uint64_t kTileBits = (uint64_t(1) << kBlocks) - 1;
 constexpr int kRowBits = kBlocks / (kTile / kCell);
-
-// The low four bits of each byte, in a row.
-SPLAT_INLINE uint64_t pack_nibbles(uint64_t v) {
-    v &= 0x0f0f0f0f0f0f0f0f;
-    v = (v | v >> 4) & 0x00ff00ff00ff00ff;
-    v = (v | v >> 8) & 0x0000ffff0000ffff;
-    return (v | v >> 16) & 0xffffffff;
-}
 
 // Positive floats order as their bits do.
 SPLAT_INLINE uint32_t depth_bits(float depth) {
@@ -213,16 +206,13 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                     };
                     // Two tiles at once, since most windows have no more: of each row of blocks
                     // 8 bits, 4 for each tile.
-                    const uint32_t beyond = kColumns - (window.columns + 3) / 4 * 4;
                     for (uint32_t column = 0; column < window.columns; column += 8) {
-                        uint64_t both = 0;
-                        for (int r = 0; r < kBlocksDown; r++)
-                            both |=
-                                uint64_t((hit[i][kBlockRows * r] & (~0u >> beyond)) >> column & 255)
-                                << 8 * r;
+                        const uint64_t both =
+                            native::split_nibbles(native::first_bytes<kBlockRows>(hit[i], column));
                         for (uint32_t k = 0; k < 2; k++) {
                             const uint32_t tile = window.tile + column / 4 + k;
-                            const uint64_t blocks = (pack_nibbles(both >> 4 * k) & rows)
+                            // Of 4 x 2 blocks 8 rows fill the half, of 4 x 4 ones 4 rows a quarter.
+                            const uint64_t blocks = (both >> 32 * k & rows)
                                                     << kRowBits * window.rows_down;
                             list(tile, uint32_t(blocks & kTileBits));
                             list(tile + tiles_x, uint32_t(blocks >> kBlocks));

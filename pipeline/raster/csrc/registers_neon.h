@@ -53,6 +53,28 @@ SPLAT_INLINE void widen_bytes(const uint8_t* from, void* to) {
     vst1q_u32(static_cast<uint32_t*>(to) + 4, vmovl_high_u16(words));
 }
 
+// The low bytes of lanes 0, kStep, 2 kStep and so on of 16 lanes of 32 bits, `from`, of which kStep
+// neighbours are alike.
+template <int kStep>
+SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
+    static_assert(kStep == 2);
+    const int32x4_t right = vdupq_n_s32(-shift);
+    const auto quarter = [&](int i) {
+        return vmovn_u32(vshlq_u32(vld1q_u32(from + 4 * i), right));
+    };
+    const uint16x8_t low = vcombine_u16(quarter(0), quarter(1));
+    const uint16x8_t high = vcombine_u16(quarter(2), quarter(3));
+    return vget_lane_u64(vreinterpret_u64_u8(vmovn_u16(vuzp1q_u16(low, high))), 0);
+}
+
+// The low four bits of each byte in a row, and in the upper half the high ones.
+SPLAT_INLINE uint64_t split_nibbles(uint64_t bytes) {
+    const uint8x8_t v = vcreate_u8(bytes);
+    const uint8x8_t low = vand_u8(v, vdup_n_u8(15)), high = vshr_n_u8(v, 4);
+    const uint8x8_t even = vuzp1_u8(low, high), odd = vuzp2_u8(low, high);
+    return vget_lane_u64(vreinterpret_u64_u8(vorr_u8(even, vshl_n_u8(odd, 4))), 0);
+}
+
 // ---- Masks: lanes of 0 or -1 ----
 
 SPLAT_INLINE uint32_t mask_bits(float32x4_t m) {

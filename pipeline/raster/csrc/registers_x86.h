@@ -119,6 +119,50 @@ SPLAT_INLINE void widen_bytes(const uint8_t* from, void* to) {
 #endif
 }
 
+// The low bytes of lanes 0, kStep, 2 kStep and so on of 16 lanes of 32 bits, `from`, of which kStep
+// neighbours are alike.
+template <int kStep>
+SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
+    const __m128i count = _mm_cvtsi32_si128(shift);
+#if SPLAT_AVX512
+    const __m128i bytes = _mm512_cvtepi32_epi8(_mm512_srl_epi32(_mm512_loadu_si512(from), count));
+    const __m128i order = kStep == 4 ? _mm_setr_epi32(0x0c080400, -1, -1, -1)
+                                     : _mm_setr_epi32(0x06040200, 0x0e0c0a08, -1, -1);
+    return uint64_t(_mm_cvtsi128_si64(_mm_shuffle_epi8(bytes, order)));
+#elif SPLAT_AVX2
+    static_assert(kStep == 2);
+    const auto* const halves = reinterpret_cast<const __m256i*>(from);
+    // Lanes 0 8 2 10 4 12 6 14
+    __m256i v =
+        _mm256_blend_epi32(_mm256_loadu_si256(halves), _mm256_loadu_si256(halves + 1), 0xaa);
+    v = _mm256_and_si256(_mm256_srl_epi32(v, count), _mm256_set1_epi32(255));
+    const __m128i words =
+        _mm_packus_epi32(_mm256_castsi256_si128(v), _mm256_extracti128_si256(v, 1));
+    const __m128i order = _mm_setr_epi32(0x0c080400, 0x0e0a0602, -1, -1);
+    return uint64_t(_mm_cvtsi128_si64(_mm_shuffle_epi8(words, order)));
+#else
+    static_assert(kStep == 2);
+    const auto quarter = [&](int i) {
+        const __m128i v = _mm_loadu_si128(reinterpret_cast<const __m128i*>(from) + i);
+        return _mm_and_si128(_mm_srl_epi32(v, count), _mm_set1_epi32(255));
+    };
+    const __m128i low = _mm_packus_epi32(quarter(0), quarter(1));
+    const __m128i high = _mm_packus_epi32(quarter(2), quarter(3));
+    const __m128i order = _mm_setr_epi32(0x0c080400, -1, -1, -1);
+    return uint64_t(_mm_cvtsi128_si64(
+        _mm_unpacklo_epi32(_mm_shuffle_epi8(low, order), _mm_shuffle_epi8(high, order))));
+#endif
+}
+
+// The low four bits of each byte in a row, and in the upper half the high ones.
+SPLAT_INLINE uint64_t split_nibbles(uint64_t bytes) {
+    const __m128i v = _mm_cvtsi64_si128(int64_t(bytes)), low = _mm_set1_epi8(15);
+    const __m128i nibbles =
+        _mm_unpacklo_epi64(_mm_and_si128(v, low), _mm_and_si128(_mm_srli_epi16(v, 4), low));
+    const __m128i pairs = _mm_maddubs_epi16(nibbles, _mm_set1_epi16(0x1001));
+    return uint64_t(_mm_cvtsi128_si64(_mm_packus_epi16(pairs, pairs)));
+}
+
 // ---- Masks: a mask register with AVX-512, lanes of 0 or -1 elsewhere ----
 
 #if SPLAT_AVX512

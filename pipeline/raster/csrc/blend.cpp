@@ -8,7 +8,10 @@
 namespace splat {
 namespace {
 
-constexpr int kSize = 64, kAbreast = 3;
+constexpr int kSize = 64, kAbreast = 4;
+// How many alphas are found before they are used. With 16 registers all: a loop that finds them and
+// uses them is longer than what a processor looks ahead, and waits for each.
+constexpr int kAlphas = kRegisterBytes == 64 ? kAbreast : kSize;
 using Gaussian = Batch<kSize>::Gaussian;
 
 // What a block's pixels add up.
@@ -73,11 +76,13 @@ SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const Vie
             const int count = list_pairs(blocks, batch.count, block, pair);
             Pixels before = going[block], behind = transmittance[block];
             Sum sum = sums[block];
+            Pixels alpha[kAlphas];
             for (int i = 0; i < count; i += kAbreast) {
-                Pixels alpha[kAbreast];
-                batch.alphas(pair + i, alpha);
+                if (i % kAlphas == 0)
+                    for (int next = i; next < std::min(count, i + kAlphas); next += kAbreast)
+                        batch.alphas<kAbreast>(pair + next, alpha + next - i);
                 for (int k = 0; k < kAbreast; k++) {
-                    const Step s(alpha[k], before);
+                    const Step s(alpha[i % kAlphas + k], before);
                     sum.add(batch.of(pair[i + k]), s, before);
                     behind = select(s.drawn, s.after, behind);
                     before = s.after;

@@ -84,9 +84,7 @@ struct GaussianPairs {
         first[batch.count] = count;
         for (int k = 0; k < kAbreast; k++) pair[count + k] = batch.kNothing;
         for (int i = 0; i < count; i += kAbreast) {
-            Pixels abreast[kAbreast];
-            batch.alphas(pair + i, abreast);
-            for (int k = 0; k < kAbreast; k++) alpha[i + k] = abreast[k];
+            batch.alphas<kAbreast>(pair + i, alpha + i);
         }
     }
 };

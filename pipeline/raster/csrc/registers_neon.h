@@ -15,6 +15,9 @@ constexpr int kRegisterBytes = 16;
 
 namespace native {
 
+SPLAT_INLINE float32x4_t minus_product(float32x4_t a, float32x4_t b, float32x4_t c) {
+    return vfmsq_f32(a, b, c);
+}
 // min and max are b where a or b is NaN, on every instruction set; NEON's own give NaN.
 SPLAT_INLINE float32x4_t min(float32x4_t a, float32x4_t b) {
     return vbslq_f32(vcltq_f32(a, b), a, b);

@@ -39,6 +39,15 @@ SPLAT_INLINE __m128 ceil(__m128 v) { return _mm_ceil_ps(v); }
 SPLAT_INLINE __m128d ceil(__m128d v) { return _mm_ceil_pd(v); }
 SPLAT_INLINE __m128i truncate(__m128 v) { return _mm_cvttps_epi32(v); }
 
+#if defined(__FMA__)
+SPLAT_INLINE __m128 minus_product(__m128 a, __m128 b, __m128 c) { return _mm_fnmadd_ps(b, c, a); }
+SPLAT_INLINE __m256 minus_product(__m256 a, __m256 b, __m256 c) {
+    return _mm256_fnmadd_ps(b, c, a);
+}
+#else
+SPLAT_INLINE __m128 minus_product(__m128 a, __m128 b, __m128 c) { return a - b * c; }
+#endif
+
 #if SPLAT_AVX2
 SPLAT_INLINE __m256 min(__m256 a, __m256 b) { return _mm256_min_ps(a, b); }
 SPLAT_INLINE __m256 max(__m256 a, __m256 b) { return _mm256_max_ps(a, b); }
@@ -54,6 +63,9 @@ SPLAT_INLINE __m256i truncate(__m256 v) { return _mm256_cvttps_epi32(v); }
 #endif
 
 #if SPLAT_AVX512
+SPLAT_INLINE __m512 minus_product(__m512 a, __m512 b, __m512 c) {
+    return _mm512_fnmadd_ps(b, c, a);
+}
 SPLAT_INLINE __m512 min(__m512 a, __m512 b) { return _mm512_min_ps(a, b); }
 SPLAT_INLINE __m512 max(__m512 a, __m512 b) { return _mm512_max_ps(a, b); }
 SPLAT_INLINE __m512d min(__m512d a, __m512d b) { return _mm512_min_pd(a, b); }

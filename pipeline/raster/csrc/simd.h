@@ -145,6 +145,17 @@ SPLAT_OPERATOR(&)
 SPLAT_OPERATOR(|)
 #undef SPLAT_OPERATOR
 
+// a - b c, one rounding where the target has such an instruction. Compilers make one of the plain
+// expression, too, but not where b c is used once more.
+template <int N>
+SPLAT_INLINE Vector<float, N> minus_product(Vector<float, N> a, Vector<float, N> b,
+                                            Vector<float, N> c) {
+    if constexpr (kOneRegister<float, N>)
+        return {native::minus_product(a.lanes, b.lanes, c.lanes)};
+    else
+        return {minus_product(a.low, b.low, c.low), minus_product(a.high, b.high, c.high)};
+}
+
 template <class T, int N>
 SPLAT_INLINE Vector<T, N> operator-(Vector<T, N> v) {
     if constexpr (kOneRegister<T, N>)

@@ -173,7 +173,7 @@ struct Batch {
     // The alphas of some pairs at once, because one alone is a chain of some fifty cycles; 0 where
     // less than kAlphaMin.
     template <int kCount>
-    SPLAT_INLINE void alphas(const uint32_t* pairs, Pixels (&alpha)[kCount]) const {
+    SPLAT_INLINE void alphas(const uint32_t* pairs, Pixels* alpha) const {
         Pixels power[kCount], raw[kCount];
         for (int k = 0; k < kCount; k++) {
             const Pixels here_u = u(pairs[k]), here_w = w(pairs[k]);
@@ -193,7 +193,7 @@ struct Step {
     Pixels weight;    // transmittance before * alpha where drawn, else 0
 
     SPLAT_INLINE Step(Pixels alpha, Pixels before) {
-        after = before - alpha * before;
+        after = minus_product(before, alpha, before);
         drawn = after >= kTransmittanceMin;
         weight = product(drawn, alpha, before);
     }

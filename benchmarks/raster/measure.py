@@ -197,9 +197,9 @@ def block_pairs(step: Step) -> int:
     counts = state.tile_begin.diff()
     tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
     rank = torch.arange(len(tile)) - state.tile_begin[:-1][tile]
-    ends = state.block_end.view(len(counts), 16)
+    ends = state.block_end.view(len(counts), -1)
     blocks = state.entries[:, 2]
-    return sum(int(((blocks >> b & 1) * (rank < ends[tile, b])).sum()) for b in range(16))
+    return sum(int(((blocks >> b & 1) * (rank < ends[tile, b])).sum()) for b in range(ends.shape[1]))
 
 
 def contributing_pairs(step: Step) -> int:

@@ -42,13 +42,14 @@ extern "C" double peak_flops(int threads) {
     constexpr int kChains = 12, kRounds = 400000;
     const double seconds = best_seconds(threads, [](int) {
         f32x16 chain[kChains];
-        for (int i = 0; i < kChains; i++) chain[i] = kLane * float(i);
+        for (int i = 0; i < kChains; i++) chain[i] = lane_numbers() * float(i);
         for (int round = 0; round < kRounds; round++) {
             for (int i = 0; i < kChains; i++) chain[i] = chain[i] * 0.999f + 1e-4f;
             asm volatile("");
         }
         for (const f32x16& c : chain) {
-            volatile float kept = c[0];
+            volatile float kept;
+            kept = *reinterpret_cast<const float*>(&c);
             (void)kept;
         }
     });

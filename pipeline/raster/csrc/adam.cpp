@@ -136,14 +136,14 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
         read_rows(d_quats + 4 * first, count, d_quat);
         read_rows(log_scales + 3 * first, count, log2_scale);
         for (f32x16& power : log2_scale)
-            power = min(select(ge(power, splat16(-kLnUnitMax)), power, splat16(-kLnUnitMax)),
+            power = min(select(power >= -kLnUnitMax, power, splat16(-kLnUnitMax)),
                         splat16(kLnUnitMax)) *
                     kLog2E;
         exp2(log2_scale, scale);
 
         // A quaternion of no direction has the world's axes, and is not turned.
         const f32x16 norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-        const Mask16 turns = ge(norm2, splat16(kQuatNorm2Min)) & lt(norm2, splat16(kNorm2Max));
+        const Mask16 turns = (norm2 >= float(kQuatNorm2Min)) & (norm2 < kNorm2Max);
         const f32x16 norm = sqrt(select(turns, norm2, splat16(1.0f))), inverse = 1.0f / norm;
         f32x16 unit[4];
         for (int i = 0; i < 4; i++)

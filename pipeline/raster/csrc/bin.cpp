@@ -4,7 +4,7 @@
 #include <atomic>
 #include <cstring>
 
-#include "simd.h"
+#include "shuffle.h"
 #include "threads.h"
 
 namespace splat {
@@ -13,7 +13,7 @@ namespace {
 // Parts of the Gaussians for each thread: visible ones are not spread evenly.
 constexpr int kPartsPerThread = 4;
 
-// Columns of blocks that are tested at once: a bit each.
+// Columns of cells that are tested at once: a bit each.
 constexpr int kColumns = 32;
 
 // Windows that are worked on at once.
@@ -22,59 +22,70 @@ constexpr int kWindows = 64;
 // Bits [first, last] of each lane that is `inside`, whole numbers; those of [0, kColumns).
 SPLAT_INLINE u32x16 bit_range(Mask16 inside, f32x16 first, f32x16 last) {
     const f32x16 end = splat16(kColumns - 1), zero = {};
-    const Mask16 some = inside & ge(last, first) & ge(last, zero) & ge(end, first);
-    const auto bit = [&](f32x16 v) {
-        return u32x16(__builtin_convertvector(min(max(v, zero), end), i32x16));
-    };
-    const u32x16 all = u32x16{} + ~0u;
-    const u32x16 range = (all << bit(first)) & (all >> (kColumns - 1 - bit(last)));
-    return u32x16(keep(some, f32x16(range)));
+    const Mask16 some = inside & (last >= first) & (last >= zero) & (end >= first);
+    const auto bit = [&](f32x16 v) { return to_int(min(max(v, zero), end)); };
+    const u32x16 from_first = shift_left(broadcast<u32x16>(~0u), bit(first));
+    const u32x16 to_last = shift_left(broadcast<u32x16>(2u), bit(last)) - 1u;
+    return bit_cast<u32x16>(keep(some, bit_cast<f32x16>(from_first & to_last)));
 }
 
-// Four rows of blocks of a Gaussian's box, and kColumns columns from a tile's first one on.
+// Four rows of cells of a Gaussian's box, and kColumns columns from a tile's first one on.
 struct Window {
     const Record* record;
-    uint32_t gaussian, tile;        // tile: of the first block
-    uint32_t rows_down, row_count;  // of blocks, from the tile's first row; 1 to 4
-    uint32_t columns;               // of blocks
+    uint32_t gaussian, tile;        // tile: of the first cell
+    uint32_t rows_down, row_count;  // of cells, from the tile's first row; 1 to 4
+    uint32_t columns;               // of cells
     float left, top;                // the first pixel's centre, from the Gaussian's
 };
 
 SPLAT_INLINE void list_windows(const Record& r, uint32_t gaussian, uint32_t tiles_x,
                                std::vector<Window>& windows) {
-    constexpr uint32_t kAcross = kTile / kBlock;  // blocks of a tile
-    const uint32_t left = r.block_left / kAcross * kAcross;
+    constexpr uint32_t kAcross = kTile / kCell;
+    const uint32_t left = r.cell_left / kAcross * kAcross;
     // A low box takes one window wherever it begins, a high one begins with a row of tiles: so no
     // two windows share a tile.
-    const bool low = uint32_t(r.block_bottom - r.block_top) < kAcross;
-    const uint32_t top = low ? r.block_top : r.block_top / kAcross * kAcross;
-    for (uint32_t y = top; y <= r.block_bottom; y += kAcross)
-        for (uint32_t x = left; x <= r.block_right; x += kColumns) {
-            const uint32_t rows = r.block_bottom - y + 1, columns = r.block_right - x + 1;
+    const bool low = uint32_t(r.cell_bottom - r.cell_top) < kAcross;
+    const uint32_t top = low ? r.cell_top : r.cell_top / kAcross * kAcross;
+    for (uint32_t y = top; y <= r.cell_bottom; y += kAcross)
+        for (uint32_t x = left; x <= r.cell_right; x += kColumns) {
+            const uint32_t rows = r.cell_bottom - y + 1, columns = r.cell_right - x + 1;
             windows.push_back({&r, gaussian, y / kAcross * tiles_x + x / kAcross, y % kAcross,
                                std::min(rows, kAcross), std::min(columns, uint32_t(kColumns)),
-                               float(double(kBlock) * x + 0.5 - r.x),
-                               float(double(kBlock) * y + 0.5 - r.y)});
+                               float(double(kCell) * x + 0.5 - r.x),
+                               float(double(kCell) * y + 0.5 - r.y)});
         }
 }
 
 // The blocks of a window in which the ellipse {alpha >= 1/255} comes near a pixel centre: a bit a
-// column, for each of the four rows of blocks. In a row of pixels the ellipse is an interval,
+// column of cells, in every kBlockRows-th lane for a row of blocks. In a row of pixels the ellipse
+// is an interval,
 //     |uu d_x + uw d_y| <= sqrt(reach - (ww d_y)^2),
 // found for the 16 rows at once.
 SPLAT_INLINE u32x16 blocks_hit(const Window& window) {
     const Record& r = *window.record;
     const float reach = r.log2_opacity - kLog2AlphaMin + kBinSlack;
     const float inv_uu = 1.0f / r.uu, slope = -r.uw * inv_uu;
-    const f32x16 dy = kLane + window.top, w = dy * r.ww, zero = {};
+    const f32x16 dy = lane_numbers() + window.top, w = dy * r.ww, zero = {};
     const f32x16 left_over = reach - w * w;
-    const Mask16 inside = ge(left_over, zero);
+    const Mask16 inside = left_over >= zero;
     const f32x16 middle = dy * slope - window.left;
     const f32x16 half = sqrt(max(left_over, zero)) * inv_uu + abs(dy * slope) * 2e-6f + 1e-3f;
     // Column c has the pixels 4 c + [0, 3].
     const f32x16 first = ceil((middle - half - 3.0f) * 0.25f);
     const f32x16 last = floor((middle + half) * 0.25f);
-    return any_of_four(bit_range(inside, first, last));
+    return any_of<kBlockRows>(bit_range(inside, first, last));
+}
+
+// Bits of a tile's blocks, and of those in a row of cells.
+constexpr uint64_t kTileBits = (uint64_t(1) << kBlocks) - 1;
+constexpr int kRowBits = kBlocks / (kTile / kCell);
+
+// The low four bits of each byte, in a row.
+SPLAT_INLINE uint64_t pack_nibbles(uint64_t v) {
+    v &= 0x0f0f0f0f0f0f0f0f;
+    v = (v | v >> 4) & 0x00ff00ff00ff00ff;
+    v = (v | v >> 8) & 0x0000ffff0000ffff;
+    return (v | v >> 16) & 0xffffffff;
 }
 
 // Positive floats order as their bits do.
@@ -192,7 +203,7 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                 for (int i = 0; i < here; i++) {
                     const Window& window = windows[begin + i];
                     const uint32_t depth = depth_bits(window.record->depth);
-                    const uint32_t rows = (1u << 4 * window.row_count) - 1;
+                    const uint64_t rows = (uint64_t(1) << kRowBits * window.row_count) - 1;
                     Found* const first = part.found.get() + part.used;
                     Found* next = first;
                     const auto list = [&](uint32_t tile, uint32_t blocks) {
@@ -200,19 +211,21 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                         next += blocks != 0;
                         part.tile_count[tile] += blocks != 0;
                     };
-                    uint32_t row[4];
+                    // Two tiles at once, since most windows have no more: of each row of blocks
+                    // 8 bits, 4 for each tile.
                     const uint32_t beyond = kColumns - (window.columns + 3) / 4 * 4;
-                    for (int r = 0; r < 4; r++) row[r] = hit[i][4 * r] & (~0u >> beyond);
-                    // Two tiles at once: most windows have no more.
                     for (uint32_t column = 0; column < window.columns; column += 8) {
+                        uint64_t both = 0;
+                        for (int r = 0; r < kBlocksDown; r++)
+                            both |= uint64_t((hit[i][kBlockRows * r] & (~0u >> beyond)) >> column &
+                                             255)
+                                    << 8 * r;
                         for (uint32_t k = 0; k < 2; k++) {
                             const uint32_t tile = window.tile + column / 4 + k;
-                            uint32_t blocks = 0;
-                            for (int r = 0; r < 4; r++)
-                                blocks |= (row[r] >> (column + 4 * k) & 15) << 4 * r;
-                            blocks = (blocks & rows) << 4 * window.rows_down;
-                            list(tile, blocks & 0xffff);
-                            list(tile + tiles_x, blocks >> 16);
+                            const uint64_t blocks = (pack_nibbles(both >> 4 * k) & rows)
+                                                    << kRowBits * window.rows_down;
+                            list(tile, uint32_t(blocks & kTileBits));
+                            list(tile + tiles_x, uint32_t(blocks >> kBlocks));
                         }
                     }
                     slots[window.gaussian].count += uint32_t(next - first);

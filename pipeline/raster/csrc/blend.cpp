@@ -13,20 +13,20 @@ using Gaussian = Batch<kSize>::Gaussian;
 
 // What a block's pixels add up.
 struct Color {
-    f32x16 rgb[3] = {};
+    Pixels rgb[3] = {};
 
-    SPLAT_INLINE void add(const Gaussian& g, const Step& s, f32x16) {
+    SPLAT_INLINE void add(const Gaussian& g, const Step& s, Pixels) {
         for (int c = 0; c < 3; c++) rgb[c] += s.weight * g.rgb[c];
     }
 };
 
 struct Depth {
-    f32x16 mean = {}, median = {};
+    Pixels mean = {}, median = {};
 
-    SPLAT_INLINE void add(const Gaussian& g, const Step& s, f32x16 before) {
+    SPLAT_INLINE void add(const Gaussian& g, const Step& s, Pixels before) {
         mean += s.weight * g.depth;
-        const Mask16 crossing = s.drawn & ge(before, splat16(0.5f)) & lt(s.after, splat16(0.5f));
-        median = select(crossing, splat16(g.depth), median);
+        const PixelMask crossing = s.drawn & (before >= 0.5f) & (s.after < 0.5f);
+        median = select(crossing, broadcast<Pixels>(g.depth), median);
     }
 };
 
@@ -35,7 +35,7 @@ SPLAT_INLINE int list_pairs(const u32x16* blocks, int batch, int block, uint32_t
     int count = 0;
     for (int n = 0; n < batch; n += 16) {
         const uint32_t near = bits(has_bit(blocks[n / 16], block));
-        count += list_bits<kBlocks>(near, n * kBlocks + block, pair + count);
+        count += list_bits<16, kBlocks>(near, n * kBlocks + block, pair + count);
     }
     for (int k = 0; k < kAbreast; k++) pair[count + k] = Batch<kSize>::kNothing;
     return count;
@@ -46,33 +46,35 @@ SPLAT_INLINE int list_pairs(const u32x16* blocks, int batch, int block, uint32_t
 // entries there are until the last of a block's pixels stops, or all.
 template <class Sum>
 SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const View& view,
-                            int64_t index, const Tile& tile, f32x16* transmittance, Sum* sums,
+                            int64_t index, const Tile& tile, Pixels* transmittance, Sum* sums,
                             int32_t* block_end) {
     const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
-    f32x16 going[kBlocks];  // transmittance of pixels that have not stopped, else 0
+    Pixels going[kBlocks];  // transmittance of pixels that have not stopped, else 0
     uint32_t alive = 0;
     for (int block = 0; block < kBlocks; block++) {
         going[block] = tile.start(block);
-        transmittance[block] = splat16(1);
-        const bool inside = any(lt(splat16(0), going[block]));
+        transmittance[block] = broadcast<Pixels>(1.0f);
+        const bool inside = any(going[block] > 0.0f);
         alive |= uint32_t(inside) << block;
         block_end[block] = inside ? int32_t(end - begin) : 0;
     }
     Batch<kSize> batch;
     for (int64_t entry = begin; entry < end && alive; entry += batch.count) {
         batch.fill(records, pairs.entries, entry, end, tile);
-        u32x16 blocks[kSize / 16] = {};
-        for (int n = 0; n < batch.count; n++) blocks[n / 16][n % 16] = batch.gaussian[n].blocks;
+        alignas(64) uint32_t near[kSize] = {};
+        for (int n = 0; n < batch.count; n++) near[n] = batch.gaussian[n].blocks;
+        u32x16 blocks[kSize / 16];
+        for (int n = 0; n < kSize; n += 16) blocks[n / 16] = load<u32x16>(near + n);
         Ahead ahead(records, pairs, view, entry + batch.count, kSize);
         for (uint32_t left = alive; left; left &= left - 1) {
-            for (int k = 0; k < kSize / kBlocks; k++) ahead.fetch();
+            for (int k = 0; k < (kSize + kBlocks - 1) / kBlocks; k++) ahead.fetch();
             const int block = __builtin_ctz(left);
             uint32_t pair[kSize + 16];
             const int count = list_pairs(blocks, batch.count, block, pair);
-            f32x16 before = going[block], behind = transmittance[block];
+            Pixels before = going[block], behind = transmittance[block];
             Sum sum = sums[block];
             for (int i = 0; i < count; i += kAbreast) {
-                f32x16 alpha[kAbreast];
+                Pixels alpha[kAbreast];
                 batch.alphas(pair + i, alpha);
                 for (int k = 0; k < kAbreast; k++) {
                     const Step s(alpha[k], before);
@@ -81,7 +83,7 @@ SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const Vie
                     before = s.after;
                 }
                 // A pixel stops for good; its transmittance would soon be denormal.
-                const Mask16 still = ge(before, splat16(kTransmittanceMin));
+                const PixelMask still = before >= kTransmittanceMin;
                 before = keep(still, before);
                 if (!any(still)) {
                     alive &= ~(1u << block);
@@ -106,16 +108,16 @@ void blend(const Record* records, const Pairs& pairs, const View& view, const fl
         const Tile tile(index, view);
         tile.expect<3>(view.width, color);
         tile.expect<1>(view.width, alpha);
-        f32x16 transmittance[kBlocks];
+        Pixels transmittance[kBlocks];
         Color sums[kBlocks];
         composite(records, pairs, view, index, tile, transmittance, sums,
                   block_end + kBlocks * index);
         for (int block = 0; block < kBlocks; block++) {
-            const f32x16 left = transmittance[block];
-            f32x16 rgb[3];
+            const Pixels left = transmittance[block];
+            Pixels rgb[3];
             for (int c = 0; c < 3; c++) rgb[c] = sums[block].rgb[c] + left * background[c];
             tile.write(block, rgb, view.width, color);
-            const f32x16 covered[1] = {1.0f - left};
+            const Pixels covered[1] = {1.0f - left};
             tile.write(block, covered, view.width, alpha);
         }
     });
@@ -128,12 +130,12 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
         const Tile tile(index, view);
         tile.expect<1>(view.width, depth);
         tile.expect<1>(view.width, median);
-        f32x16 transmittance[kBlocks];
+        Pixels transmittance[kBlocks];
         Depth sums[kBlocks];
         int32_t block_end[kBlocks];
         composite(records, pairs, view, index, tile, transmittance, sums, block_end);
         for (int block = 0; block < kBlocks; block++) {
-            const f32x16 mean[1] = {sums[block].mean}, middle[1] = {sums[block].median};
+            const Pixels mean[1] = {sums[block].mean}, middle[1] = {sums[block].median};
             tile.write(block, mean, view.width, depth);
             tile.write(block, middle, view.width, median);
         }

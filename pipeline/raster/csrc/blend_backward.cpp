@@ -18,20 +18,20 @@ constexpr int kSize = 16, kAbreast = 4;
 
 // What a block's pixels ask for, and where they have come to.
 struct BlockTargets {
-    f32x16 rgb[3], alpha, depth;
-    f32x16 transmittance;  // 0 once stopped
-    f32x16 behind;         // S: starts as the whole sum, ends as 0
-    f32x16 left;           // Gaussians yet to be given to, where that is limited
+    Pixels rgb[3], alpha, depth;
+    Pixels transmittance;  // 0 once stopped
+    Pixels behind;         // S: starts as the whole sum, ends as 0
+    Pixels left;           // Gaussians yet to be given to, where that is limited
 
     // Pixels outside the image ask for nothing.
     SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
                           const ImageGradientsIn& in) {
-        f32x16 color[3];
+        Pixels color[3];
         tile.read(block, in.color, view.width, color);
         tile.read(block, in.d_color, view.width, rgb);
         // The background shows through 1 - alpha.
-        f32x16 under = {};
-        behind = f32x16{};
+        Pixels under = {};
+        behind = Pixels{};
         for (int c = 0; c < 3; c++) {
             under += rgb[c] * in.background[c];
             behind += color[c] * rgb[c];
@@ -39,12 +39,12 @@ struct BlockTargets {
         alpha = -under;
         behind -= under;
         const auto plane = [&](const float* image) {
-            f32x16 values[1];
+            Pixels values[1];
             tile.read(block, image, view.width, values);
             return values[0];
         };
         if (in.d_alpha) {
-            const f32x16 d_alpha = plane(in.d_alpha);
+            const Pixels d_alpha = plane(in.d_alpha);
             alpha += d_alpha;
             behind += plane(in.alpha) * d_alpha;
         }
@@ -53,14 +53,14 @@ struct BlockTargets {
             behind += plane(in.depth) * depth;
         }
         transmittance = tile.start(block);
-        left = splat16(float(in.per_pixel));
+        left = broadcast<Pixels>(float(in.per_pixel));
     }
 
     // A pixel that has given to as many as it may asks for nothing more.
     SPLAT_INLINE void count(const Step& s) {
-        left -= keep(lt(splat16(0), s.weight), splat16(1));
-        const Mask16 more = lt(splat16(0), left);
-        for (f32x16& channel : rgb) channel = keep(more, channel);
+        left -= keep(s.weight > 0.0f, broadcast<Pixels>(1.0f));
+        const PixelMask more = left > 0.0f;
+        for (Pixels& channel : rgb) channel = keep(more, channel);
         alpha = keep(more, alpha);
         depth = keep(more, depth);
         behind = keep(more, behind);
@@ -70,20 +70,21 @@ struct BlockTargets {
 // The pairs of a batch, Gaussian by Gaussian, and their alphas: one flat list, because the end of a
 // short loop over a Gaussian's blocks would be mispredicted as often as not.
 struct GaussianPairs {
-    f32x16 alpha[kSize * kBlocks + kAbreast];
-    uint32_t pair[kSize * kBlocks + 16];
+    Pixels alpha[kSize * kBlocks + kAbreast];
+    uint32_t pair[kSize * kBlocks + kBlocks];
     int first[kSize + 1];  // pair of each Gaussian, and the number of pairs
 
     SPLAT_INLINE void list(const Batch<kSize>& batch, uint32_t alive) {
         int count = 0;
         for (int n = 0; n < batch.count; n++) {
             first[n] = count;
-            count += list_bits<1>(batch.gaussian[n].blocks & alive, n * kBlocks, pair + count);
+            const uint32_t blocks = batch.gaussian[n].blocks & alive;
+            count += list_bits<kBlocks, 1>(blocks, n * kBlocks, pair + count);
         }
         first[batch.count] = count;
         for (int k = 0; k < kAbreast; k++) pair[count + k] = batch.kNothing;
         for (int i = 0; i < count; i += kAbreast) {
-            f32x16 abreast[kAbreast];
+            Pixels abreast[kAbreast];
             batch.alphas(pair + i, abreast);
             for (int k = 0; k < kAbreast; k++) alpha[i + k] = abreast[k];
         }
@@ -92,19 +93,19 @@ struct GaussianPairs {
 
 // One Gaussian over one block: adds to the lanes' moments.
 template <bool kDepthGradient, bool kAbsolute, bool kLimited>
-SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, f32x16 alpha,
-                                BlockTargets& t, f32x16 (&moments)[12]) {
+SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels alpha,
+                                BlockTargets& t, Pixels (&moments)[12]) {
     const auto& g = batch.of(pair);
-    const f32x16 u = batch.u(pair), w = batch.w(pair);
+    const Pixels u = batch.u(pair), w = batch.w(pair);
     const Step s(alpha, t.transmittance);
     t.transmittance = keep(s.drawn, s.after);
-    f32x16 e = t.alpha + t.rgb[0] * g.rgb[0] + t.rgb[1] * g.rgb[1] + t.rgb[2] * g.rgb[2];
+    Pixels e = t.alpha + t.rgb[0] * g.rgb[0] + t.rgb[1] * g.rgb[1] + t.rgb[2] * g.rgb[2];
     if (kDepthGradient) e += t.depth * g.depth;
     t.behind -= s.weight * e;
-    const f32x16 odds = alpha * reciprocal(1.0f - alpha);
+    const Pixels odds = alpha * reciprocal(1.0f - alpha);
     // Where alpha is held at its maximum it does not move with the Gaussian.
-    const f32x16 v = keep(s.drawn & lt(alpha, splat16(kAlphaMax)), s.weight * e - odds * t.behind);
-    const f32x16 vu = v * u, vw = v * w;
+    const Pixels v = keep(s.drawn & (alpha < kAlphaMax), s.weight * e - odds * t.behind);
+    const Pixels vu = v * u, vw = v * w;
     moments[kV] += v;
     moments[kVU] += vu;
     moments[kVW] += vw;
@@ -131,7 +132,7 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
         const Tile tile(index, view);
         BlockTargets targets[kBlocks];
         for (int block = 0; block < kBlocks; block++) targets[block].set(block, tile, view, in);
-        const i32x16 end_of_blocks = load<i32x16>(block_end + kBlocks * index);
+        const auto end_of_blocks = load<Signed<kBlocks>>(block_end + kBlocks * index);
         Batch<kSize> batch;
         GaussianPairs list;
         const auto slot = [&](uint32_t number) {
@@ -148,7 +149,7 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
             Ahead ahead(records, pairs, view, entry + batch.count, kSize);
             for (int n = 0; n < batch.count; n++) {
                 ahead.fetch();
-                f32x16 moments[12] = {};
+                Pixels moments[12] = {};
                 for (int i = list.first[n]; i < list.first[n + 1]; i++)
                     backward_pair<kDepthGradient, kAbsolute, kLimited>(
                         batch, list.pair[i], list.alpha[i], targets[list.pair[i] % kBlocks],

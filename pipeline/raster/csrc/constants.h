@@ -3,6 +3,8 @@
 
 #include <cstdint>
 
+#include "simd.h"
+
 namespace splat {
 
 // ---- The method (3D Gaussian Splatting, Kerbl et al. 2023, unless said otherwise) ----
@@ -47,8 +49,17 @@ constexpr int64_t kMaxIntersections = int64_t(1) << 27;
 
 // ---- Layout ----
 
-// A tile is 16 x 16 pixels: 4 x 4 blocks of 4 x 4 pixels, each one 512-bit vector of float32.
-constexpr int kTile = 16, kBlock = 4, kBlocks = 16;
+// A tile is 16 x 16 pixels in compact blocks, because more lanes of them lie inside a small ellipse
+// than of a row: of 4 x 4 pixels with AVX-512, and of 4 x 2, whose sums stay in 16 registers,
+// elsewhere. A block is one vector.
+constexpr int kTile = 16;
+constexpr int kBlockColumns = 4, kBlockRows = kRegisterBytes == 64 ? 4 : 2;
+constexpr int kBlockPixels = kBlockColumns * kBlockRows;
+constexpr int kBlocks = kTile * kTile / kBlockPixels;
+constexpr int kBlocksAcross = kTile / kBlockColumns, kBlocksDown = kTile / kBlockRows;
+
+// Boxes of Gaussians are kept in cells of 4 x 4 pixels.
+constexpr int kCell = 4, kLog2Cell = 2;
 
 // Slack of the ellipse-tile test, in log2(alpha). The blend kernel decides pixel by pixel and
 // errs by under 3e-5 in this unit; the test must never leave out what it would draw.

@@ -1,5 +1,5 @@
-// Gaussians are projected in groups of 16: the lanes of one vector of float32, or of two of
-// float64. Here are the ways between the lanes and the arrays.
+// Gaussians are projected in groups of 16: the lanes of one vector of float32. Here are the ways
+// between the lanes and the arrays.
 #pragma once
 
 #include "project_math.h"
@@ -34,6 +34,20 @@ SPLAT_INLINE void write_column(f32x16 column, int count, float* to) {
     std::memcpy(to, &column, (count < kGroup ? count : kGroup) * sizeof(float));
 }
 
+// A group is projected in parts, since float64 takes more registers. Lanes of part `number`, and
+// all of them again from a value per part.
+constexpr int kGroupParts = kGroup / kProjectLanes;
+SPLAT_INLINE Lanes widened(const f32x16& v, int number) {
+    return widen(load<Vector<float, kProjectLanes>>(reinterpret_cast<const float*>(&v) +
+                                                    kProjectLanes * number));
+}
+template <class Part, class Of>
+SPLAT_INLINE f32x16 narrowed(const Part (&parts)[kGroupParts], const Of& of) {
+    Vector<float, kProjectLanes> lanes[kGroupParts];
+    for (int i = 0; i < kGroupParts; i++) lanes[i] = narrow(of(parts[i]));
+    return join<kGroupParts>(lanes);
+}
+
 // A group's parameters but for the spherical harmonics. Zeros, which no quaternion survives,
 // beyond the last Gaussian.
 struct Group {
@@ -49,14 +63,15 @@ struct Group {
         read_rows(g.quats + 4 * first, count, quat);
         opacity_logit = read_column(g.opacity_logits + first, count);
     }
-    SPLAT_INLINE Inputs half(int h) const {
-        const auto three = [h](const f32x16* v) {
-            return Vec3{widen(v[0], h), widen(v[1], h), widen(v[2], h)};
+    SPLAT_INLINE Inputs part(int number) const {
+        const auto wide = [number](const f32x16& v) { return widened(v, number); };
+        const auto three = [&](const f32x16* v) {
+            return Vec3{wide(v[0]), wide(v[1]), wide(v[2])};
         };
         return {three(mean),
                 three(log_scale),
-                {widen(quat[0], h), widen(quat[1], h), widen(quat[2], h), widen(quat[3], h)},
-                widen(opacity_logit, h)};
+                {wide(quat[0]), wide(quat[1]), wide(quat[2]), wide(quat[3])},
+                wide(opacity_logit)};
     }
 };
 SPLAT_INLINE int64_t groups(const Gaussians& g) { return (g.count + kGroup - 1) / kGroup; }
@@ -70,7 +85,7 @@ struct CameraCenter {
             xyz[i] = -(v.rotation[i] * v.translation[0] + v.rotation[3 + i] * v.translation[1] +
                        v.rotation[6 + i] * v.translation[2]);
     }
-    // Directions to eight Gaussians, and the inverse lengths.
+    // Directions to a part's Gaussians, and the inverse lengths.
     struct Toward {
         Vec3 unit;
         Lanes inv_length;
@@ -78,13 +93,16 @@ struct CameraCenter {
     SPLAT_INLINE Toward toward(const Vec3& mean) const {
         const Vec3 d = {mean.x - xyz[0], mean.y - xyz[1], mean.z - xyz[2]};
         const Lanes length2 = dot(d, d);
-        const Lanes inv = select(length2 > 0.0, inverse_sqrt(length2), splat8(0.0));
+        const Lanes inv = select(length2 > 0.0, inverse_sqrt(length2), all_lanes(0.0));
         return {inv * d, inv};
     }
 };
-SPLAT_INLINE Directions directions(const CameraCenter::Toward (&t)[2]) {
-    return {narrow(t[0].unit.x, t[1].unit.x), narrow(t[0].unit.y, t[1].unit.y),
-            narrow(t[0].unit.z, t[1].unit.z), narrow(t[0].inv_length, t[1].inv_length)};
+SPLAT_INLINE Directions directions(const CameraCenter::Toward (&toward)[kGroupParts]) {
+    using Toward = CameraCenter::Toward;
+    return {narrowed(toward, [](const Toward& t) { return t.unit.x; }),
+            narrowed(toward, [](const Toward& t) { return t.unit.y; }),
+            narrowed(toward, [](const Toward& t) { return t.unit.z; }),
+            narrowed(toward, [](const Toward& t) { return t.inv_length; })};
 }
 
 }  // namespace splat

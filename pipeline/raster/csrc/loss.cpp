@@ -18,7 +18,8 @@
 #include <vector>
 
 #include "memory.h"
-#include "simd.h"
+#include "shuffle.h"
+#include "simd_math.h"
 #include "threads.h"
 
 namespace splat {
@@ -47,28 +48,40 @@ struct Window {
     }
 };
 
-// Lanes [kFirst, kFirst + 16) of two vectors in a row.
-template <int kFirst>
-SPLAT_INLINE f32x16 lanes_from(f32x16 left, f32x16 right) {
-    constexpr int k = kFirst;
-    return __builtin_shuffle(left, right,
-                             i32x16{k, k + 1, k + 2, k + 3, k + 4, k + 5, k + 6, k + 7, k + 8,
-                                    k + 9, k + 10, k + 11, k + 12, k + 13, k + 14, k + 15});
-}
+// One register: two rows of the four blurs of the images are eight sums, which shall stay in
+// registers.
+constexpr int kLanes = kRegisterBytes / int(sizeof(float));
+using Lanes = Vector<float, kLanes>;
 
+#if SPLAT_AVX512
+// Lanes [kFirst, kFirst + 16) of two vectors in a row.
+template <int kFirst, int... kEach>
+SPLAT_INLINE Lanes lanes_from(Lanes left, Lanes right, std::integer_sequence<int, kEach...>) {
+    return shuffle<(kFirst + kEach)...>(left, right);
+}
 // Shifted from three whole vectors: a load of ten others, each across two cache lines, takes twice
 // as long.
-SPLAT_INLINE f32x16 blur_across(const float* centre, const Window& k) {
-    const f32x16 left = load<f32x16>(centre - 16), here = load<f32x16>(centre),
-                 right = load<f32x16>(centre + 16);
-    f32x16 sum = here * k.tap[0];
-    sum += (lanes_from<13>(left, here) + lanes_from<3>(here, right)) * k.tap[1];
-    sum += (lanes_from<10>(left, here) + lanes_from<6>(here, right)) * k.tap[2];
-    sum += (lanes_from<7>(left, here) + lanes_from<9>(here, right)) * k.tap[3];
-    sum += (lanes_from<4>(left, here) + lanes_from<12>(here, right)) * k.tap[4];
-    sum += (lanes_from<1>(left, here) + lanes_from<15>(here, right)) * k.tap[5];
+SPLAT_INLINE Lanes blur_across(const float* centre, const Window& k) {
+    const Lanes left = load<Lanes>(centre - 16), here = load<Lanes>(centre),
+                right = load<Lanes>(centre + 16);
+    constexpr LaneSequence<16> lanes;
+    Lanes sum = here * k.tap[0];
+    sum += (lanes_from<13>(left, here, lanes) + lanes_from<3>(here, right, lanes)) * k.tap[1];
+    sum += (lanes_from<10>(left, here, lanes) + lanes_from<6>(here, right, lanes)) * k.tap[2];
+    sum += (lanes_from<7>(left, here, lanes) + lanes_from<9>(here, right, lanes)) * k.tap[3];
+    sum += (lanes_from<4>(left, here, lanes) + lanes_from<12>(here, right, lanes)) * k.tap[4];
+    sum += (lanes_from<1>(left, here, lanes) + lanes_from<15>(here, right, lanes)) * k.tap[5];
     return sum;
 }
+#else
+SPLAT_INLINE Lanes blur_across(const float* centre, const Window& k) {
+    Lanes sum = load<Lanes>(centre) * k.tap[0];
+#pragma GCC unroll 5
+    for (int i = 1; i <= kRadius; i++)
+        sum += (load<Lanes>(centre - 3 * i) + load<Lanes>(centre + 3 * i)) * k.tap[i];
+    return sum;
+}
+#endif
 static_assert(kRadius == 5 && kReach == 16, "blur_across");
 
 // The last kRows rows of something.
@@ -157,7 +170,7 @@ class Strip {
     }
 
     // Adds a row's taps to two sums, of the row kRadius below the first of kRows and of the next.
-    SPLAT_INLINE void add_row(int row, f32x16 value, f32x16 (&sums)[2]) const {
+    SPLAT_INLINE void add_row(int row, Lanes value, Lanes (&sums)[2]) const {
         if (row < kTaps) sums[0] += value * window_.tap[std::abs(row - kRadius)];
         if (row > 0) sums[1] += value * window_.tap[std::abs(row - 1 - kRadius)];
     }
@@ -167,11 +180,11 @@ class Strip {
         const float *xs[kRows], *ys[kRows];
         for (int t = 0; t < kRows; t++)
             xs[t] = x_.row(y + t - kRadius), ys[t] = y_.row(y + t - kRadius);
-        for (int64_t i = 0; i < stride_; i += 16) {
-            f32x16 m_x[2] = {}, m_y[2] = {}, m_2[2] = {}, m_xy[2] = {};
+        for (int64_t i = 0; i < stride_; i += kLanes) {
+            Lanes m_x[2] = {}, m_y[2] = {}, m_2[2] = {}, m_xy[2] = {};
 #pragma GCC unroll 12
             for (int t = 0; t < kRows; t++) {
-                const f32x16 a = load<f32x16>(xs[t] + i), b = load<f32x16>(ys[t] + i);
+                const Lanes a = load<Lanes>(xs[t] + i), b = load<Lanes>(ys[t] + i);
                 add_row(t, a, m_x);
                 add_row(t, b, m_y);
                 add_row(t, a * a + b * b, m_2);
@@ -197,33 +210,37 @@ class Strip {
         const float *x = x_.row(y), *target = y_.row(y);
         float *to_m = d_m_.row(y), *to_2 = d_2_.row(y), *to_xy = d_xy_.row(y);
         const float* keep = keep_.row(y);
-        f32x16 error = {}, ssim = {};
-        for (int64_t i = kReach; i < stride_ - kReach; i += 16) {
-            const f32x16 m_x = blur_across(line[0] + i, window_);
-            const f32x16 m_y = blur_across(line[1] + i, window_);
-            const f32x16 squares = m_x * m_x + m_y * m_y, product = m_x * m_y;
-            const f32x16 a1 = 2.0f * product + kC1;
-            const f32x16 a2 = 2.0f * (blur_across(line[3] + i, window_) - product) + kC2;
-            const f32x16 b1 = squares + kC1;
+        Lanes error[16 / kLanes] = {}, ssim[16 / kLanes] = {};  // 16 sums each, on every target
+        for (int64_t i = kReach; i < stride_ - kReach; i += kLanes) {
+            const Lanes m_x = blur_across(line[0] + i, window_);
+            const Lanes m_y = blur_across(line[1] + i, window_);
+            const Lanes squares = m_x * m_x + m_y * m_y, product = m_x * m_y;
+            const Lanes a1 = 2.0f * product + kC1;
+            const Lanes a2 = 2.0f * (blur_across(line[3] + i, window_) - product) + kC2;
+            const Lanes b1 = squares + kC1;
             // No variance is negative, whatever rounding says.
-            const f32x16 variance = max(blur_across(line[2] + i, window_) - squares, f32x16{});
-            const f32x16 b2 = variance + kC2;
-            const f32x16 inverse = reciprocal(b1 * b2);
-            const f32x16 value = a1 * a2 * inverse;
-            const f32x16 over_b1 = value * b2 * inverse, over_b2 = value * b1 * inverse;
-            const f32x16 weight = load<f32x16>(keep + i);
+            const Lanes variance = max(blur_across(line[2] + i, window_) - squares, Lanes{});
+            const Lanes b2 = variance + kC2;
+            const Lanes inverse = reciprocal(b1 * b2);
+            const Lanes value = a1 * a2 * inverse;
+            const Lanes over_b1 = value * b2 * inverse, over_b2 = value * b1 * inverse;
+            const Lanes weight = load<Lanes>(keep + i);
             if (i >= 2 * kReach && i < 2 * kReach + own_) {
-                const f32x16 d = load<f32x16>(x + i) - load<f32x16>(target + i);
-                error += weight * (abs(d) + square_ * d * d);
-                ssim += weight * value;
+                const Lanes d = load<Lanes>(x + i) - load<Lanes>(target + i);
+                const int64_t part = i / kLanes % (16 / kLanes);
+                error[part] += weight * (abs(d) + square_ * d * d);
+                ssim[part] += weight * value;
             }
-            const f32x16 d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
+            const Lanes d_m = m_y * (a2 - a1) * inverse + m_x * (over_b2 - over_b1);
             store(to_m + i, weight * 2.0f * d_m);
             store(to_2 + i, -weight * over_b2);
             store(to_xy + i, weight * 2.0f * a1 * inverse);
         }
         Sums sums = {};
-        for (int lane = 0; lane < 16; lane++) sums.error += error[lane], sums.ssim += ssim[lane];
+        float errors[16], ssims[16];
+        std::memcpy(errors, error, sizeof(errors));
+        std::memcpy(ssims, ssim, sizeof(ssims));
+        for (int lane = 0; lane < 16; lane++) sums.error += errors[lane], sums.ssim += ssims[lane];
         return sums;
     }
 
@@ -233,10 +250,10 @@ class Strip {
         for (int k = 0; k < 3; k++) {
             const float* rows[kRows];
             for (int t = 0; t < kRows; t++) rows[t] = rings[k].row(y + t - kRadius);
-            for (int64_t i = kReach; i < stride_ - kReach; i += 16) {
-                f32x16 sums[2] = {};
+            for (int64_t i = kReach; i < stride_ - kReach; i += kLanes) {
+                Lanes sums[2] = {};
 #pragma GCC unroll 12
-                for (int t = 0; t < kRows; t++) add_row(t, load<f32x16>(rows[t] + i), sums);
+                for (int t = 0; t < kRows; t++) add_row(t, load<Lanes>(rows[t] + i), sums);
                 store(line_[0][k] + i, sums[0]);
                 store(line_[1][k] + i, sums[1]);
             }
@@ -245,18 +262,19 @@ class Strip {
 
     // Row y of the gradient, from what blur_derivatives_down left.
     void write(int64_t y, float* const* line, float* grad) {
-        for (int64_t i = 2 * kReach; i < 2 * kReach + own_; i += 16) {
-            const f32x16 a = load<f32x16>(x_.row(y) + i), b = load<f32x16>(y_.row(y) + i);
-            const f32x16 ssim = blur_across(line[0] + i, window_) +
+        for (int64_t i = 2 * kReach; i < 2 * kReach + end_ - begin_; i += kLanes) {
+            const Lanes a = load<Lanes>(x_.row(y) + i), b = load<Lanes>(y_.row(y) + i);
+            const Lanes ssim = blur_across(line[0] + i, window_) +
                                 2.0f * a * blur_across(line[1] + i, window_) +
                                 b * blur_across(line[2] + i, window_);
-            const f32x16 sign =
-                select(lt(b, a), splat16(1), splat16(0)) - select(lt(a, b), splat16(1), splat16(0));
-            const f32x16 out = load<f32x16>(keep_.row(y) + i) *
+            const Lanes one = broadcast<Lanes>(1.0f);
+            const Lanes sign =
+                keep(a > b, one) - keep(b > a, one);
+            const Lanes out = load<Lanes>(keep_.row(y) + i) *
                                (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
             std::memcpy(grad + y * values_ + column, &out,
-                        std::min(end_ - column, int64_t(16)) * sizeof(float));
+                        std::min(end_ - column, int64_t(kLanes)) * sizeof(float));
         }
     }
 

@@ -20,8 +20,8 @@ struct PixelRange {
 };
 SPLAT_INLINE PixelRange pixel_range(Lanes center, Lanes extent, int64_t size) {
     const Lanes first = ceil(center - extent - 0.5), last = floor(center + extent - 0.5);
-    const Lanes end = splat8(double(size - 1));
-    return {select(first > 0.0, first, splat8(0.0)), select(last < end, last, end)};
+    const Lanes end = all_lanes(double(size - 1));
+    return {select(first > 0.0, first, all_lanes(0.0)), select(last < end, last, end)};
 }
 
 // How many standard deviations a Gaussian of full opacity reaches, rounded up.
@@ -49,7 +49,7 @@ class OutOfView {
         reach_x_ = length(view.fx, view.cx, double(view.width));
         reach_y_ = length(view.fy, view.cy, double(view.height));
     }
-    // Whether none of eight Gaussians can be drawn, and none is to be counted as dropped: true
+    // Whether none of a part's Gaussians can be drawn, and none is to be counted as dropped: true
     // only where a bound on their ellipses is sure of it.
     SPLAT_INLINE bool sure(const Inputs& in) const {
         const Vec3 cam = in_camera(in.mean, view_);
@@ -62,16 +62,16 @@ class OutOfView {
         const Lanes scale = exp(longest) * inv_z;
         const Lanes reach_x = reach_x_ * scale + (0.55 * kMostReach + 1.0);
         const Lanes reach_y = reach_y_ * scale + (0.55 * kMostReach + 1.0);
-        const i64x8 beside = i64x8(x + reach_x < 0.0) | i64x8(x - reach_x > double(view_.width)) |
-                             i64x8(y + reach_y < 0.0) | i64x8(y - reach_y > double(view_.height));
+        const LaneMask beside = (x + reach_x < 0.0) | (x - reach_x > double(view_.width)) |
+                                (y + reach_y < 0.0) | (y - reach_y > double(view_.height));
         // Far from every overflow for which a Gaussian would be dropped.
-        const i64x8 tame = i64x8(larger(reach_x, reach_y) < 1e12) & i64x8(cam.z < 1e12) &
-                           i64x8(larger(x, -x) < 1e12) & i64x8(larger(y, -y) < 1e12);
+        const LaneMask tame = (larger(reach_x, reach_y) < 1e12) & (cam.z < 1e12) &
+                              (larger(x, -x) < 1e12) & (larger(y, -y) < 1e12);
         const Lanes norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] +
                             in.quat[2] * in.quat[2] + in.quat[3] * in.quat[3];
-        const i64x8 usable = i64x8(finite_sum(in, norm2) == 0.0) & i64x8(norm2 >= kQuatNorm2Min);
-        const i64x8 behind = i64x8(cam.z <= view_.near);
-        return bits(usable & (behind | (beside & tame))) == 0xff;
+        const LaneMask usable = (finite_sum(in, norm2) == 0.0) & (norm2 >= kQuatNorm2Min);
+        const LaneMask behind = cam.z <= view_.near;
+        return bits(usable & (behind | (beside & tame))) == (1u << kProjectLanes) - 1;
     }
 
   private:
@@ -79,7 +79,7 @@ class OutOfView {
     double reach_x_, reach_y_;
 };
 
-// Eight Gaussians on the image.
+// A part's Gaussians on the image.
 struct Seen {
     Lanes x, y, depth, uu, uw, ww, log2_opacity, radius;
     PixelRange columns, rows;  // with slack
@@ -110,27 +110,30 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
     s.columns = pixel_range(p.x, extent_x + kBoxSlack, view.width);
     s.rows = pixel_range(p.y, extent_y + kBoxSlack, view.height);
 
-    const i64x8 usable = i64x8(finite_sum(in, p.norm2) == 0.0) & i64x8(p.norm2 >= kQuatNorm2Min);
-    const i64x8 in_front = i64x8(p.cam.z > view.near);
+    const LaneMask usable = (finite_sum(in, p.norm2) == 0.0) & (p.norm2 >= kQuatNorm2Min);
+    const LaneMask in_front = p.cam.z > view.near;
     // The centre may lie anywhere, but the depth is kept in float32.
-    const i64x8 sound = i64x8(p.det > 0.0) & i64x8(p.xx < kCovarianceMax) &
-                        i64x8(p.yy < kCovarianceMax) & i64x8(p.x - p.x == 0.0) &
-                        i64x8(p.y - p.y == 0.0) & i64x8(p.cam.z < 1e38);
+    const LaneMask sound = (p.det > 0.0) & (p.xx < kCovarianceMax) & (p.yy < kCovarianceMax) &
+                           (p.x - p.x == 0.0) & (p.y - p.y == 0.0) & (p.cam.z < 1e38);
     const PixelRange across = pixel_range(p.x, extent_x, view.width);
     const PixelRange down = pixel_range(p.y, extent_y, view.height);
-    s.dropped = bits(~usable | (in_front & ~sound));
-    s.drawn = bits(usable & in_front & sound & i64x8(reach > 0.0) &
-                   i64x8(across.first <= across.last) & i64x8(down.first <= down.last));
+    const uint32_t all = (1u << kProjectLanes) - 1;
+    s.dropped = (~bits(usable) | (bits(in_front) & ~bits(sound))) & all;
+    s.drawn = bits(usable & in_front & sound & (reach > 0.0) & (across.first <= across.last) &
+                   (down.first <= down.last));
     return s;
 }
 
 // The records of a group, one a vector.
-SPLAT_INLINE void make_records(const Seen (&s)[2], const f32x16 (&rgb)[3], f32x16 (&records)[16]) {
-    const auto both = [&](Lanes Seen::* field) { return narrow(s[0].*field, s[1].*field); };
+SPLAT_INLINE void make_records(const Seen (&seen)[kGroupParts], const f32x16 (&rgb)[3],
+                               f32x16 (&records)[16]) {
+    const auto all = [&](Lanes Seen::* field) {
+        return narrowed(seen, [=](const Seen& s) { return s.*field; });
+    };
     const auto halves = [&](Lanes Seen::* field, f32x16* to) {  // of float64
         alignas(64) float pairs[32];
-        store(pairs, s[0].*field);
-        store(pairs + 16, s[1].*field);
+        for (int i = 0; i < kGroupParts; i++)
+            store(pairs + 2 * kProjectLanes * i, seen[i].*field);
         f32x16 split[2];
         deinterleave(pairs, split);
         to[0] = split[0];
@@ -138,20 +141,20 @@ SPLAT_INLINE void make_records(const Seen (&s)[2], const f32x16 (&rgb)[3], f32x1
     };
     // Two numbers of 16 bits
     const auto corner = [&](Lanes PixelRange::* end) {
-        const auto blocks = [&](PixelRange Seen::* range) {
-            const f32x16 pixel = narrow(s[0].*range.*end, s[1].*range.*end);
-            return u32x16(__builtin_convertvector(pixel, i32x16)) / uint32_t(kBlock);
+        const auto cells = [&](PixelRange Seen::* range) {
+            const f32x16 pixel = narrowed(seen, [=](const Seen& s) { return s.*range.*end; });
+            return bit_cast<u32x16>(to_int(pixel)) >> kLog2Cell;
         };
-        return f32x16(blocks(&Seen::columns) | (blocks(&Seen::rows) << 16));
+        return bit_cast<f32x16>(cells(&Seen::columns) | (cells(&Seen::rows) << 16));
     };
     halves(&Seen::x, records);
     halves(&Seen::y, records + 2);
-    records[4] = both(&Seen::uu);
-    records[5] = both(&Seen::uw);
-    records[6] = both(&Seen::ww);
-    records[7] = both(&Seen::log2_opacity);
+    records[4] = all(&Seen::uu);
+    records[5] = all(&Seen::uw);
+    records[6] = all(&Seen::ww);
+    records[7] = all(&Seen::log2_opacity);
     for (int c = 0; c < 3; c++) records[8 + c] = rgb[c];
-    records[11] = both(&Seen::depth);
+    records[11] = all(&Seen::depth);
     records[12] = corner(&PixelRange::first);
     records[13] = corner(&PixelRange::last);
     records[14] = records[15] = f32x16{};
@@ -170,21 +173,25 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
         int64_t visible = 0, dropped = 0;
         for (int64_t number = begin; number < end; number++) {
             const Group group(in, number);
-            Seen seen[2];
-            CameraCenter::Toward toward[2];
-            if (group.count == kGroup && out_of_view.sure(group.half(0)) &&
-                out_of_view.sure(group.half(1))) {
+            int part = 0;
+            while (part < kGroupParts && out_of_view.sure(group.part(part))) part++;
+            if (group.count == kGroup && part == kGroupParts) {
                 store(radii + group.first, f32x16{});
                 continue;
             }
-            for (int h = 0; h < 2; h++) {
-                const Inputs half = group.half(h);
-                seen[h] = see(half, view);
-                toward[h] = center.toward(half.mean);
+            Seen seen[kGroupParts];
+            CameraCenter::Toward toward[kGroupParts];
+            uint32_t drawn = 0, unusable = 0;
+            for (part = 0; part < kGroupParts; part++) {
+                const Inputs inputs = group.part(part);
+                seen[part] = see(inputs, view);
+                toward[part] = center.toward(inputs.mean);
+                drawn |= seen[part].drawn << kProjectLanes * part;
+                unusable |= seen[part].dropped << kProjectLanes * part;
             }
             const uint32_t there = (1u << group.count) - 1;
-            uint32_t drawn = there & (seen[0].drawn | seen[1].drawn << 8);
-            dropped += __builtin_popcount(there & (seen[0].dropped | seen[1].dropped << 8));
+            drawn &= there;
+            dropped += __builtin_popcount(there & unusable);
             if (drawn) {
                 ShBlock sh;
                 sh.read(view.sh_degree, in.sh + sh_width * group.first, sh_width, drawn);
@@ -198,8 +205,8 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                 for (int lane = 0; lane < kGroup; lane++)
                     if (drawn >> lane & 1) store(records + group.first + lane, rows[lane]);
             }
-            write_column(keep(mask(drawn), narrow(seen[0].radius, seen[1].radius)), group.count,
-                         radii + group.first);
+            const f32x16 radius = narrowed(seen, [](const Seen& s) { return s.radius; });
+            write_column(keep(mask(drawn), radius), group.count, radii + group.first);
         }
         all_visible += visible;
         all_dropped += dropped;

@@ -13,13 +13,12 @@ constexpr double kLn2 = 0.69314718055994530942;
 
 // The sums of one Gaussian's slots, lanes as in a slot.
 SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
-    Lanes low = {}, high = {};
+    Lanes sum[kGroupParts] = {};
     for (uint32_t s = 0; s < slots.count; s++) {
         const f32x16 slot = load<f32x16>(slot_gradients + int64_t(slots.first + s) * kSlotFloats);
-        low += widen(slot, 0);
-        high += widen(slot, 1);
+        for (int i = 0; i < kGroupParts; i++) sum[i] += widened(slot, i);
     }
-    return narrow(low, high);
+    return narrowed(sum, [](const Lanes& lanes) { return lanes; });
 }
 
 // What a group's image asks for: fields of the records, and sums of the slots by Moment.
@@ -50,14 +49,15 @@ struct GroupMoments {
         const f32x16 zero = {};
         f32x16 most = zero;
         for (const f32x16& m : moment) most = max(most, abs(m));
-        return bits(lt(zero, most));
+        return bits(most > zero);
     }
 
     // From the moments of y = (u, w) to the image plane. ln alpha = ln opacity - ln 2 (u^2 + w^2)
     // and y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
-    SPLAT_INLINE ImageGradients half(int h) const {
-        const auto get = [&](Moment m) { return widen(moment[m], h); };
-        const Lanes l00 = widen(uu, h), l10 = widen(uw, h), l11 = widen(ww, h);
+    SPLAT_INLINE ImageGradients part(int number) const {
+        const auto get = [&](Moment m) { return widened(moment[m], number); };
+        const Lanes l00 = widened(uu, number), l10 = widened(uw, number),
+                    l11 = widened(ww, number);
         ImageGradients g;
         g.x = 2.0 * kLn2 * l00 * get(kVU);
         g.y = 2.0 * kLn2 * (l10 * get(kVU) + l11 * get(kVW));
@@ -78,18 +78,20 @@ struct GroupMoments {
 struct GroupGradients {
     f32x16 mean[3], log_scale[3], quat[4], opacity_logit, means2d[2];
 
-    GroupGradients(const InputGradients (&g)[2], const ImageGradients (&image)[2]) {
+    GroupGradients(const InputGradients (&g)[kGroupParts],
+                   const ImageGradients (&image)[kGroupParts]) {
         const auto three = [&](Vec3 InputGradients::* field, f32x16* to) {
-            to[0] = narrow((g[0].*field).x, (g[1].*field).x);
-            to[1] = narrow((g[0].*field).y, (g[1].*field).y);
-            to[2] = narrow((g[0].*field).z, (g[1].*field).z);
+            to[0] = narrowed(g, [=](const InputGradients& part) { return (part.*field).x; });
+            to[1] = narrowed(g, [=](const InputGradients& part) { return (part.*field).y; });
+            to[2] = narrowed(g, [=](const InputGradients& part) { return (part.*field).z; });
         };
         three(&InputGradients::mean, mean);
         three(&InputGradients::log_scale, log_scale);
-        for (int k = 0; k < 4; k++) quat[k] = narrow(g[0].quat[k], g[1].quat[k]);
-        opacity_logit = narrow(g[0].opacity_logit, g[1].opacity_logit);
-        means2d[0] = narrow(image[0].x, image[1].x);
-        means2d[1] = narrow(image[0].y, image[1].y);
+        for (int k = 0; k < 4; k++)
+            quat[k] = narrowed(g, [=](const InputGradients& part) { return part.quat[k]; });
+        opacity_logit = narrowed(g, [](const InputGradients& part) { return part.opacity_logit; });
+        means2d[0] = narrowed(image, [](const ImageGradients& part) { return part.x; });
+        means2d[1] = narrowed(image, [](const ImageGradients& part) { return part.y; });
     }
     template <class Visit>
     SPLAT_INLINE void each(const Visit& visit) {
@@ -117,18 +119,21 @@ void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t
 
 // A group's share in the camera's gradients. d_mean: through the direction of view, which a shift
 // of the scene in the camera's frame turns as a shift of the means does.
-void add_camera(const Group& group, const View& view, const ImageGradients (&image)[2],
-                const InputGradients (&half)[2], const f32x16 (&d_mean)[3], uint32_t sound,
-                double* out) {
-    for (int h = 0; h < 2; h++) {
+void add_camera(const Group& group, const View& view, const ImageGradients (&image)[kGroupParts],
+                const InputGradients (&gradients)[kGroupParts], const f32x16 (&d_mean)[3],
+                uint32_t sound, double* out) {
+    for (int part = 0; part < kGroupParts; part++) {
         Lanes share[kCameraParameters];
-        camera_backward(project(group.half(h), view), image[h], half[h], view, share);
-        const Vec3 turned = {widen(d_mean[0], h), widen(d_mean[1], h), widen(d_mean[2], h)};
+        camera_backward(project(group.part(part), view), image[part], gradients[part], view, share);
+        const Vec3 turned = {widened(d_mean[0], part), widened(d_mean[1], part),
+                             widened(d_mean[2], part)};
         for (int i = 0; i < 3; i++) share[3 + i] += dot(row(view.rotation, i), turned);
+        double values[kCameraParameters][kProjectLanes];
+        std::memcpy(values, share, sizeof(values));
         for (int lane = 0; lane < kProjectLanes; lane++) {
-            if (!(sound >> (kProjectLanes * h + lane) & 1)) continue;
+            if (!(sound >> (kProjectLanes * part + lane) & 1)) continue;
             for (int k = 0; k < kCameraParameters; k++)
-                if (std::isfinite(share[k][lane])) out[k] += share[k][lane];
+                if (std::isfinite(values[k][lane])) out[k] += values[k][lane];
         }
     }
 }
@@ -160,28 +165,28 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
             write_zeros(out, first, group.count, sh_width);
             return;
         }
-        ImageGradients image[2];
-        InputGradients half[2];
-        CameraCenter::Toward toward[2];
-        for (int h = 0; h < 2; h++) {
-            const Inputs inputs = group.half(h);
-            image[h] = asked.half(h);
-            half[h] = project_backward(project(inputs, view), image[h], view);
-            toward[h] = center.toward(inputs.mean);
+        ImageGradients image[kGroupParts];
+        InputGradients gradients[kGroupParts];
+        CameraCenter::Toward toward[kGroupParts];
+        for (int part = 0; part < kGroupParts; part++) {
+            const Inputs inputs = group.part(part);
+            image[part] = asked.part(part);
+            gradients[part] = project_backward(project(inputs, view), image[part], view);
+            toward[part] = center.toward(inputs.mean);
         }
-        GroupGradients g(half, image);
+        GroupGradients g(gradients, image);
 
         // Colour: where it was clamped to zero it does not fall further, but may come back. 3DGS
         // has it stand still (view.black_stays): a sixth of bonsai's Gaussians were black in every
         // view then, for good.
         Mask16 sound = mask(drawn);  // every gradient fits into float32
         const f32x16 zero = {}, most = splat16(1e37f);
-        const auto check = [&](f32x16& v) { sound = sound & ge(most, abs(v)); };
+        const auto check = [&](f32x16& v) { sound = sound & (most >= abs(v)); };
         f32x16 d_rgb[3], d_mean[3];
         for (int c = 0; c < 3; c++) {
             const f32x16 d = asked.moment[kRed + c];
             const f32x16 rising = view.black_stays ? zero : min(d, zero);
-            d_rgb[c] = select(lt(zero, asked.rgb[c]), d, rising);
+            d_rgb[c] = select(asked.rgb[c] > zero, d, rising);
             check(d_rgb[c]);
         }
         ShBlock sh;
@@ -199,7 +204,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
         if (out.camera)
-            add_camera(group, view, image, half, d_mean, bits(sound),
+            add_camera(group, view, image, gradients, d_mean, bits(sound),
                        camera.data() + kCameraParameters * number);
         write_rows(g.mean, group.count, out.means + 3 * first);
         write_rows(g.log_scale, group.count, out.log_scales + 3 * first);

@@ -1,15 +1,18 @@
-// The projection of 8 Gaussians at a time, in float64, and its derivative. Sources: Kerbl et al.
+// The projection of some Gaussians at a time, in float64, and its derivative. Sources: Kerbl et al.
 // 2023 (covariance), Zwicker et al. 2002 (EWA), Yu et al. 2024 (compensation); twin.py's project
 // says the same in fewer words.
 #pragma once
 
-#include "simd.h"
+#include "simd_math.h"
 #include "types.h"
 
 namespace splat {
 
-using Lanes = f64x8;
-constexpr int kProjectLanes = 8;
+// As many as fit into one register: of the hundred values in use at once, fewer are spilled.
+constexpr int kProjectLanes = kRegisterBytes / int(sizeof(double));
+using Lanes = Vector<double, kProjectLanes>;
+using LaneMask = Mask<double, kProjectLanes>;
+SPLAT_INLINE Lanes all_lanes(double x) { return broadcast<Lanes>(x); }
 
 struct Vec3 {
     Lanes x, y, z;
@@ -23,7 +26,7 @@ SPLAT_INLINE Vec3 operator-(const Vec3& a, const Vec3& b) {
     return {a.x - b.x, a.y - b.y, a.z - b.z};
 }
 SPLAT_INLINE Vec3 row(const double* matrix, int i) {
-    return {splat8(matrix[3 * i]), splat8(matrix[3 * i + 1]), splat8(matrix[3 * i + 2])};
+    return {all_lanes(matrix[3 * i]), all_lanes(matrix[3 * i + 1]), all_lanes(matrix[3 * i + 2])};
 }
 
 struct Inputs {
@@ -98,7 +101,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     p.opacity = p.sigmoid;
     if (view.antialias) {
         p.ratio = p.plain_det / p.det;
-        p.opacity *= sqrt(select(p.ratio > kCompensationMin, p.ratio, splat8(kCompensationMin)));
+        p.opacity *= sqrt(select(p.ratio > kCompensationMin, p.ratio, all_lanes(kCompensationMin)));
     }
     return p;
 }
@@ -125,8 +128,8 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
     out.opacity_logit = g.ln_opacity * (1.0 - p.sigmoid);
     if (view.antialias) {
         // ln opacity = ln sigmoid + (ln plain_det - ln det) / 2 above the floor
-        const Lanes half = select(p.ratio > kCompensationMin, 0.5 * g.ln_opacity, splat8(0.0));
-        const Lanes plain = half / select(p.plain_det > 0.0, p.plain_det, splat8(1.0));
+        const Lanes half = select(p.ratio > kCompensationMin, 0.5 * g.ln_opacity, all_lanes(0.0));
+        const Lanes plain = half / select(p.plain_det > 0.0, p.plain_det, all_lanes(1.0));
         const Lanes dilated = half / p.det;
         d_xx += plain * (p.yy - kDilation) - dilated * p.yy;
         d_yy += plain * (p.xx - kDilation) - dilated * p.xx;
@@ -166,7 +169,7 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
     // T's rows: f / z (W_i - u W_2), with u clamped; the centre: f x / z + c
     const Vec3 forward = row(view.rotation, 2);
     const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z;
-    const Lanes zero = splat8(0.0);
+    const Lanes zero = all_lanes(0.0);
     const Lanes d_u =
         select(free_u == p.u, -view.fx * p.inv_z * dot(d_t[0], forward), zero) + view.fx * g.x;
     const Lanes d_v =
@@ -198,7 +201,7 @@ SPLAT_INLINE void camera_backward(const Projected& p, const ImageGradients& g,
     out[4] = d.cam.y;
     out[5] = d.cam.z;
     // Where u is clamped it stands at a place of the image, and goes as (c_x + ...) / f_x.
-    const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z, zero = splat8(0.0);
+    const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z, zero = all_lanes(0.0);
     const Lanes along_u = dot(d.t[0], w[2]) * p.inv_z, along_v = dot(d.t[1], w[2]) * p.inv_z;
     const Lanes held_u = select(free_u == p.u, zero, along_u);
     const Lanes held_v = select(free_v == p.v, zero, along_v);

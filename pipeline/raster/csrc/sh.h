@@ -101,11 +101,11 @@ SPLAT_INLINE uint32_t sh_colors(const Directions& d, int degree, const ShBlock& 
     sh_basis<false>(degree, d.x, d.y, d.z, basis, nullptr, nullptr, nullptr);
     for (f32x16& c : rgb) c = splat16(0.5f);
     const f32x16 bound = splat16(limit), zero = {};
-    Mask16 sane = ge(bound, zero);
+    Mask16 sane = bound >= zero;
     for (int k = 0; k < sh_count(degree); k++)
         for (int c = 0; c < 3; c++) {
             const f32x16 value = sh.value[3 * k + c];
-            sane = sane & ge(bound, abs(value));
+            sane = sane & (bound >= abs(value));
             rgb[c] += basis[k] * value;
         }
     for (f32x16& c : rgb) c = max(c, zero);

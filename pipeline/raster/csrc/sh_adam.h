@@ -7,6 +7,7 @@
 #include <cmath>
 
 #include "sh.h"
+#include "simd_math.h"
 
 namespace splat {
 

@@ -1,4 +1,5 @@
-// Rearrangements of lanes: constant shuffles of two vectors at a time.
+// Rearrangements of lanes: constant shuffles of two registers, and of pairs of registers what
+// renaming does not do.
 #pragma once
 
 #include <utility>
@@ -7,112 +8,205 @@
 
 namespace splat {
 
-using SixteenLanes = std::make_integer_sequence<int, 16>;
+template <int N>
+using LaneSequence = std::make_integer_sequence<int, N>;
 
-// ---- 16 rows of K floats, 2 to 4, to and from a vector per column ----
+// Lanes kOrder of a and b, which are one register each; b's are numbered from N.
+template <int... kOrder, int N>
+SPLAT_INLINE Vector<float, N> shuffle(Vector<float, N> a, Vector<float, N> b) {
+    static_assert(sizeof...(kOrder) == N && kOneRegister<float, N>);
+#if __has_builtin(__builtin_shufflevector)
+    return {__builtin_shufflevector(a.lanes, b.lanes, kOrder...)};
+#else  // GCC 11
+    return {__builtin_shuffle(a.lanes, b.lanes, typename Signed<N>::Register{kOrder...})};
+#endif
+}
 
-template <int K, int kColumn, int... kLanes>
-SPLAT_INLINE f32x16 column_of(const f32x16* rows, std::integer_sequence<int, kLanes...>) {
+// ---- N rows of K floats, 2 to 4, to and from a vector per column ----
+
+template <int K, int kColumn, int N, int... kLanes>
+SPLAT_INLINE Vector<float, N> column_of(const Vector<float, N>* rows,
+                                        std::integer_sequence<int, kLanes...>) {
     constexpr auto at = [](int lane) { return K * lane + kColumn; };
-    f32x16 v =
-        __builtin_shuffle(rows[0], rows[1], i32x16{(at(kLanes) < 32 ? at(kLanes) : kLanes)...});
+    auto v = shuffle<(at(kLanes) < 2 * N ? at(kLanes) : kLanes)...>(rows[0], rows[1]);
     if constexpr (K > 2)
-        v = __builtin_shuffle(v, rows[2],
-                              i32x16{(at(kLanes) / 16 == 2 ? at(kLanes) - 16 : kLanes)...});
+        v = shuffle<(at(kLanes) / N == 2 ? at(kLanes) - N : kLanes)...>(v, rows[2]);
     if constexpr (K > 3)
-        v = __builtin_shuffle(v, rows[3],
-                              i32x16{(at(kLanes) / 16 == 3 ? at(kLanes) - 32 : kLanes)...});
+        v = shuffle<(at(kLanes) / N == 3 ? at(kLanes) - 2 * N : kLanes)...>(v, rows[3]);
     return v;
 }
-template <int K, int kPart, int... kLanes>
-SPLAT_INLINE f32x16 rows_of(const f32x16* columns, std::integer_sequence<int, kLanes...>) {
-    constexpr auto column = [](int lane) { return (16 * kPart + lane) % K; };
-    constexpr auto row = [](int lane) { return (16 * kPart + lane) / K; };
-    f32x16 v = __builtin_shuffle(columns[0], columns[1],
-                                 i32x16{((column(kLanes) == 1 ? 16 : 0) + row(kLanes))...});
+template <int K, int kPart, int N, int... kLanes>
+SPLAT_INLINE Vector<float, N> rows_of(const Vector<float, N>* columns,
+                                      std::integer_sequence<int, kLanes...>) {
+    constexpr auto column = [](int lane) { return (N * kPart + lane) % K; };
+    constexpr auto row = [](int lane) { return (N * kPart + lane) / K; };
+    auto v = shuffle<((column(kLanes) == 1 ? N : 0) + row(kLanes))...>(columns[0], columns[1]);
     if constexpr (K > 2)
-        v = __builtin_shuffle(v, columns[2],
-                              i32x16{(column(kLanes) == 2 ? 16 + row(kLanes) : kLanes)...});
+        v = shuffle<(column(kLanes) == 2 ? N + row(kLanes) : kLanes)...>(v, columns[2]);
     if constexpr (K > 3)
-        v = __builtin_shuffle(v, columns[3],
-                              i32x16{(column(kLanes) == 3 ? 16 + row(kLanes) : kLanes)...});
+        v = shuffle<(column(kLanes) == 3 ? N + row(kLanes) : kLanes)...>(v, columns[3]);
     return v;
 }
-template <int K, int... kColumns>
-SPLAT_INLINE void deinterleave(const float* from, f32x16* to,
+template <int K, int N, int... kColumns>
+SPLAT_INLINE void deinterleave(const float* from, Vector<float, N>* to,
                                std::integer_sequence<int, kColumns...>) {
-    f32x16 rows[K];
+    Vector<float, N> rows[K];
     std::memcpy(rows, from, sizeof(rows));
-    ((to[kColumns] = column_of<K, kColumns>(rows, SixteenLanes{})), ...);
+    ((to[kColumns] = column_of<K, kColumns>(rows, LaneSequence<N>{})), ...);
 }
-template <int K, int... kParts>
-SPLAT_INLINE void interleave(const f32x16* columns, float* to,
+template <int K, int N, int... kParts>
+SPLAT_INLINE void interleave(const Vector<float, N>* columns, float* to,
                              std::integer_sequence<int, kParts...>) {
-    (store(to + 16 * kParts, rows_of<K, kParts>(columns, SixteenLanes{})), ...);
+    (store(to + N * kParts, rows_of<K, kParts>(columns, LaneSequence<N>{})), ...);
 }
-template <int K>
-SPLAT_INLINE void deinterleave(const float* from, f32x16 (&to)[K]) {
-    deinterleave<K>(from, to, std::make_integer_sequence<int, K>{});
-}
-template <int K>
-SPLAT_INLINE void interleave(const f32x16 (&columns)[K], float* to) {
-    interleave<K>(columns, to, std::make_integer_sequence<int, K>{});
-}
-
-// ---- 4 x 4 pixels: from rows, which begin with 4 pixels of K floats, to a vector per channel ----
-
-template <int K, int kChannel, int... kLanes>
-SPLAT_INLINE f32x16 channel_of(const f32x16* rows, std::integer_sequence<int, kLanes...>) {
-    const i32x16 order = {(16 * (kLanes / 4 % 2) + K * (kLanes % 4) + kChannel)...};
-    return __builtin_shuffle(__builtin_shuffle(rows[0], rows[1], order),
-                             __builtin_shuffle(rows[2], rows[3], order),
-                             i32x16{(kLanes < 8 ? kLanes : 16 + kLanes)...});
-}
-template <int K, int kRow, int... kLanes>
-SPLAT_INLINE f32x16 pixels_of(const f32x16* channels, std::integer_sequence<int, kLanes...>) {
-    constexpr auto pixel = [](int lane) { return 4 * kRow + lane / K % 4; };
-    f32x16 v = __builtin_shuffle(channels[0], i32x16{pixel(kLanes)...});
-    if constexpr (K == 3) {
-        v = __builtin_shuffle(v, channels[1],
-                              i32x16{(kLanes % K == 1 ? 16 + pixel(kLanes) : kLanes)...});
-        v = __builtin_shuffle(v, channels[2],
-                              i32x16{(kLanes % K == 2 ? 16 + pixel(kLanes) : kLanes)...});
+template <int K, int N>
+SPLAT_INLINE void deinterleave(const float* from, Vector<float, N> (&to)[K]) {
+    if constexpr (kOneRegister<float, N>) {
+        deinterleave<K, N>(from, to, std::make_integer_sequence<int, K>{});
+    } else {
+        Vector<float, N / 2> low[K], high[K];
+        deinterleave(from, low);
+        deinterleave(from + K * N / 2, high);
+        for (int k = 0; k < K; k++) to[k] = {low[k], high[k]};
     }
-    return v;
 }
-template <int K, int... kChannels>
-SPLAT_INLINE void to_channels(const f32x16* rows, f32x16* channels,
-                              std::integer_sequence<int, kChannels...>) {
-    ((channels[kChannels] = channel_of<K, kChannels>(rows, SixteenLanes{})), ...);
+template <int K, int N>
+SPLAT_INLINE void interleave(const Vector<float, N> (&columns)[K], float* to) {
+    if constexpr (kOneRegister<float, N>) {
+        interleave<K, N>(columns, to, std::make_integer_sequence<int, K>{});
+    } else {
+        Vector<float, N / 2> low[K], high[K];
+        for (int k = 0; k < K; k++) low[k] = columns[k].low, high[k] = columns[k].high;
+        interleave(low, to);
+        interleave(high, to + K * N / 2);
+    }
 }
-template <int K, int... kRows>
-SPLAT_INLINE void to_rows(const f32x16* channels, f32x16* rows,
-                          std::integer_sequence<int, kRows...>) {
-    ((rows[kRows] = pixels_of<K, kRows>(channels, SixteenLanes{})), ...);
-}
-template <int K>
-SPLAT_INLINE void to_channels(const f32x16 (&rows)[4], f32x16 (&channels)[K]) {
-    to_channels<K>(rows, channels, std::make_integer_sequence<int, K>{});
-}
-template <int K>
-SPLAT_INLINE void to_rows(const f32x16 (&channels)[K], f32x16 (&rows)[4]) {
-    to_rows<K>(channels, rows, std::make_integer_sequence<int, 4>{});
-}
+
+// ---- Rows of 4 pixels of K floats, 1 or 3, from and to a vector per channel ----
+
+#if SPLAT_AVX512
+
+// A vector holds one of 4 rows, which begins with 4 pixels.
+template <int kRows, int K>
+class PixelRows {
+    static_assert(kRows == 4);
+
+  public:
+    SPLAT_INLINE void read(int row, const float* from, int count) {
+        rows_[row] = {_mm512_maskz_loadu_ps(__mmask16((1u << K * count) - 1), from)};
+    }
+    SPLAT_INLINE void write(int row, float* to, int count) const {
+        _mm512_mask_storeu_ps(to, __mmask16((1u << K * count) - 1), rows_[row].lanes);
+    }
+    SPLAT_INLINE void to_channels(f32x16 (&channels)[K]) const {
+        to_channels(channels, std::make_integer_sequence<int, K>{});
+    }
+    SPLAT_INLINE void from_channels(const f32x16 (&channels)[K]) {
+        from_channels(channels, std::make_integer_sequence<int, 4>{});
+    }
+
+  private:
+    template <int kChannel, int... kLanes>
+    SPLAT_INLINE f32x16 channel(std::integer_sequence<int, kLanes...>) const {
+        constexpr auto at = [](int lane) { return 16 * (lane / 4 % 2) + K * (lane % 4) + kChannel; };
+        return shuffle<(kLanes < 8 ? kLanes : 16 + kLanes)...>(
+            shuffle<at(kLanes)...>(rows_[0], rows_[1]), shuffle<at(kLanes)...>(rows_[2], rows_[3]));
+    }
+    template <int kRow, int... kLanes>
+    static SPLAT_INLINE f32x16 pixels(const f32x16* channels,
+                                      std::integer_sequence<int, kLanes...>) {
+        constexpr auto pixel = [](int lane) { return 4 * kRow + lane / K % 4; };
+        f32x16 v = shuffle<pixel(kLanes)...>(channels[0], channels[0]);
+        if constexpr (K == 3) {
+            v = shuffle<(kLanes % K == 1 ? 16 + pixel(kLanes) : kLanes)...>(v, channels[1]);
+            v = shuffle<(kLanes % K == 2 ? 16 + pixel(kLanes) : kLanes)...>(v, channels[2]);
+        }
+        return v;
+    }
+    template <int... kChannels>
+    SPLAT_INLINE void to_channels(f32x16 (&channels)[K],
+                                  std::integer_sequence<int, kChannels...>) const {
+        ((channels[kChannels] = channel<kChannels>(LaneSequence<16>{})), ...);
+    }
+    template <int... kEach>
+    SPLAT_INLINE void from_channels(const f32x16* channels,
+                                    std::integer_sequence<int, kEach...>) {
+        ((rows_[kEach] = pixels<kEach>(channels, LaneSequence<16>{})), ...);
+    }
+
+    f32x16 rows_[4] = {};
+};
+
+#else
+
+// A row is one vector of 4 pixels per channel.
+template <int kRows, int K>
+class PixelRows {
+  public:
+    SPLAT_INLINE void read(int row, const float* from, int count) {
+        float padded[4 * K] = {};
+        if (count < 4)
+            from = static_cast<float*>(std::memcpy(padded, from, K * count * sizeof(float)));
+        Quarter channels[K];
+        if constexpr (K == 1)
+            channels[0] = load<Quarter>(from);
+        else
+            deinterleave(from, channels);
+        for (int k = 0; k < K; k++) rows_[k][row] = channels[k];
+    }
+    SPLAT_INLINE void write(int row, float* to, int count) const {
+        float padded[4 * K];
+        float* const whole = count < 4 ? padded : to;
+        Quarter channels[K];
+        for (int k = 0; k < K; k++) channels[k] = rows_[k][row];
+        if constexpr (K == 1)
+            store(whole, channels[0]);
+        else
+            interleave(channels, whole);
+        if (count < 4) std::memcpy(to, padded, K * count * sizeof(float));
+    }
+    SPLAT_INLINE void to_channels(Vector<float, 4 * kRows> (&channels)[K]) const {
+        for (int k = 0; k < K; k++) channels[k] = join<kRows>(rows_[k]);
+    }
+    SPLAT_INLINE void from_channels(const Vector<float, 4 * kRows> (&channels)[K]) {
+        for (int k = 0; k < K; k++)
+            for (int row = 0; row < kRows; row++)
+                rows_[k][row] =
+                    load<Quarter>(reinterpret_cast<const float*>(&channels[k]) + 4 * row);
+    }
+
+  private:
+    using Quarter = Vector<float, 4>;
+    Quarter rows_[K][kRows] = {};
+};
+
+#endif
 
 // ---- 16 x 16 transposed ----
 
-template <int kStep, int... kLanes>
-SPLAT_INLINE void swap_blocks(f32x16& a, f32x16& b, std::integer_sequence<int, kLanes...>) {
-    const i32x16 upper = {(kLanes & kStep ? 16 + kLanes - kStep : kLanes)...};
-    const i32x16 lower = {(kLanes & kStep ? 16 + kLanes : kLanes + kStep)...};
-    const f32x16 first = __builtin_shuffle(a, b, upper);
-    b = __builtin_shuffle(a, b, lower);
+template <int kStep, int N, int... kLanes>
+SPLAT_INLINE void swap_blocks(Vector<float, N>& a, Vector<float, N>& b,
+                              std::integer_sequence<int, kLanes...>) {
+    const auto first = shuffle<(kLanes & kStep ? N + kLanes - kStep : kLanes)...>(a, b);
+    b = shuffle<(kLanes & kStep ? N + kLanes : kLanes + kStep)...>(a, b);
     a = first;
+}
+// Of each block of 2 kStep lanes, a's upper half for b's lower one.
+template <int kStep, int N>
+SPLAT_INLINE void swap_blocks(Vector<float, N>& a, Vector<float, N>& b) {
+    if constexpr (kOneRegister<float, N>) {
+        swap_blocks<kStep>(a, b, LaneSequence<N>{});
+    } else if constexpr (kStep == N / 2) {
+        std::swap(a.high, b.low);
+    } else {
+        swap_blocks<kStep>(a.low, b.low);
+        swap_blocks<kStep>(a.high, b.high);
+    }
 }
 template <int kStep>
 SPLAT_INLINE void transpose_step(f32x16* rows) {
     for (int i = 0; i < 16; i++)
-        if (!(i & kStep)) swap_blocks<kStep>(rows[i], rows[i + kStep], SixteenLanes{});
+        if (!(i & kStep)) swap_blocks<kStep>(rows[i], rows[i + kStep]);
 }
 SPLAT_INLINE void transpose(f32x16* rows) {  // 16 x 16
     transpose_step<8>(rows);
@@ -123,44 +217,76 @@ SPLAT_INLINE void transpose(f32x16* rows) {  // 16 x 16
 
 // ---- Sums over lanes ----
 
+// Lane i is v's lane i ^ kDistance, 1 or 2.
+template <int kDistance, int N, int... kLanes>
+SPLAT_INLINE Vector<float, N> swapped(Vector<float, N> v, std::integer_sequence<int, kLanes...>) {
+    return shuffle<(kLanes ^ kDistance)...>(v, v);
+}
+template <int kDistance, int N>
+SPLAT_INLINE Vector<float, N> swapped(Vector<float, N> v) {
+    if constexpr (kOneRegister<float, N>)
+        return swapped<kDistance>(v, LaneSequence<N>{});
+    else
+        return {swapped<kDistance>(v.low), swapped<kDistance>(v.high)};
+}
+
+// In every lane: the bits set in any of its kCount lanes, 2 or 4: 0 to kCount - 1 and so on.
+template <int kCount>
+SPLAT_INLINE u32x16 any_of(u32x16 v) {
+    v |= bit_cast<u32x16>(swapped<1>(bit_cast<f32x16>(v)));
+    if (kCount == 4) v |= bit_cast<u32x16>(swapped<2>(bit_cast<f32x16>(v)));
+    return v;
+}
+
+// Of each block of 2 kStep lanes the sum of its halves: a's blocks, then b's.
+template <int kStep, int N, int... kLanes>
+SPLAT_INLINE Vector<float, N> fold(Vector<float, N> a, Vector<float, N> b,
+                                   std::integer_sequence<int, kLanes...>) {
+    constexpr auto at = [](int lane) { return lane / kStep * 2 * kStep + lane % kStep; };
+    return shuffle<at(kLanes)...>(a, b) + shuffle<(at(kLanes) + kStep)...>(a, b);
+}
+template <int kStep, int N>
+SPLAT_INLINE Vector<float, N> fold(Vector<float, N> a, Vector<float, N> b) {
+    if constexpr (kOneRegister<float, N>)
+        return fold<kStep>(a, b, LaneSequence<N>{});
+    else if constexpr (kStep == N / 2)
+        return {a.low + a.high, b.low + b.high};
+    else
+        return {fold<kStep>(a.low, a.high), fold<kStep>(b.low, b.high)};
+}
+
+// Lanes kFirst, kSecond of a, then of b, in each quarter of 4 lanes.
+template <int kFirst, int kSecond, int N, int... kLanes>
+SPLAT_INLINE Vector<float, N> within(Vector<float, N> a, Vector<float, N> b,
+                                     std::integer_sequence<int, kLanes...>) {
+    return shuffle<(kLanes / 4 * 4 + (kLanes % 2 ? kSecond : kFirst) +
+                    (kLanes % 4 < 2 ? 0 : N))...>(a, b);
+}
+template <int kFirst, int kSecond, int N>
+SPLAT_INLINE Vector<float, N> within(Vector<float, N> a, Vector<float, N> b) {
+    if constexpr (kOneRegister<float, N>)
+        return within<kFirst, kSecond>(a, b, LaneSequence<N>{});
+    else
+        return {within<kFirst, kSecond>(a.low, b.low), within<kFirst, kSecond>(a.high, b.high)};
+}
+
 // Lane sums of 12 vectors in a fixed order: sum(v[i]) lands in lane sum_lane(i), the other lanes
 // are junk. Each step halves the lanes of two vectors into one.
 constexpr int sum_lane(int i) { return 4 * (i % 4) + i / 4; }
 
-template <int A, int B, int C, int D>
-SPLAT_INLINE f32x16 quarters(f32x16 a, f32x16 b) {  // 128-bit parts A, B of a, then C, D of b
-    const i32x16 order = {4 * A,      4 * A + 1,  4 * A + 2,  4 * A + 3,  4 * B,      4 * B + 1,
-                          4 * B + 2,  4 * B + 3,  4 * C + 16, 4 * C + 17, 4 * C + 18, 4 * C + 19,
-                          4 * D + 16, 4 * D + 17, 4 * D + 18, 4 * D + 19};
-    return __builtin_shuffle(a, b, order);
-}
-template <int A, int B>
-SPLAT_INLINE f32x16 within(f32x16 a, f32x16 b) {  // in each 128-bit part: A, B of a, A, B of b
-    const i32x16 order = {A,     B,     A + 16, B + 16, A + 4,  B + 4,  A + 20, B + 20,
-                          A + 8, B + 8, A + 24, B + 24, A + 12, B + 12, A + 28, B + 28};
-    return __builtin_shuffle(a, b, order);
-}
-
-SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[12]) {
-    f32x16 part[3];
+template <int N>
+SPLAT_INLINE f32x16 sum_lanes(const Vector<float, N> (&v)[12]) {
+    f32x16 part[3];  // of four vectors a quarter of lanes each
     for (int i = 0; i < 3; i++) {
-        const f32x16* u = v + 4 * i;
-        const f32x16 a = quarters<0, 1, 0, 1>(u[0], u[1]) + quarters<2, 3, 2, 3>(u[0], u[1]);
-        const f32x16 b = quarters<0, 1, 0, 1>(u[2], u[3]) + quarters<2, 3, 2, 3>(u[2], u[3]);
-        part[i] = quarters<0, 2, 0, 2>(a, b) + quarters<1, 3, 1, 3>(a, b);
+        const Vector<float, N>* u = v + 4 * i;
+        if constexpr (N == 16)
+            part[i] = fold<4>(fold<8>(u[0], u[1]), fold<8>(u[2], u[3]));
+        else
+            part[i] = combine(fold<4>(u[0], u[1]), fold<4>(u[2], u[3]));
     }
     const f32x16 a = within<0, 1>(part[0], part[1]) + within<2, 3>(part[0], part[1]);
     const f32x16 b = within<0, 1>(part[2], part[2]) + within<2, 3>(part[2], part[2]);
     return within<0, 2>(a, b) + within<1, 3>(a, b);
-}
-
-// The same for 4 vectors: sum(v[i]) lands in lane 4 i.
-SPLAT_INLINE f32x16 sum_lanes(const f32x16 (&v)[4]) {
-    const f32x16 a = quarters<0, 1, 0, 1>(v[0], v[1]) + quarters<2, 3, 2, 3>(v[0], v[1]);
-    const f32x16 b = quarters<0, 1, 0, 1>(v[2], v[3]) + quarters<2, 3, 2, 3>(v[2], v[3]);
-    const f32x16 part = quarters<0, 2, 0, 2>(a, b) + quarters<1, 3, 1, 3>(a, b);
-    const f32x16 pairs = within<0, 1>(part, part) + within<2, 3>(part, part);
-    return within<0, 2>(pairs, pairs) + within<1, 3>(pairs, pairs);
 }
 
 }  // namespace splat

@@ -1,303 +1,443 @@
-// Vectors of 512 bits in GCC's vector extension, which clang shares: one vector register with
-// AVX-512, two with AVX2, four with SSE or NEON; the compiler splits. The arithmetic is written
-// once. Only what the extension cannot say well has a second form for AVX-512.
+// Vectors of a fixed number of lanes in registers that the target has. A vector that fits is one
+// register; a longer one is a pair of vectors of half the lanes. So a 16-lane float32 vector is one
+// AVX-512 register, two of AVX2 or four of SSE and NEON, and the arithmetic is written once.
+//
+// GCC and Clang could split long vectors themselves, but GCC does it lane by lane through memory.
 #pragma once
 
 #include <cstdint>
 #include <cstring>
-#if defined(__AVX512F__) && defined(__AVX512DQ__)
-#include <immintrin.h>
-#define SPLAT_AVX512 1
-#else
-#define SPLAT_AVX512 0
-#endif
+#include <type_traits>
 
 #define SPLAT_INLINE inline __attribute__((always_inline))
 
+#if defined(__x86_64__)
+#include "registers_x86.h"
+#elif defined(__aarch64__)
+#include "registers_neon.h"
+#else
+#error "the kernels are written for x86-64 and aarch64"
+#endif
+
 namespace splat {
 
-typedef float f32x16 __attribute__((vector_size(64)));
-typedef int32_t i32x16 __attribute__((vector_size(64)));
-typedef float f32x8 __attribute__((vector_size(32)));
-typedef double f64x8 __attribute__((vector_size(64)));
-typedef int64_t i64x8 __attribute__((vector_size(64)));
-// Where bits are put together, or lanes may hold junk: these wrap around by definition.
-typedef uint32_t u32x16 __attribute__((vector_size(64)));
-typedef uint64_t u64x8 __attribute__((vector_size(64)));
+// ---- Types ----
 
-constexpr f32x16 kLane = {0, 1, 2, 3, 4, 5, 6, 7, 8, 9, 10, 11, 12, 13, 14, 15};
+template <class T, int N>
+constexpr bool kOneRegister = N * sizeof(T) <= kRegisterBytes;
 
-SPLAT_INLINE f32x16 splat16(float x) { return f32x16{} + x; }
-SPLAT_INLINE f64x8 splat8(double x) { return f64x8{} + x; }
+template <class T, int N, bool = kOneRegister<T, N>>
+struct Vector {
+    Vector<T, N / 2> low, high;
+};
+template <class T, int N>
+struct Vector<T, N, true> {
+    typedef T Register __attribute__((vector_size(N * sizeof(T))));
+    Register lanes;
+};
+
+// A truth value per lane of Vector<T, N>.
+template <class T, int N, bool = kOneRegister<T, N>>
+struct Mask {
+    Mask<T, N / 2> low, high;
+};
+template <class T, int N>
+struct Mask<T, N, true> {
+#if SPLAT_AVX512
+    native::MaskBits<N> lanes;
+#else
+    typename Vector<T, N>::Register lanes;
+#endif
+};
+
+using f32x16 = Vector<float, 16>;
+using f32x8 = Vector<float, 8>;
+using i32x16 = Vector<int32_t, 16>;
+using u32x16 = Vector<uint32_t, 16>;  // wraps around: for bits, and lanes that may hold junk
+using Mask16 = Mask<float, 16>;
+
+template <int N>
+using Signed = Vector<int32_t, N>;
+template <int N>
+using Unsigned = Vector<uint32_t, N>;
+
+// ---- Memory ----
+
+// Register by register: GCC 12 would copy 32 bytes as two halves, and who stores halves and loads
+// the whole waits for both.
+template <class V>
+SPLAT_INLINE V load(const void* from) {
+    if constexpr (sizeof(V) <= kRegisterBytes) {
+        typedef typename V::Register Unaligned __attribute__((aligned(1), may_alias));
+        return {*static_cast<const Unaligned*>(from)};
+    } else {
+        using Half = decltype(V::low);
+        return {load<Half>(from), load<Half>(static_cast<const char*>(from) + sizeof(Half))};
+    }
+}
+template <class V>
+SPLAT_INLINE void store(void* to, V v) {
+    if constexpr (sizeof(V) <= kRegisterBytes) {
+        typedef typename V::Register Unaligned __attribute__((aligned(1), may_alias));
+        *static_cast<Unaligned*>(to) = v.lanes;
+    } else {
+        store(to, v.low);
+        store(static_cast<char*>(to) + sizeof(v.low), v.high);
+    }
+}
+
+// The bits of a vector as one of another type.
+template <class To, class T, int N>
+SPLAT_INLINE To bit_cast(Vector<T, N> v) {
+    static_assert(sizeof(To) == sizeof(v));
+    if constexpr (kOneRegister<T, N>)
+        return {(typename To::Register)v.lanes};
+    else
+        return {bit_cast<decltype(To::low)>(v.low), bit_cast<decltype(To::high)>(v.high)};
+}
+
+// ---- Arithmetic, lane by lane ----
 
 template <class V, class T>
-SPLAT_INLINE V load(const T* from) {
+SPLAT_INLINE V broadcast(T x) {
     V v;
-    std::memcpy(&v, from, sizeof(V));
+    if constexpr (sizeof(V) <= kRegisterBytes) {
+        // Not 0 + x, which is not x where x is -0.
+        if constexpr (std::is_floating_point_v<T>)
+            v.lanes = x - typename V::Register{};
+        else
+            v.lanes = typename V::Register{} + x;
+    } else {
+        v.low = v.high = broadcast<decltype(V::low)>(x);
+    }
     return v;
 }
-template <class V, class T>
-SPLAT_INLINE void store(T* to, V v) {
-    std::memcpy(to, &v, sizeof(V));
+SPLAT_INLINE f32x16 splat16(float x) { return broadcast<f32x16>(x); }
+
+template <class T>
+using Scalar = std::common_type_t<T>;  // not deduced: literals convert
+
+#define SPLAT_OPERATOR(op)                                                                    \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Vector<T, N> b) {                   \
+        if constexpr (kOneRegister<T, N>)                                                     \
+            return {a.lanes op b.lanes};                                                      \
+        else                                                                                  \
+            return {a.low op b.low, a.high op b.high};                                        \
+    }                                                                                         \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Scalar<T> b) {                      \
+        return a op broadcast<Vector<T, N>>(b);                                               \
+    }                                                                                         \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Vector<T, N> operator op(Scalar<T> a, Vector<T, N> b) {                      \
+        return broadcast<Vector<T, N>>(a) op b;                                               \
+    }                                                                                         \
+    template <class T, int N, class B>                                                        \
+    SPLAT_INLINE Vector<T, N>& operator op##=(Vector<T, N>& a, B b) {                         \
+        return a = a op b;                                                                    \
+    }
+SPLAT_OPERATOR(+)
+SPLAT_OPERATOR(-)
+SPLAT_OPERATOR(*)
+SPLAT_OPERATOR(/)
+SPLAT_OPERATOR(&)
+SPLAT_OPERATOR(|)
+#undef SPLAT_OPERATOR
+
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> operator-(Vector<T, N> v) {
+    if constexpr (kOneRegister<T, N>)
+        return {-v.lanes};
+    else
+        return {-v.low, -v.high};
+}
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> operator<<(Vector<T, N> v, int bits) {
+    if constexpr (kOneRegister<T, N>)
+        return {v.lanes << bits};
+    else
+        return {v.low << bits, v.high << bits};
+}
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> operator>>(Vector<T, N> v, int bits) {
+    if constexpr (kOneRegister<T, N>)
+        return {v.lanes >> bits};
+    else
+        return {v.low >> bits, v.high >> bits};
 }
 
-// The first `count` lanes, 0 to 16, from and to memory; zeros stand for the others.
-SPLAT_INLINE f32x16 load_first(const float* from, int count) {
+// v[i] << bits[i], for bits in [0, 31].
+template <int N>
+SPLAT_INLINE Unsigned<N> shift_left(Unsigned<N> v, Signed<N> bits) {
+    if constexpr (kOneRegister<uint32_t, N>)
+        return {native::shift_left(v.lanes, bits.lanes)};
+    else
+        return {shift_left(v.low, bits.low), shift_left(v.high, bits.high)};
+}
+
+// min and max are b where a or b is NaN.
+#define SPLAT_FUNCTION(name)                                         \
+    template <class T, int N>                                        \
+    SPLAT_INLINE Vector<T, N> name(Vector<T, N> a, Vector<T, N> b) { \
+        if constexpr (kOneRegister<T, N>)                            \
+            return {native::name(a.lanes, b.lanes)};                 \
+        else                                                         \
+            return {name(a.low, b.low), name(a.high, b.high)};       \
+    }
+SPLAT_FUNCTION(min)
+SPLAT_FUNCTION(max)
+#undef SPLAT_FUNCTION
+#define SPLAT_FUNCTION(name)                          \
+    template <class T, int N>                         \
+    SPLAT_INLINE Vector<T, N> name(Vector<T, N> v) {  \
+        if constexpr (kOneRegister<T, N>)             \
+            return {native::name(v.lanes)};           \
+        else                                          \
+            return {name(v.low), name(v.high)};       \
+    }
+SPLAT_FUNCTION(sqrt)
+SPLAT_FUNCTION(floor)
+SPLAT_FUNCTION(ceil)
+#undef SPLAT_FUNCTION
+
+template <int N>
+SPLAT_INLINE Vector<float, N> abs(Vector<float, N> v) {
+    return bit_cast<Vector<float, N>>(bit_cast<Unsigned<N>>(v) & 0x7fffffffu);
+}
+
+// ---- Masks ----
+
 #if SPLAT_AVX512
-    return _mm512_maskz_loadu_ps(__mmask16((1u << count) - 1), from);
+#define SPLAT_COMPARISON(name, op)                                                            \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) {                            \
+        return {native::name(a.lanes, b.lanes)};                                              \
+    }
 #else
-    f32x16 v = {};
-    std::memcpy(&v, from, count * sizeof(float));
-    return v;
+#define SPLAT_COMPARISON(name, op)                                                            \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) {                            \
+        if constexpr (kOneRegister<T, N>)                                                     \
+            return {(typename Vector<T, N>::Register)(a.lanes op b.lanes)};                   \
+        else                                                                                  \
+            return {name(a.low, b.low), name(a.high, b.high)};                                \
+    }
+#endif
+SPLAT_COMPARISON(ge, >=)
+SPLAT_COMPARISON(gt, >)
+SPLAT_COMPARISON(eq, ==)
+#undef SPLAT_COMPARISON
+// False where a lane is NaN, as all comparisons.
+#define SPLAT_COMPARISON(op, expression)                                          \
+    template <class T, int N>                                                     \
+    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Vector<T, N> b) {         \
+        return expression;                                                        \
+    }                                                                             \
+    template <class T, int N>                                                     \
+    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Scalar<T> b) {            \
+        return a op broadcast<Vector<T, N>>(b);                                   \
+    }
+SPLAT_COMPARISON(>=, ge(a, b))
+SPLAT_COMPARISON(>, gt(a, b))
+SPLAT_COMPARISON(<=, ge(b, a))
+SPLAT_COMPARISON(<, gt(b, a))
+SPLAT_COMPARISON(==, eq(a, b))
+#undef SPLAT_COMPARISON
+
+#if SPLAT_AVX512
+#define SPLAT_MASK_OPERATOR(op)                                                \
+    template <class T, int N>                                                  \
+    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) {          \
+        return {{uint16_t(a.lanes.bits op b.lanes.bits)}};                     \
+    }
+#else
+#define SPLAT_MASK_OPERATOR(op)                                                               \
+    template <class T, int N>                                                                 \
+    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) {                         \
+        if constexpr (kOneRegister<T, N>) {                                                   \
+            using Bits = typename Vector<uint32_t, int(N * sizeof(T) / 4)>::Register;         \
+            return {(typename Vector<T, N>::Register)((Bits)a.lanes op (Bits)b.lanes)};       \
+        } else {                                                                              \
+            return {a.low op b.low, a.high op b.high};                                        \
+        }                                                                                     \
+    }
+#endif
+SPLAT_MASK_OPERATOR(&)
+SPLAT_MASK_OPERATOR(|)
+#undef SPLAT_MASK_OPERATOR
+
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> select(Mask<T, N> m, Vector<T, N> yes, Vector<T, N> no) {
+    if constexpr (kOneRegister<T, N>)
+        return {native::select(m.lanes, yes.lanes, no.lanes)};
+    else
+        return {select(m.low, yes.low, no.low), select(m.high, yes.high, no.high)};
+}
+
+// 0 where not m.
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> keep(Mask<T, N> m, Vector<T, N> v) {
+#if SPLAT_AVX512
+    return {native::keep(m.lanes, v.lanes)};
+#else
+    if constexpr (kOneRegister<T, N>) {
+        using Bits = typename Vector<uint32_t, int(N * sizeof(T) / 4)>::Register;
+        return {(typename Vector<T, N>::Register)((Bits)m.lanes & (Bits)v.lanes)};
+    } else {
+        return {keep(m.low, v.low), keep(m.high, v.high)};
+    }
 #endif
 }
-SPLAT_INLINE void store_first(float* to, f32x16 v, int count) {
+
+// a b, and 0 where not m.
+template <class T, int N>
+SPLAT_INLINE Vector<T, N> product(Mask<T, N> m, Vector<T, N> a, Vector<T, N> b) {
 #if SPLAT_AVX512
-    _mm512_mask_storeu_ps(to, __mmask16((1u << count) - 1), v);
+    return {native::product(m.lanes, a.lanes, b.lanes)};
 #else
-    std::memcpy(to, &v, count * sizeof(float));
+    return keep(m, a * b);
 #endif
 }
 
-// ---- Masks of 16 lanes: a mask register with AVX-512, lanes of 0 or -1 elsewhere ----
-
+// A bit per lane, the first in bit 0.
+template <class T, int N>
+SPLAT_INLINE uint32_t bits(Mask<T, N> m) {
 #if SPLAT_AVX512
-struct Mask16 {
-    __mmask16 bits;
-};
-SPLAT_INLINE Mask16 ge(f32x16 a, f32x16 b) { return {_mm512_cmp_ps_mask(a, b, _CMP_GE_OQ)}; }
-SPLAT_INLINE Mask16 lt(f32x16 a, f32x16 b) { return {_mm512_cmp_ps_mask(a, b, _CMP_LT_OQ)}; }
-SPLAT_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {__mmask16(a.bits & b.bits)}; }
-SPLAT_INLINE Mask16 and_not(Mask16 a, Mask16 b) { return {__mmask16(a.bits & ~b.bits)}; }
-SPLAT_INLINE f32x16 select(Mask16 m, f32x16 yes, f32x16 no) {
-    return _mm512_mask_mov_ps(no, m.bits, yes);
-}
-SPLAT_INLINE f32x16 keep(Mask16 m, f32x16 v) { return _mm512_maskz_mov_ps(m.bits, v); }
-SPLAT_INLINE f32x16 product(Mask16 m, f32x16 a, f32x16 b) {  // 0 where not m
-    return _mm512_maskz_mul_ps(m.bits, a, b);
-}
-SPLAT_INLINE uint32_t bits(Mask16 m) { return m.bits; }
-SPLAT_INLINE f32x16 min(f32x16 a, f32x16 b) { return _mm512_min_ps(a, b); }
-SPLAT_INLINE f32x16 max(f32x16 a, f32x16 b) { return _mm512_max_ps(a, b); }
-SPLAT_INLINE f32x16 floor(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_NEG_INF); }
-SPLAT_INLINE f32x16 ceil(f32x16 v) { return _mm512_roundscale_ps(v, _MM_FROUND_TO_POS_INF); }
-SPLAT_INLINE f32x16 sqrt(f32x16 v) { return _mm512_sqrt_ps(v); }
-SPLAT_INLINE f64x8 sqrt(f64x8 v) { return _mm512_sqrt_pd(v); }
-SPLAT_INLINE f64x8 floor(f64x8 v) { return _mm512_roundscale_pd(v, _MM_FROUND_TO_NEG_INF); }
-SPLAT_INLINE f64x8 ceil(f64x8 v) { return _mm512_roundscale_pd(v, _MM_FROUND_TO_POS_INF); }
-SPLAT_INLINE uint32_t bits(i64x8 m) { return _mm512_movepi64_mask(__m512i(m)); }
-SPLAT_INLINE Mask16 mask(uint32_t bits) { return {__mmask16(bits)}; }
+    return m.lanes.bits;
 #else
-struct Mask16 {
-    i32x16 lanes;
-};
-SPLAT_INLINE Mask16 ge(f32x16 a, f32x16 b) { return {i32x16(a >= b)}; }
-SPLAT_INLINE Mask16 lt(f32x16 a, f32x16 b) { return {i32x16(a < b)}; }
-SPLAT_INLINE Mask16 operator&(Mask16 a, Mask16 b) { return {a.lanes & b.lanes}; }
-SPLAT_INLINE Mask16 and_not(Mask16 a, Mask16 b) { return {a.lanes & ~b.lanes}; }
-SPLAT_INLINE f32x16 select(Mask16 m, f32x16 yes, f32x16 no) {
-    return f32x16((m.lanes & i32x16(yes)) | (~m.lanes & i32x16(no)));
-}
-SPLAT_INLINE f32x16 keep(Mask16 m, f32x16 v) { return f32x16(m.lanes & i32x16(v)); }
-SPLAT_INLINE f32x16 product(Mask16 m, f32x16 a, f32x16 b) { return keep(m, a * b); }
-SPLAT_INLINE uint32_t bits(Mask16 m) {
-    uint32_t packed = 0;
-    for (int i = 0; i < 16; i++) packed |= uint32_t(m.lanes[i] & 1) << i;
-    return packed;
-}
-SPLAT_INLINE f32x16 min(f32x16 a, f32x16 b) { return select(lt(a, b), a, b); }
-SPLAT_INLINE f32x16 max(f32x16 a, f32x16 b) { return select(lt(a, b), b, a); }
-SPLAT_INLINE f32x16 floor(f32x16 v) {
-    for (int i = 0; i < 16; i++) v[i] = __builtin_floorf(v[i]);
-    return v;
-}
-SPLAT_INLINE f32x16 ceil(f32x16 v) {
-    for (int i = 0; i < 16; i++) v[i] = __builtin_ceilf(v[i]);
-    return v;
-}
-SPLAT_INLINE f32x16 sqrt(f32x16 v) {
-    for (int i = 0; i < 16; i++) v[i] = __builtin_sqrtf(v[i]);
-    return v;
-}
-SPLAT_INLINE f64x8 sqrt(f64x8 v) {
-    for (int i = 0; i < 8; i++) v[i] = __builtin_sqrt(v[i]);
-    return v;
-}
-SPLAT_INLINE f64x8 floor(f64x8 v) {
-    for (int i = 0; i < 8; i++) v[i] = __builtin_floor(v[i]);
-    return v;
-}
-SPLAT_INLINE f64x8 ceil(f64x8 v) {
-    for (int i = 0; i < 8; i++) v[i] = __builtin_ceil(v[i]);
-    return v;
-}
-SPLAT_INLINE uint32_t bits(i64x8 m) {
-    uint32_t packed = 0;
-    for (int i = 0; i < 8; i++) packed |= uint32_t(m[i] & 1) << i;
-    return packed;
-}
-SPLAT_INLINE Mask16 mask(uint32_t bits) {
-    i32x16 lanes;
-    for (int i = 0; i < 16; i++) lanes[i] = -int32_t(bits >> i & 1);
-    return {lanes};
-}
+    if constexpr (kOneRegister<T, N>)
+        return native::mask_bits(m.lanes);
+    else
+        return bits(m.low) | bits(m.high) << (N / 2);
 #endif
-
-SPLAT_INLINE Mask16 gt(i32x16 a, int32_t b) {
+}
+template <class T, int N>
+SPLAT_INLINE bool any(Mask<T, N> m) {
 #if SPLAT_AVX512
-    return {_mm512_cmpgt_epi32_mask(__m512i(a), _mm512_set1_epi32(b))};
+    return m.lanes.bits != 0;
 #else
-    return {a > b};
+    if constexpr (kOneRegister<T, N>)
+        return native::mask_bits(m.lanes) != 0;
+    else
+        return any(m.low | m.high);
 #endif
 }
 
 // Lanes of which bit number `bit` is set.
-SPLAT_INLINE Mask16 has_bit(u32x16 v, int bit) {
+template <int N>
+SPLAT_INLINE Mask<float, N> has_bit(Unsigned<N> v, int bit) {
 #if SPLAT_AVX512
-    return {_mm512_test_epi32_mask(__m512i(v), _mm512_set1_epi32(1 << bit))};
+    return {native::has_bit((__m512i)v.lanes, bit)};
 #else
-    return {-i32x16(v >> uint32_t(bit) & 1u)};
+    if constexpr (kOneRegister<uint32_t, N>)
+        return {(typename Vector<float, N>::Register)((typename Signed<N>::Register)(
+                    v.lanes << (31 - bit)) < 0)};
+    else
+        return {has_bit(v.low, bit), has_bit(v.high, bit)};
 #endif
 }
 
-SPLAT_INLINE bool any(Mask16 m) {
+template <int N>
+SPLAT_INLINE Mask<float, N> gt(Signed<N> a, int32_t b) {
 #if SPLAT_AVX512
-    return m.bits != 0;
+    return {native::gt((__m512i)a.lanes, _mm512_set1_epi32(b))};
 #else
-    int32_t seen = 0;
-    for (int i = 0; i < 16; i++) seen |= m.lanes[i];
-    return seen != 0;
+    if constexpr (kOneRegister<int32_t, N>)
+        return {(typename Vector<float, N>::Register)(a.lanes > b)};
+    else
+        return {gt(a.low, b), gt(a.high, b)};
 #endif
 }
 
-// Writes base + kStep i for every bit i of `bits`, lowest first; returns how many. May write junk
-// up to to[15].
-template <uint32_t kStep>
+// The lanes whose bits are set.
+SPLAT_INLINE Mask16 mask(uint32_t bits) {
+#if SPLAT_AVX512
+    return {{uint16_t(bits)}};
+#else
+    alignas(64) static constexpr uint32_t kBit[16] = {
+        1,      1 << 1, 1 << 2,  1 << 3,  1 << 4,  1 << 5,  1 << 6,  1 << 7,
+        1 << 8, 1 << 9, 1 << 10, 1 << 11, 1 << 12, 1 << 13, 1 << 14, 1 << 15};
+    const i32x16 set = bit_cast<i32x16>(load<u32x16>(kBit) & bits);
+    return gt(set, 0);
+#endif
+}
+
+// ---- Conversions ----
+
+alignas(64) constexpr float kLaneNumbers[16] = {0, 1, 2,  3,  4,  5,  6,  7,
+                                                8, 9, 10, 11, 12, 13, 14, 15};
+SPLAT_INLINE f32x16 lane_numbers() { return load<f32x16>(kLaneNumbers); }
+
+// Towards zero; junk where the result does not fit.
+template <int N>
+SPLAT_INLINE Signed<N> to_int(Vector<float, N> v) {
+    if constexpr (kOneRegister<float, N>)
+        return {(typename Signed<N>::Register)native::truncate(v.lanes)};
+    else
+        return {to_int(v.low), to_int(v.high)};
+}
+
+// Between float32 and float64, where the latter is one register.
+template <int N>
+SPLAT_INLINE Vector<double, N> widen(Vector<float, N> v) {
+    return {native::widen(v.lanes)};
+}
+template <int N>
+SPLAT_INLINE Vector<float, N> narrow(Vector<double, N> v) {
+    return {native::narrow(v.lanes)};
+}
+
+// One vector of parts in a row. (Stores of parts and a load of the whole would wait for memory.)
+template <int N>
+SPLAT_INLINE Vector<float, 2 * N> combine(Vector<float, N> low, Vector<float, N> high) {
+    if constexpr (kOneRegister<float, 2 * N>)
+        return {native::combine(low.lanes, high.lanes)};
+    else
+        return {low, high};
+}
+template <int kCount, int N>
+SPLAT_INLINE Vector<float, kCount * N> join(const Vector<float, N>* parts) {
+    if constexpr (kCount == 1)
+        return parts[0];
+    else
+        return combine(join<kCount / 2>(parts), join<kCount / 2>(parts + kCount / 2));
+}
+
+// ---- Bits as numbers ----
+
+#if !SPLAT_AVX512
+// The places of the bits of a byte, lowest first.
+struct BitPlaces {
+    uint8_t of[256][8];
+    constexpr BitPlaces() : of() {
+        for (int byte = 0; byte < 256; byte++)
+            for (int bit = 0, n = 0; bit < 8; bit++)
+                if (byte >> bit & 1) of[byte][n++] = uint8_t(bit);
+    }
+};
+alignas(64) constexpr BitPlaces kBitPlaces;
+#endif
+
+// Writes base + kStep i for every bit i of kBits, lowest first; returns how many. May write junk
+// up to to[kBits - 1].
+template <int kBits, uint32_t kStep>
 SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
 #if SPLAT_AVX512
-    const u32x16 all = base + kStep * __builtin_convertvector(kLane, u32x16);
-    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), __m512i(all)));
+    static_assert(kBits == 16);
+    const u32x16 all = bit_cast<u32x16>(to_int(lane_numbers())) * kStep + base;
+    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), (__m512i)all.lanes));
     return __builtin_popcount(bits);
 #else
-    int n = 0;
-    for (; bits; bits &= bits - 1) to[n++] = base + kStep * uint32_t(__builtin_ctz(bits));
-    return n;
-#endif
-}
-
-// In lanes 0, 4, 8 and 12: the bits set in any of the four lanes from there on.
-SPLAT_INLINE u32x16 any_of_four(u32x16 v) {
-    v |= __builtin_shuffle(v, u32x16{1, 0, 3, 2, 5, 4, 7, 6, 9, 8, 11, 10, 13, 12, 15, 14});
-    return v | __builtin_shuffle(v, u32x16{2, 3, 0, 1, 6, 7, 4, 5, 10, 11, 8, 9, 14, 15, 12, 13});
-}
-
-SPLAT_INLINE f32x16 abs(f32x16 v) { return f32x16(i32x16(v) & 0x7fffffff); }
-
-// 1 / x to about 2^-26, for x in [1e-37, 1e37].
-SPLAT_INLINE f32x16 reciprocal(f32x16 x) {
-#if SPLAT_AVX512
-    const f32x16 guess = _mm512_rcp14_ps(x);
-    return guess * (2.0f - x * guess);
-#else
-    return 1.0f / x;
-#endif
-}
-
-// 1 / x and 1 / sqrt(x) in float64 to about 2^-52, for x in [1e-300, 1e300]: Newton's steps from a
-// guess of 14 bits, where a division of eight lanes takes 16 to 24 cycles and a root more. 0 and
-// infinity may give NaN.
-SPLAT_INLINE f64x8 reciprocal(f64x8 x) {
-#if SPLAT_AVX512
-    f64x8 guess = _mm512_rcp14_pd(x);
-    for (int i = 0; i < 2; i++) guess += guess * (1.0 - x * guess);
-    return guess;
-#else
-    return 1.0 / x;
-#endif
-}
-SPLAT_INLINE f64x8 inverse_sqrt(f64x8 x) {
-#if SPLAT_AVX512
-    f64x8 guess = _mm512_rsqrt14_pd(x);
-    for (int i = 0; i < 2; i++) guess += 0.5 * guess * (1.0 - x * guess * guess);
-    return guess;
-#else
-    return 1.0 / sqrt(x);
-#endif
-}
-
-// ---- Two vectors of eight for one of sixteen ----
-
-SPLAT_INLINE f64x8 widen(f32x16 v, int half) {
-    f32x8 part;
-    std::memcpy(&part, reinterpret_cast<const char*>(&v) + half * sizeof(part), sizeof(part));
-    return __builtin_convertvector(part, f64x8);
-}
-SPLAT_INLINE f32x16 narrow(f64x8 low, f64x8 high) {
-#if SPLAT_AVX512
-    const __m512 lower = _mm512_castps256_ps512(_mm512_cvtpd_ps(low));
-    return _mm512_insertf32x8(lower, _mm512_cvtpd_ps(high), 1);
-#else
-    const f32x8 parts[2] = {__builtin_convertvector(low, f32x8),
-                            __builtin_convertvector(high, f32x8)};
-    return load<f32x16>(parts);
-#endif
-}
-
-// ---- Elementary functions ----
-
-// 2^x in float32, relative error under 2e-7 for x in [-126, 126]; junk, but no trap, outside.
-// Rounds by the magic number 1.5 * 2^23, whose low bits are then the exponent.
-template <int kCount>
-SPLAT_INLINE void exp2(const f32x16 (&x)[kCount], f32x16 (&out)[kCount]) {
-    const float magic = 12582912.0f;
-    f32x16 shifted[kCount], f[kCount], f2[kCount];
-    for (int i = 0; i < kCount; i++) shifted[i] = x[i] + magic;
-    for (int i = 0; i < kCount; i++) f[i] = x[i] - (shifted[i] - magic);
-    for (int i = 0; i < kCount; i++) f2[i] = f[i] * f[i];
-    for (int i = 0; i < kCount; i++) {
-        const f32x16 low = 0.6931469440460205f * f[i] + 1.0000001192092896f;
-        const f32x16 mid = 0.05550713092088699f * f[i] + 0.24022120237350464f;
-        const f32x16 high = 0.001327647129073739f * f[i] + 0.009675540961325169f;
-        const f32x16 power = (high * f2[i] + mid) * f2[i] + low;
-        out[i] = f32x16(u32x16(power) + (u32x16(shifted[i]) << 23));
+    int count = 0;
+    for (int byte = 0; byte < kBits / 8; byte++, bits >>= 8) {
+        Unsigned<8> places;
+        native::widen_bytes(kBitPlaces.of[bits & 255], &places);
+        store(to + count, places * kStep + (base + 8 * byte * kStep));
+        count += __builtin_popcount(bits & 255);
     }
-}
-
-template <class V>
-SPLAT_INLINE f64x8 select(V m, f64x8 yes, f64x8 no) {
-    return f64x8((i64x8(m) & i64x8(yes)) | (~i64x8(m) & i64x8(no)));
-}
-
-SPLAT_INLINE f64x8 clamp(f64x8 v, double low, double high) {
-    v = select(v < low, splat8(low), v);
-    return select(v > high, splat8(high), v);
-}
-
-// e^x in float64, relative error under 1e-13; x is clamped to [-700, 700]. Taylor to degree 11
-// on |r| <= ln(2) / 2.
-SPLAT_INLINE f64x8 exp(f64x8 x) {
-    const double magic = 6755399441055744.0;  // 1.5 * 2^52
-    x = clamp(x, -700.0, 700.0);
-    const f64x8 shifted = x * 1.4426950408889634 + magic;
-    const f64x8 n = shifted - magic;
-    const f64x8 r = (x - n * 0.693147180369123816490) - n * 1.90821492927058770002e-10;
-    constexpr double inverse_factorial[] = {1.0 / 3628800, 1.0 / 362880, 1.0 / 40320, 1.0 / 5040,
-                                            1.0 / 720,     1.0 / 120,    1.0 / 24,    1.0 / 6,
-                                            0.5,           1.0,          1.0};
-    f64x8 p = splat8(1.0 / 39916800);
-    for (double c : inverse_factorial) p = p * r + c;
-    return f64x8(u64x8(p) + (u64x8(shifted) << 52));
-}
-
-// log2(x) in float64 for normal x > 0, absolute error under 1e-13: x = 2^e m with m in
-// [0.71, 1.42], ln m = 2 artanh((m - 1) / (m + 1)).
-SPLAT_INLINE f64x8 log2(f64x8 x) {
-    const i64x8 e = i64x8(u64x8(x) - 0x3fe6a09e667f3bcdULL) >> 52;  // less the bits of sqrt(0.5)
-    const f64x8 m = f64x8(u64x8(x) - (u64x8(e) << 52));
-    const f64x8 s = (m - 1.0) * reciprocal(m + 1.0), s2 = s * s;
-    f64x8 p = splat8(1.0 / 17);
-    for (int n = 15; n > 0; n -= 2) p = p * s2 + 1.0 / n;
-    return __builtin_convertvector(e, f64x8) + 2.8853900817779268 * s * p;
+    return count;
+#endif
 }
 
 }  // namespace splat

@@ -4,14 +4,19 @@
 
 #include "blend.h"
 #include "shuffle.h"
+#include "simd_math.h"
 #include "types.h"
 
 namespace splat {
 
-// Lane i of a block is its pixel (i % 4, i / 4), block i of a tile its block (i % 4, i / 4):
-// compact blocks, because more lanes of them lie inside a small ellipse than of a row of 16 pixels.
-constexpr f32x16 kColumn = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
-constexpr f32x16 kRow = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+// A block's pixels. Lane i is its pixel (i % 4, i / 4); block i of a tile is (i % 4, i / 4).
+using Pixels = Vector<float, kBlockPixels>;
+using PixelMask = Mask<float, kBlockPixels>;
+alignas(64) constexpr float kColumnNumbers[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
+alignas(64) constexpr float kRowNumbers[16] = {0, 0, 0, 0, 1, 1, 1, 1, 2, 2, 2, 2, 3, 3, 3, 3};
+SPLAT_INLINE Pixels columns() { return load<Pixels>(kColumnNumbers); }
+SPLAT_INLINE Pixels rows() { return load<Pixels>(kRowNumbers); }
+static_assert(kBlockColumns == 4 && kBlockPixels <= 16);
 
 // The pixels of one tile.
 struct Tile {
@@ -27,19 +32,21 @@ struct Tile {
     }
 
     // Transmittance of a block before the first Gaussian: 1 inside, 0 outside, where nothing draws.
-    SPLAT_INLINE f32x16 start(int block) const {
-        const Mask16 inside = lt(kColumn, splat16(float(columns - kBlock * (block % 4)))) &
-                              lt(kRow, splat16(float(rows - kBlock * (block / 4))));
-        return keep(inside, splat16(1));
+    SPLAT_INLINE Pixels start(int block) const {
+        const PixelMask inside =
+            (splat::columns() < float(columns - kBlockColumns * (block % kBlocksAcross))) &
+            (splat::rows() < float(rows - kBlockRows * (block / kBlocksAcross)));
+        return keep(inside, broadcast<Pixels>(1.0f));
     }
 
     // Calls visit(row in the block, pixel in an image of this width, number of pixels) for each of
     // a block's rows that the image has.
     template <class Visit>
     SPLAT_INLINE void each_row(int block, int64_t width, const Visit& visit) const {
-        const int left = kBlock * (block % 4), top = kBlock * (block / 4);
-        const int across = columns - left < kBlock ? columns - left : kBlock;
-        const int down = rows - top < kBlock ? rows - top : kBlock;
+        const int left = kBlockColumns * (block % kBlocksAcross);
+        const int top = kBlockRows * (block / kBlocksAcross);
+        const int across = columns - left < kBlockColumns ? columns - left : kBlockColumns;
+        const int down = rows - top < kBlockRows ? rows - top : kBlockRows;
         if (across > 0)
             for (int row = 0; row < down; row++)
                 visit(row, (y + top + row) * width + x + left, across);
@@ -47,13 +54,13 @@ struct Tile {
     // A block of an image of K floats a pixel, a vector a channel; zeros outside it.
     template <int K>
     SPLAT_INLINE void read(int block, const float* image, int64_t width,
-                           f32x16 (&channels)[K]) const {
-        f32x16 pixels[kBlock] = {};
+                           Pixels (&channels)[K]) const {
+        PixelRows<kBlockRows, K> pixels;
         each_row(block, width,
                  [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
-                     pixels[row] = load_first(image + K * pixel, K * count);
+                     pixels.read(row, image + K * pixel, count);
                  });
-        to_channels(pixels, channels);
+        pixels.to_channels(channels);
     }
     // Asks for a tile's lines of an image of K floats a pixel that will be written: rows lie far
     // apart, and each line that is written would wait for its first bytes.
@@ -64,13 +71,13 @@ struct Tile {
                 __builtin_prefetch(image + K * ((y + row) * width + x) + 16 * line, 1);
     }
     template <int K>
-    SPLAT_INLINE void write(int block, const f32x16 (&channels)[K], int64_t width,
+    SPLAT_INLINE void write(int block, const Pixels (&channels)[K], int64_t width,
                             float* image) const {
-        f32x16 pixels[kBlock];
-        to_rows(channels, pixels);
+        PixelRows<kBlockRows, K> pixels;
+        pixels.from_channels(channels);
         each_row(block, width,
                  [&](int row, int64_t pixel, int count) __attribute__((always_inline)) {
-                     store_first(image + K * pixel, pixels[row], K * count);
+                     pixels.write(row, image + K * pixel, count);
                  });
     }
 };
@@ -97,7 +104,7 @@ class Ahead {
 };
 
 // The next Gaussians of a tile, as seen from it, and (Gaussian, block) pairs of them, numbered
-// 16 * place in the batch + block.
+// kBlocks * place in the batch + block.
 //
 // log2(alpha) = log2_opacity - u^2 - w^2 (see Record), where u and w are those of a block's first
 // pixel plus what a pixel's place in the block adds. The tile's first pixel's are found in
@@ -105,7 +112,7 @@ class Ahead {
 template <int kSize>
 struct Batch {
     struct alignas(64) Gaussian {
-        f32x16 across;                   // u in a block, less its first pixel's
+        Pixels across;                   // u in a block, less its first pixel's
         float uu, uw, ww, log2_opacity;  // as in the Record
         float rgb[3], depth;
         uint32_t slot, blocks;  // as in the Entry
@@ -135,43 +142,48 @@ struct Batch {
             std::memcpy(&g.uu, &r.uu, 8 * sizeof(float));
             g.slot = e.slot;
             g.blocks = e.blocks;
-            const f32x16 across = kColumn * r.uu + kRow * r.uw;
-            g.across = across;
-            // Blocks lie in a tile as pixels do in a block.
-            store(first_u + kBlocks * n, float(kBlock) * across + float(r.uu * dx + r.uw * dy));
-            store(first_w + kBlocks * n, float(kBlock) * kRow * r.ww + float(r.ww * dy));
+            g.across = columns() * r.uu + rows() * r.uw;
+            // A vector's lanes are as many blocks, which lie in the tile as pixels do in a block.
+            const float u = float(r.uu * dx + r.uw * dy), w = float(r.ww * dy);
+            for (int block = 0; block < kBlocks; block += kBlockPixels) {
+                const Pixels row = rows() + float(block / kBlocksAcross);
+                const int at = kBlocks * n + block;
+                const Pixels right = columns() * (float(kBlockColumns) * r.uu);
+                store(first_u + at, right + row * (float(kBlockRows) * r.uw) + u);
+                store(first_w + at, row * (float(kBlockRows) * r.ww) + w);
+            }
         }
     }
 
     SPLAT_INLINE const Gaussian& of(uint32_t pair) const { return gaussian[pair / kBlocks]; }
-    SPLAT_INLINE f32x16 u(uint32_t pair) const { return of(pair).across + first_u[pair]; }
-    SPLAT_INLINE f32x16 w(uint32_t pair) const { return kRow * of(pair).ww + first_w[pair]; }
+    SPLAT_INLINE Pixels u(uint32_t pair) const { return of(pair).across + first_u[pair]; }
+    SPLAT_INLINE Pixels w(uint32_t pair) const { return rows() * of(pair).ww + first_w[pair]; }
 
     // The alphas of some pairs at once, because one alone is a chain of some fifty cycles; 0 where
     // less than kAlphaMin.
     template <int kCount>
-    SPLAT_INLINE void alphas(const uint32_t* pairs, f32x16 (&alpha)[kCount]) const {
-        f32x16 power[kCount], raw[kCount];
+    SPLAT_INLINE void alphas(const uint32_t* pairs, Pixels (&alpha)[kCount]) const {
+        Pixels power[kCount], raw[kCount];
         for (int k = 0; k < kCount; k++) {
-            const f32x16 here_u = u(pairs[k]), here_w = w(pairs[k]);
+            const Pixels here_u = u(pairs[k]), here_w = w(pairs[k]);
             power[k] = of(pairs[k]).log2_opacity - here_u * here_u - here_w * here_w;
         }
         exp2(power, raw);
         // Junk where nothing is seen could be denormal, which costs a hundred cycles.
         for (int k = 0; k < kCount; k++)
-            alpha[k] = keep(ge(power[k], splat16(kLog2AlphaMin)), min(raw[k], splat16(kAlphaMax)));
+            alpha[k] = keep(power[k] >= kLog2AlphaMin, min(raw[k], broadcast<Pixels>(kAlphaMax)));
     }
 };
 
 // The blending of one Gaussian over one block of pixels.
 struct Step {
-    f32x16 after;   // transmittance behind it, if it is drawn
-    Mask16 drawn;   // contributes, or has an alpha of 0
-    f32x16 weight;  // transmittance before * alpha where drawn, else 0
+    Pixels after;     // transmittance behind it, if it is drawn
+    PixelMask drawn;  // contributes, or has an alpha of 0
+    Pixels weight;    // transmittance before * alpha where drawn, else 0
 
-    SPLAT_INLINE Step(f32x16 alpha, f32x16 before) {
+    SPLAT_INLINE Step(Pixels alpha, Pixels before) {
         after = before - alpha * before;
-        drawn = ge(after, splat16(kTransmittanceMin));
+        drawn = after >= kTransmittanceMin;
         weight = product(drawn, alpha, before);
     }
 };

@@ -44,8 +44,8 @@ struct alignas(64) Record {
     double x, y;
     float uu, uw, ww, log2_opacity;
     float rgb[3], depth;
-    // The box of {alpha >= 1/255} in blocks of 4 x 4 pixels, inside the image; all inclusive
-    uint16_t block_left, block_top, block_right, block_bottom;
+    // The box of {alpha >= 1/255} inside the image, in cells of 4 x 4 pixels; all inclusive
+    uint16_t cell_left, cell_top, cell_right, cell_bottom;
     float unused[2];
 };
 static_assert(sizeof(Record) == 64);

@@ -6,12 +6,12 @@ CORES ?= all
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint format docs viewer setup extension clean
+.PHONY: demo test test-native lint format docs viewer setup extension clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
-	@echo "make test   run the tests"
+	@echo "make test   run the tests;  make test-native  those of the C++ code alone"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
 	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
@@ -58,7 +58,12 @@ demo: extension data/demo/demo.json
 	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
 
 test: setup $(VENV)/dev
-	@$(BIN)/python -m pytest tests -n 2 --dist loadfile
+	@$(BIN)/python -m pytest tests -n 2 --dist worksteal
+
+# What a C++ compiler can change; CXX chooses it. test_targets.py uses every compiler anyway.
+NATIVE_TESTS := tests/raster tests/sfm/test_matching.py tests/training --ignore tests/raster/test_targets.py
+test-native: setup $(VENV)/dev
+	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
 
 lint: $(VENV)/dev
 	@$(BIN)/ruff check .

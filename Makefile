@@ -27,8 +27,8 @@ PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compi
 $(VENV)/product: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
-	@command -v $${CXX:-g++} >/dev/null || \
-	  { echo "error: no C++ compiler found ($${CXX:-g++}); install g++, or set CXX"; exit 2; }
+	@command -v $${CXX:-g++} >/dev/null || { test -z "$$CXX" && command -v clang++ >/dev/null; } || \
+	  { echo "error: no C++ compiler found ($${CXX:-g++, clang++}); install g++, or set CXX"; exit 2; }
 	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || \
 	  { echo "error: no virtual environment could be made; on Debian and Ubuntu install python3-venv"; exit 2; }
 	@$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \

@@ -20,7 +20,7 @@ from typing import Any
 
 from pipeline.config.runs import Run
 from pipeline.config.schema import Config
-from pipeline.runtime.job import EXIT_USER_ERROR
+from pipeline.runtime.errors import EXIT_USER_ERROR
 
 # The same run on the same machine gives these to the bit.
 QUALITY = (

@@ -18,8 +18,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.config.runs import Run
 from pipeline.reporting.data import ranked
-from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import EXIT_USER_ERROR
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 GAP, LABEL = 6, 20  # pixels
 

@@ -19,6 +19,7 @@ from PIL import Image
 from pipeline.config.schema import Density, Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.runtime.atomic import write_json
+from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.memory import memory_mb
 from pipeline.scene.model import View
@@ -72,7 +73,7 @@ def main() -> int:
     parser.add_argument("--size", type=int, nargs=2, default=[1600, 1067], metavar=("W", "H"))
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--memory-mb", type=int, help="train.memory_mb: pictures from disk")
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--json", type=Path, help="write the figures as data")
     args = parser.parse_args()
     width, height = args.size

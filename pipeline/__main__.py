@@ -1,16 +1,17 @@
-"""``python -m pipeline``: convert, render, measure and look at Gaussians, whoever trained them."""
+"""``python -m pipeline``: convert, render, measure and look at Gaussians, whoever trained them;
+examine the machine."""
 
 from __future__ import annotations
 
 import argparse
-import os
+import json
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import EXIT_USER_ERROR, as_user_error
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.machine import usable_cores
 
 MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
 EXAMPLES = """examples:
@@ -18,6 +19,7 @@ EXAMPLES = """examples:
   python -m pipeline render scene.spz --cameras data/garden/sparse/0 -o renders
   python -m pipeline evaluate point_cloud.ply --scene results/garden
   python -m pipeline view results/garden
+  python -m pipeline doctor
 
 To reconstruct a scene from photographs: snakemake --cores all results/NAME/metrics.json
 """
@@ -26,9 +28,9 @@ To reconstruct a scene from photographs: snakemake --cores all results/NAME/metr
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return the process's exit code: 2 where the user must mend something."""
     options = vars(_parser().parse_args(arguments))
-    command: Callable[..., None] = options.pop("command")
+    command: Callable[..., int | None] = options.pop("command")
     try:
-        command(**options)
+        code = command(**options)
     except UserError as error:
         return _fail(error)
     except OSError as error:
@@ -36,7 +38,7 @@ def main(arguments: list[str] | None = None) -> int:
         if known is None:
             raise
         return _fail(known)
-    return 0
+    return code or 0
 
 
 def _fail(error: UserError) -> int:
@@ -94,6 +96,15 @@ def _tensorboard(**options: Any) -> None:
     from pipeline.watching.tensorboard import write_events
 
     _tell(write_events(**options), [])
+
+
+def _doctor(json_wanted: bool, results: Path) -> int:
+    from pipeline import doctor
+
+    found = doctor.examine(results)
+    text = json.dumps(doctor.as_data(found), indent=2) if json_wanted else None
+    _tell([text] if text else doctor.as_text(found), [])
+    return 0 if doctor.is_ready(found) else EXIT_USER_ERROR
 
 
 def _tell(lines: list[str], warnings: list[str]) -> None:
@@ -220,6 +231,23 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--follow", action="store_true", help="go on with what trainings add, until Ctrl-C"
     )
+
+    sub = commands.add_parser(
+        "doctor",
+        help="show what this machine has, what of it is used, and what is missing",
+        description="Processor and instruction set, compilers, memory, graphics cards, packages "
+        "and disk: what is there (+ used, - optional and absent, ! needed and missing) and what "
+        "to do. Exits with 2 where something needed is missing.",
+    )
+    sub.set_defaults(command=_doctor)
+    sub.add_argument("--json", dest="json_wanted", action="store_true", help="print JSON")
+    sub.add_argument(
+        "--results",
+        type=Path,
+        default=Path("results"),
+        metavar="FOLDER",
+        help="where results go: its disk is examined (default: %(default)s)",
+    )
     return parser
 
 
@@ -236,7 +264,7 @@ def _add_rendering(parser: argparse.ArgumentParser, background: str, antialias: 
         "--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this"
     )
     parser.add_argument(
-        "--threads", type=_positive, default=os.cpu_count() or 1, help="(default: all cores)"
+        "--threads", type=_positive, default=usable_cores(), help="(default: all cores)"
     )
 
 

@@ -7,13 +7,13 @@ from __future__ import annotations
 
 import argparse
 import json
-import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
 from typing import NoReturn
 
 from pipeline.runtime.job import Job, Request, run_stage
+from pipeline.runtime.machine import usable_cores
 
 
 def main(stage: str, work: Callable[[Job], None], description: str | None) -> NoReturn:
@@ -27,7 +27,7 @@ def main(stage: str, work: Callable[[Job], None], description: str | None) -> No
     parser.add_argument(
         "--publish", nargs="*", default=[], metavar="FILE=PATH", help="extra copies of outputs"
     )
-    parser.add_argument("--threads", type=int, default=os.cpu_count() or 1)
+    parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--log", type=Path, help="also write messages here")
     args = parser.parse_args()
     request = Request(

@@ -99,7 +99,11 @@ def run(job: Job) -> None:
         "known_depths": sum(map(len, known or ())),
         **result.counters,
     }
-    job.timings = {"curve_seconds": result.curve_seconds, "earlier_s": round(earlier, 3)}
+    job.timings = {
+        "ms_per_step": round(1e3 * result.seconds / result.steps, 3),
+        "curve_seconds": result.curve_seconds,
+        "earlier_s": round(earlier, 3),
+    }
 
 
 def find_depths(

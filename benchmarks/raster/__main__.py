@@ -1,11 +1,14 @@
-"""Times the rasterizer's operators and holds them to the twin; see docs/raster.md."""
+"""Times the rasterizer's operators, or drawing alone, and compares them with the twin; see
+docs/raster.md."""
 
 from __future__ import annotations
 
 import argparse
 import os
 import sys
+from collections.abc import Callable
 from dataclasses import asdict
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +16,23 @@ from typing import Any
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
 from benchmarks.raster.accuracy import Accuracy, accuracy, twin_ratio
+from benchmarks.raster.drawing import report_drawings
+from benchmarks.raster.library import Library, heading, measured_library, measured_on
 from benchmarks.raster.measure import (
     BLOCK_OPERATIONS,
     Spread,
     Step,
     Turn,
     block_pairs,
+    block_pixels,
     contributing_pairs,
     take_turns,
 )
-from benchmarks.raster.peak import VECTOR_FLOPS, Calibration, Peak
+from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.probe import OPERATORS, versus
-from benchmarks.raster.scenes import synthetic, trained
+from benchmarks.raster.scenes import Scene, synthetic, trained
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.machine import machine_facts
 
 COUNTS = [10_000, 50_000, 200_000, 1_000_000]
 SIZES = [(480, 270), (960, 540), (1920, 1080)]
@@ -40,6 +45,13 @@ def _size(text: str) -> tuple[int, int]:
     return int(width), int(height)
 
 
+def _share(text: str) -> float:
+    value = float(text)
+    if not 0 < value <= 1:
+        raise argparse.ArgumentTypeError(f"expected a number above 0 and up to 1, found {text!r}")
+    return value
+
+
 def _arguments() -> argparse.Namespace:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.raster",
@@ -48,9 +60,16 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians")
     parser.add_argument(
-        "--sizes", type=_size, nargs="+", default=SIZES, metavar="WxH", help="image sizes, pixels"
-    )
+        "--sizes", type=_size, nargs="+", metavar="WxH",
+        help="image sizes, pixels; without it 480x270 960x540 1920x1080, or the model's own",
+    )  # fmt: skip
     parser.add_argument("--radius", type=float, default=5.0, help="mean 3-sigma radius, pixels")
+    parser.add_argument(
+        "--in-view", type=_share, default=1.0, help="share of the Gaussians that the view shows"
+    )
+    parser.add_argument(
+        "--draw", action="store_true", help="measure drawing alone, in frames a second"
+    )
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
     parser.add_argument("--seconds", type=float, default=4.0, help="spent on a scene's times")
     parser.add_argument(
@@ -64,9 +83,10 @@ def _arguments() -> argparse.Namespace:
     return parser.parse_args()
 
 
-def _header(step: Step, pairs: int, error: Accuracy) -> None:
+def _header(step: Step, pairs: int, error: Accuracy, library: Library) -> None:
     print(
-        f"\n{step.scene.name}; {step.threads} threads; {pairs / 1e6:.3f}M contributing pairs, "
+        f"\n{heading(library)}\n"
+        f"{step.scene.name}; {step.threads} threads; {pairs / 1e6:.3f}M contributing pairs, "
         f"{step.drawn.num_intersections} (Gaussian, tile) pairs\n"
         f"error against the float64 twin: colour {error.colour:.1e}, "
         f"gradients {error.gradient:.1e} relative\n"
@@ -75,11 +95,11 @@ def _header(step: Step, pairs: int, error: Accuracy) -> None:
     )
 
 
-def _report(step: Step, turns: list[Turn], peak: Peak) -> dict[str, Any]:
+def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict[str, Any]:
     """Prints one number of threads' table; the same as data."""
     pairs, blocks, error = contributing_pairs(step), block_pairs(step), accuracy(step)
     costs = step.costs(pairs)
-    _header(step, pairs, error)
+    _header(step, pairs, error, library)
     operators: dict[str, dict[str, Any]] = {}
     for name in turns[0].times:
         wall = Spread.of([t.times[name].wall for t in turns])
@@ -95,8 +115,11 @@ def _report(step: Step, turns: list[Turn], peak: Peak) -> dict[str, Any]:
             found["of_peak"] = costs[name].seconds(peak) * 1e3 / cpu.median
             line += f" {found['of_peak']:8.2f}"
         if name in BLOCK_OPERATIONS and blocks:
-            least = 1e3 * BLOCK_OPERATIONS[name] * blocks  # ms, at one vector operation a second
-            over = Spread.of([t.times[name].cpu * t.flops / VECTOR_FLOPS / least for t in turns])
+            instructions = BLOCK_OPERATIONS[name] * block_pixels(step) / library.lanes
+            least = 1e3 * instructions * blocks  # ms, at one instruction a second
+            over = Spread.of(
+                [t.times[name].cpu * peak.instructions(t.flops) / least for t in turns]
+            )
             found["of_bound"] = asdict(over)
             line += f" {over.median:8.2f}x {f'{over.low:.2f} to {over.high:.2f}':>12}"
         operators[name] = found
@@ -104,6 +127,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak) -> dict[str, Any]:
     return {
         "scene": step.scene.name, "gaussians": step.scene.count, "size": list(step.state.size),
         "threads": step.threads, "turns": len(turns), "pairs": pairs, "block_pairs": blocks,
+        "block_pixels": block_pixels(step),
         "tile_pairs": step.drawn.num_intersections, "operators": operators, "error": asdict(error),
         "flops": asdict(Spread.of([t.flops for t in turns])),
     }  # fmt: skip
@@ -139,17 +163,32 @@ def _against_the_probe(step: Step, probe: Path, turns: int) -> dict[str, Any]:
     return {**asdict(found), "ratio": found.ratio, "step_ratio": found.step_ratio}
 
 
+def _scenes(args: argparse.Namespace) -> list[Callable[[], Scene]]:
+    """Made one by one: the largest are some hundred megabytes."""
+    if args.model:
+        return [partial(trained, args.model, size) for size in args.sizes or [None]]
+    return [
+        partial(synthetic, count, width, height, args.radius, args.in_view)
+        for width, height in args.sizes or SIZES
+        for count in args.counts
+    ]
+
+
 def main() -> None:
     args = _arguments()
-    scenes = (
-        [lambda: trained(args.model)]
-        if args.model
-        else [
-            lambda n=n, w=w, h=h: synthetic(n, w, h, args.radius)
-            for w, h in args.sizes
-            for n in args.counts
-        ]
-    )
+    library = measured_library()
+    print(heading(library))
+    if args.draw:
+        drawn = [report_drawings(make(), args.threads, args.seconds) for make in _scenes(args)]
+        record = {**measured_on(library), "results": drawn}
+    else:
+        record = _operators(args, library)
+    if args.json:
+        write_json(args.json, record)
+
+
+def _operators(args: argparse.Namespace, library: Library) -> dict[str, Any]:
+    """Prints the tables of a training step's operators; the same as data."""
     calibration = Calibration()
     results, speedups, peaks, ratios = [], [], [], []
     for threads in args.threads:
@@ -158,31 +197,29 @@ def main() -> None:
         ratio = twin_ratio(threads)
         ratios.append({"threads": threads, **asdict(ratio)})
         print(
-            f"{threads} threads: peak {peak.flops / 1e9:.0f} GFLOP/s, {peak.bytes / 1e9:.1f} GB/s; "
-            f"{ratio.scene}, forward and backward: twin {ratio.twin:.0f} ms, kernels "
-            f"{ratio.kernels:.2f} ms, 1 : {ratio.twin / ratio.kernels:.0f} (the twin holds every "
-            "pixel of every Gaussian: no larger scene fits)"
+            f"{peak}\n"
+            f"{threads} threads: {ratio.scene}, forward and backward: twin {ratio.twin:.0f} ms, "
+            f"kernels {ratio.kernels:.2f} ms, 1 : {ratio.twin / ratio.kernels:.0f} (the twin holds "
+            "every pixel of every Gaussian: no larger scene fits)"
         )
-    for make in scenes:
+    for make in _scenes(args):
         scene = make()
         steps = [Step(scene, threads) for threads in args.threads]
         taken = take_turns(steps, calibration, args.seconds)
         for step, turns, peak in zip(steps, taken, peaks, strict=True):
-            result = _report(step, turns, peak)
+            result = _report(step, turns, peak, library)
             if args.probe:
                 result["probe"] = _against_the_probe(step, args.probe, args.turns)
             results.append(result)
         for step, turns in zip(steps[1:], taken[1:], strict=True):
             speedups.append(_speedups(steps[0], taken[0], step, turns))
-    if args.json:
-        value = {
-            "machine": machine_facts(),
-            "peak": [asdict(p) for p in peaks],
-            "twin": ratios,
-            "results": results,
-            "speedups": speedups,
-        }
-        write_json(args.json, value)
+    return {
+        **measured_on(library),
+        "peak": [{**asdict(p), "per_cycle": p.per_cycle} for p in peaks],
+        "twin": ratios,
+        "results": results,
+        "speedups": speedups,
+    }
 
 
 if __name__ == "__main__":

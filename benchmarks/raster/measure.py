@@ -18,9 +18,14 @@ from pipeline.raster import RasterOptions, build, forward
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT, SQUARE_WEIGHT = Train().ssim_weight, Train().square_weight
 MIN_TURNS = 5  # quartiles of fewer say nothing
-# Vector operations that one Gaussian over one block of 16 pixels takes at least: place 2, exponent
-# 2, 2^x 11, its bounds 3, transmittance 3; forward colour and what is left 4; backward place again
-# 2, transmittance 1, what the pixel asks 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
+TILE_PIXELS = 16 * 16
+# Operations on all pixels of a block that one Gaussian takes at least: place 2, exponent 2, 2^x 11,
+# its bounds 3, transmittance 3; forward colour and what is left 4; backward place again 2,
+# transmittance 1, what the pixel asks 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
+# Each is as many instructions as registers hold the block's pixels. "Of bound" is the measured time
+# over the time of these instructions at the rate at which the processor starts multiply-adds. It is
+# no strict bound: processors that have further units for additions, comparisons and bits start
+# more of those.
 BLOCK_OPERATIONS = {"blend": 25, "blend backward": 48}
 
 
@@ -190,16 +195,23 @@ def take_turns(steps: Sequence[Step], calibration: Calibration, seconds: float) 
     return taken
 
 
+def block_pixels(step: Step) -> int:
+    """Pixels of a block; the kernels' blocks depend on their target."""
+    tiles = step.state.tile_begin.numel() - 1
+    return TILE_PIXELS * tiles // step.state.block_end.numel()
+
+
 def block_pairs(step: Step) -> int:
-    """How many (Gaussian, block of 16 pixels) pairs have to be looked at: those of the bins, up to
-    where a block's last pixel stops."""
+    """How many (Gaussian, block) pairs have to be looked at: those of the bins, up to where a
+    block's last pixel stops."""
     state = step.state
     counts = state.tile_begin.diff()
     tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
     rank = torch.arange(len(tile)) - state.tile_begin[:-1][tile]
     ends = state.block_end.view(len(counts), -1)
     blocks = state.entries[:, 2]
-    return sum(int(((blocks >> b & 1) * (rank < ends[tile, b])).sum()) for b in range(ends.shape[1]))
+    numbers = range(ends.shape[1])
+    return sum(int(((blocks >> b & 1) * (rank < ends[tile, b])).sum()) for b in numbers)
 
 
 def contributing_pairs(step: Step) -> int:

@@ -10,32 +10,43 @@ import torch
 
 from pipeline.raster import RasterCamera
 from pipeline.scene.colmap import read_model
+from pipeline.scene.model import Camera
 from pipeline.splats.order import morton_order
 from pipeline.splats.ply import read_splat_ply
+
+MOST_VIEWS = 16  # of a trained model, spread over its images
 
 Arrays = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians and a view of them.
+    """Gaussians and views of them.
 
     Attributes:
         name: for people.
         gaussians: means, log_scales, quats, opacity_logits, sh, float32.
+        views: all of one size; a training step is measured with the first.
     """
 
     name: str
     gaussians: Arrays
-    camera: RasterCamera
+    views: tuple[RasterCamera, ...]
+
+    @property
+    def camera(self) -> RasterCamera:
+        return self.views[0]
 
     @property
     def count(self) -> int:
         return len(self.gaussians[0])
 
 
-def synthetic(count: int, width: int, height: int, radius: float) -> Scene:
+def synthetic(count: int, width: int, height: int, radius: float, in_view: float = 1.0) -> Scene:
     """Gaussians spread evenly over an image, as seen from the front; seeded by ``count``.
+
+    A share of ``in_view`` lies in the image, the others around it, as in a scene that no view shows
+    whole.
 
     On the image: 3-sigma radius log-normal with mean ``radius`` pixels and sigma 0.5, minor axis
     0.3 to 1 of the major one, any direction; depth 1 to 10; opacity logits normal with sigma 1.5.
@@ -44,7 +55,7 @@ def synthetic(count: int, width: int, height: int, radius: float) -> Scene:
     """
     rng = np.random.default_rng(count)
     focal = 1.2 * width
-    pixel = rng.random((count, 2)) * [width, height]
+    pixel = ((rng.random((count, 2)) - 0.5) / np.sqrt(in_view) + 0.5) * [width, height]
     depth = 1 + 9 * rng.random(count)
     major = radius * np.exp(0.5 * rng.standard_normal(count) - 0.125) / 3
     minor = major * (0.3 + 0.7 * rng.random(count))
@@ -63,20 +74,34 @@ def synthetic(count: int, width: int, height: int, radius: float) -> Scene:
         width, height, focal, focal, width / 2, height / 2, torch.eye(4, dtype=torch.float64)
     )
     name = f"{count} at {width}x{height}, radius {radius:g}"
+    if in_view < 1:
+        name += f", {in_view:g} of them in view"
     order = morton_order(gaussians[0])
-    return Scene(name, tuple(field[order] for field in gaussians), camera)  # type: ignore[arg-type]
+    ordered = tuple(field[order] for field in gaussians)
+    return Scene(name, ordered, (camera,))  # type: ignore[arg-type]
 
 
-def trained(folder: Path) -> Scene:
-    """An export folder: its ``point_cloud.ply`` seen by the first image of its ``sparse/0``."""
+def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
+    """An export folder: its ``point_cloud.ply`` seen by the images of its ``sparse/0``.
+
+    Args:
+        size: width and height to draw instead of the first image's, which is stretched to it.
+    """
     arrays = read_splat_ply(folder / "point_cloud.ply")
     model = read_model(folder / "sparse" / "0")
-    posed = min(model.images.values(), key=lambda image: image.name)
-    lens = model.cameras[posed.camera_id]
-    camera = RasterCamera(
-        lens.width, lens.height, *lens.pinhole, torch.from_numpy(posed.world_to_camera)
-    )
+    posed = sorted(model.images.values(), key=lambda image: image.name)
+    lens = model.cameras[posed[0].camera_id]
+    width, height = size or (lens.width, lens.height)
+    step = max(1, len(posed) // MOST_VIEWS)
+    views = [
+        _view(model.cameras[image.camera_id].resized(width, height), image.world_to_camera)
+        for image in posed[::step][:MOST_VIEWS]
+    ]
     fields = (arrays.means, arrays.log_scales, arrays.quats, arrays.opacity_logits, arrays.sh)
     gaussians = tuple(torch.from_numpy(np.ascontiguousarray(f)) for f in fields)
-    name = f"{folder}: {len(arrays)} at {lens.width}x{lens.height}, seen from {posed.name}"
-    return Scene(name, gaussians, camera)  # type: ignore[arg-type]
+    name = f"{folder}: {len(arrays)} at {width}x{height}, seen from {posed[0].name}"
+    return Scene(name, gaussians, tuple(views))  # type: ignore[arg-type]
+
+
+def _view(camera: Camera, pose: np.ndarray) -> RasterCamera:
+    return RasterCamera(camera.width, camera.height, *camera.pinhole, torch.from_numpy(pose))

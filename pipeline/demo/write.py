@@ -25,6 +25,7 @@ from pipeline.demo.shapes import Sphere
 from pipeline.photos.distortion import normalised, pixels
 from pipeline.runtime.atomic import replace_folder, write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.progress import Progress
 from pipeline.scene.colmap import write_model
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
@@ -106,7 +107,7 @@ def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
     for name in ("images", "depth_gt", *(["masks"] if spec.masks else [])):
         (work / name).mkdir(parents=True)
     try:
-        _write(work, spec, processes or os.cpu_count() or 1)
+        _write(work, spec, processes or usable_cores())
         replace_folder(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)

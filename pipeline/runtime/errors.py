@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 from pathlib import Path
+
+EXIT_USER_ERROR = 2
 
 
 class UserError(Exception):
@@ -23,3 +26,14 @@ class UserError(Exception):
     def __str__(self) -> str:
         text = f"{self.file}: {self.what}" if self.file is not None else self.what
         return f"{text}\n  what to do: {self.fix}" if self.fix else text
+
+
+def as_user_error(error: OSError) -> UserError | None:
+    """Failures of disk and permissions are the surroundings' fault, not the program's."""
+    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
+        fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"
+        return UserError("the disk is full", file=error.filename, fix=fix)
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        fix = "make it writable, or run in another folder (snakemake --directory)"
+        return UserError("permission denied", file=error.filename, fix=fix)
+    return None

@@ -5,7 +5,8 @@ when all is done, so that what exists is whole. Two sidecars stand beside the ou
 
 - ``stage.json``: the same for the same work. Key, digests of inputs and outputs, counters,
   decisions, warnings.
-- ``run.json``: how this run went. Versions, commit, machine, wall and CPU time, peak memory.
+- ``run.json``: how this run went. Versions, commit, machine, instruction set, wall and CPU time,
+  peak memory.
 
 A stage whose key and inputs are those of its finished folder is not worked again: Snakemake
 deletes a job's declared outputs before it runs it, so a hidden copy of ``stage.json`` lets the
@@ -17,7 +18,6 @@ hard links in the same way.
 from __future__ import annotations
 
 import contextlib
-import errno
 import fcntl
 import hashlib
 import json
@@ -40,14 +40,15 @@ from typing import Any, TypeVar
 
 from pydantic import BaseModel
 
+from pipeline.runtime import targets
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.machine import machine_facts
 from pipeline.runtime.memory import peak_memory_mb
+from pipeline.runtime.native import native_facts
 from pipeline.runtime.progress import Console, write_progress_to
 
 SIDE_CARS = ("stage.json", "run.json", ".stage.json")
-EXIT_USER_ERROR = 2
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -134,6 +135,7 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
     """
     with _logging_to(request.log, request.out.parent.name):
         try:
+            targets.usable()  # a wrong $SPLATMAKE_TARGET ends the run before any work
             return _run_locked(request, work)
         except UserError as error:
             _say_error(request, error)
@@ -160,17 +162,6 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
 def _say_error(request: Request, error: UserError) -> None:
     scene = request.out.parent.name
     print(f"error in {request.stage} of {scene}: {error}", file=sys.stderr, flush=True)
-
-
-def as_user_error(error: OSError) -> UserError | None:
-    """Failures of disk and permissions are the surroundings' fault, not the program's."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
-        fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"
-        return UserError("the disk is full", file=error.filename, fix=fix)
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        fix = "make it writable, or run in another folder (snakemake --directory)"
-        return UserError("permission denied", file=error.filename, fix=fix)
-    return None
 
 
 def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
@@ -364,7 +355,8 @@ def _write_sidecars(job: Job, inputs: dict[str, str], wall: float) -> None:
 
 
 def run_facts(job: Job, wall: float) -> dict[str, Any]:
-    """How a run went: times in seconds, memory in MiB, versions, commit, machine."""
+    """How a run went: times in seconds, memory in MiB, versions, commit, machine,
+    instruction set."""
     own = resource.getrusage(resource.RUSAGE_SELF)
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     return {
@@ -374,6 +366,7 @@ def run_facts(job: Job, wall: float) -> dict[str, Any]:
         "threads": job.threads,
         "seed": job.key["seed"],
         **machine_facts(),
+        **native_facts(),
         "versions": versions(),
         "commit": _commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),

@@ -1,49 +1,46 @@
-"""Which machine this is: what a time means nothing without."""
+"""Which machine this is, and what of it this process may use: cores and memory."""
 
 from __future__ import annotations
 
 import os
 import platform
+import sys
 from contextlib import suppress
 from pathlib import Path, PurePosixPath
 from typing import Any
 
-
-def processor() -> list[str]:
-    """What the system says of its first core: model and instruction sets, a line each."""
-    lines = [platform.machine(), platform.processor()]
-    try:
-        with open("/proc/cpuinfo", encoding="utf-8") as file:
-            for line in file:
-                if not line.strip():
-                    break  # one core speaks for all
-                if line.startswith(("model name", "flags", "Features", "CPU part")):
-                    lines.append(line.strip())
-    except OSError:
-        pass
-    return lines
+from pipeline.runtime.processor import processor_name, sysctl_value
 
 
 def machine_facts() -> dict[str, Any]:
     """Host, processor, logical cores, memory in MiB, and the load average of the last minute (1 is
     one busy core, this process among them; None where the system counts none)."""
-    named = [line for line in processor() if line.startswith("model name")]
     try:
         load = round(os.getloadavg()[0], 2)
-    except OSError:
+    except (AttributeError, OSError):
         load = None
     return {
         "host": platform.node(),
         "platform": platform.platform(),
-        "processor": named[0].partition(":")[2].strip() if named else platform.machine(),
+        "processor": processor_name(),
         "cores": os.cpu_count(),
         "memory_mb": physical_memory() >> 20,
         "load_average": load,
     }
 
 
+def usable_cores() -> int:
+    """Logical cores that this process may run on; a batch system or taskset may allow fewer than
+    there are."""
+    if hasattr(os, "sched_getaffinity"):  # not on macOS
+        return len(os.sched_getaffinity(0))
+    return os.cpu_count() or 1
+
+
 def physical_memory() -> int:
     """Bytes that the machine has."""
+    if sys.platform == "darwin":
+        return int(sysctl_value("hw.memsize"))
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 

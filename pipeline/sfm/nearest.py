@@ -1,11 +1,13 @@
 """Exact matching of descriptors: the Python face of csrc/nearest.cpp.
 
-``python -m pipeline.sfm.nearest`` compiles it beforehand; otherwise its first use does.
+``python -m pipeline.sfm.nearest`` compiles it beforehand, with ``--target`` for other processors;
+otherwise its first use does.
 """
 
 from __future__ import annotations
 
 import ctypes
+import sys
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
@@ -13,14 +15,20 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.native import NativeLibrary
+from pipeline.runtime.native import NativeLibrary, build_main
+from pipeline.runtime.targets import Extension
 
 LIBRARY = NativeLibrary(
     name="matcher",
     file="libmatcher.so",
     sources=Path(__file__).parent / "csrc",
-    # -march=native: the vector width of this machine.
-    flags=("-std=c++17", "-O3", "-march=native", "-fPIC", "-Wall", "-Wno-psabi"),
+    flags=("-std=c++17", "-O3", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-unknown-warning-option"),
+    # Products of bytes, four to a lane.
+    extensions={
+        "x86-64-v3": [Extension("avx_vnni", ("-mavxvnni",))],
+        "x86-64-v4": [Extension("avx512_vnni", ("-mavx512vnni",))],
+        "aarch64": [Extension("asimddp", ("-march=armv8.2-a+dotprod",))],
+    },
 )
 SIZE = 128
 # COLMAP's: descriptors (unit vectors times 512) more than 0.7 radians apart are no match.
@@ -90,10 +98,10 @@ def match_descriptors(
 
 @cache
 def _library() -> ctypes.CDLL:
-    library = ctypes.CDLL(str(LIBRARY.build()))
+    library = ctypes.CDLL(str(LIBRARY.build().path))
     library.nearest.restype = None
     return library
 
 
 if __name__ == "__main__":
-    print(LIBRARY.build())
+    sys.exit(build_main(lambda: LIBRARY))

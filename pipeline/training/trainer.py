@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Train
-from pipeline.raster import Forward, RasterCamera, RasterOptions, backward, forward, l1_ssim
+from pipeline.raster import Forward, RasterCamera, RasterOptions, backward, build, forward, l1_ssim
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.memory import machine_mb, memory_mb
@@ -40,6 +40,7 @@ from pipeline.training.pace import GAUSSIANS_A_STEP, Pace
 from pipeline.training.render import near_plane, raster_camera
 from pipeline.training.schedule import Schedule
 from pipeline.training.shelf import DiskShelf, MemoryShelf, Shelf
+from pipeline.training.speed import StepTimer, build_record, other_build
 from pipeline.training.state import TrainState, Window
 from pipeline.training.targets import Target, Targets, usable_factor
 
@@ -107,7 +108,8 @@ def train(
     Args:
         threads: of the native operators; torch itself runs on one, so that sums are the same.
         journal: file for how it goes, second by second (``training.journal``).
-        on_log: called with one line for each warning.
+        on_log: called with one line for each warning, and for the instruction set, the compiler
+            and the time a step takes.
 
     Raises:
         UserError: no views or no Gaussians, unreadable pictures, no view sees a Gaussian, the
@@ -148,6 +150,7 @@ class _Run:
         on_log: Callable[[str], None] | None,
     ):
         self.config, self.threads = config, threads
+        self.built = build.load()
         self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
@@ -220,6 +223,8 @@ class _Run:
         # What happened to checkpoints is told, but is no part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
         if found is not None:
+            if text := other_build(found.values, self.built):
+                self.log(text)
             state.restore(found.step, found.arrays, found.values)
         started = saved = time.monotonic()
         seconds_before = state.seconds
@@ -227,11 +232,14 @@ class _Run:
         progress.start_at(state.clock)
         journal = Journal(journal_file, state.step)
         records = max(1, steps // CURVE_RECORDS)
+        timer = StepTimer(self.built, self.threads, steps - state.clock)
         while state.clock < steps:
             before = state.clock
             self.step()
             now = time.monotonic()
             state.seconds = seconds_before + now - started
+            if text := timer.passes(state.seconds, self.factor()):
+                self.log(text)
             if state.clock // records > before // records or state.clock == steps:
                 self.record()
             if now - saved >= CHECKPOINT_SECONDS and state.clock < steps:
@@ -468,9 +476,10 @@ class _Run:
 
     def save(self) -> None:
         state = self.state
+        values = state.values() | {"built": build_record(self.built)}
         checkpoint.save(
             self.checkpoint_dir,
-            Checkpoint(state.step, self.identity, state.arrays(), state.values()),
+            Checkpoint(state.step, self.identity, state.arrays(), values),
         )
 
     def result(self) -> TrainResult:

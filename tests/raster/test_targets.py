@@ -8,7 +8,6 @@ SPLATMAKE_REQUIRE_COMPILERS set, as in CI, a missing one fails.
 from __future__ import annotations
 
 import os
-import platform
 import shutil
 import struct
 import subprocess
@@ -21,19 +20,12 @@ import pytest
 import torch
 
 from pipeline.raster import RasterCamera, RasterOptions, build, twin
-from pipeline.runtime.machine import processor
+from pipeline.runtime import processor, targets
+from tests.raster.compiled import compiled
 from tests.raster.scenes import NAMES, Scene, camera, random_scene, relative
 
-DRIVER = Path(__file__).with_name("driver.cpp")
 COMPILERS = ("g++", "clang++")
-# Flags, and what a processor's list of features must hold to run the result.
-X86 = {
-    "x86-64-v2": ("-march=x86-64-v2", {"sse4_2"}),
-    "x86-64-v3": ("-march=x86-64-v3", {"avx2", "fma"}),
-    "x86-64-v4": ("-march=x86-64-v4", {"avx512f", "avx512bw", "avx512dq", "avx512vl"}),
-}
-MATRIX = [(compiler, target) for target in (*X86, "aarch64") for compiler in COMPILERS]
-ARM_PACKAGES = "apt-get install qemu-user g++-aarch64-linux-gnu"
+MATRIX = [(compiler, target.name) for target in targets.TARGETS for compiler in COMPILERS]
 
 # As in test_kernels.py; a processor without fused multiply-adds rounds twice as often.
 COLOR, DEPTH, MEDIAN, RADIUS, GRADIENT = 2e-6, 2e-5, 1e-5, 1e-4, 1e-5
@@ -51,39 +43,23 @@ def missing(what: str, fix: str) -> NoReturn:
     pytest.skip(text)
 
 
-@dataclass(frozen=True)
-class Toolchain:
-    """How a target's programs are compiled, and what runs them here."""
-
-    compile: list[str]
-    run: list[str]
-
-
-def toolchain(compiler: str, target: str) -> Toolchain:
-    """Skips, or fails, where the compiler or the emulator is missing."""
-    machine = platform.machine()
-    arm, native = target == "aarch64", (target == "aarch64") == (machine in ("aarch64", "arm64"))
-    if not native and machine != "x86_64":
-        pytest.skip(f"not run: {target} on {machine}")
-    command = [compiler]
-    if arm and not native:
-        cross = "aarch64-linux-gnu-g++"
-        if shutil.which(cross) is None:  # clang++ needs its headers and libraries
-            missing(f"no {cross}", ARM_PACKAGES)
-        if shutil.which("qemu-aarch64") is None:
-            missing("no qemu-aarch64", ARM_PACKAGES)
-        command = [cross] if compiler == "g++" else [compiler, "--target=aarch64-linux-gnu"]
-        command.append("-static")
+def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[str]]:
+    """The command that compiles for a target, and what runs its programs here. Skips, or fails,
+    where one of them is missing."""
     if shutil.which(compiler) is None:
         missing(f"no {compiler}", "apt-get install g++ clang")
-    flags = [f for f in build.FLAGS if not f.startswith(("-march", "-mcpu", "-fPIC"))]
-    command += [*flags, "-march=armv8-a" if arm else X86[target][0], "-I", str(build.SOURCES)]
-    return Toolchain(command, ["qemu-aarch64"] if arm and not native else [])
-
-
-def runs_here(target: str) -> bool:
-    listed = set(" ".join(processor()).split())
-    return target not in X86 or X86[target][1] <= listed
+    here = processor.architecture()
+    if target.architecture == here:
+        return [compiler], []
+    if (here, target.name) != ("x86-64", "aarch64"):
+        pytest.skip(f"not run: {target.name} on {here}")
+    # Linked statically, so that the emulator needs no libraries. clang++ takes g++'s.
+    cross = "aarch64-linux-gnu-g++"
+    for tool in (cross, "qemu-aarch64"):
+        if shutil.which(tool) is None:
+            missing(f"no {tool}", "apt-get install qemu-user g++-aarch64-linux-gnu")
+    command = [cross] if compiler == "g++" else [compiler, "--target=aarch64-linux-gnu"]
+    return [*command, "-static"], ["qemu-aarch64"]
 
 
 @dataclass(frozen=True)
@@ -185,21 +161,22 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
 @pytest.mark.slow
 @pytest.mark.parametrize(("compiler", "target"), MATRIX)
 def test_every_target_by_every_compiler_matches_the_reference(
-    tmp_path: Path, cases: list[Case], compiler: str, target: str
+    tmp_path: Path,
+    tmp_path_factory: pytest.TempPathFactory,
+    cases: list[Case],
+    compiler: str,
+    target: str,
 ) -> None:
     """The reference's image and gradients, and 300 wild scenes without a value that is not
     finite."""
-    tools = toolchain(compiler, target)
-    kernels = [str(p) for p in build.source_files() if p.suffix == ".cpp" and p.stem != "binding"]
-    driver = tmp_path / "driver"
-    command = [*tools.compile, str(DRIVER), *kernels, "-o", str(driver)]
-    compiled = subprocess.run(command, capture_output=True, text=True)
-    assert compiled.returncode == 0, compiled.stderr[-3000:]
-    if not runs_here(target):
-        pytest.skip(f"compiled, but not run: this processor has no {target}")
+    chosen = targets.named(target)
+    command, emulator = toolchain(compiler, chosen)
+    driver = compiled(tmp_path_factory, command, build.flags(target)) / "driver"
+    if not emulator and chosen.missing:
+        pytest.skip(f"compiled, but not run: this processor lacks {', '.join(chosen.missing)}")
     for case in cases:
         case.write(tmp_path / "in")
-        subprocess.run([*tools.run, driver, tmp_path / "in", tmp_path / "out"], check=True)
+        subprocess.run([*emulator, driver, tmp_path / "in", tmp_path / "out"], check=True)
         check(case, *case.read(tmp_path / "out"))
-    done = subprocess.run([*tools.run, driver], capture_output=True, text=True, timeout=600)
+    done = subprocess.run([*emulator, driver], capture_output=True, text=True, timeout=600)
     assert done.stdout.strip() == "clean", done.stdout + done.stderr

@@ -38,14 +38,26 @@ def fail(job: Job) -> None:
     raise AssertionError("worked although everything was there")
 
 
+def test_a_wrong_target_ends_a_stage_before_its_work(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("SPLATMAKE_TARGET", "x86-64-v9")
+    assert run_stage(request(tmp_path), fail) == 2
+    assert "unknown instruction-set target 'x86-64-v9'" in capsys.readouterr().err
+    assert not (tmp_path / "scene" / "work").exists()
+
+
 def test_outputs_and_sidecars_appear_together(tmp_path):
     assert run_stage(request(tmp_path), write("a")) == 0
     out = tmp_path / "scene" / "work"
     record = json.loads((out / "stage.json").read_text())
     assert list(record["outputs"]) == ["result.txt"]
-    assert {"wall_s", "cpu_s", "peak_rss_mb", "versions"} <= json.loads(
-        (out / "run.json").read_text()
-    ).keys()
+    assert {
+        "wall_s",
+        "cpu_s",
+        "peak_rss_mb",
+        "versions",
+        "instruction_set",
+        "compiler",
+    } <= json.loads((out / "run.json").read_text()).keys()
     assert record["counters"] == {"written": 1}
 
 

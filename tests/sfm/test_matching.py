@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import ctypes
 import json
-import platform
 import shutil
 import sqlite3
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +17,9 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import schema
+from pipeline.runtime import processor, targets
 from pipeline.runtime.native import compiler
+from pipeline.runtime.targets import Variant
 from pipeline.scene.plan import make_plan
 from pipeline.scene.scan import scan
 from pipeline.sfm import nearest as near
@@ -67,19 +69,75 @@ def test_the_two_nearest_are_the_two_nearest(counts, kind, seed):
     same(of_b, plainly(b, a))
 
 
-@pytest.mark.slow
-def test_other_instruction_sets_find_the_same(tmp_path, monkeypatch):
-    flags = {"x86_64": ["-march=native -mno-avx512vnni", "-march=haswell", "-march=x86-64"]}
-    a, b = wild(1, 301, "bytes"), wild(2, 277, "extremes")
-    expected = near.nearest(a, b)
-    for index, march in enumerate(flags.get(platform.machine(), ["-O1"])):
-        library = tmp_path / f"{index}.so"
-        source = near.LIBRARY.sources / "nearest.cpp"
-        options = [*near.LIBRARY.flags, *march.split(), "-Werror", "-shared"]
-        subprocess.run([*compiler(), *options, str(source), "-o", str(library)], check=True)
-        monkeypatch.setattr(near, "_library", lambda path=library: ctypes.CDLL(str(path)))
-        for one, two in zip(near.nearest(a, b), expected, strict=True):
-            same(one, two)
+SOURCE = near.LIBRARY.sources / "nearest.cpp"
+
+
+def cases() -> Iterator[tuple[np.ndarray, np.ndarray]]:
+    """Descriptors that leave vectors part full, with the largest products and with ties."""
+    for kinds in (("bytes", "extremes"), ("extremes", "extremes"), ("alike", "alike")):
+        yield wild(1, 301, kinds[0]), wild(2, 277, kinds[1])
+
+
+def check_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: list[str]) -> None:
+    """Compile the matcher with these flags and compare it with numpy."""
+    library = tmp_path / "matcher.so"
+    command = [*compiler(), *flags, "-Werror", "-shared", str(SOURCE), "-o", str(library)]
+    subprocess.run(command, check=True)
+    monkeypatch.setattr(near, "_library", lambda: ctypes.CDLL(str(library)))
+    for a, b in cases():
+        of_a, of_b = near.nearest(a, b)
+        same(of_a, plainly(a, b))
+        same(of_b, plainly(b, a))
+
+
+VARIANTS = [
+    variant
+    for target in targets.TARGETS
+    for variant in targets.all_variants(target, near.LIBRARY.extensions)
+]
+
+
+@pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
+def test_every_target_finds_the_same(tmp_path, monkeypatch, variant):
+    wanted = {extension.feature for extension in variant.extensions}
+    if variant.target.missing or not wanted <= processor.features():
+        pytest.skip(f"this processor cannot run {variant.name}")
+    check_library(tmp_path, monkeypatch, near.LIBRARY.flags_for(variant))
+
+
+def test_the_form_for_avx_vnni_finds_the_same(tmp_path, monkeypatch):
+    """Few processors have it: its one instruction is replaced by some of AVX2's."""
+    target = targets.named("x86-64-v3")
+    if target.missing:
+        pytest.skip(f"this processor cannot run {target.name}")
+    header = ["-include", str(Path(__file__).with_name("avx_vnni.h"))]
+    check_library(tmp_path, monkeypatch, near.LIBRARY.flags_for(Variant(target)) + header)
+
+
+ARM_COMPILER, ARM_EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
+
+
+@pytest.mark.skipif(
+    not (shutil.which(ARM_COMPILER) and shutil.which(ARM_EMULATOR)),
+    reason=f"needs {ARM_COMPILER} and {ARM_EMULATOR}",
+)
+@pytest.mark.parametrize(
+    "variant",
+    [variant for variant in VARIANTS if variant.target.name == "aarch64"],
+    ids=lambda variant: variant.name,
+)
+def test_an_emulated_arm_processor_finds_the_same(tmp_path, variant):
+    program, found = tmp_path / "driver", tmp_path / "found"
+    files = [str(Path(__file__).with_name("nearest_driver.cpp")), str(SOURCE)]
+    flags = [*near.LIBRARY.flags_for(variant), "-Werror", "-static"]
+    subprocess.run([ARM_COMPILER, *flags, *files, "-o", str(program)], check=True)
+    for a, b in cases():
+        (tmp_path / "input").write_bytes(a.tobytes() + b.tobytes())
+        command = [ARM_EMULATOR, program, str(len(a)), str(len(b)), tmp_path / "input", found]
+        subprocess.run(command, check=True)
+        values = np.fromfile(found, np.int32)
+        same(near.Neighbours(*values[: 3 * len(a)].reshape(3, -1)), plainly(a, b))
+        same(near.Neighbours(*values[3 * len(a) :].reshape(3, -1)), plainly(b, a))
 
 
 def test_matches_are_mutual_distinct_and_near():

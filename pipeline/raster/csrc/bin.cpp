@@ -217,9 +217,9 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                     for (uint32_t column = 0; column < window.columns; column += 8) {
                         uint64_t both = 0;
                         for (int r = 0; r < kBlocksDown; r++)
-                            both |= uint64_t((hit[i][kBlockRows * r] & (~0u >> beyond)) >> column &
-                                             255)
-                                    << 8 * r;
+                            both |=
+                                uint64_t((hit[i][kBlockRows * r] & (~0u >> beyond)) >> column & 255)
+                                << 8 * r;
                         for (uint32_t k = 0; k < 2; k++) {
                             const uint32_t tile = window.tile + column / 4 + k;
                             const uint64_t blocks = (pack_nibbles(both >> 4 * k) & rows)

@@ -8,7 +8,7 @@
 namespace splat {
 namespace {
 
-constexpr int kSize = 64, kAbreast = 4;
+constexpr int kSize = 64, kAbreast = 3;
 using Gaussian = Batch<kSize>::Gaussian;
 
 // What a block's pixels add up.

@@ -102,7 +102,7 @@ SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels
     Pixels e = t.alpha + t.rgb[0] * g.rgb[0] + t.rgb[1] * g.rgb[1] + t.rgb[2] * g.rgb[2];
     if (kDepthGradient) e += t.depth * g.depth;
     t.behind -= s.weight * e;
-    const Pixels odds = alpha * reciprocal(1.0f - alpha);
+    const Pixels odds = quotient(alpha, 1.0f - alpha);
     // Where alpha is held at its maximum it does not move with the Gaussian.
     const Pixels v = keep(s.drawn & (alpha < kAlphaMax), s.weight * e - odds * t.behind);
     const Pixels vu = v * u, vw = v * w;

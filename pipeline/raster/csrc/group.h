@@ -26,12 +26,16 @@ SPLAT_INLINE void write_rows(const f32x16 (&columns)[K], int count, float* to) {
     if (count < kGroup) std::memcpy(to, padded, count * K * sizeof(float));
 }
 SPLAT_INLINE f32x16 read_column(const float* from, int count) {
+    if (count >= kGroup) return load<f32x16>(from);
     f32x16 column = {};
-    std::memcpy(&column, from, (count < kGroup ? count : kGroup) * sizeof(float));
+    std::memcpy(&column, from, count * sizeof(float));
     return column;
 }
 SPLAT_INLINE void write_column(f32x16 column, int count, float* to) {
-    std::memcpy(to, &column, (count < kGroup ? count : kGroup) * sizeof(float));
+    if (count >= kGroup)
+        store(to, column);
+    else
+        std::memcpy(to, &column, count * sizeof(float));
 }
 
 // A group is projected in parts, since float64 takes more registers. Lanes of part `number`, and

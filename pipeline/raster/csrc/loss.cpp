@@ -265,16 +265,18 @@ class Strip {
         for (int64_t i = 2 * kReach; i < 2 * kReach + end_ - begin_; i += kLanes) {
             const Lanes a = load<Lanes>(x_.row(y) + i), b = load<Lanes>(y_.row(y) + i);
             const Lanes ssim = blur_across(line[0] + i, window_) +
-                                2.0f * a * blur_across(line[1] + i, window_) +
-                                b * blur_across(line[2] + i, window_);
+                               2.0f * a * blur_across(line[1] + i, window_) +
+                               b * blur_across(line[2] + i, window_);
             const Lanes one = broadcast<Lanes>(1.0f);
-            const Lanes sign =
-                keep(a > b, one) - keep(b > a, one);
+            const Lanes sign = keep(a > b, one) - keep(b > a, one);
             const Lanes out = load<Lanes>(keep_.row(y) + i) *
-                               (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
+                              (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
-            std::memcpy(grad + y * values_ + column, &out,
-                        std::min(end_ - column, int64_t(kLanes)) * sizeof(float));
+            float* const to = grad + y * values_ + column;
+            if (column + kLanes <= end_)
+                store(to, out);
+            else
+                std::memcpy(to, &out, (end_ - column) * sizeof(float));
         }
     }
 

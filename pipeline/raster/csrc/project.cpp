@@ -132,8 +132,7 @@ SPLAT_INLINE void make_records(const Seen (&seen)[kGroupParts], const f32x16 (&r
     };
     const auto halves = [&](Lanes Seen::* field, f32x16* to) {  // of float64
         alignas(64) float pairs[32];
-        for (int i = 0; i < kGroupParts; i++)
-            store(pairs + 2 * kProjectLanes * i, seen[i].*field);
+        for (int i = 0; i < kGroupParts; i++) store(pairs + 2 * kProjectLanes * i, seen[i].*field);
         f32x16 split[2];
         deinterleave(pairs, split);
         to[0] = split[0];

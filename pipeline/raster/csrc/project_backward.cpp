@@ -56,8 +56,7 @@ struct GroupMoments {
     // and y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
     SPLAT_INLINE ImageGradients part(int number) const {
         const auto get = [&](Moment m) { return widened(moment[m], number); };
-        const Lanes l00 = widened(uu, number), l10 = widened(uw, number),
-                    l11 = widened(ww, number);
+        const Lanes l00 = widened(uu, number), l10 = widened(uw, number), l11 = widened(ww, number);
         ImageGradients g;
         g.x = 2.0 * kLn2 * l00 * get(kVU);
         g.y = 2.0 * kLn2 * (l10 * get(kVU) + l11 * get(kVW));

@@ -127,12 +127,12 @@ template <int N>
 struct MaskBits {
     uint16_t bits;
 };
-#define SPLAT_COMPARE(name, predicate)                                                     \
-    SPLAT_INLINE MaskBits<16> name(__m512 a, __m512 b) {                                   \
-        return {_mm512_cmp_ps_mask(a, b, predicate)};                                      \
-    }                                                                                      \
-    SPLAT_INLINE MaskBits<8> name(__m512d a, __m512d b) {                                  \
-        return {_mm512_cmp_pd_mask(a, b, predicate)};                                      \
+#define SPLAT_COMPARE(name, predicate)                    \
+    SPLAT_INLINE MaskBits<16> name(__m512 a, __m512 b) {  \
+        return {_mm512_cmp_ps_mask(a, b, predicate)};     \
+    }                                                     \
+    SPLAT_INLINE MaskBits<8> name(__m512d a, __m512d b) { \
+        return {_mm512_cmp_pd_mask(a, b, predicate)};     \
     }
 SPLAT_COMPARE(ge, _CMP_GE_OQ)
 SPLAT_COMPARE(gt, _CMP_GT_OQ)
@@ -162,9 +162,7 @@ SPLAT_INLINE __m128d select(__m128d m, __m128d yes, __m128d no) {
 #if SPLAT_AVX2
 SPLAT_INLINE uint32_t mask_bits(__m256 m) { return uint32_t(_mm256_movemask_ps(m)); }
 SPLAT_INLINE uint32_t mask_bits(__m256d m) { return uint32_t(_mm256_movemask_pd(m)); }
-SPLAT_INLINE __m256 select(__m256 m, __m256 yes, __m256 no) {
-    return _mm256_blendv_ps(no, yes, m);
-}
+SPLAT_INLINE __m256 select(__m256 m, __m256 yes, __m256 no) { return _mm256_blendv_ps(no, yes, m); }
 SPLAT_INLINE __m256d select(__m256d m, __m256d yes, __m256d no) {
     return _mm256_blendv_pd(no, yes, m);
 }

@@ -51,7 +51,7 @@ template <int K, int N, int... kColumns>
 SPLAT_INLINE void deinterleave(const float* from, Vector<float, N>* to,
                                std::integer_sequence<int, kColumns...>) {
     Vector<float, N> rows[K];
-    std::memcpy(rows, from, sizeof(rows));
+    for (int k = 0; k < K; k++) rows[k] = load<Vector<float, N>>(from + N * k);
     ((to[kColumns] = column_of<K, kColumns>(rows, LaneSequence<N>{})), ...);
 }
 template <int K, int N, int... kParts>
@@ -108,7 +108,9 @@ class PixelRows {
   private:
     template <int kChannel, int... kLanes>
     SPLAT_INLINE f32x16 channel(std::integer_sequence<int, kLanes...>) const {
-        constexpr auto at = [](int lane) { return 16 * (lane / 4 % 2) + K * (lane % 4) + kChannel; };
+        constexpr auto at = [](int lane) {
+            return 16 * (lane / 4 % 2) + K * (lane % 4) + kChannel;
+        };
         return shuffle<(kLanes < 8 ? kLanes : 16 + kLanes)...>(
             shuffle<at(kLanes)...>(rows_[0], rows_[1]), shuffle<at(kLanes)...>(rows_[2], rows_[3]));
     }
@@ -129,8 +131,7 @@ class PixelRows {
         ((channels[kChannels] = channel<kChannels>(LaneSequence<16>{})), ...);
     }
     template <int... kEach>
-    SPLAT_INLINE void from_channels(const f32x16* channels,
-                                    std::integer_sequence<int, kEach...>) {
+    SPLAT_INLINE void from_channels(const f32x16* channels, std::integer_sequence<int, kEach...>) {
         ((rows_[kEach] = pixels<kEach>(channels, LaneSequence<16>{})), ...);
     }
 

@@ -117,25 +117,25 @@ SPLAT_INLINE f32x16 splat16(float x) { return broadcast<f32x16>(x); }
 template <class T>
 using Scalar = std::common_type_t<T>;  // not deduced: literals convert
 
-#define SPLAT_OPERATOR(op)                                                                    \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Vector<T, N> b) {                   \
-        if constexpr (kOneRegister<T, N>)                                                     \
-            return {a.lanes op b.lanes};                                                      \
-        else                                                                                  \
-            return {a.low op b.low, a.high op b.high};                                        \
-    }                                                                                         \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Scalar<T> b) {                      \
-        return a op broadcast<Vector<T, N>>(b);                                               \
-    }                                                                                         \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Vector<T, N> operator op(Scalar<T> a, Vector<T, N> b) {                      \
-        return broadcast<Vector<T, N>>(a) op b;                                               \
-    }                                                                                         \
-    template <class T, int N, class B>                                                        \
-    SPLAT_INLINE Vector<T, N>& operator op##=(Vector<T, N>& a, B b) {                         \
-        return a = a op b;                                                                    \
+#define SPLAT_OPERATOR(op)                                                  \
+    template <class T, int N>                                               \
+    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Vector<T, N> b) { \
+        if constexpr (kOneRegister<T, N>)                                   \
+            return {a.lanes op b.lanes};                                    \
+        else                                                                \
+            return {a.low op b.low, a.high op b.high};                      \
+    }                                                                       \
+    template <class T, int N>                                               \
+    SPLAT_INLINE Vector<T, N> operator op(Vector<T, N> a, Scalar<T> b) {    \
+        return a op broadcast<Vector<T, N>>(b);                             \
+    }                                                                       \
+    template <class T, int N>                                               \
+    SPLAT_INLINE Vector<T, N> operator op(Scalar<T> a, Vector<T, N> b) {    \
+        return broadcast<Vector<T, N>>(a) op b;                             \
+    }                                                                       \
+    template <class T, int N, class B>                                      \
+    SPLAT_INLINE Vector<T, N>& operator op## = (Vector<T, N> & a, B b) {    \
+        return a = a op b;                                                  \
     }
 SPLAT_OPERATOR(+)
 SPLAT_OPERATOR(-)
@@ -188,13 +188,13 @@ SPLAT_INLINE Unsigned<N> shift_left(Unsigned<N> v, Signed<N> bits) {
 SPLAT_FUNCTION(min)
 SPLAT_FUNCTION(max)
 #undef SPLAT_FUNCTION
-#define SPLAT_FUNCTION(name)                          \
-    template <class T, int N>                         \
-    SPLAT_INLINE Vector<T, N> name(Vector<T, N> v) {  \
-        if constexpr (kOneRegister<T, N>)             \
-            return {native::name(v.lanes)};           \
-        else                                          \
-            return {name(v.low), name(v.high)};       \
+#define SPLAT_FUNCTION(name)                         \
+    template <class T, int N>                        \
+    SPLAT_INLINE Vector<T, N> name(Vector<T, N> v) { \
+        if constexpr (kOneRegister<T, N>)            \
+            return {native::name(v.lanes)};          \
+        else                                         \
+            return {name(v.low), name(v.high)};      \
     }
 SPLAT_FUNCTION(sqrt)
 SPLAT_FUNCTION(floor)
@@ -209,19 +209,19 @@ SPLAT_INLINE Vector<float, N> abs(Vector<float, N> v) {
 // ---- Masks ----
 
 #if SPLAT_AVX512
-#define SPLAT_COMPARISON(name, op)                                                            \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) {                            \
-        return {native::name(a.lanes, b.lanes)};                                              \
+#define SPLAT_COMPARISON(name, op)                                 \
+    template <class T, int N>                                      \
+    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) { \
+        return {native::name(a.lanes, b.lanes)};                   \
     }
 #else
-#define SPLAT_COMPARISON(name, op)                                                            \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) {                            \
-        if constexpr (kOneRegister<T, N>)                                                     \
-            return {(typename Vector<T, N>::Register)(a.lanes op b.lanes)};                   \
-        else                                                                                  \
-            return {name(a.low, b.low), name(a.high, b.high)};                                \
+#define SPLAT_COMPARISON(name, op)                                          \
+    template <class T, int N>                                               \
+    SPLAT_INLINE Mask<T, N> name(Vector<T, N> a, Vector<T, N> b) {          \
+        if constexpr (kOneRegister<T, N>)                                   \
+            return {(typename Vector<T, N>::Register)(a.lanes op b.lanes)}; \
+        else                                                                \
+            return {name(a.low, b.low), name(a.high, b.high)};              \
     }
 #endif
 SPLAT_COMPARISON(ge, >=)
@@ -229,14 +229,14 @@ SPLAT_COMPARISON(gt, >)
 SPLAT_COMPARISON(eq, ==)
 #undef SPLAT_COMPARISON
 // False where a lane is NaN, as all comparisons.
-#define SPLAT_COMPARISON(op, expression)                                          \
-    template <class T, int N>                                                     \
-    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Vector<T, N> b) {         \
-        return expression;                                                        \
-    }                                                                             \
-    template <class T, int N>                                                     \
-    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Scalar<T> b) {            \
-        return a op broadcast<Vector<T, N>>(b);                                   \
+#define SPLAT_COMPARISON(op, expression)                                  \
+    template <class T, int N>                                             \
+    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Vector<T, N> b) { \
+        return expression;                                                \
+    }                                                                     \
+    template <class T, int N>                                             \
+    SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Scalar<T> b) {    \
+        return a op broadcast<Vector<T, N>>(b);                           \
     }
 SPLAT_COMPARISON(>=, ge(a, b))
 SPLAT_COMPARISON(>, gt(a, b))
@@ -246,21 +246,21 @@ SPLAT_COMPARISON(==, eq(a, b))
 #undef SPLAT_COMPARISON
 
 #if SPLAT_AVX512
-#define SPLAT_MASK_OPERATOR(op)                                                \
-    template <class T, int N>                                                  \
-    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) {          \
-        return {{uint16_t(a.lanes.bits op b.lanes.bits)}};                     \
+#define SPLAT_MASK_OPERATOR(op)                                       \
+    template <class T, int N>                                         \
+    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) { \
+        return {{uint16_t(a.lanes.bits op b.lanes.bits)}};            \
     }
 #else
-#define SPLAT_MASK_OPERATOR(op)                                                               \
-    template <class T, int N>                                                                 \
-    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) {                         \
-        if constexpr (kOneRegister<T, N>) {                                                   \
-            using Bits = typename Vector<uint32_t, int(N * sizeof(T) / 4)>::Register;         \
-            return {(typename Vector<T, N>::Register)((Bits)a.lanes op (Bits)b.lanes)};       \
-        } else {                                                                              \
-            return {a.low op b.low, a.high op b.high};                                        \
-        }                                                                                     \
+#define SPLAT_MASK_OPERATOR(op)                                                         \
+    template <class T, int N>                                                           \
+    SPLAT_INLINE Mask<T, N> operator op(Mask<T, N> a, Mask<T, N> b) {                   \
+        if constexpr (kOneRegister<T, N>) {                                             \
+            using Bits = typename Vector<uint32_t, int(N * sizeof(T) / 4)>::Register;   \
+            return {(typename Vector<T, N>::Register)((Bits)a.lanes op(Bits) b.lanes)}; \
+        } else {                                                                        \
+            return {a.low op b.low, a.high op b.high};                                  \
+        }                                                                               \
     }
 #endif
 SPLAT_MASK_OPERATOR(&)
@@ -331,8 +331,8 @@ SPLAT_INLINE Mask<float, N> has_bit(Unsigned<N> v, int bit) {
     return {native::has_bit((__m512i)v.lanes, bit)};
 #else
     if constexpr (kOneRegister<uint32_t, N>)
-        return {(typename Vector<float, N>::Register)((typename Signed<N>::Register)(
-                    v.lanes << (31 - bit)) < 0)};
+        return {(typename Vector<float, N>::Register)(
+            (typename Signed<N>::Register)(v.lanes << (31 - bit)) < 0)};
     else
         return {has_bit(v.low, bit), has_bit(v.high, bit)};
 #endif

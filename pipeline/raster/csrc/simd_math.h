@@ -16,6 +16,16 @@ SPLAT_INLINE Vector<float, N> reciprocal(Vector<float, N> x) {
 #endif
 }
 
+// x / y for y in [1e-37, 1e37], to about 2^-23.
+template <int N>
+SPLAT_INLINE Vector<float, N> quotient(Vector<float, N> x, Vector<float, N> y) {
+#if SPLAT_AVX512
+    return x * reciprocal(y);
+#else
+    return x / y;
+#endif
+}
+
 // 1 / x and 1 / sqrt(x) in float64 to about 2^-52, for x in [1e-300, 1e300]. With AVX-512 by
 // Newton's steps from a guess of 14 bits, where a division of eight lanes takes 16 to 24 cycles and
 // a root more. 0 and infinity may give NaN.
@@ -40,6 +50,10 @@ SPLAT_INLINE Vector<double, N> inverse_sqrt(Vector<double, N> x) {
 #endif
 }
 
+// Of 2^x on [-1/2, 1/2], from the constant on.
+constexpr float kExp2[] = {1.0000001192092896f,  0.6931469440460205f,   0.24022120237350464f,
+                           0.05550713092088699f, 0.009675540961325169f, 0.001327647129073739f};
+
 // 2^x in float32, relative error under 2e-7 for x in [-126, 126]; junk, but no trap, outside.
 // Rounds by the magic number 1.5 * 2^23, whose low bits are then the exponent. Of some vectors at
 // once, because one alone is a chain of dependent operations.
@@ -47,17 +61,28 @@ template <int N, int kCount>
 SPLAT_INLINE void exp2(const Vector<float, N> (&x)[kCount], Vector<float, N> (&out)[kCount]) {
     using V = Vector<float, N>;
     const float magic = 12582912.0f;
-    V shifted[kCount], f[kCount], f2[kCount];
+    V shifted[kCount], f[kCount], power[kCount];
     for (int i = 0; i < kCount; i++) shifted[i] = x[i] + magic;
     for (int i = 0; i < kCount; i++) f[i] = x[i] - (shifted[i] - magic);
+#if SPLAT_AVX512
+    // Estrin's scheme: the shorter chain.
+    V f2[kCount];
     for (int i = 0; i < kCount; i++) f2[i] = f[i] * f[i];
     for (int i = 0; i < kCount; i++) {
-        const V low = 0.6931469440460205f * f[i] + 1.0000001192092896f;
-        const V mid = 0.05550713092088699f * f[i] + 0.24022120237350464f;
-        const V high = 0.001327647129073739f * f[i] + 0.009675540961325169f;
-        const V power = (high * f2[i] + mid) * f2[i] + low;
-        out[i] = bit_cast<V>(bit_cast<Unsigned<N>>(power) + (bit_cast<Unsigned<N>>(shifted[i]) << 23));
+        const V low = kExp2[1] * f[i] + kExp2[0];
+        const V mid = kExp2[3] * f[i] + kExp2[2];
+        const V high = kExp2[5] * f[i] + kExp2[4];
+        power[i] = (high * f2[i] + mid) * f2[i] + low;
     }
+#else
+    // Horner's: fewer constants in registers.
+    for (int i = 0; i < kCount; i++) power[i] = kExp2[5] * f[i] + kExp2[4];
+    for (int k = 3; k >= 0; k--)
+        for (int i = 0; i < kCount; i++) power[i] = power[i] * f[i] + kExp2[k];
+#endif
+    for (int i = 0; i < kCount; i++)
+        out[i] = bit_cast<V>(bit_cast<Unsigned<N>>(power[i]) +
+                             (bit_cast<Unsigned<N>>(shifted[i]) << 23));
 }
 
 template <int N>

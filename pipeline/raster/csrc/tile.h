@@ -111,8 +111,13 @@ class Ahead {
 // float64, so that a centre a thousand pixels away costs no digits.
 template <int kSize>
 struct Batch {
+    // Rows of a block times ww: kept where that is exact, for rows 0 and 1.
+    static constexpr bool kKeepsDown = kBlockRows == 2;
+    struct Nothing {};
+    using Down = std::conditional_t<kKeepsDown, Pixels, Nothing>;
     struct alignas(64) Gaussian {
         Pixels across;                   // u in a block, less its first pixel's
+        Down down;                       // the same of w
         float uu, uw, ww, log2_opacity;  // as in the Record
         float rgb[3], depth;
         uint32_t slot, blocks;  // as in the Entry
@@ -143,6 +148,7 @@ struct Batch {
             g.slot = e.slot;
             g.blocks = e.blocks;
             g.across = columns() * r.uu + rows() * r.uw;
+            if constexpr (kKeepsDown) g.down = rows() * r.ww;
             // A vector's lanes are as many blocks, which lie in the tile as pixels do in a block.
             const float u = float(r.uu * dx + r.uw * dy), w = float(r.ww * dy);
             for (int block = 0; block < kBlocks; block += kBlockPixels) {
@@ -157,7 +163,12 @@ struct Batch {
 
     SPLAT_INLINE const Gaussian& of(uint32_t pair) const { return gaussian[pair / kBlocks]; }
     SPLAT_INLINE Pixels u(uint32_t pair) const { return of(pair).across + first_u[pair]; }
-    SPLAT_INLINE Pixels w(uint32_t pair) const { return rows() * of(pair).ww + first_w[pair]; }
+    SPLAT_INLINE Pixels w(uint32_t pair) const {
+        if constexpr (kKeepsDown)
+            return of(pair).down + first_w[pair];
+        else
+            return rows() * of(pair).ww + first_w[pair];
+    }
 
     // The alphas of some pairs at once, because one alone is a chain of some fifty cycles; 0 where
     // less than kAlphaMin.

@@ -3,9 +3,9 @@
 // both directions.
 //
 // |a - b|^2 = |a|^2 + |b|^2 - 2 a.b. The products a.b take nearly all of the time. B is packed so
-// that one vector holds 4 bytes (VNNI) or 2 (elsewhere) of 16 descriptors, and A's bytes are
-// spread over the lanes: a lane is a descriptor of B, and no sum goes across lanes. ROWS x COLUMNS
-// vectors of sums stay in registers.
+// that one vector holds 4 bytes (VNNI, Arm's dot product) or 2 (elsewhere) of as many descriptors
+// as it has lanes of 32 bits, and A's bytes are spread over the lanes: a lane is a descriptor of B,
+// and no sum goes across lanes. ROWS x COLUMNS vectors of sums stay in registers.
 
 #include <algorithm>
 #include <cstdint>
@@ -14,6 +14,8 @@
 #include <vector>
 #if defined(__SSE2__)
 #include <immintrin.h>
+#elif defined(__ARM_NEON)
+#include <arm_neon.h>
 #endif
 
 namespace {
@@ -32,9 +34,16 @@ typedef int8_t Packed;
 #elif defined(__AVX512BW__)
 constexpr int LANES = 16, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 4;
 typedef int16_t Packed;
+#elif defined(__AVXVNNI__)
+constexpr int LANES = 8, STEP = 4, OFFSET = 128, ROWS = 4, COLUMNS = 2;
+typedef int8_t Packed;
 #elif defined(__AVX2__)
 constexpr int LANES = 8, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 2;
 typedef int16_t Packed;
+#elif defined(__ARM_FEATURE_DOTPROD)
+// Unsigned bytes times unsigned bytes.
+constexpr int LANES = 4, STEP = 4, OFFSET = 0, ROWS = 4, COLUMNS = 4;
+typedef uint8_t Packed;
 #else
 constexpr int LANES = 4, STEP = 2, OFFSET = 0, ROWS = 4, COLUMNS = 2;
 typedef int16_t Packed;
@@ -47,12 +56,23 @@ inline Ints add_products(Ints sum, int32_t a, const Packed* b) {
     return (Ints)_mm512_dpbusd_epi32((__m512i)sum, _mm512_set1_epi32(a), _mm512_loadu_si512(b));
 #elif defined(__AVX512BW__)
     return sum + (Ints)_mm512_madd_epi16(_mm512_set1_epi32(a), _mm512_loadu_si512(b));
+#elif defined(__AVXVNNI__)
+    const __m256i some = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(b));
+    return (Ints)_mm256_dpbusd_avx_epi32((__m256i)sum, _mm256_set1_epi32(a), some);
 #elif defined(__AVX2__)
     const __m256i some = _mm256_loadu_si256(reinterpret_cast<const __m256i*>(b));
     return sum + (Ints)_mm256_madd_epi16(_mm256_set1_epi32(a), some);
 #elif defined(__SSE2__)
     const __m128i some = _mm_loadu_si128(reinterpret_cast<const __m128i*>(b));
     return sum + (Ints)_mm_madd_epi16(_mm_set1_epi32(a), some);
+#elif defined(__ARM_FEATURE_DOTPROD)
+    return (Ints)vdotq_u32((uint32x4_t)sum, (uint8x16_t)vdupq_n_s32(a), vld1q_u8(b));
+#elif defined(__ARM_NEON)
+    const int16x8_t some = vld1q_s16(b);
+    const int16x4_t pair = vreinterpret_s16_s32(vdup_n_s32(a));
+    const int32x4_t low = vmull_s16(pair, vget_low_s16(some));
+    const int32x4_t high = vmull_s16(pair, vget_high_s16(some));
+    return sum + (Ints)vpaddq_s32(low, high);
 #else
     const int16_t low = int16_t(a & 0xffff), high = int16_t(a >> 16);
     for (int l = 0; l < LANES; ++l) sum[l] += low * b[2 * l] + high * b[2 * l + 1];

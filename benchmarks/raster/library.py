@@ -1,0 +1,64 @@
+"""What the measured kernels are compiled for, and by what: every table says so."""
+
+from __future__ import annotations
+
+import subprocess
+from dataclasses import dataclass
+from typing import Any
+
+from pipeline.raster import build
+from pipeline.runtime.machine import machine_facts
+
+# The compiler's macro of each instruction set, best first, and float32 lanes of its registers.
+INSTRUCTION_SETS = (
+    ("__AVX512F__", "AVX-512", 16),
+    ("__AVX2__", "AVX2", 8),
+    ("__AVX__", "AVX", 8),
+    ("__SSE4_2__", "SSE4.2", 4),
+    ("__SSE2__", "SSE2", 4),
+    ("__ARM_NEON", "NEON", 4),
+)
+
+
+@dataclass(frozen=True)
+class Library:
+    """Attributes:
+    target: one of ``pipeline.runtime.targets``.
+    instruction_set: the widest that the kernels may use.
+    lanes: float32 lanes of its registers.
+    compiler: name and version.
+    """
+
+    target: str
+    instruction_set: str
+    lanes: int
+    compiler: str
+
+
+def measured_library() -> Library:
+    """Of the kernels that this process loads."""
+    built = build.load()
+    command = [*build.compiler(), *build.flags(built.target), "-x", "c++", "-dM", "-E", "/dev/null"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    macros = done.stdout.split()
+    _, name, lanes = next(found for found in INSTRUCTION_SETS if found[0] in macros)
+    return Library(built.target, name, lanes, built.compiler)
+
+
+def measured_on(library: Library) -> dict[str, Any]:
+    """The machine and the library, as data."""
+    return {
+        "machine": machine_facts(),
+        "target": library.target,
+        "instruction_set": library.instruction_set,
+        "compiler": library.compiler,
+    }
+
+
+def heading(library: Library) -> str:
+    """The same, as a line above a table."""
+    facts = machine_facts()
+    return (
+        f"{facts['processor']}, {facts['cores']} cores; kernels for {library.target} "
+        f"({library.instruction_set}) by {library.compiler}"
+    )

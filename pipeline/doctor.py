@@ -1,0 +1,279 @@
+"""``python -m pipeline doctor``: what the machine has, what of it is used, and what is missing.
+
+It imports nothing that could be missing: neither torch nor pydantic nor the stages.
+"""
+
+from __future__ import annotations
+
+import importlib.metadata
+import os
+import platform
+import re
+import shutil
+import subprocess
+import sys
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+from pipeline.runtime import machine, native, processor, targets
+from pipeline.runtime.errors import UserError
+
+PYTHON = (3, 11)
+LOW_DISK = 10 << 30
+LOW_MEMORY = 4 << 30
+VULKAN_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
+# Distribution -> what it is for.
+NEEDED = {
+    "torch": "training",
+    "pycolmap": "camera poses",
+    "opencv-contrib-python-headless": "features and images",
+    "snakemake": "running the stages",
+    "pydantic": "the configuration",
+}
+OPTIONAL = {
+    "pillow-heif": "HEIC and HEIF photographs",
+    "viser": "python -m pipeline view",
+    "tensorboard": "python -m pipeline tensorboard",
+}
+
+
+@dataclass(frozen=True)
+class Finding:
+    """One line of the report.
+
+    Attributes:
+        state: "used", "there" (not used), "absent" (optional), "missing" (needed).
+        fix: what to do, where there is something to do.
+    """
+
+    topic: str
+    text: str
+    state: str = "used"
+    fix: str | None = None
+
+
+def examine(results: Path = Path("results")) -> list[Finding]:
+    """All findings, in the order of the report."""
+    return [
+        *_python(),
+        *_processor(),
+        *_compilers(),
+        *_libraries(),
+        *_memory(),
+        *_graphics(),
+        *_packages(),
+        *_programs(),
+        _disk(results),
+    ]
+
+
+def as_text(findings: Sequence[Finding]) -> list[str]:
+    """The report's lines."""
+    width = max(len(finding.topic) for finding in findings)
+    lines = []
+    for finding in findings:
+        mark = {"missing": "!", "absent": "-", "there": " "}.get(finding.state, "+")
+        note = " (not used)" if finding.state == "there" else ""
+        lines.append(f"{mark} {finding.topic:<{width}}  {finding.text}{note}")
+        if finding.fix:
+            lines.append(f"  {'':<{width}}    what to do: {finding.fix}")
+    missing = sum(finding.state == "missing" for finding in findings)
+    lines.append("")
+    lines.append(f"{missing} needed things are missing" if missing else "ready to run")
+    return lines
+
+
+def as_data(findings: Sequence[Finding]) -> dict[str, Any]:
+    """The report for other programs."""
+    return {"ready": is_ready(findings), "findings": [asdict(finding) for finding in findings]}
+
+
+def is_ready(findings: Sequence[Finding]) -> bool:
+    """Whether nothing that is needed is missing."""
+    return all(finding.state != "missing" for finding in findings)
+
+
+def _python() -> list[Finding]:
+    text = f"{platform.python_version()} ({sys.executable})"
+    wanted = ".".join(map(str, PYTHON))
+    if sys.version_info[:2] < PYTHON:
+        fix = f"install Python {wanted} or newer"
+        return [Finding("Python", f"{text}, {wanted} or newer is needed", "missing", fix)]
+    return [Finding("Python", text)]
+
+
+def _processor() -> list[Finding]:
+    cores, usable = os.cpu_count() or 1, machine.usable_cores()
+    text = f"{processor.processor_name()}, {processor.architecture()}, {platform.system()}"
+    found = [Finding("processor", text), Finding("cores", f"{cores}, {usable} of them usable")]
+    has = [t.name for t in targets.of_this_architecture() if not t.missing]
+    text = f"the processor has {', '.join(has) or 'none of the targets'}"
+    try:
+        target = targets.usable()[0].name
+    except UserError as error:
+        return [*found, Finding("instruction set", error.what, "missing", error.fix)]
+    forced = f" ({targets.VARIABLE})" if os.environ.get(targets.VARIABLE) else ""
+    return [*found, Finding("instruction set", f"{text}; {target} is used{forced}")]
+
+
+def _compilers() -> list[Finding]:
+    chosen, used = os.environ.get("CXX"), native.find_compiler()
+    names = dict.fromkeys([*([chosen] if chosen else []), "g++", "clang++"])
+    found = []
+    for name in names:
+        command = name.split()
+        topic = f"compiler {name}" + (" ($CXX)" if name == chosen else "")
+        if not command or shutil.which(command[0]) is None:
+            found.append(Finding(topic, "not found", "absent"))
+        else:
+            version = native.compiler_identity(command).partition("\n")[0]
+            found.append(Finding(topic, version, "used" if command == used else "there"))
+    return found
+
+
+def _libraries() -> list[Finding]:
+    """The native libraries, built or not. The modules that define them import no torch; the
+    matcher's imports numpy."""
+    found = []
+    for topic, make in (("rasterizer", _rasterizer), ("matcher", _matcher)):
+        try:
+            variants = targets.usable_variants((library := make()).extensions)
+            # As NativeLibrary.build does: lesser targets only where nothing can be compiled.
+            if native.find_compiler() is not None:
+                variants = variants[:1]
+            built = next(filter(None, map(library.find, variants)), None)
+        except UserError as error:
+            found.append(Finding(topic, error.what, "missing", error.fix))
+        except ImportError as error:
+            found.append(Finding(topic, f"cannot be loaded: {error}", "missing", "make setup"))
+        else:
+            found.append(_library_finding(topic, built))
+    return found
+
+
+def _library_finding(topic: str, built: native.Built | None) -> Finding:
+    if built is not None:
+        return Finding(topic, f"built for {built.target} by {built.compiler}")
+    try:
+        native.compiler()
+    except UserError as error:
+        return Finding(topic, error.what, "missing", error.fix)
+    return Finding(topic, "not built yet: compiled at its first use, or by make setup")
+
+
+def _rasterizer() -> native.NativeLibrary:
+    from pipeline.raster.build import library
+
+    return library()
+
+
+def _matcher() -> native.NativeLibrary:
+    from pipeline.sfm.nearest import LIBRARY
+
+    return LIBRARY
+
+
+def _memory() -> list[Finding]:
+    physical, usable = machine.physical_memory(), machine.usable_memory()
+    text = f"{physical / 2**30:.1f} GiB, {usable / 2**30:.1f} GiB of it usable"
+    few = usable < LOW_MEMORY
+    fix = "lower views.max_long_side_px for large photographs" if few else None
+    return [Finding("memory", text, fix=fix)]
+
+
+def _graphics() -> list[Finding]:
+    """Graphics cards and Vulkan devices: shown, and none is used."""
+    query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
+    cards = _output(query).splitlines()
+    gpu = [Finding("GPU", f"{card.strip()} (NVIDIA)", "there") for card in cards if card.strip()]
+    names = re.findall(r"deviceName\s*=\s*(.+)", _output(["vulkaninfo", "--summary"]))
+    drivers = _vulkan_drivers()
+    vulkan = [Finding("Vulkan", name.strip(), "there") for name in dict.fromkeys(names)]
+    if not vulkan and drivers:
+        text = f"drivers {', '.join(drivers)}; vulkaninfo, which names devices, is not installed"
+        vulkan = [Finding("Vulkan", text, "there")]
+    none = "none found; everything runs on the processor"
+    return [
+        *(gpu or [Finding("GPU", none, "absent")]),
+        *(vulkan or [Finding("Vulkan", none, "absent")]),
+    ]
+
+
+def _vulkan_drivers() -> list[str]:
+    """Names of the drivers' manifests (ICD files)."""
+    listed = os.environ.get("VK_DRIVER_FILES") or os.environ.get("VK_ICD_FILENAMES")
+    if listed:
+        files = [Path(name) for name in listed.split(os.pathsep)]
+    else:
+        own = Path(os.environ.get("XDG_DATA_HOME") or "~/.local/share").expanduser()
+        folders = [*map(Path, VULKAN_FOLDERS), own / "vulkan" / "icd.d"]
+        files = [file for folder in folders for file in sorted(folder.glob("*.json"))]
+    return list(dict.fromkeys(file.stem for file in files if file.is_file()))
+
+
+def _packages() -> list[Finding]:
+    found = []
+    for name, purpose in NEEDED.items():
+        version = _version(name)
+        if version is None:
+            fix = "make setup, or pip install with the versions of pyproject.toml"
+            found.append(Finding(name, f"not installed: {purpose}", "missing", fix))
+        else:
+            found.append(Finding(name, version))
+    for name, purpose in OPTIONAL.items():
+        version = _version(name)
+        if version is None:
+            found.append(Finding(name, f"no {purpose}", "absent", f"pip install {name}"))
+        else:
+            found.append(Finding(name, f"{version}: {purpose}"))
+    return [*found, _lpips()]
+
+
+def _lpips() -> Finding:
+    topic = "LPIPS weights"
+    if any(find_spec(name) is None for name in ("numpy", "torch")):
+        return Finding(topic, "need torch", "absent")
+    from pipeline.metrics.lpips import weights_found
+
+    found = {net: len(weights_found(net)) for net in ("vgg", "alex")}
+    whole = [net for net, files in found.items() if files == 2]
+    if whole:
+        return Finding(topic, ", ".join(whole))
+    fix = "pipeline/metrics/lpips.py names the two files and their folder"
+    return Finding(topic, "not found: metrics.json has no LPIPS", "absent", fix)
+
+
+def _programs() -> list[Finding]:
+    if path := shutil.which("ffmpeg"):
+        return [Finding("ffmpeg", f"{path}: videos in H.264")]
+    fix = "install ffmpeg for videos that every player shows"
+    return [Finding("ffmpeg", "not found: videos in VP9", "absent", fix)]
+
+
+def _disk(results: Path) -> Finding:
+    place = results.resolve()
+    while not place.exists():
+        place = place.parent
+    free = shutil.disk_usage(place).free
+    text = f"{free / 2**30:.1f} GiB free for {results}/ (in {place})"
+    fix = "large scenes need more: run in a folder on a larger disk (snakemake --directory)"
+    return Finding("disk", text, fix=fix if free < LOW_DISK else None)
+
+
+def _version(distribution: str) -> str | None:
+    try:
+        return importlib.metadata.version(distribution)
+    except importlib.metadata.PackageNotFoundError:
+        return None
+
+
+def _output(command: list[str]) -> str:
+    """What a program prints; empty where it is absent, fails or hangs."""
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=20)
+    except (OSError, subprocess.TimeoutExpired):
+        return ""
+    return done.stdout if done.returncode == 0 else ""

@@ -1,0 +1,62 @@
+"""What training runs on, and the measured time of its steps: for the log, no part of a result."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from pipeline.runtime.native import Built
+
+#: Steps of this process before the measurement (first pages of memory, cold caches), and in it.
+WARM_UP, MEASURED = 10, 40
+
+
+class StepTimer:
+    """Measures some early steps of one process, once.
+
+    Args:
+        steps: that are left to do.
+    """
+
+    def __init__(self, built: Built, threads: int, steps: int):
+        self.built, self.threads = built, threads
+        self.done, self.start = 0, 0.0
+        # A short run is measured as well as it can be.
+        self.first = min(WARM_UP, steps // 2)
+        self.last = min(WARM_UP + MEASURED, steps)
+
+    def passes(self, seconds: float, factor: int) -> str | None:
+        """A step is over. Returns the line for the log after the last one that is measured.
+
+        Args:
+            seconds: of training so far.
+            factor: that the pictures were reduced by.
+        """
+        self.done += 1
+        if self.done == self.first:
+            self.start = seconds
+        if self.done != self.last or self.first == 0:
+            return None
+        each = 1e3 * (seconds - self.start) / (self.last - self.first)
+        size = "full size" if factor == 1 else f"1/{factor} of their size"
+        return (
+            f"{self.built.target}, {self.built.compiler}, {self.threads} threads: "
+            f"{each:.1f} ms a step, images at {size}"
+        )
+
+
+def build_record(built: Built) -> dict[str, str]:
+    """What a checkpoint notes of the library that made it."""
+    return {"instruction_set": built.target, "compiler": built.compiler}
+
+
+def other_build(values: dict[str, Any], built: Built) -> str | None:
+    """A line for the log where a checkpoint was made by another library. It is used all the same:
+    the bits are promised for one library alone, the quality is the same with any."""
+    before = values.get("built")
+    if before is None or before == build_record(built):
+        return None
+    return (
+        f"training continues with {built.target} ({built.compiler}) from a checkpoint made with "
+        f"{before['instruction_set']} ({before['compiler']}): the last bits of the result are "
+        "those of neither alone"
+    )

@@ -7,13 +7,10 @@ SPLATMAKE_REQUIRE_COMPILERS set, as in CI, a missing one fails.
 
 from __future__ import annotations
 
-import os
-import shutil
 import struct
 import subprocess
 from dataclasses import dataclass
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -23,6 +20,7 @@ from pipeline.raster import RasterCamera, RasterOptions, build, twin
 from pipeline.runtime import processor, targets
 from tests.raster.compiled import compiled
 from tests.raster.scenes import NAMES, Scene, camera, random_scene, relative
+from tests.tools import need
 
 COMPILERS = ("g++", "clang++")
 MATRIX = [(compiler, target.name) for target in targets.TARGETS for compiler in COMPILERS]
@@ -36,18 +34,10 @@ CASES = [
 ]
 
 
-def missing(what: str, fix: str) -> NoReturn:
-    text = f"not run: {what} ({fix})"
-    if os.environ.get("SPLATMAKE_REQUIRE_COMPILERS"):
-        pytest.fail(text)
-    pytest.skip(text)
-
-
 def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[str]]:
     """The command that compiles for a target, and what runs its programs here. Skips, or fails,
     where one of them is missing."""
-    if shutil.which(compiler) is None:
-        missing(f"no {compiler}", "apt-get install g++ clang")
+    need(compiler)
     here = processor.architecture()
     if target.architecture == here:
         return [compiler], []
@@ -55,9 +45,7 @@ def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[st
         pytest.skip(f"not run: {target.name} on {here}")
     # Linked statically, so that the emulator needs no libraries. clang++ takes g++'s.
     cross = "aarch64-linux-gnu-g++"
-    for tool in (cross, "qemu-aarch64"):
-        if shutil.which(tool) is None:
-            missing(f"no {tool}", "apt-get install qemu-user g++-aarch64-linux-gnu")
+    need(cross, "qemu-aarch64")
     command = [cross] if compiler == "g++" else [compiler, "--target=aarch64-linux-gnu"]
     return [*command, "-static"], ["qemu-aarch64"]
 

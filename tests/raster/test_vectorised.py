@@ -9,7 +9,6 @@ or one row in scalar code stays below.
 from __future__ import annotations
 
 import platform
-import shutil
 import subprocess
 from pathlib import Path
 
@@ -19,6 +18,7 @@ from pipeline.raster import build
 from pipeline.runtime.targets import TARGETS
 from tests.raster.compiled import compiled
 from tests.raster.disassembly import Loop, innermost_loops
+from tests.tools import need
 
 KERNELS = ("blend", "blend_backward", "loss", "project", "project_backward", "adam")
 X86 = platform.machine().lower() in ("x86_64", "amd64")
@@ -36,9 +36,7 @@ def _tools(target: str) -> tuple[list[str], str]:
         compiler, objdump = ["aarch64-linux-gnu-g++", "-static"], "aarch64-linux-gnu-objdump"
     else:
         compiler, objdump = build.compiler(), "objdump"
-    for tool in (compiler[0], objdump):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is not installed")
+    need(compiler[0], objdump)
     return compiler, objdump
 
 

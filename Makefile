@@ -6,19 +6,25 @@ CORES ?= all
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test lint format docs viewer setup clean
+.PHONY: demo test test-native lint format docs viewer setup extension clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
-	@echo "make test   run the tests"
+	@echo "make test   run the tests;  make test-native  those of the C++ code alone"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
 	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
 	@echo "make viewer rebuild the pages' viewer (needs Node 20 or newer)"
 	@echo "make clean  remove results/ and data/demo"
 
-$(VENV)/installed: pyproject.toml
+# pip would compile every module to bytecode, which takes longer than the rest of the installation;
+# Python compiles those that are imported, unless this variable forbids it.
+export PYTHONDONTWRITEBYTECODE :=
+PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r
+
+# Three stamp files: the program's own packages, those of its extras, those of the developers.
+$(VENV)/product: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
 	@command -v $${CXX:-g++} >/dev/null || { test -z "$$CXX" && command -v clang++ >/dev/null; } || \
@@ -26,38 +32,51 @@ $(VENV)/installed: pyproject.toml
 	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || \
 	  { echo "error: no virtual environment could be made; on Debian and Ubuntu install python3-venv"; exit 2; }
 	@$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-	  print("\n".join(p["dependencies"] + sum(p["optional-dependencies"].values(), [])))' > $(VENV)/requirements.txt
-	@echo "installing dependencies into $(VENV) (once; a minute or two)"
-	@$(BIN)/pip install --quiet --disable-pip-version-check -r $(VENV)/requirements.txt
+	  groups = {"product": p["dependencies"], **p["optional-dependencies"]}; \
+	  [open(f"$(VENV)/{name}.txt", "w").write("\n".join(group)) for name, group in groups.items()]'
+	@echo "installing dependencies into $(VENV) (once; about a minute)"
+	@$(PIP_INSTALL) $@.txt
 	@touch $@
 
-setup: $(VENV)/installed
+$(VENV)/watch $(VENV)/dev: $(VENV)/product
+	@echo "installing the packages of '$(@F)' into $(VENV)"
+	@$(PIP_INSTALL) $@.txt
+	@touch $@
+
+extension: $(VENV)/product
 	@$(BIN)/python -m pipeline.raster.build
 	@$(BIN)/python -m pipeline.sfm.nearest
 
-data/demo/demo.json: | setup
+setup: extension $(VENV)/watch
+
+data/demo/demo.json: | extension
 	@$(BIN)/python -m pipeline.demo data/demo
 
 # Fewer steps than the preset's: the demo is small, and shall be there within minutes.
-demo: setup data/demo/demo.json
-	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json --config 'train={"steps": 2500}'
+demo: extension data/demo/demo.json
+	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json --config 'train={"steps": 1500}'
 	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
 
-test: setup
-	@$(BIN)/python -m pytest tests -n 2 --dist loadfile
+test: setup $(VENV)/dev
+	@$(BIN)/python -m pytest tests -n 2 --dist worksteal
 
-lint: $(VENV)/installed
+# What a C++ compiler can change; CXX chooses it. test_targets.py uses every compiler anyway.
+NATIVE_TESTS := tests/raster tests/sfm/test_matching.py tests/training --ignore tests/raster/test_targets.py
+test-native: setup $(VENV)/dev
+	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
+
+lint: $(VENV)/dev
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/snakefmt --check Snakefile
 	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
 
-format: $(VENV)/installed
+format: $(VENV)/dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile
 	@$(BIN)/clang-format -i $$(git ls-files 'pipeline/*/csrc/*')
 
-docs: $(VENV)/installed
+docs: $(VENV)/product
 	@$(BIN)/python -m pipeline.config.docs
 
 VIEWER := pipeline/reporting/viewer

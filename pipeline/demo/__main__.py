@@ -39,13 +39,13 @@ def main(arguments: list[str] | None = None) -> int:
     add("--masks", action="store_true", help="a moving ball, and masks that leave it out")
     add("--noise", type=float, default=default.noise, help="read noise of dng, 14-bit steps")
     add("--seed", type=int, default=default.seed, help="another seed, other camera positions")
-    add("--threads", type=int, default=None, help="views rendered at once; None is all cores")
+    add("--processes", type=int, help="number of views rendered at once; None is one per core")
     options = vars(parser.parse_args(arguments))
-    folder, threads = options.pop("folder"), options.pop("threads")
+    folder, processes = options.pop("folder"), options.pop("processes")
     options["width"], options["height"] = options.pop("size")
     options["points"] = not options.pop("no_points")
     try:
-        write_demo(folder, DemoSpec(**options), threads)
+        write_demo(folder, DemoSpec(**options), processes)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return 2

@@ -205,7 +205,7 @@ def _floor_irradiance(point: Array) -> Array:
 @cache
 def shadow_maps() -> Array:
     """(1 + lamps, SHADOW_CELLS, SHADOW_CELLS): shares of the sky and of each lamp that points of
-    the floor see past the objects. Computed once (two seconds): call it before threads start."""
+    the floor see past the objects. Computed once per process (a second)."""
     side = np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_CELLS)
     x, y = (v.ravel() for v in np.meshgrid(side, side))
     point = np.stack([x, y, np.zeros_like(x)])

@@ -7,6 +7,7 @@ band: full of blobs for SIFT, and free of the aliasing that noise on a lattice b
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -48,24 +49,34 @@ class Material:
         return np.clip(base + tint_a * a + tint_b * b, 0.01, 0.95)
 
     def _field(self, point: Floats, blur: Floats, which: int) -> Floats:
-        rng = np.random.default_rng([self.seed, which])
         total = np.zeros(point.shape[1], np.float32)
         variance = 0.0
-        for wavelength in np.geomspace(self.finest, self.coarsest, BANDS):
+        for wavelength, directions, phases in _waves(self, which):
             # Amplitudes grow slowly with the wavelength, as in natural pictures.
             amplitude = (wavelength / self.coarsest) ** 0.3
             variance += amplitude**2 * WAVES_PER_BAND / 2
-            directions = rng.normal(size=(WAVES_PER_BAND, 3))
-            directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-            phases = rng.uniform(0, 2 * np.pi, WAVES_PER_BAND)
+            waves = directions[0] * point[0]
+            waves += directions[1] * point[1]
+            waves += directions[2] * point[2]
+            waves += phases
             band = np.zeros_like(total)
-            for k, phase in zip(
-                (directions * 2 * np.pi / wavelength).astype(np.float32), phases, strict=True
-            ):
-                band += np.cos(
-                    k[0] * point[0] + k[1] * point[1] + k[2] * point[2] + np.float32(phase)
-                )
+            for wave in np.cos(waves, out=waves):
+                band += wave
             # A Gaussian blur of sigma s leaves exp(-2 pi^2 s^2 / wavelength^2) of a wave.
             fade = np.exp(np.float32(-2 * np.pi**2 / wavelength**2) * blur * blur)
             total += np.float32(amplitude) * fade * band
         return np.tanh(np.float32(STEEPNESS / np.sqrt(variance)) * total)
+
+
+@cache
+def _waves(material: Material, which: int) -> list[tuple[float, Floats, Floats]]:
+    """Of each band: wavelength, (3, WAVES_PER_BAND, 1) wave vectors, (WAVES_PER_BAND, 1) phases."""
+    rng = np.random.default_rng([material.seed, which])
+    bands = []
+    for wavelength in np.geomspace(material.finest, material.coarsest, BANDS):
+        directions = rng.normal(size=(WAVES_PER_BAND, 3))
+        directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+        phases = rng.uniform(0, 2 * np.pi, (WAVES_PER_BAND, 1)).astype(np.float32)
+        vectors = (directions * 2 * np.pi / wavelength).astype(np.float32).T[:, :, None]
+        bands.append((float(wavelength), np.ascontiguousarray(vectors), phases))
+    return bands

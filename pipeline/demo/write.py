@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 import shutil
-from concurrent.futures import ThreadPoolExecutor
+from collections.abc import Iterator
+from concurrent.futures import ProcessPoolExecutor
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
+from functools import lru_cache, partial
+from multiprocessing import get_context
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -15,7 +19,7 @@ from PIL import Image
 
 from pipeline.demo.cameras import LENSES, lens, orbit
 from pipeline.demo.render import Rays, rays, render
-from pipeline.demo.scene import OBJECTS, VISITOR, Thing, shadow_maps
+from pipeline.demo.scene import OBJECTS, VISITOR, Thing
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
 from pipeline.demo.shapes import Sphere
 from pipeline.photos.distortion import normalised, pixels
@@ -28,6 +32,7 @@ from pipeline.scene.model import Camera, Points, Posed, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
 Poses = Literal["none", "colmap", "transforms"]
+Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # a view's depth and colours
 
 POINTS_PER_VIEW = 200
 # A point is seen where its depth agrees with the truth to this share: surfaces slope in a pixel.
@@ -79,12 +84,15 @@ class DemoSpec:
             raise UserError("a Bayer mosaic has even sides", fix="Choose an even --size.")
 
 
-def write_demo(folder: Path, spec: DemoSpec, threads: int | None = None) -> None:
-    """Write the demo scene; the same spec writes the same bytes at any number of threads.
+def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
+    """Write the demo scene; the same spec writes the same bytes at any number of processes.
 
     Inside ``folder``: ``images/``; ``sparse_gt/`` (COLMAP text, the exact cameras of the stored
     pixels); ``depth_gt/*.npy`` (float32 z at pixel centres, 0 where there is nothing);
     ``masks/``, ``sparse/0`` or ``transforms.json`` if asked for; ``demo.json`` (the spec).
+
+    Args:
+        processes: number of views rendered at once; None is one per core.
 
     Raises:
         UserError: options that do not go together, or ``folder`` holds something else.
@@ -99,26 +107,18 @@ def write_demo(folder: Path, spec: DemoSpec, threads: int | None = None) -> None
     for name in ("images", "depth_gt", *(["masks"] if spec.masks else [])):
         (work / name).mkdir(parents=True)
     try:
-        _write(work, spec, threads or usable_cores())
+        _write(work, spec, processes or usable_cores())
         replace_folder(work, folder)
     finally:
         shutil.rmtree(work, ignore_errors=True)
 
 
-def _write(folder: Path, spec: DemoSpec, threads: int) -> None:
-    camera = lens(spec.distortion, spec.width, spec.height)
-    views = orbit([f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed)
-    through = rays(camera)
-    shadow_maps()
+def _write(folder: Path, spec: DemoSpec, processes: int) -> None:
+    camera, views = _camera(spec), _views(spec)
     progress = Progress("rendering the demo scene", spec.views, "views")
     depths, colours = [], []
-    with ThreadPoolExecutor(threads) as pool:
-        jobs = [
-            pool.submit(_write_view, folder, spec, camera, through, i, posed)
-            for i, posed in enumerate(views)
-        ]
-        for job in jobs:
-            depth, colour = job.result()
+    with _written_views(folder, spec, min(processes, spec.views)) as written:
+        for depth, colour in written:
             depths.append(depth)
             colours.append(colour)
             progress.advance()
@@ -133,13 +133,42 @@ def _write(folder: Path, spec: DemoSpec, threads: int) -> None:
     write_json(folder / "demo.json", asdict(spec))
 
 
-def _write_view(
-    folder: Path, spec: DemoSpec, camera: Camera, through: Rays, number: int, posed: Posed
-) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+@contextmanager
+def _written_views(folder: Path, spec: DemoSpec, processes: int) -> Iterator[Iterator[Written]]:
+    """Renders and writes all views; yields the results of ``_write_view`` in order.
+
+    Processes, not threads: rendering is many short numpy calls, which hold the interpreter's lock.
+    Spawned, not forked: the caller may have started threads.
+    """
+    write = partial(_write_view, folder, spec)
+    if processes == 1:
+        yield map(write, range(spec.views))
+        return
+    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
+        yield pool.map(write, range(spec.views))
+
+
+def _camera(spec: DemoSpec) -> Camera:
+    return lens(spec.distortion, spec.width, spec.height)
+
+
+def _views(spec: DemoSpec) -> list[Posed]:
+    return orbit([f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed)
+
+
+@lru_cache(maxsize=1)
+def _rays(spec: DemoSpec) -> Rays:
+    """The rays through the camera's pixels, computed once per process."""
+    return rays(_camera(spec))
+
+
+def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
     """Render and write one view. Its depth and colours are returned for the points; depth is 0
     where they show nothing of the scene."""
+    camera, posed = _camera(spec), _views(spec)[number]
     things = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
-    seen = render(posed, camera, through, things, transparent=spec.alpha, visitor=spec.masks)
+    options = {"transparent": spec.alpha, "visitor": spec.masks}
+    seen = render(posed, camera, _rays(spec), things, **options)
     stem = Path(posed.name).stem
     path = folder / "images" / posed.name
     taken = f"2026:01:01 12:{number // 60 % 60:02d}:{number % 60:02d}"

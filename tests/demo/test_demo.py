@@ -35,7 +35,7 @@ SPEC = DemoSpec(
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("demo") / "scene"
-    write_demo(folder, SPEC, threads=2)
+    write_demo(folder, SPEC)
     return folder
 
 
@@ -114,22 +114,22 @@ def test_given_points_lie_on_the_surfaces_that_their_views_see(folder: Path) -> 
         assert np.all(np.abs(depth - z) < 0.02 * z)
 
 
-def test_same_bytes_at_any_number_of_threads(tmp_path: Path) -> None:
+def test_same_bytes_at_any_number_of_processes(tmp_path: Path) -> None:
     noisy = DemoSpec(views=3, width=48, height=36, format="dng", noise=5.0, poses="transforms")
     masked = DemoSpec(views=3, width=48, height=36, masks=True)
     for spec in (noisy, masked):
-        for threads in (1, 3):
-            write_demo(tmp_path / str(threads), spec, threads)
+        for processes in (1, 3):
+            write_demo(tmp_path / str(processes), spec, processes)
         one, three = (
-            {p.relative_to(tmp_path / t): p.read_bytes() for p in (tmp_path / t).rglob("*.*")}
-            for t in ("1", "3")
+            {p.relative_to(tmp_path / n): p.read_bytes() for p in (tmp_path / n).rglob("*.*")}
+            for n in ("1", "3")
         )
         assert one == three and len(one) > 9
 
 
 def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> None:
     _, _, pictures, _ = load(folder)
-    write_demo(tmp_path / "jpg", replace(SPEC, format="jpg"), 2)
+    write_demo(tmp_path / "jpg", replace(SPEC, format="jpg"))
     for i, picture in enumerate(pictures):
         jpeg = load_rgb(tmp_path / "jpg" / "images" / f"view_{i:03d}.jpg")
         assert np.sqrt(np.mean((jpeg.astype(float) - picture) ** 2)) < 4
@@ -139,7 +139,7 @@ def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> N
     assert by_diagonal == pytest.approx(camera.params[0], rel=0.02)  # whole millimetres
     assert float(exif[37386]) * float(exif[41486]) / 10 == pytest.approx(camera.params[0], 1e-3)
 
-    write_demo(tmp_path / "dng", replace(SPEC, format="dng"), 2)
+    write_demo(tmp_path / "dng", replace(SPEC, format="dng"))
     paths = sorted((tmp_path / "dng" / "images").iterdir())
     photos = [
         Photo(name=p.name, path=str(p), width=160, height=120, digest="", raw=True) for p in paths
@@ -157,7 +157,7 @@ def test_transforms_say_the_same_as_the_truth(tmp_path: Path, distortion: str) -
     spec = DemoSpec(
         views=2, width=32, height=24, distortion=distortion, poses="transforms", format="png"
     )
-    write_demo(tmp_path / "s", spec, 1)
+    write_demo(tmp_path / "s", spec)
     told = json.loads((tmp_path / "s" / "transforms.json").read_text())
     truth = read_model(tmp_path / "s" / "sparse_gt")
     for frame in told["frames"]:
@@ -176,7 +176,7 @@ def test_transforms_say_the_same_as_the_truth(tmp_path: Path, distortion: str) -
 
 def test_masks_hide_the_visitor_and_nothing_else(folder: Path, tmp_path: Path) -> None:
     _, _, pictures, _ = load(folder)
-    write_demo(tmp_path / "s", replace(SPEC, masks=True), 2)
+    write_demo(tmp_path / "s", replace(SPEC, masks=True))
     for i, plain in enumerate(pictures):
         mask = load_mask(tmp_path / "s" / "masks" / f"view_{i:03d}.png")
         visited = load_rgb(tmp_path / "s" / "images" / f"view_{i:03d}.png")
@@ -189,7 +189,7 @@ def test_masks_hide_the_visitor_and_nothing_else(folder: Path, tmp_path: Path) -
 
 def test_alpha_covers_the_objects_alone(folder: Path, tmp_path: Path) -> None:
     _, views, pictures, _ = load(folder)
-    write_demo(tmp_path / "s", replace(SPEC, alpha=True, poses="none"), 2)
+    write_demo(tmp_path / "s", replace(SPEC, alpha=True, poses="none"))
     for view, plain in zip(views, pictures, strict=True):
         rgb, alpha = load_rgba(tmp_path / "s" / "images" / view.name)
         assert alpha is not None and 0.05 < (alpha == 255).mean() < 0.6
@@ -237,7 +237,7 @@ def test_options_that_do_not_go_together_and_foreign_folders(
     with pytest.raises(UserError, match="no demo scene"):
         write_demo(tmp_path / "mine", DemoSpec(views=1, width=32, height=24))
     assert not (tmp_path / "a").exists() and (tmp_path / "mine" / "holiday.jpg").exists()
-    small = [str(tmp_path / "b"), "--views", "1", "--size", "32x24", "--threads", "1"]
+    small = [str(tmp_path / "b"), "--views", "1", "--size", "32x24", "--processes", "1"]
     assert main(small) == 0 and main(small) == 0  # a demo scene may be written over
     assert json.loads((tmp_path / "b" / "demo.json").read_text())["views"] == 1
 
@@ -255,7 +255,7 @@ def test_sfm_registers_every_view_of_a_tiny_scene(
 ) -> None:
     from pipeline.metrics.pose import pose_error
 
-    write_demo(tmp_path / "s", spec, 2)
+    write_demo(tmp_path / "s", spec)
     # A process of its own: pycolmap's libpng must not meet cv2's.
     script = """
 import sys, pycolmap

@@ -7,12 +7,16 @@ from pathlib import Path
 import pytest
 
 from tests.e2e.harness import TINY, copy_project, make_scene, snakemake
+from tests.once import made_once
+
+
+def reconstruct(project: Path) -> None:
+    copy_project(project)
+    make_scene(project, "tiny")
+    snakemake(project, "results/tiny/metrics.json", config=TINY)
 
 
 @pytest.fixture(scope="session")
 def finished(tmp_path_factory) -> Path:
     """A project whose scene ``tiny`` was reconstructed from photographs on two cores."""
-    project = copy_project(tmp_path_factory.mktemp("e2e") / "project")
-    make_scene(project, "tiny")
-    snakemake(project, "results/tiny/metrics.json", config=TINY)
-    return project
+    return made_once(tmp_path_factory, "e2e-finished", reconstruct)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.harness import TINY, copy_project, copy_run, make_scene, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_project, copy_run, rules_run, snakemake
 
 pytestmark = pytest.mark.slow
 
@@ -157,7 +157,7 @@ def test_all_scenes_leave_out_a_folder_that_is_none(finished, tmp_path):
     assert "dta: no scene here" in lost.stdout
 
 
-def test_results_that_cannot_be_written(project, tmp_path):
+def test_results_that_cannot_be_written(finished, tmp_path):
     """A small file system stands for a full disk; without the right to mount one, skip."""
     disk = tmp_path / "disk"
     disk.mkdir()
@@ -168,7 +168,7 @@ def test_results_that_cannot_be_written(project, tmp_path):
         pytest.skip("needs the right to mount a small file system")
     try:
         small = copy_project(tmp_path / "small")
-        make_scene(small, "tiny")
+        shutil.copytree(finished / "data", small / "data")
         (small / "results").symlink_to(disk)
         fails(small, "tiny", "disk is full", "what to do")
     finally:

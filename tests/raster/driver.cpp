@@ -1,6 +1,8 @@
-// Runs every kernel over ordinary and wild scenes without torch, for builds under sanitizers and
-// for other instruction sets. Says what is wrong and exits with 1, or writes the ordinary scene's
-// image and gradients to the file named by the first argument.
+// Runs every kernel without torch, for builds under sanitizers and for other instruction sets.
+//
+//   driver               ordinary and wild scenes; prints what is wrong and exits with 1, or
+//   "clean" driver OUTPUT        writes an ordinary scene's image and gradients driver INPUT OUTPUT
+//   reads a scene and a view, writes what the kernels make of them
 
 #include <cmath>
 #include <cstdio>
@@ -167,9 +169,89 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     }
 }
 
+// What test_targets.py writes: these, then the Gaussians' fields, then dL/d of color, alpha and
+// depth, then the loss's target.
+struct Header {
+    int64_t count, degree, width, height, antialias, per_pixel, threads;
+    double fx, fy, cx, cy, rotation[9], translation[3], near, background[3];
+};
+
+template <class T>
+void read(std::FILE* in, T* to, size_t count) {
+    if (std::fread(to, sizeof(T), count, in) == count) return;
+    std::puts("the input ends too early");
+    std::exit(2);
+}
+
+// One view of the scene in a file; threads and results are as the file's reader expects them.
+int run_file(const char* input, const char* output) {
+    std::FILE *in = std::fopen(input, "rb"), *out = std::fopen(output, "wb");
+    if (!in || !out) return 2;
+    Header h;
+    read(in, &h, 1);
+    Scene s(h.count, int(h.degree));
+    for (Array<float>* field : s.fields) read(in, field->get(), field->size);
+    const size_t n = size_t(h.count), pixels = size_t(h.width * h.height);
+    Array<float> d_color(3 * pixels), d_alpha(pixels), d_depth(pixels), target(3 * pixels);
+    for (Array<float>* image : {&d_color, &d_alpha, &d_depth, &target})
+        read(in, image->get(), image->size);
+    std::fclose(in);
+
+    View view = {h.width, h.height,         h.fx,         h.fy, h.cx, h.cy, {}, {},
+                 h.near,  h.antialias != 0, int(h.degree)};
+    std::memcpy(view.rotation, h.rotation, sizeof(view.rotation));
+    std::memcpy(view.translation, h.translation, sizeof(view.translation));
+    const int threads = int(h.threads);
+    const float background[3] = {float(h.background[0]), float(h.background[1]),
+                                 float(h.background[2])};
+    const Gaussians gaussians = {
+        s.count,       (h.degree + 1) * (h.degree + 1), s.means.get(), s.log_scales.get(),
+        s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
+    Array<Record> records(n);
+    Array<float> radii(n), color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);
+    Array<Slots> slots(n);
+    Array<int32_t> block_end(size_t(kBlocks * view.tiles()));
+    project_view(gaussians, view, threads, records.get(), radii.get());
+    Binner binner;
+    if (!binner.find(records.get(), radii.get(), s.count, view, threads, slots.get())) return 2;
+    Array<Entry> entries(size_t(binner.intersections()));
+    Array<int64_t> begin(size_t(view.tiles() + 1));
+    binner.write(entries.get(), begin.get());
+    const Pairs pairs = {entries.get(), begin.get()};
+    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(),
+          block_end.get());
+    blend_depth(records.get(), pairs, view, threads, depth.get(), median.get());
+
+    Array<float> slot_gradients(entries.size * kSlotFloats);
+    Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
+    Array<float> d_means2d(2 * n), d_abs(2 * n), d_loss(3 * pixels);
+    Array<double> d_camera(kCameraParameters);
+    blend_backward(records.get(), pairs, view,
+                   {color.get(), alpha.get(), depth.get(), d_color.get(), d_alpha.get(),
+                    d_depth.get(), background, true, h.per_pixel},
+                   block_end.get(), threads, slot_gradients.get());
+    project_view_backward(gaussians, view, threads, records.get(), radii.get(), slots.get(),
+                          slot_gradients.get(),
+                          {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
+                           d_sh.get(), d_means2d.get(), d_abs.get(), d_camera.get()},
+                          nullptr);
+    l1_ssim({h.width, h.height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
+            d_loss.get());
+    Array<float> m(s.sh.size), v(s.sh.size);
+    const double rate = 1e-2;
+    adam_step(s.sh.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
+              {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
+    for (Array<float>* result : {&color, &alpha, &depth, &median, &radii, &d_means, &d_scales,
+                                 &d_quats, &d_opacity, &d_sh, &d_means2d, &d_abs, &d_loss, &s.sh})
+        std::fwrite(result->get(), sizeof(float), result->size, out);
+    std::fwrite(d_camera.get(), sizeof(double), d_camera.size, out);
+    return std::fclose(out) ? 2 : 0;
+}
+
 }  // namespace
 
 int main(int argc, char** argv) {
+    if (argc > 2) return run_file(argv[1], argv[2]);
     std::mt19937 random(7);
     if (argc > 1) {
         std::FILE* out = std::fopen(argv[1], "wb");

@@ -13,15 +13,9 @@ import pytest
 from pipeline.raster import build
 from pipeline.runtime import targets
 from pipeline.runtime.errors import UserError
+from tests.raster.compiled import compiled
 
-DRIVER = Path(__file__).with_name("driver.cpp")
 REPOSITORY = Path(__file__).parents[2]
-
-
-def compile_driver(target: Path, *flags: str) -> None:
-    kernels = [str(p) for p in build.source_files() if p.suffix == ".cpp" and p.stem != "binding"]
-    command = [*build.compiler(), *flags, "-I", str(build.SOURCES), str(DRIVER), *kernels]
-    subprocess.run([*command, "-o", str(target)], check=True, capture_output=True, text=True)
 
 
 def test_source_hash_needs_no_torch_and_follows_the_sources(
@@ -84,14 +78,12 @@ def test_two_builds_at_once_leave_one_whole_library(tmp_path: Path) -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["address,undefined", "thread"])
-def test_sanitizers_find_nothing(tmp_path: Path, kinds: str) -> None:
+def test_sanitizers_find_nothing(tmp_path_factory: pytest.TempPathFactory, kinds: str) -> None:
     """Every kernel over 300 wild scenes, on one to three threads."""
-    compile_driver(
-        tmp_path / "driver",
-        *(*targets.usable()[0].flags, "-std=c++17", "-O1", "-g", "-pthread", "-Wno-psabi"),
-        *(f"-fsanitize={kinds}", "-fno-sanitize-recover=all"),
-    )
-    done = subprocess.run([tmp_path / "driver"], capture_output=True, text=True, timeout=600)
+    flags = [*targets.usable()[0].flags, "-std=c++17", "-O1", "-g", "-pthread", "-Wno-psabi"]
+    flags += [f"-fsanitize={kinds}", "-fno-sanitize-recover=all"]
+    driver = compiled(tmp_path_factory, build.compiler(), flags) / "driver"
+    done = subprocess.run([driver], capture_output=True, text=True, timeout=600)
     if "unexpected memory mapping" in done.stderr:
         pytest.skip("this system's memory layout is not the sanitizer's")
     assert done.returncode == 0, done.stdout + done.stderr[-3000:]
@@ -99,15 +91,17 @@ def test_sanitizers_find_nothing(tmp_path: Path, kinds: str) -> None:
 
 
 @pytest.mark.slow
-def test_other_instruction_sets_give_the_same_answers(tmp_path: Path) -> None:
+def test_other_instruction_sets_give_the_same_answers(
+    tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
+) -> None:
     """The same scene for every target that this machine can run: equal to rounding."""
     names = [target.name for target in targets.of_this_architecture() if not target.missing]
     if len(names) < 2:
         pytest.skip("one target alone runs on this processor")
     results = []
     for name in names:
-        program, output = tmp_path / f"driver-{name}", tmp_path / f"out-{name}"
-        compile_driver(program, *build.flags(name))
+        program = compiled(tmp_path_factory, build.compiler(), build.flags(name)) / "driver"
+        output = tmp_path / f"out-{name}"
         subprocess.run([program, output], check=True, timeout=600)
         results.append(np.fromfile(output, np.float32).astype(np.float64))
     for other in results[1:]:

@@ -9,16 +9,16 @@ or one row in scalar code stays below.
 from __future__ import annotations
 
 import platform
-import shutil
 import subprocess
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import pytest
 
 from pipeline.raster import build
 from pipeline.runtime.targets import TARGETS
+from tests.raster.compiled import compiled
 from tests.raster.disassembly import Loop, innermost_loops
+from tests.tools import need
 
 KERNELS = ("blend", "blend_backward", "loss", "project", "project_backward", "adam")
 X86 = platform.machine().lower() in ("x86_64", "amd64")
@@ -33,12 +33,10 @@ def _tools(target: str) -> tuple[list[str], str]:
     if (target == "aarch64") == X86:
         if not X86:
             pytest.skip("no cross compiler for x86-64 is looked for")
-        compiler, objdump = ["aarch64-linux-gnu-g++"], "aarch64-linux-gnu-objdump"
+        compiler, objdump = ["aarch64-linux-gnu-g++", "-static"], "aarch64-linux-gnu-objdump"
     else:
         compiler, objdump = build.compiler(), "objdump"
-    for tool in (compiler[0], objdump):
-        if shutil.which(tool) is None:
-            pytest.skip(f"{tool} is not installed")
+    need(compiler[0], objdump)
     return compiler, objdump
 
 
@@ -53,19 +51,10 @@ def _fault(loop: Loop) -> str | None:
 
 
 @pytest.mark.parametrize("target", [target.name for target in TARGETS])
-def test_inner_loops_are_vector_code(target: str, tmp_path: Path) -> None:
+def test_inner_loops_are_vector_code(target: str, tmp_path_factory: pytest.TempPathFactory) -> None:
     compiler, objdump = _tools(target)
-
-    def loops(kernel: str) -> list[Loop]:
-        out = tmp_path / f"{kernel}.o"
-        source = build.SOURCES / f"{kernel}.cpp"
-        command = [*compiler, *build.flags(target), "-c", str(source), "-o", str(out)]
-        done = subprocess.run(command, capture_output=True, text=True)
-        assert done.returncode == 0, done.stderr
-        return innermost_loops(objdump, out)
-
-    with ThreadPoolExecutor(2) as pool:
-        found = dict(zip(KERNELS, pool.map(loops, KERNELS), strict=True))
+    folder = compiled(tmp_path_factory, compiler, build.flags(target))
+    found = {kernel: innermost_loops(objdump, folder / f"{kernel}.o") for kernel in KERNELS}
     faults = []
     for kernel in KERNELS:
         wrong = list(dict.fromkeys(filter(None, map(_fault, found[kernel]))))

@@ -60,7 +60,7 @@ def test_the_table_compares_with_pycolmap_and_the_plot_shows_both():
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes") / "demo"
-    write_demo(folder, DemoSpec(views=6, width=320, height=240), None)
+    write_demo(folder, DemoSpec(views=6, width=320, height=240))
     return folder
 
 

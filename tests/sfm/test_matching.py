@@ -27,6 +27,7 @@ from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
 from stages.wiring import ROLES, stage_key
 from tests.sfm import corner, jobs
+from tests.tools import need
 
 FEATURES = schema.Features(max_features=500)
 
@@ -117,16 +118,13 @@ def test_the_form_for_avx_vnni_finds_the_same(tmp_path, monkeypatch):
 ARM_COMPILER, ARM_EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
 
 
-@pytest.mark.skipif(
-    not (shutil.which(ARM_COMPILER) and shutil.which(ARM_EMULATOR)),
-    reason=f"needs {ARM_COMPILER} and {ARM_EMULATOR}",
-)
 @pytest.mark.parametrize(
     "variant",
     [variant for variant in VARIANTS if variant.target.name == "aarch64"],
     ids=lambda variant: variant.name,
 )
 def test_an_emulated_arm_processor_finds_the_same(tmp_path, variant):
+    need(ARM_COMPILER, ARM_EMULATOR)
     program, found = tmp_path / "driver", tmp_path / "found"
     files = [str(Path(__file__).with_name("nearest_driver.cpp")), str(SOURCE)]
     flags = [*near.LIBRARY.flags_for(variant), "-Werror", "-static"]

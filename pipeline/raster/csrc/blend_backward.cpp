@@ -14,7 +14,7 @@
 namespace splat {
 namespace {
 
-constexpr int kSize = 16, kAbreast = 4;
+constexpr int kSize = 16, kAbreast = kRegisterBytes == 64 ? 4 : 2;
 
 // What a block's pixels ask for, and where they have come to.
 struct BlockTargets {

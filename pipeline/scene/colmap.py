@@ -7,7 +7,6 @@ which is what ``images.bin`` stores in all versions of the format).
 
 from __future__ import annotations
 
-import math
 from pathlib import Path
 
 import numpy as np
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene import colmap_binary, colmap_text
-from pipeline.scene.colmap_records import REMEDY, Keypoints, PointTable, Tracks
+from pipeline.scene.colmap_records import POINT2D, REMEDY, Keypoints, PointTable, Tracks
 from pipeline.scene.model import Points, Reconstruction
 from pipeline.scene.rotations import quat_to_rotation, rotation_to_quat
 
@@ -120,23 +119,21 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
     )
 
 
-def _index_tracks(
-    model: Reconstruction,
-) -> tuple[Keypoints, Tracks]:
-    """For writing: (x, y, point id) of each image's keypoints, and each point's track as
-    (image id, keypoint index)."""
+def _index_tracks(model: Reconstruction) -> tuple[Keypoints, Tracks]:
+    """For writing: the images' keypoints and the points' tracks into them."""
     points = model.points
-    keypoints: Keypoints = {number: [] for number in model.images}
-    tracks: Tracks = []
-    images, xy = points.track_image_id.tolist(), points.track_xy.tolist()
-    starts = points.track_start.tolist()
-    for p in range(len(points)):
-        track = []
-        for row in range(starts[p], starts[p + 1]):
-            x, y = xy[row]
-            if math.isfinite(x) and math.isfinite(y):
-                seen = keypoints[images[row]]
-                track.append((images[row], len(seen)))
-                seen.append((x, y, p + 1))
-        tracks.append(track)
-    return keypoints, tracks
+    rows = np.flatnonzero(np.isfinite(points.track_xy).all(axis=1))
+    owner = np.repeat(np.arange(len(points)), points.track_length)[rows]
+    image = points.track_image_id[rows]
+    seen = np.zeros(len(rows), POINT2D)
+    seen["xy"], seen["point"] = points.track_xy[rows], owner + 1
+    by_image = np.argsort(image, kind="stable")
+    numbers, starts = np.unique(image[by_image], return_index=True)
+    ends = [*starts[1:].tolist(), len(rows)]
+    keypoints: Keypoints = {number: seen[:0] for number in model.images}
+    index = np.empty(len(rows), np.int64)
+    for number, start, end in zip(numbers.tolist(), starts.tolist(), ends, strict=False):
+        of_image = by_image[start:end]
+        keypoints[number] = seen[of_image]
+        index[of_image] = np.arange(end - start)
+    return keypoints, Tracks(np.bincount(owner, minlength=len(points)), image, index)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.runtime.errors import UserError
 from pipeline.scene.colmap_records import (
+    POINT2D,
     REMEDY,
     Keypoints,
     PointTable,
@@ -24,7 +25,6 @@ from pipeline.scene.model import CAMERA_MODELS, Camera, Points, Posed, Reconstru
 from pipeline.scene.rotations import rotation_to_quat
 
 _MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
-_POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
 _POINT3D = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("length", "<u8")]
 )
@@ -104,9 +104,9 @@ def read_images(
         number, *pose, camera_id = reader.take("I7dI")
         posed = make_posed(file, reader.name(), int(camera_id), list(pose[:4]), list(pose[4:]))
         add_image(file, images, cameras, int(number), posed)
-        count = reader.count(_POINT2D.itemsize)
-        start = reader.skip(count * _POINT2D.itemsize)
-        keypoints[int(number)] = np.frombuffer(reader.data, _POINT2D, count, start)["xy"]
+        count = reader.count(POINT2D.itemsize)
+        start = reader.skip(count * POINT2D.itemsize)
+        keypoints[int(number)] = np.frombuffer(reader.data, POINT2D, count, start)["xy"]
     reader.end()
     return images, keypoints
 
@@ -161,14 +161,24 @@ def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
         out.append(struct.pack("<I7dI", number, *pose, image.camera_id))
         out.append(image.name.encode() + b"\0")
         out.append(struct.pack("<Q", len(keypoints[number])))
-        out.extend(struct.pack("<ddQ", *seen) for seen in keypoints[number])
+        out.append(keypoints[number].tobytes())
     return b"".join(out)
 
 
 def points_bytes(points: Points, tracks: Tracks) -> bytes:
-    out = [struct.pack("<Q", len(points))]
-    for p, track in enumerate(tracks):
-        rgb, error = points.rgb[p].tolist(), float(points.error[p])
-        out.append(struct.pack("<Q3d3BdQ", p + 1, *points.xyz[p], *rgb, error, len(track)))
-        out.extend(struct.pack("<II", *element) for element in track)
-    return b"".join(out)
+    table = np.zeros(len(points), _POINT3D)
+    table["id"] = np.arange(1, len(points) + 1)
+    table["xyz"], table["rgb"] = points.xyz, points.rgb
+    table["error"], table["length"] = points.error, tracks.length
+    track = np.zeros(len(tracks.image), _TRACK)
+    track["image"], track["index"] = tracks.image, tracks.index
+    # Each record is followed by its track: say for each byte of both where it goes.
+    before = np.cumsum(tracks.length) - tracks.length
+    starts = np.arange(len(points)) * _POINT3D.itemsize + before * _TRACK.itemsize
+    within = np.arange(len(track)) - np.repeat(before, tracks.length)
+    ends = np.repeat(starts + _POINT3D.itemsize, tracks.length)
+    out = np.empty(table.nbytes + track.nbytes, np.uint8)
+    for records, at in ((table, starts), (track, ends + _TRACK.itemsize * within)):
+        size = records.dtype.itemsize
+        out[at[:, None] + np.arange(size)] = records.view(np.uint8).reshape(-1, size)
+    return struct.pack("<Q", len(points)) + out.tobytes()

@@ -14,10 +14,20 @@ from pipeline.scene.model import CAMERA_MODELS, Camera, Posed
 from pipeline.scene.rotations import quat_to_rotation
 
 REMEDY = "export the model again from COLMAP (binary or text), or set poses: ignore"
-Keypoints = dict[int, list[tuple[float, float, int]]]
-"""For writing: (x, y, point id) of each image's keypoints, by image id."""
-Tracks = list[list[tuple[int, int]]]
-"""For writing: each point's track as (image id, keypoint index)."""
+POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
+"""A keypoint as binary files hold it."""
+Keypoints = dict[int, NDArray[np.void]]
+"""For writing: each image's keypoints (``POINT2D``), by image id."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """For writing: length (P,) and, one after another, the tracks' image ids and keypoint indices
+    (M,)."""
+
+    length: NDArray[np.int64]
+    image: NDArray[np.int64]
+    index: NDArray[np.int64]
 
 
 @dataclass(frozen=True)

@@ -150,15 +150,19 @@ def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
         pose = [*rotation_to_quat(image.rotation), *image.translation]
         numbers = " ".join(repr(float(v)) for v in pose)
         out.append(f"{number} {numbers} {image.camera_id} {image.name}")
-        out.append(" ".join(f"{x!r} {y!r} {point}" for x, y, point in keypoints[number]))
+        of_image = keypoints[number]
+        seen = zip(*of_image["xy"].T.tolist(), of_image["point"].tolist(), strict=True)
+        out.append(" ".join(f"{x!r} {y!r} {point}" for x, y, point in seen))
     return ("\n".join(out) + "\n").encode()
 
 
 def points_bytes(points: Points, tracks: Tracks) -> bytes:
     out = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
-    for p, track in enumerate(tracks):
+    elements = [f"{i} {k}" for i, k in zip(tracks.image, tracks.index, strict=True)]
+    ends = np.cumsum(tracks.length).tolist()
+    for p, (end, length) in enumerate(zip(ends, tracks.length.tolist(), strict=True)):
         xyz = " ".join(repr(float(v)) for v in points.xyz[p])
         rgb = " ".join(str(v) for v in points.rgb[p].tolist())
         row = f"{p + 1} {xyz} {rgb} {float(points.error[p])!r}"
-        out.append(" ".join([row, *(f"{image} {index}" for image, index in track)]))
+        out.append(" ".join([row, *elements[end - length : end]]))
     return ("\n".join(out) + "\n").encode()

@@ -116,14 +116,14 @@ def read_points(file: Path) -> PointTable:
     # Records differ in length by their tracks: find where each starts, then gather at once.
     count = reader.count(_POINT3D.itemsize)
     starts = np.empty(count, np.int64)
-    length_at, at, size = struct.Struct("<Q").unpack_from, reader.at, len(reader.data)
+    length_at, here, size = struct.Struct("<Q").unpack_from, reader.at, len(reader.data)
     for row in range(count):
-        starts[row], at = at, at + _POINT3D.itemsize
-        if at <= size:
-            at += length_at(reader.data, at - 8)[0] * _TRACK.itemsize
-        if at > size:
+        starts[row], here = here, here + _POINT3D.itemsize
+        if here <= size:
+            here += length_at(reader.data, here - 8)[0] * _TRACK.itemsize
+        if here > size:
             break
-    reader.skip(at - reader.at)
+    reader.skip(here - reader.at)
     reader.end()
     data = np.frombuffer(reader.data, np.uint8)
 

@@ -7,6 +7,7 @@ from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
 from pipeline.sfm.triangulation import triangulate
+from pipeline.splats.arrays import write_arrays
 from pipeline.splats.init import gaussians_from_points, gaussians_random
 from stages.command import main
 
@@ -54,10 +55,7 @@ def run(job: Job) -> None:
         import numpy as np
 
         first = gaussians_from_points(points, np.array([v.centre for v in train]), config, 0)
-    # torch only now: the triangulation starts processes that import this module and pycolmap.
-    from pipeline.splats.gaussians import Gaussians
-
-    Gaussians.from_arrays(first).save(job.out / "gaussians.npz")
+    write_arrays(job.out / "gaussians.npz", first.arrays())
     job.decide(f"{len(first)} Gaussians from {'random places' if method == 'random' else 'points'}")
     job.counters |= {
         "num_gaussians": len(first),

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 import zipfile
 import zlib
 from collections.abc import Mapping
@@ -14,8 +13,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import write_arrays
 from pipeline.splats.init import InitGaussians
 
 FIX = "delete it and run again"
@@ -89,10 +88,7 @@ class Gaussians:
 
     def save(self, path: Path) -> None:
         """Write a ``.npz`` file; the same Gaussians always give the same bytes."""
-        buffer = io.BytesIO()
-        # numpy stamps the members of its archives with a fixed date.
-        np.savez(buffer, **self.arrays())  # type: ignore[arg-type]
-        write_bytes(path, buffer.getvalue())
+        write_arrays(path, self.arrays())
 
     @staticmethod
     def load(path: Path) -> Gaussians:

@@ -109,7 +109,10 @@ class Strip {
           values_(3 * in.width),
           own_((end - begin + 15) / 16 * 16),
           stride_(own_ + 4 * kReach),
-          memory_(size_t((6 * kRows + 8) * stride_)) {
+          origin_(begin - 2 * kReach),
+          from_(std::max(origin_, int64_t(0))),
+          to_(std::min(origin_ + stride_, values_)),
+          memory_(size_t((6 * kRows + 9) * stride_)) {
         float* next = memory_.get();
         for (Ring* ring : {&x_, &y_, &keep_, &d_m_, &d_2_, &d_xy_}) {
             *ring = {next, stride_};
@@ -117,6 +120,9 @@ class Strip {
         }
         for (auto& lines : line_)
             for (float*& line : lines) line = next, next += stride_;
+        inside_ = next;
+        for (int64_t i = 0; i < stride_; i++)
+            inside_[i] = origin_ + i >= from_ && origin_ + i < to_ ? 1.0f : 0.0f;
     }
 
     // Rows [first, last) of the gradient, and their sums.
@@ -148,26 +154,32 @@ class Strip {
 
     // Row y of the images, zeros beyond them and, in both, nothing to tell where a mask hides them.
     void read(int64_t y) {
-        float *x = x_.row(y), *target = y_.row(y), *keep = keep_.row(y);
-        for (float* row : {x, target, keep}) std::memset(row, 0, stride_ * sizeof(float));
-        if (y < 0 || y >= in_.height) return;
-        const int64_t origin = begin_ - 2 * kReach;  // column of a buffer's first float
-        const int64_t from = std::max(origin, int64_t(0));
-        const int64_t to = std::min(origin + stride_, values_);
-        const int64_t offset = y * values_;
-        std::memcpy(x + from - origin, in_.rendered + offset + from, (to - from) * sizeof(float));
+        float *x = x_.row(y), *target = y_.row(y);
+        const bool outside = y < 0 || y >= in_.height;
+        const int64_t first = outside ? stride_ : from_ - origin_;
+        for (float* row : {x, target}) {
+            std::memset(row, 0, first * sizeof(float));
+            if (!outside)
+                std::memset(row + to_ - origin_, 0, (origin_ + stride_ - to_) * sizeof(float));
+        }
+        if (outside) return;
+        const int64_t offset = y * values_ + from_, size = to_ - from_;
+        std::memcpy(x + first, in_.rendered + offset, size * sizeof(float));
         if (in_.target_float)
-            std::memcpy(target + from - origin, in_.target_float + offset + from,
-                        (to - from) * sizeof(float));
+            std::memcpy(target + first, in_.target_float + offset, size * sizeof(float));
         else
-            for (int64_t i = from; i < to; i++)
-                target[i - origin] = float(in_.target_bytes[offset + i]) / 255.0f;
-        for (int64_t i = from; i < to; i++) keep[i - origin] = 1;
+            for (int64_t i = 0; i < size; i++)
+                target[first + i] = float(in_.target_bytes[offset + i]) / 255.0f;
         if (!in_.mask) return;
-        for (int64_t i = from; i < to; i++)
+        float* const keep = keep_.row(y);
+        std::memcpy(keep, inside_, stride_ * sizeof(float));
+        for (int64_t i = from_; i < to_; i++)
             if (in_.mask[y * in_.width + i / 3])
-                x[i - origin] = target[i - origin], keep[i - origin] = 0;
+                x[i - origin_] = target[i - origin_], keep[i - origin_] = 0;
     }
+
+    // 1 where values count, 0 beyond the image and where a mask hides it.
+    const float* weights(int64_t y) const { return in_.mask ? keep_.row(y) : inside_; }
 
     // Adds a row's taps to two sums, of the row kRadius below the first of kRows and of the next.
     SPLAT_INLINE void add_row(int row, Lanes value, Lanes (&sums)[2]) const {
@@ -209,7 +221,7 @@ class Strip {
         }
         const float *x = x_.row(y), *target = y_.row(y);
         float *to_m = d_m_.row(y), *to_2 = d_2_.row(y), *to_xy = d_xy_.row(y);
-        const float* keep = keep_.row(y);
+        const float* keep = weights(y);
         Lanes error[16 / kLanes] = {}, ssim[16 / kLanes] = {};  // 16 sums each, on every target
         for (int64_t i = kReach; i < stride_ - kReach; i += kLanes) {
             const Lanes m_x = blur_across(line[0] + i, window_);
@@ -269,7 +281,7 @@ class Strip {
                                b * blur_across(line[2] + i, window_);
             const Lanes one = broadcast<Lanes>(1.0f);
             const Lanes sign = keep(a > b, one) - keep(b > a, one);
-            const Lanes out = load<Lanes>(keep_.row(y) + i) *
+            const Lanes out = load<Lanes>(weights(y) + i) *
                               (error_scale_ * (sign + 2 * square_ * (a - b)) + ssim_scale_ * ssim);
             const int64_t column = begin_ + i - 2 * kReach;
             float* const to = grad + y * values_ + column;
@@ -284,10 +296,11 @@ class Strip {
     const Window& window_;
     const float square_, error_scale_, ssim_scale_;
     const int64_t begin_, end_, values_;
-    const int64_t own_, stride_;  // floats of the strip in whole vectors; of a buffer's row
+    const int64_t own_, stride_;        // floats of the strip in whole vectors; of a buffer's row
+    const int64_t origin_, from_, to_;  // columns: a buffer's first, those that the image has
     const Scratch<float> memory_;
     Ring x_, y_, keep_, d_m_, d_2_, d_xy_;
-    float* line_[2][4];
+    float *line_[2][4], *inside_;
 };
 
 // Values that no mask hides.

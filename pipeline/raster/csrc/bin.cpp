@@ -211,7 +211,6 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                             native::split_nibbles(native::first_bytes<kBlockRows>(hit[i], column));
                         for (uint32_t k = 0; k < 2; k++) {
                             const uint32_t tile = window.tile + column / 4 + k;
-                            // Of 4 x 2 blocks 8 rows fill the half, of 4 x 4 ones 4 rows a quarter.
                             const uint64_t blocks = (both >> 32 * k & rows)
                                                     << kRowBits * window.rows_down;
                             list(tile, uint32_t(blocks & kTileBits));

@@ -9,8 +9,8 @@ namespace splat {
 namespace {
 
 constexpr int kSize = 64, kAbreast = 4;
-// How many alphas are found before they are used. With 16 registers all: a loop that finds them and
-// uses them is longer than what a processor looks ahead, and waits for each.
+// Alphas computed before compositing starts. With 16 registers: all of a batch. One loop that
+// computes and composites exceeds the processor's reorder window, so that its latencies add up.
 constexpr int kAlphas = kRegisterBytes == 64 ? kAbreast : kSize;
 using Gaussian = Batch<kSize>::Gaussian;
 

@@ -16,14 +16,14 @@ namespace {
 
 constexpr int kSize = 16, kAbreast = kRegisterBytes == 64 ? 4 : 2;
 
-// What a block's pixels ask for, and where they have come to.
+// Gradients and compositing state of a block's pixels.
 struct BlockTargets {
     Pixels rgb[3], alpha, depth;
     Pixels transmittance;  // 0 once stopped
     Pixels behind;         // S: starts as the whole sum, ends as 0
-    Pixels left;           // Gaussians yet to be given to, where that is limited
+    Pixels left;           // Gaussians that still receive gradients, where that is limited
 
-    // Pixels outside the image ask for nothing.
+    // Pixels outside the image have zero gradients.
     SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
                           const ImageGradientsIn& in) {
         Pixels color[3];
@@ -56,7 +56,7 @@ struct BlockTargets {
         left = broadcast<Pixels>(float(in.per_pixel));
     }
 
-    // A pixel that has given to as many as it may asks for nothing more.
+    // A pixel whose number of Gaussians is used up has zero gradients from then on.
     SPLAT_INLINE void count(const Step& s) {
         left -= keep(s.weight > 0.0f, broadcast<Pixels>(1.0f));
         const PixelMask more = left > 0.0f;

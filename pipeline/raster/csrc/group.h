@@ -1,5 +1,5 @@
-// Gaussians are projected in groups of 16: the lanes of one vector of float32. Here are the ways
-// between the lanes and the arrays.
+// Gaussians are projected in groups of 16, the lanes of one float32 vector. This file converts
+// between these lanes and the arrays.
 #pragma once
 
 #include "project_math.h"
@@ -38,8 +38,8 @@ SPLAT_INLINE void write_column(f32x16 column, int count, float* to) {
         std::memcpy(to, &column, count * sizeof(float));
 }
 
-// A group is projected in parts, since float64 takes more registers. Lanes of part `number`, and
-// all of them again from a value per part.
+// A group is projected in float64 in parts of one register. `widened` gives the float64 lanes of
+// part `number`; `narrowed` joins a value per part into one float32 vector.
 constexpr int kGroupParts = kGroup / kProjectLanes;
 SPLAT_INLINE Lanes widened(const f32x16& v, int number) {
     return widen(load<Vector<float, kProjectLanes>>(reinterpret_cast<const float*>(&v) +

@@ -48,8 +48,7 @@ struct Window {
     }
 };
 
-// One register: two rows of the four blurs of the images are eight sums, which shall stay in
-// registers.
+// One register per vector: the four blurs of two rows need eight sums in registers.
 constexpr int kLanes = kRegisterBytes / int(sizeof(float));
 using Lanes = Vector<float, kLanes>;
 

@@ -8,7 +8,7 @@
 
 namespace splat {
 
-// As many as fit into one register: of the hundred values in use at once, fewer are spilled.
+// One register: about a hundred values are live at once, and wider vectors would be spilled more.
 constexpr int kProjectLanes = kRegisterBytes / int(sizeof(double));
 using Lanes = Vector<double, kProjectLanes>;
 using LaneMask = Mask<double, kProjectLanes>;

@@ -41,7 +41,7 @@ SPLAT_INLINE float64x2_t ceil(float64x2_t v) { return vrndpq_f64(v); }
 SPLAT_INLINE uint32x4_t shift_left(uint32x4_t v, int32x4_t bits) { return vshlq_u32(v, bits); }
 SPLAT_INLINE int32x4_t truncate(float32x4_t v) { return vcvtq_s32_f32(v); }
 
-// As many float32 as float64 fit into a register.
+// Conversions of as many lanes as float64 values fit into a register.
 SPLAT_INLINE float64x2_t widen(float32x2_t v) { return vcvt_f64_f32(v); }
 SPLAT_INLINE float32x2_t narrow(float64x2_t v) { return vcvt_f32_f64(v); }
 
@@ -56,8 +56,8 @@ SPLAT_INLINE void widen_bytes(const uint8_t* from, void* to) {
     vst1q_u32(static_cast<uint32_t*>(to) + 4, vmovl_high_u16(words));
 }
 
-// The low bytes of lanes 0, kStep, 2 kStep and so on of 16 lanes of 32 bits, `from`, of which kStep
-// neighbours are alike.
+// The low bytes, after a right shift, of lanes 0, kStep, 2 kStep, ... of the 16 numbers at `from`.
+// Each kStep neighbours must be equal.
 template <int kStep>
 SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
     static_assert(kStep == 2);
@@ -70,7 +70,7 @@ SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
     return vget_lane_u64(vreinterpret_u64_u8(vmovn_u16(vuzp1q_u16(low, high))), 0);
 }
 
-// The low four bits of each byte in a row, and in the upper half the high ones.
+// The low nibbles of all bytes, packed, in the lower half; the high nibbles in the upper half.
 SPLAT_INLINE uint64_t split_nibbles(uint64_t bytes) {
     const uint8x8_t v = vcreate_u8(bytes);
     const uint8x8_t low = vand_u8(v, vdup_n_u8(15)), high = vshr_n_u8(v, 4);

@@ -79,7 +79,7 @@ SPLAT_INLINE __m512d ceil(__m512d v) { return _mm512_roundscale_pd(v, _MM_FROUND
 SPLAT_INLINE __m512i truncate(__m512 v) { return _mm512_cvttps_epi32(v); }
 #endif
 
-// As many float32 as float64 fit into a register.
+// Conversions of as many lanes as float64 values fit into a register.
 #if SPLAT_AVX512
 SPLAT_INLINE __m512d widen(__m256 v) { return _mm512_cvtps_pd(v); }
 SPLAT_INLINE __m256 narrow(__m512d v) { return _mm512_cvtpd_ps(v); }
@@ -114,7 +114,8 @@ SPLAT_INLINE Register shift_left(Register v, Bits bits) {
     return (Register)_mm512_sllv_epi32((__m512i)v, (__m512i)bits);
 #elif SPLAT_AVX2
     return (Register)_mm256_sllv_epi32((__m256i)v, (__m256i)bits);
-#else  // times 2^bits, made as a float; 2^31 does not fit and gives its bits all the same
+#else  // v 2^bits, with 2^bits built as a float; the conversion of 2^31 overflows to its bit
+       // pattern
     const __m128i exponent = _mm_slli_epi32(_mm_add_epi32((__m128i)bits, _mm_set1_epi32(127)), 23);
     return (Register)_mm_mullo_epi32((__m128i)v, _mm_cvttps_epi32(_mm_castsi128_ps(exponent)));
 #endif
@@ -131,8 +132,8 @@ SPLAT_INLINE void widen_bytes(const uint8_t* from, void* to) {
 #endif
 }
 
-// The low bytes of lanes 0, kStep, 2 kStep and so on of 16 lanes of 32 bits, `from`, of which kStep
-// neighbours are alike.
+// The low bytes, after a right shift, of lanes 0, kStep, 2 kStep, ... of the 16 numbers at `from`.
+// Each kStep neighbours must be equal.
 template <int kStep>
 SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
     const __m128i count = _mm_cvtsi32_si128(shift);
@@ -166,7 +167,7 @@ SPLAT_INLINE uint64_t first_bytes(const uint32_t* from, int shift) {
 #endif
 }
 
-// The low four bits of each byte in a row, and in the upper half the high ones.
+// The low nibbles of all bytes, packed, in the lower half; the high nibbles in the upper half.
 SPLAT_INLINE uint64_t split_nibbles(uint64_t bytes) {
     const __m128i v = _mm_cvtsi64_si128(int64_t(bytes)), low = _mm_set1_epi8(15);
     const __m128i nibbles =

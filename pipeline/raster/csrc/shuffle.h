@@ -1,5 +1,5 @@
-// Rearrangements of lanes: constant shuffles of two registers, and of pairs of registers what
-// renaming does not do.
+// Rearrangements of lanes. Between registers of a pair they are renamings; within a register they
+// are constant shuffles.
 #pragma once
 
 #include <utility>

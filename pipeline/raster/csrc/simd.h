@@ -63,8 +63,8 @@ using Unsigned = Vector<uint32_t, N>;
 
 // ---- Memory ----
 
-// Register by register: GCC 12 would copy 32 bytes as two halves, and who stores halves and loads
-// the whole waits for both.
+// Register by register: GCC 12 copies 32 bytes as two halves, and a load of a whole register after
+// stores of its halves stalls.
 template <class V>
 SPLAT_INLINE V load(const void* from) {
     if constexpr (sizeof(V) <= kRegisterBytes) {
@@ -102,7 +102,7 @@ template <class V, class T>
 SPLAT_INLINE V broadcast(T x) {
     V v;
     if constexpr (sizeof(V) <= kRegisterBytes) {
-        // Not 0 + x, which is not x where x is -0.
+        // Not 0 + x, which is +0 for x = -0.
         if constexpr (std::is_floating_point_v<T>)
             v.lanes = x - typename V::Register{};
         else
@@ -145,8 +145,8 @@ SPLAT_OPERATOR(&)
 SPLAT_OPERATOR(|)
 #undef SPLAT_OPERATOR
 
-// a - b c, one rounding where the target has such an instruction. Compilers make one of the plain
-// expression, too, but not where b c is used once more.
+// a - b c with one rounding where the target has fused multiply-add. Compilers contract the plain
+// expression only where b c has no other use.
 template <int N>
 SPLAT_INLINE Vector<float, N> minus_product(Vector<float, N> a, Vector<float, N> b,
                                             Vector<float, N> c) {
@@ -399,7 +399,7 @@ SPLAT_INLINE Vector<float, N> narrow(Vector<double, N> v) {
     return {native::narrow(v.lanes)};
 }
 
-// One vector of parts in a row. (Stores of parts and a load of the whole would wait for memory.)
+// Joins vectors in registers: a load of a whole register after stores of its parts would stall.
 template <int N>
 SPLAT_INLINE Vector<float, 2 * N> combine(Vector<float, N> low, Vector<float, N> high) {
     if constexpr (kOneRegister<float, 2 * N>)

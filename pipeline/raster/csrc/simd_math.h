@@ -26,9 +26,9 @@ SPLAT_INLINE Vector<float, N> quotient(Vector<float, N> x, Vector<float, N> y) {
 #endif
 }
 
-// 1 / x and 1 / sqrt(x) in float64 to about 2^-52, for x in [1e-300, 1e300]. With AVX-512 by
-// Newton's steps from a guess of 14 bits, where a division of eight lanes takes 16 to 24 cycles and
-// a root more. 0 and infinity may give NaN.
+// 1 / x and 1 / sqrt(x) in float64 to about 2^-52, for x in [1e-300, 1e300]. With AVX-512 by two
+// Newton steps from a 14-bit estimate: a division of eight lanes takes 16 to 24 cycles there, a
+// square root more. 0 and infinity may give NaN.
 template <int N>
 SPLAT_INLINE Vector<double, N> reciprocal(Vector<double, N> x) {
 #if SPLAT_AVX512
@@ -50,13 +50,13 @@ SPLAT_INLINE Vector<double, N> inverse_sqrt(Vector<double, N> x) {
 #endif
 }
 
-// Of 2^x on [-1/2, 1/2], from the constant on.
+// Polynomial coefficients of 2^x on [-1/2, 1/2], constant first.
 constexpr float kExp2[] = {1.0000001192092896f,  0.6931469440460205f,   0.24022120237350464f,
                            0.05550713092088699f, 0.009675540961325169f, 0.001327647129073739f};
 
 // 2^x in float32, relative error under 2e-7 for x in [-126, 126]; junk, but no trap, outside.
-// Rounds by the magic number 1.5 * 2^23, whose low bits are then the exponent. Of some vectors at
-// once, because one alone is a chain of dependent operations.
+// Rounds by adding 1.5 * 2^23, whose low bits then hold the exponent. Takes several vectors, since
+// one alone is a chain of dependent operations.
 template <int N, int kCount>
 SPLAT_INLINE void exp2(const Vector<float, N> (&x)[kCount], Vector<float, N> (&out)[kCount]) {
     using V = Vector<float, N>;
@@ -65,7 +65,7 @@ SPLAT_INLINE void exp2(const Vector<float, N> (&x)[kCount], Vector<float, N> (&o
     for (int i = 0; i < kCount; i++) shifted[i] = x[i] + magic;
     for (int i = 0; i < kCount; i++) f[i] = x[i] - (shifted[i] - magic);
 #if SPLAT_AVX512
-    // Estrin's scheme: the shorter chain.
+    // Estrin's scheme: a shorter dependency chain.
     V f2[kCount];
     for (int i = 0; i < kCount; i++) f2[i] = f[i] * f[i];
     for (int i = 0; i < kCount; i++) {
@@ -75,7 +75,7 @@ SPLAT_INLINE void exp2(const Vector<float, N> (&x)[kCount], Vector<float, N> (&o
         power[i] = (high * f2[i] + mid) * f2[i] + low;
     }
 #else
-    // Horner's: fewer constants in registers.
+    // Horner's scheme: fewer live registers.
     for (int i = 0; i < kCount; i++) power[i] = kExp2[5] * f[i] + kExp2[4];
     for (int k = 3; k >= 0; k--)
         for (int i = 0; i < kCount; i++) power[i] = power[i] * f[i] + kExp2[k];

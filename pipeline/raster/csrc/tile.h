@@ -9,7 +9,7 @@
 
 namespace splat {
 
-// A block's pixels. Lane i is its pixel (i % 4, i / 4); block i of a tile is (i % 4, i / 4).
+// A block's pixels: lane i is pixel (i % 4, i / 4) of a block, block i is (i % 4, i / 4) of a tile.
 using Pixels = Vector<float, kBlockPixels>;
 using PixelMask = Mask<float, kBlockPixels>;
 alignas(64) constexpr float kColumnNumbers[16] = {0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3, 0, 1, 2, 3};
@@ -62,8 +62,7 @@ struct Tile {
                  });
         pixels.to_channels(channels);
     }
-    // Asks for a tile's lines of an image of K floats a pixel that will be written: rows lie far
-    // apart, and each line that is written would wait for its first bytes.
+    // Prefetches a tile's cache lines of an image of K floats per pixel for writing.
     template <int K>
     SPLAT_INLINE void expect(int64_t width, const float* image) const {
         for (int row = 0; row < rows; row++)
@@ -82,8 +81,8 @@ struct Tile {
     }
 };
 
-// Asks for the next batch's records a few at a time between other work: they are met in no order,
-// and many at once would wait for each other.
+// Prefetches the next batch's records a few at a time between other work: their addresses are
+// scattered, and many requests at once would queue.
 class Ahead {
   public:
     // Of the `count` entries from number `next` of all on: past the end of a tile lies another.
@@ -111,7 +110,7 @@ class Ahead {
 // float64, so that a centre a thousand pixels away costs no digits.
 template <int kSize>
 struct Batch {
-    // Rows of a block times ww: kept where that is exact, for rows 0 and 1.
+    // w relative to a block's first pixel is stored where it is exact: for rows 0 and 1.
     static constexpr bool kKeepsDown = kBlockRows == 2;
     struct Nothing {};
     using Down = std::conditional_t<kKeepsDown, Pixels, Nothing>;
@@ -149,7 +148,7 @@ struct Batch {
             g.blocks = e.blocks;
             g.across = columns() * r.uu + rows() * r.uw;
             if constexpr (kKeepsDown) g.down = rows() * r.ww;
-            // A vector's lanes are as many blocks, which lie in the tile as pixels do in a block.
+            // Lanes are blocks here: they are laid out in a tile as pixels are in a block.
             const float u = float(r.uu * dx + r.uw * dy), w = float(r.ww * dy);
             for (int block = 0; block < kBlocks; block += kBlockPixels) {
                 const Pixels row = rows() + float(block / kBlocksAcross);

@@ -60,8 +60,8 @@ demo: extension data/demo/demo.json
 test: setup $(VENV)/dev
 	@$(BIN)/python -m pytest tests -n 2 --dist worksteal
 
-# What a C++ compiler can change; CXX chooses it. test_targets.py uses every compiler anyway.
-NATIVE_TESTS := tests/raster tests/sfm/test_matching.py tests/training --ignore tests/raster/test_targets.py
+# What a C++ compiler can change; CXX chooses it.
+NATIVE_TESTS := tests/raster tests/sfm/test_matching.py tests/training
 test-native: setup $(VENV)/dev
 	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
 

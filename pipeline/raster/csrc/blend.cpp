@@ -78,9 +78,12 @@ SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const Vie
             Sum sum = sums[block];
             Pixels alpha[kAlphas];
             for (int i = 0; i < count; i += kAbreast) {
-                if (i % kAlphas == 0)
+                if constexpr (kAlphas == kAbreast) {  // no loop that the compiler would keep
+                    batch.alphas<kAbreast>(pair + i, alpha);
+                } else if (i % kAlphas == 0) {
                     for (int next = i; next < std::min(count, i + kAlphas); next += kAbreast)
                         batch.alphas<kAbreast>(pair + next, alpha + next - i);
+                }
                 for (int k = 0; k < kAbreast; k++) {
                     const Step s(alpha[i % kAlphas + k], before);
                     sum.add(batch.of(pair[i + k]), s, before);

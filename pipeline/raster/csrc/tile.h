@@ -112,6 +112,9 @@ template <int kSize>
 struct Batch {
     // w relative to a block's first pixel is stored where it is exact: for rows 0 and 1.
     static constexpr bool kKeepsDown = kBlockRows == 2;
+    // One vector holds a tile's blocks, which are as wide as high: u of their first pixels is u
+    // in a block, scaled.
+    static constexpr bool kSquareBlocks = kBlocks == kBlockPixels && kBlockColumns == kBlockRows;
     struct Nothing {};
     using Down = std::conditional_t<kKeepsDown, Pixels, Nothing>;
     struct alignas(64) Gaussian {
@@ -146,16 +149,22 @@ struct Batch {
             std::memcpy(&g.uu, &r.uu, 8 * sizeof(float));
             g.slot = e.slot;
             g.blocks = e.blocks;
-            g.across = columns() * r.uu + rows() * r.uw;
+            const Pixels across = columns() * r.uu + rows() * r.uw;
+            g.across = across;
             if constexpr (kKeepsDown) g.down = rows() * r.ww;
             // Lanes are blocks here: they are laid out in a tile as pixels are in a block.
             const float u = float(r.uu * dx + r.uw * dy), w = float(r.ww * dy);
-            for (int block = 0; block < kBlocks; block += kBlockPixels) {
-                const Pixels row = rows() + float(block / kBlocksAcross);
-                const int at = kBlocks * n + block;
+            if constexpr (kSquareBlocks) {
+                store(first_u + kBlocks * n, float(kBlockColumns) * across + u);
+                store(first_w + kBlocks * n, float(kBlockRows) * rows() * r.ww + w);
+            } else {
                 const Pixels right = columns() * (float(kBlockColumns) * r.uu);
-                store(first_u + at, right + row * (float(kBlockRows) * r.uw) + u);
-                store(first_w + at, row * (float(kBlockRows) * r.ww) + w);
+                for (int block = 0; block < kBlocks; block += kBlockPixels) {
+                    const Pixels row = rows() + float(block / kBlocksAcross);
+                    const int at = kBlocks * n + block;
+                    store(first_u + at, right + row * (float(kBlockRows) * r.uw) + u);
+                    store(first_w + at, row * (float(kBlockRows) * r.ww) + w);
+                }
             }
         }
     }

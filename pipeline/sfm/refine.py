@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Set
 from dataclasses import dataclass
 from typing import cast
@@ -19,6 +20,7 @@ MAX_SHIFT = 0.06
 # Tracks that fit better than this, in pixels, were made by these very cameras.
 EXACT_PX = 0.01
 FUNCTION_TOLERANCE = 1e-5
+POINTS_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -90,28 +92,18 @@ def adjust(
     model: pycolmap.Reconstruction,
     free_principal_point: Set[int] = frozenset(),
     *,
-    points_only: bool = False,
     loss_px: float = 1.0,
+    tolerance: float = FUNCTION_TOLERANCE,
 ) -> float:
-    """Robust bundle adjustment of everything, with the principal points of those cameras, or of the
-    points between cameras that stay; returns the final cost.
+    """Robust bundle adjustment of everything, with the principal points of those cameras; returns
+    the final cost.
 
-    Residuals beyond ``loss_px`` pixels count less (Cauchy's loss).
-
-    On one thread: on more, Ceres sums the residuals in the order they come.
+    Residuals beyond ``loss_px`` pixels count less (Cauchy's loss). It ends with the first step
+    that lowers the cost by no more than the share ``tolerance``.
     """
-    options = pycolmap.BundleAdjustmentOptions(
-        refine_principal_point=bool(free_principal_point),
-        refine_focal_length=not points_only,
-        refine_extra_params=not points_only,
-        refine_rig_from_world=not points_only,
-        print_summary=False,
-    )
-    ceres = options.ceres
-    ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
-    ceres.loss_function_scale = loss_px
-    ceres.solver_options.num_threads = 1
-    ceres.solver_options.function_tolerance = FUNCTION_TOLERANCE
+    options = _options(loss_px, tolerance)
+    options.refine_principal_point = bool(free_principal_point)
+    options.ceres.solver_options.use_inner_iterations = _has_one_block_order(model)
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -120,10 +112,65 @@ def adjust(
         for camera_id in sorted(set(model.cameras) - free_principal_point):
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
+    return _solve(options, config, model)
+
+
+def adjust_points(model: pycolmap.Reconstruction, *, loss_px: float) -> float:
+    """The same for the points alone, between cameras that stay."""
+    options = _options(loss_px, POINTS_TOLERANCE)
+    options.refine_focal_length = False
+    options.refine_extra_params = False
+    options.refine_rig_from_world = False
+    options.ceres.solver_options.use_inner_iterations = True
+    config = pycolmap.BundleAdjustmentConfig()
+    # Without its images: pycolmap then takes no derivatives by their poses.
+    for point_id in sorted(model.point3D_ids()):
+        config.add_variable_point(point_id)
+    return _solve(options, config, model)
+
+
+def _options(loss_px: float, tolerance: float) -> pycolmap.BundleAdjustmentOptions:
+    """On one thread: on more, Ceres sums the residuals in the order they come."""
+    options = pycolmap.BundleAdjustmentOptions(
+        refine_principal_point=False,
+        print_summary=False,
+    )
+    ceres = options.ceres
+    ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
+    ceres.loss_function_scale = loss_px
+    ceres.solver_options.num_threads = 1
+    # Models come near their optimum: no damping, or focal lengths and principal points lag behind.
+    ceres.solver_options.initial_trust_region_radius = 1e8
+    ceres.solver_options.function_tolerance = tolerance
+    return options
+
+
+def _solve(
+    options: pycolmap.BundleAdjustmentOptions,
+    config: pycolmap.BundleAdjustmentConfig,
+    model: pycolmap.Reconstruction,
+) -> float:
     adjuster = pycolmap.create_default_ceres_bundle_adjuster(options, config, model)
     summary = cast(pycolmap.CeresBundleAdjustmentSummary, adjuster.solve())
     model.update_point_3d_errors()
     return float(summary.ceres_summary.final_cost)
+
+
+def _has_one_block_order(model: pycolmap.Reconstruction) -> bool:
+    """True where Ceres's inner iterations have one order: all points, all poses, all cameras.
+
+    After each step they adjust blocks one by one. A robust loss makes the steps short, and with
+    them a third as many are needed. Ceres takes the blocks with the fewest neighbours first, and
+    of equal ones the one that lies first in memory, which changes from run to run. So each camera
+    must have more poses than each pose has cameras (one pose is fixed), and each image more points
+    than any point has images and cameras.
+    """
+    images = [model.image(i) for i in model.reg_image_ids()]
+    poses = Counter(image.camera_id for image in images)
+    longest = max((point.track.length() for point in model.points3D.values()), default=0)
+    fewest = min((image.num_points3D for image in images), default=0)
+    neighbours = longest + min(longest, len(poses))
+    return min(poses.values(), default=0) >= 3 and fewest > neighbours
 
 
 def _rich_cameras(model: pycolmap.Reconstruction) -> set[int]:

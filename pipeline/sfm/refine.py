@@ -20,7 +20,6 @@ MAX_SHIFT = 0.06
 # Tracks that fit better than this, in pixels, were made by these very cameras.
 EXACT_PX = 0.01
 FUNCTION_TOLERANCE = 1e-5
-POINTS_TOLERANCE = 1e-4
 
 
 @dataclass(frozen=True)
@@ -117,11 +116,13 @@ def adjust(
 
 def adjust_points(model: pycolmap.Reconstruction, *, loss_px: float) -> float:
     """The same for the points alone, between cameras that stay."""
-    options = _options(loss_px, POINTS_TOLERANCE)
+    options = _options(loss_px, FUNCTION_TOLERANCE)
     options.refine_focal_length = False
     options.refine_extra_params = False
     options.refine_rig_from_world = False
+    # Points do not depend on each other: inner iterations bring each to its end in one step.
     options.ceres.solver_options.use_inner_iterations = True
+    options.ceres.solver_options.max_num_iterations = 1
     config = pycolmap.BundleAdjustmentConfig()
     # Without its images: pycolmap then takes no derivatives by their poses.
     for point_id in sorted(model.point3D_ids()):

@@ -68,6 +68,7 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
         _longest_tracks(model, TRACKS_TO_DECIDE),
         radial=config.refine_radial == "auto",
         principal_point=config.refine_principal_point,
+        inner_iterations=True,
     )
     adjusted = _adjust_again(model, found) if found.freed else found.model
     if not found.freed or not _is_finite(adjusted):
@@ -93,7 +94,7 @@ def _adjust_again(model: pycolmap.Reconstruction, found: Refined) -> pycolmap.Re
     # The cameras have moved: points must follow before a loss that gives up distant ones.
     adjust_points(model, loss_px=WIDE_LOSS_PX)
     thinned = _longest_tracks(model, TRACKS_PER_IMAGE)
-    adjust(thinned, found.centres, loss_px=LOSS_PX, tolerance=TOLERANCE)
+    adjust(thinned, found.centres, loss_px=LOSS_PX, tolerance=TOLERANCE, inner_iterations=True)
     return thinned
 
 

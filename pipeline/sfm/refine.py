@@ -37,7 +37,13 @@ class Refined:
     decisions: list[str]
 
 
-def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str) -> Refined:
+def refine(
+    model: pycolmap.Reconstruction,
+    *,
+    radial: bool,
+    principal_point: str,
+    inner_iterations: bool = False,
+) -> Refined:
     """Adjust all of the model once more, robustly, and free more of its cameras step by step as
     long as that pays: a second radial term, then the principal point.
 
@@ -45,10 +51,11 @@ def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
         model: not changed.
         radial: cameras may turn from SIMPLE_RADIAL to RADIAL.
         principal_point: "yes", "no", or "auto" (where it pays).
+        inner_iterations: see ``adjust``.
     """
     rich = _rich_cameras(model)
     best = pycolmap.Reconstruction(model)
-    cost = adjust(best)
+    cost = adjust(best, inner_iterations=inner_iterations)
     # Ceres halves the squares.
     if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
         return Refined(best, False, set(), ["the tracks fit exactly: there is nothing to free"])
@@ -64,7 +71,7 @@ def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
         freer = pycolmap.Reconstruction(best)
         for camera_id in rich:
             _make_radial(freer.camera(camera_id))
-        freer_cost = adjust(freer)
+        freer_cost = adjust(freer, inner_iterations=inner_iterations)
         gain = 1 - freer_cost / max(cost, 1e-12)
         kept = gain >= MIN_GAIN
         decisions.append(
@@ -75,7 +82,7 @@ def refine(model: pycolmap.Reconstruction, *, radial: bool, principal_point: str
             best, cost, freed = freer, freer_cost, True
     if principal_point != "no":
         freer = pycolmap.Reconstruction(best)
-        freer_cost = adjust(freer, rich)
+        freer_cost = adjust(freer, rich, inner_iterations=inner_iterations)
         gain, shift = 1 - freer_cost / max(cost, 1e-12), _largest_shift(best, freer, rich)
         kept = principal_point == "yes" or (gain >= MIN_GAIN and shift <= MAX_SHIFT)
         decisions.append(
@@ -93,16 +100,24 @@ def adjust(
     *,
     loss_px: float = 1.0,
     tolerance: float = FUNCTION_TOLERANCE,
+    inner_iterations: bool = False,
 ) -> float:
     """Robust bundle adjustment of everything, with the principal points of those cameras; returns
     the final cost.
 
     Residuals beyond ``loss_px`` pixels count less (Cauchy's loss). It ends with the first step
     that lowers the cost by no more than the share ``tolerance``.
+
+    ``inner_iterations``: points, poses and cameras are adjusted one by one after each step, where
+    that has one order. A robust loss makes steps short; so a third as many are needed. It pays for
+    long tracks, whose steps cost most.
     """
     options = _options(loss_px, tolerance)
     options.refine_principal_point = bool(free_principal_point)
-    options.ceres.solver_options.use_inner_iterations = _has_one_block_order(model)
+    if inner_iterations and _has_one_block_order(model):
+        options.ceres.solver_options.use_inner_iterations = True
+        # No damping: such steps are good, and principal points lag behind.
+        options.ceres.solver_options.initial_trust_region_radius = 1e8
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
@@ -120,9 +135,11 @@ def adjust_points(model: pycolmap.Reconstruction, *, loss_px: float) -> float:
     options.refine_focal_length = False
     options.refine_extra_params = False
     options.refine_rig_from_world = False
-    # Points do not depend on each other: inner iterations bring each to its end in one step.
+    # Points do not depend on each other: inner iterations bring each to its end in one step, which
+    # undamped does not stop short.
     options.ceres.solver_options.use_inner_iterations = True
     options.ceres.solver_options.max_num_iterations = 1
+    options.ceres.solver_options.initial_trust_region_radius = 1e8
     config = pycolmap.BundleAdjustmentConfig()
     # Without its images: pycolmap then takes no derivatives by their poses.
     for point_id in sorted(model.point3D_ids()):
@@ -140,8 +157,6 @@ def _options(loss_px: float, tolerance: float) -> pycolmap.BundleAdjustmentOptio
     ceres.loss_function_type = pycolmap.LossFunctionType.CAUCHY
     ceres.loss_function_scale = loss_px
     ceres.solver_options.num_threads = 1
-    # Models come near their optimum: no damping, or focal lengths and principal points lag behind.
-    ceres.solver_options.initial_trust_region_radius = 1e8
     ceres.solver_options.function_tolerance = tolerance
     return options
 
@@ -160,11 +175,10 @@ def _solve(
 def _has_one_block_order(model: pycolmap.Reconstruction) -> bool:
     """True where Ceres's inner iterations have one order: all points, all poses, all cameras.
 
-    After each step they adjust blocks one by one. A robust loss makes the steps short, and with
-    them a third as many are needed. Ceres takes the blocks with the fewest neighbours first, and
-    of equal ones the one that lies first in memory, which changes from run to run. So each camera
-    must have more poses than each pose has cameras (one pose is fixed), and each image more points
-    than any point has images and cameras.
+    Ceres takes the blocks with the fewest neighbours first, and of equal ones the one that lies
+    first in memory, which changes from run to run. So each camera must have more poses than each
+    pose has cameras (one pose is fixed), and each image more points than any point has images and
+    cameras.
     """
     images = [model.image(i) for i in model.reg_image_ids()]
     poses = Counter(image.camera_id for image in images)

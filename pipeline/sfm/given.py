@@ -23,14 +23,18 @@ from pipeline.sfm.georeference import robust_similarity
 from pipeline.sfm.models import write_model
 from pipeline.sfm.placement import apply
 from pipeline.sfm.quiet import quiet_colmap
-from pipeline.sfm.refine import Refined, adjust, refine
+from pipeline.sfm.refine import Refined, adjust, adjust_points, refine
 
-# Poses and lenses are found from the longest tracks, so many a photograph: 292 photographs with
-# 2300 points each take two thirds of the time, and train as well (docs/sfm.md).
+# Poses and lenses are found from the longest tracks, so many a photograph (docs/sfm.md). What to
+# free shows in fewer.
 TRACKS_PER_IMAGE = 1000
+TRACKS_TO_DECIDE = 200
 # In the end residuals beyond this many pixels count less: given tracks are mostly better than that,
 # and the rest worse (bonsai: median 0.29, a tenth beyond 0.96).
 LOSS_PX = 0.3
+WIDE_LOSS_PX = 1.0
+# Smaller than for decisions: principal points converge last.
+TOLERANCE = 1e-6
 # Points that the adjusted world is laid over the given one by.
 ANCHORS = 5000
 
@@ -59,20 +63,21 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
     model = pycolmap.Reconstruction(sparse)
     model.update_point_3d_errors()
     before = float(model.compute_mean_reprojection_error())
+    given = _anchors(model)
     found = refine(
-        _longest_tracks(model),
+        _longest_tracks(model, TRACKS_TO_DECIDE),
         radial=config.refine_radial == "auto",
         principal_point=config.refine_principal_point,
+        inner_iterations=True,
     )
-    if found.freed:
-        adjust(found.model, found.centres, loss_px=LOSS_PX)
-    if not found.freed or not _is_finite(found.model):
+    adjusted = _adjust_again(model, found) if found.freed else found.model
+    if not found.freed or not _is_finite(adjusted):
         out.mkdir(parents=True, exist_ok=True)
         for file in pose_files(sparse):
             shutil.copy(file, out)
         return GivenReport(False, before, before, [*found.decisions, "poses stay as given"])
-    given = _anchors(model)
-    _take_over(model, found)
+    _take_over(model, adjusted)
+    adjust_points(model, loss_px=LOSS_PX)
     _lay_over(model, given)
     write_model(model, out)
     after = float(model.compute_mean_reprojection_error())
@@ -83,10 +88,20 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
     return GivenReport(True, before, after, [*found.decisions, told])
 
 
-def _longest_tracks(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
+def _adjust_again(model: pycolmap.Reconstruction, found: Refined) -> pycolmap.Reconstruction:
+    """The longest tracks of ``model`` and its cameras, adjusted from what was found with fewer."""
+    _take_over(model, found.model)
+    # The cameras have moved: points must follow before a loss that gives up distant ones.
+    adjust_points(model, loss_px=WIDE_LOSS_PX)
+    thinned = _longest_tracks(model, TRACKS_PER_IMAGE)
+    adjust(thinned, found.centres, loss_px=LOSS_PX, tolerance=TOLERANCE, inner_iterations=True)
+    return thinned
+
+
+def _longest_tracks(model: pycolmap.Reconstruction, per_image: int) -> pycolmap.Reconstruction:
     """A copy with the points alone that fill the images' shares, those seen by most first."""
     thinned = pycolmap.Reconstruction(model)
-    missing = dict.fromkeys(thinned.reg_image_ids(), TRACKS_PER_IMAGE)
+    missing = dict.fromkeys(thinned.reg_image_ids(), per_image)
     lengths = {number: point.track.length() for number, point in thinned.points3D.items()}
     for number in sorted(lengths, key=lambda number: (-lengths[number], number)):
         images = [element.image_id for element in thinned.point3D(number).track.elements]
@@ -98,17 +113,15 @@ def _longest_tracks(model: pycolmap.Reconstruction) -> pycolmap.Reconstruction:
     return thinned
 
 
-def _take_over(model: pycolmap.Reconstruction, found: Refined) -> None:
-    """Give ``model`` the cameras that were found, and its points their places between them."""
-    for number, camera in found.model.cameras.items():
+def _take_over(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
+    """Give ``model`` the cameras, poses and points of ``adjusted``, which may have fewer points."""
+    for number, camera in adjusted.cameras.items():
         model.cameras[number].model = camera.model
         model.cameras[number].params = camera.params
-    for number, frame in found.model.frames.items():
+    for number, frame in adjusted.frames.items():
         model.frame(number).rig_from_world = frame.rig_from_world
-    # From where the adjusted points went, so that none starts behind a camera.
-    for number, point in found.model.points3D.items():
+    for number, point in adjusted.points3D.items():
         model.point3D(number).xyz = point.xyz
-    adjust(model, points_only=True, loss_px=LOSS_PX)
 
 
 def _anchors(model: pycolmap.Reconstruction) -> dict[int, NDArray[np.float64]]:

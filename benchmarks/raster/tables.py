@@ -13,6 +13,10 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PAGE, RECORDS = ROOT / "docs" / "raster.md", ROOT / "benchmarks" / "records"
+PHASES = [
+    *("projection, SH", "bin", "blend", "loss", "blend backward", "projection, SH backward"),
+    *("Adam", "step"),
+]
 MARKER = re.compile(r"<!-- raster: ([^>]+) -->\n(?:\|[^\n]*\n)*")
 
 
@@ -22,7 +26,7 @@ def column(record: dict[str, Any], result: dict[str, Any]) -> list[str]:
     cells = [
         f"{record['target']}, {result['threads']} threads, {count // 1000}k at {width}x{height}"
     ]
-    for operator in result["operators"].values():
+    for operator in map(result["operators"].get, PHASES):
         share = f" ({operator['of_peak']:.2f})" if "of_peak" in operator else ""
         cells.append(f"{operator['ms']['median']:.3g}{share}")
     return cells
@@ -30,8 +34,7 @@ def column(record: dict[str, Any], result: dict[str, Any]) -> list[str]:
 
 def table(records: list[dict[str, Any]]) -> str:
     """One column for each scene and number of threads of each record."""
-    operators = list(records[0]["results"][0]["operators"])
-    columns = [["", *operators]]
+    columns = [["", *PHASES]]
     columns += [column(record, result) for record in records for result in record["results"]]
     rows = ["| " + " | ".join(cells) + " |" for cells in zip(*columns, strict=True)]
     rows.insert(1, "|---" * len(columns) + "|")

@@ -1,4 +1,4 @@
-"""Every instruction-set target by the compiler in use ($CXX, or g++), against the float64 reference.
+"""Every instruction-set target by the compiler in use (CXX, or g++) against the float64 reference.
 
 A target that this processor lacks is emulated (aarch64) or compiled only (x86-64-v4), which the
 skip's reason says. Compilers and the emulator may be missing on a user's machine; with

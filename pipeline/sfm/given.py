@@ -90,10 +90,10 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
 
 def _adjust_again(model: pycolmap.Reconstruction, found: Refined) -> pycolmap.Reconstruction:
     """The longest tracks of ``model`` and its cameras, adjusted from what was found with fewer."""
-    _take_over(model, found.model)
-    # The cameras have moved: points must follow before a loss that gives up distant ones.
-    adjust_points(model, loss_px=WIDE_LOSS_PX)
     thinned = _longest_tracks(model, TRACKS_PER_IMAGE)
+    _take_over(thinned, found.model)
+    # The cameras have moved: points must follow before a loss that gives up distant ones.
+    adjust_points(thinned, loss_px=WIDE_LOSS_PX)
     adjust(thinned, found.centres, loss_px=LOSS_PX, tolerance=TOLERANCE, inner_iterations=True)
     return thinned
 
@@ -114,14 +114,15 @@ def _longest_tracks(model: pycolmap.Reconstruction, per_image: int) -> pycolmap.
 
 
 def _take_over(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction) -> None:
-    """Give ``model`` the cameras, poses and points of ``adjusted``, which may have fewer points."""
+    """Give ``model`` the cameras and poses of ``adjusted``, and the points that both have."""
     for number, camera in adjusted.cameras.items():
         model.cameras[number].model = camera.model
         model.cameras[number].params = camera.params
     for number, frame in adjusted.frames.items():
         model.frame(number).rig_from_world = frame.rig_from_world
     for number, point in adjusted.points3D.items():
-        model.point3D(number).xyz = point.xyz
+        if model.exists_point3D(number):
+            model.point3D(number).xyz = point.xyz
 
 
 def _anchors(model: pycolmap.Reconstruction) -> dict[int, NDArray[np.float64]]:

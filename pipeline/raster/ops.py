@@ -82,7 +82,7 @@ class _State:
     records: torch.Tensor  # (N, 16)
     entries: torch.Tensor  # (M, 3) int32
     tile_begin: torch.Tensor  # (tiles + 1,) int64
-    block_end: torch.Tensor  # (tiles, 16) int32
+    block_end: torch.Tensor  # (tiles, blocks of a tile) int32
     slots: torch.Tensor  # (N, 2) int32
 
 

@@ -1,5 +1,7 @@
-"""Times the rasterizer's operators, or drawing alone, and compares them with the twin; see
-docs/raster.md."""
+"""Times the rasterizer's operators, or drawing alone, and compares them with the reference.
+
+See docs/raster.md.
+"""
 
 from __future__ import annotations
 

@@ -51,7 +51,6 @@ struct Mask<T, N, true> {
 };
 
 using f32x16 = Vector<float, 16>;
-using f32x8 = Vector<float, 8>;
 using i32x16 = Vector<int32_t, 16>;
 using u32x16 = Vector<uint32_t, 16>;  // wraps around: for bits, and lanes that may hold junk
 using Mask16 = Mask<float, 16>;

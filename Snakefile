@@ -1,12 +1,12 @@
-# The DAG and nothing else: a rule a stage. What a stage reads and when it runs again stands in
-# stages/wiring.py, what a scene needs in pipeline/scene/plan.py, what a stage does in stages/.
+# The DAG and nothing else: a rule for each stage, made from its declaration in stages/. What a scene
+# needs is decided by the plan before any job starts.
 
 import os
 import sys
 
 sys.path.insert(0, workflow.basedir)
 
-from stages.project import SnakemakeProject
+from stages.workflow.project import SnakemakeProject
 
 if os.path.exists("config/config.yaml"):
 
@@ -16,8 +16,9 @@ if os.path.exists("config/config.yaml"):
 project = SnakemakeProject(config, workflow.basedir)
 THREADS = workflow.cores or 8
 RUN = (
-    "python -m stages.{rule} --out results/{wildcards.scene:q}/{rule} --key {params.key:q}"
-    " --input {params.inputs:q} --publish {params.publish:q} --threads {threads} --log {log:q}"
+    "python -m stages {rule} --out results/{wildcards.scene:q}/{rule} --key {params.key:q}"
+    " --input {params.inputs:q} --publish {params.publish:q} --threads {threads}"
+    " --memory-mb {resources.mem_mb} --log {log:q}"
 )
 
 
@@ -69,7 +70,7 @@ rule benchmark:
     params:
         outcomes=project.outcomes,
     shell:
-        "python -m stages.batch --results results --outcomes {params.outcomes:q}"
+        "python -m stages.workflow.batch --results results --outcomes {params.outcomes:q}"
 
 
 rule plan:
@@ -83,228 +84,34 @@ rule plan:
     params:
         plan=project.plan,
     shell:
-        "python -m stages.plan --out {output.plan:q} --picture {output.picture:q}"
+        "python -m stages.workflow.plan --out {output.plan:q} --picture {output.picture:q}"
         " --plan {params.plan:q}"
 
 
-rule inspect:
-    output:
-        "results/{scene}/inspect/stage.json",
-    log:
-        "results/{scene}/logs/inspect.log",
-    threads: THREADS
-    params:
-        key=project.key("inspect"),
-        inputs=[],
-        publish=[],
-    shell:
-        RUN
+# A rule for each stage: what it reads, its key and its outputs follow from its declaration.
+for spec in project.stages:
 
-
-rule decode:
-    input:
-        unpack(project.inputs("decode")),
-    output:
-        "results/{scene}/decode/stage.json",
-    log:
-        "results/{scene}/logs/decode.log",
-    threads: THREADS
-    resources:
-        mem_mb=2000,
-    params:
-        key=project.key("decode"),
-        inputs=project.folders("decode"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule features:
-    input:
-        unpack(project.inputs("features")),
-    output:
-        "results/{scene}/features/stage.json",
-    log:
-        "results/{scene}/logs/features.log",
-    threads: THREADS
-    resources:
-        mem_mb=3000,
-    params:
-        key=project.key("features"),
-        inputs=project.folders("features"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule matches:
-    input:
-        unpack(project.inputs("matches")),
-    output:
-        "results/{scene}/matches/stage.json",
-    log:
-        "results/{scene}/logs/matches.log",
-    threads: THREADS
-    resources:
-        mem_mb=3000,
-    params:
-        key=project.key("matches"),
-        inputs=project.folders("matches"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule sfm:
-    input:
-        unpack(project.inputs("sfm")),
-    output:
-        "results/{scene}/sfm/stage.json",
-    log:
-        "results/{scene}/logs/sfm.log",
-    threads: THREADS
-    resources:
-        mem_mb=4000,
-    params:
-        key=project.key("sfm"),
-        inputs=project.folders("sfm"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule refine:
-    input:
-        unpack(project.inputs("refine")),
-    output:
-        "results/{scene}/refine/stage.json",
-    log:
-        "results/{scene}/logs/refine.log",
-    threads: THREADS
-    resources:
-        mem_mb=4000,
-    params:
-        key=project.key("refine"),
-        inputs=project.folders("refine"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule undistort:
-    input:
-        unpack(project.inputs("undistort")),
-    output:
-        "results/{scene}/undistort/stage.json",
-    log:
-        "results/{scene}/logs/undistort.log",
-    threads: THREADS
-    resources:
-        mem_mb=2000,
-    params:
-        key=project.key("undistort"),
-        inputs=project.folders("undistort"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule init:
-    input:
-        unpack(project.inputs("init")),
-    output:
-        "results/{scene}/init/stage.json",
-    log:
-        "results/{scene}/logs/init.log",
-    threads: THREADS
-    resources:
-        mem_mb=3000,
-    params:
-        key=project.key("init"),
-        inputs=project.folders("init"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule train:
-    input:
-        unpack(project.inputs("train")),
-    output:
-        "results/{scene}/train/stage.json",
-    log:
-        "results/{scene}/logs/train.log",
-    threads: THREADS
-    resources:
-        mem_mb=project.training_memory,
-    params:
-        key=project.key("train"),
-        inputs=project.folders("train"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule evaluate:
-    input:
-        unpack(project.inputs("evaluate")),
-    output:
-        "results/{scene}/evaluate/stage.json",
-    log:
-        "results/{scene}/logs/evaluate.log",
-    threads: THREADS
-    resources:
-        mem_mb=3000,
-    params:
-        key=project.key("evaluate"),
-        inputs=project.folders("evaluate"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule export:
-    input:
-        unpack(project.inputs("export")),
-    output:
-        "results/{scene}/export/stage.json",
-    log:
-        "results/{scene}/logs/export.log",
-    threads: THREADS
-    resources:
-        mem_mb=2000,
-    params:
-        key=project.key("export"),
-        inputs=project.folders("export"),
-        publish=[],
-    shell:
-        RUN
-
-
-rule report:
-    input:
-        unpack(project.inputs("report")),
-        plan="results/{scene}/plan.json",
-    output:
-        stage="results/{scene}/report/stage.json",
-        metrics=report(
-            "results/{scene}/metrics.json",
-            caption="pipeline/reporting/captions/metrics.rst",
-            category="{scene}",
-        ),
-        page=report(
-            "results/{scene}/report.html",
-            caption="pipeline/reporting/captions/page.rst",
-            category="{scene}",
-        ),
-    log:
-        "results/{scene}/logs/report.log",
-    threads: THREADS
-    resources:
-        mem_mb=2000,
-    params:
-        key=project.key("report"),
-        inputs=project.folders("report"),
-        publish=project.published("metrics.json", "report.html"),
-    shell:
-        RUN
+    rule:
+        name:
+            spec.name
+        input:
+            unpack(project.inputs(spec)),
+        output:
+            **{
+                f"published_{number}": report(
+                    f"results/{{scene}}/{file}", caption=caption, category="{scene}"
+                )
+                for number, (file, caption) in enumerate(spec.publishes.items())
+            },
+            stage=f"results/{{scene}}/{spec.name}/stage.json",
+        log:
+            f"results/{{scene}}/logs/{spec.name}.log",
+        threads: THREADS
+        resources:
+            mem_mb=project.memory_mb(spec),
+        params:
+            key=project.key(spec),
+            inputs=project.folders(spec),
+            publish=project.published(spec),
+        shell:
+            RUN

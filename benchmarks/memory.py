@@ -85,11 +85,11 @@ def main() -> int:
             Inputs(views, made_gaussians(args.gaussians, views[0].fx), scene_extent(views)),
             Train(
                 steps=args.steps,
-                memory_mb=args.memory_mb,
                 density=Density(max_gaussians=args.gaussians),
             ),
             seed=0,
             threads=args.threads,
+            memory_mb=args.memory_mb,
             checkpoint_dir=folder / "checkpoints",
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))

@@ -1,30 +1,60 @@
-"""Develop RAW files, all views of a scene alike. Outputs: ``images/``, ``images.json``, and
-the given poses, if there are any, under the developed pictures' names, with ``georeference.json``
-where they were moved."""
+"""Develop RAW files, all photographs of a scene alike.
+
+Outputs: ``images/``, ``images.json``, and where poses are given ``sparse/0`` with the names of the
+developed images, and ``georeference.json`` where the given poses were moved.
+"""
+
+from __future__ import annotations
 
 import shutil
+from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Decode
-from pipeline.photos.raw import develop
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model, write_model
-from pipeline.scene.given import GEOREFERENCE, renamed
-from pipeline.scene.manifest import Manifest
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec
+from stages.workflow.inputs import input_model, read_manifest
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    manifest = Manifest.read(job.inputs["photos"] / "images.json")
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    if scan.num_raw == 0:
+        return StagePlan(run=False, reason="no RAW files: the photographs are read as they are")
+    config = settled.config.decode
+    depth = "16-bit linear" if config.linear else "8-bit sRGB"
+    half = ", half size" if config.half_size else ""
+    text = (
+        f"{depth}, {config.demosaic} demosaicking{half}, one white balance "
+        f"({config.white_balance}) for all"
+    )
+    reason = f"{scan.num_raw} of {len(scan.photos)} photographs are RAW"
+    return StagePlan(run=True, reason=reason, decisions=[text])
+
+
+def work(job: Job) -> None:
+    from pipeline.photos.raw import develop
+    from pipeline.scene.colmap import write_model
+    from pipeline.scene.given import GEOREFERENCE, renamed
+
+    manifest = read_manifest(job, "photos")
     report = develop(manifest, job.section(Decode), job.out, threads=job.threads)
     for text in report.warnings:
         job.warn(text)
-    sparse = job.inputs["photos"] / "sparse" / "0"
-    if sparse.is_dir():
-        write_model(job.out / "sparse" / "0", renamed(read_model(sparse), report.manifest))
+    if (job.inputs["photos"] / "sparse" / "0").is_dir():
+        given = renamed(input_model(job, "photos"), report.manifest)
+        write_model(job.out / "sparse" / "0", given)
     if (job.inputs["photos"] / GEOREFERENCE).is_file():
         shutil.copy(job.inputs["photos"] / GEOREFERENCE, job.out)
     job.counters = {"developed": len(report.manifest.photos)}
 
 
-if __name__ == "__main__":
-    main("decode", run, __doc__)
+SPEC = StageSpec(
+    name="decode",
+    work=work,
+    decide=decide,
+    inputs={"photos": ("inspect",)},
+    options=("decode",),
+    packages=("rawpy",),
+)

@@ -1,69 +1,98 @@
-"""Held-out views against their photographs, poses against the truth where it is known, and what
-the photographs did not see.
+"""Renders of the test views against their photographs, and estimated poses against true ones where
+``sparse_gt`` gives them. Outputs: ``evaluation.json`` with ``renders/``."""
 
-Outputs: ``evaluation.json`` with ``renders/``, ``coverage.json`` with ``coverage/``.
-"""
+from __future__ import annotations
 
-import json
 from dataclasses import asdict
+from typing import TYPE_CHECKING, Any
 
-from pipeline.config.schema import Evaluate, Split, Train, Views
-from pipeline.coverage.measure import World, measure_coverage
-from pipeline.metrics.evaluate import choose_protocol, evaluate_views
-from pipeline.metrics.pose import pose_error
+from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model
-from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import View
-from pipeline.scene.views import load_views, scene_up
-from pipeline.splats.gaussians import Gaussians
-from stages.command import main
-from stages.models import trained_model
+from pipeline.scene.stage import StagePlan, StageSpec
+from stages.workflow.inputs import (
+    DRAWING_OPTIONS,
+    MODEL,
+    POSES,
+    VIEWS,
+    input_model,
+    read_json,
+    trained_gaussians,
+    trained_model,
+    trained_views,
+)
+
+if TYPE_CHECKING:
+    from pipeline.scene.plan import Plan
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    manifest = Manifest.read(job.inputs["views"] / "images.json")
-    split = job.section(Split)
-    model = trained_model(job)
-    views = load_views(manifest, model, job.section(Views), split)
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    every = settled.config.split.holdout_every
+    truth = ["pose error against the truth in sparse_gt/"] if scan.truth is not None else []
+    reason = f"one view in {every}, sorted by name, is held out"
+    if every == 0:
+        reason = "no view is held out: measured on the training views"
+    return StagePlan(run=True, reason=reason, decisions=truth)
+
+
+def work(job: Job) -> None:
+    from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+    from pipeline.metrics.pose import pose_error
+    from pipeline.scene.colmap import read_model
+
     train = job.section(Train)
-    protocol = choose_protocol(views, split, train)
-    gaussians = Gaussians.load(job.inputs["train"] / "gaussians.npz")
+    protocol = choose_protocol(trained_views(job), job.section(Split), train)
     evaluation = evaluate_views(
-        gaussians,
+        trained_gaussians(job),
         protocol,
         job.section(Evaluate),
         train,
         job.out / "renders",
-        gains=json.loads((job.inputs["train"] / "exposure.json").read_text()),
+        gains=read_json(job.inputs["train"] / "exposure.json"),
         threads=job.threads,
     )
-    for text in evaluation.pop("warnings"):
-        job.warn(text)
+    job.tell([], evaluation.pop("warnings"))
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
-        poses = job.inputs["poses"] / "sparse" / "0"
-        estimated = model if train.refine_poses else read_model(poses)
+        estimated = trained_model(job) if train.refine_poses else input_model(job, "poses")
         evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
-    world = world_of(job, manifest, views)
-    measure_coverage(
-        job.out, gaussians, views, protocol, train, evaluation, world, threads=job.threads
-    )
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
     if not protocol.every:
         job.warn("no view was held out: quality was measured on training views")
 
 
-def world_of(job: Job, manifest: Manifest, views: list[View]) -> World:
-    up = scene_up(views, manifest)
-    placed = job.inputs["poses"] / "georeference.json"
-    unit = json.loads(placed.read_text()).get("unit", "") if placed.is_file() else ""
-    return World(up, "m" if unit.startswith("metres") else None)
+def facts(plan: Plan) -> dict[str, Any]:
+    from pipeline.metrics.lpips import weights_found
+
+    weights = weights_found(plan.config.evaluate.lpips_net)
+    return {"lpips_weights": weights, "truth": plan.facts["truth_digest"]}
 
 
-if __name__ == "__main__":
-    main("evaluate", run, __doc__)
+SPEC = StageSpec(
+    name="evaluate",
+    work=work,
+    decide=decide,
+    inputs={
+        "views": VIEWS,
+        "model": MODEL,
+        "train": ("train",),
+        "poses": POSES,
+        "inspect": ("inspect",),
+    },
+    options=(
+        "evaluate",
+        "views",
+        "split",
+        *DRAWING_OPTIONS,
+        "train.refine_poses",
+        "train.ssim_weight",
+    ),
+    packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
+    memory_mb=3000,
+    facts=facts,
+)

@@ -1,21 +1,49 @@
-"""SIFT keypoints and descriptors. Outputs: one ``.npz`` a photograph."""
+"""SIFT keypoints and descriptors. Output: one ``.npz`` a photograph."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Features
 from pipeline.runtime.job import Job
-from pipeline.scene.manifest import Manifest
-from pipeline.sfm.features import extract_features
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
+from stages.workflow.inputs import PHOTOS, read_manifest
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    manifest = Manifest.read(job.inputs["photos"] / "images.json")
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    config = settled.config.features
+    longest = min(max(max(size) for size in scan.sizes), config.max_long_side_px)
+    keypoints = (
+        f"up to {config.max_features} SIFT keypoints each ({config.backend}), at {longest} px"
+    )
+    return unless_posed(scan, "keypoints to find the poses by", [keypoints])
+
+
+def work(job: Job) -> None:
+    from pipeline.sfm.features import extract_features
+
     report = extract_features(
-        manifest, job.section(Features), job.out, cache=job.shared_cache, threads=job.threads
+        read_manifest(job, "photos"),
+        job.section(Features),
+        job.out,
+        cache=job.shared_cache,
+        threads=job.threads,
     )
     job.record(report)
     # How the run went, not what came of it.
     job.timings["num_cached"] = job.counters.pop("num_cached")
 
 
-if __name__ == "__main__":
-    main("features", run, __doc__)
+SPEC = StageSpec(
+    name="features",
+    work=work,
+    decide=decide,
+    inputs={"photos": PHOTOS},
+    options=("features",),
+    packages=("opencv-contrib-python-headless", "pycolmap"),
+    memory_mb=3000,
+)

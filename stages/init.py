@@ -1,28 +1,48 @@
 """The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from pipeline.config.schema import Features, Init, Matches, Split, Views
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model
-from pipeline.scene.manifest import Manifest
-from pipeline.scene.views import load_views
-from pipeline.sfm.triangulation import triangulate
-from pipeline.splats.arrays import write_arrays
-from pipeline.splats.init import gaussians_from_points, gaussians_random
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec
+from stages.workflow.inputs import MODEL, VIEWS, input_model, read_manifest
 
-# Fewer sparse points than this say too little about the scene to start from.
-MIN_POINTS = 100
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    config = settled.config.init
+    if config.method == "random":
+        return StagePlan(run=True, reason=f"{config.num_random} random Gaussians")
+    if scan.poses is None:
+        return StagePlan(run=True, reason="Gaussians from the sparse points of sfm")
+    if scan.poses.num_points:
+        points = f"{scan.poses.num_points} sparse points"
+        return StagePlan(run=True, reason=f"Gaussians from the given {points}")
+    return StagePlan(
+        run=True,
+        reason="Gaussians from points triangulated at the given poses, which came without any",
+        decisions=["pairs of cameras that stand close and look alike"],
+    )
+
+
+def work(job: Job) -> None:
+    from pipeline.scene.colmap import read_model
+    from pipeline.scene.views import load_views
+    from pipeline.sfm.triangulation import triangulate
+    from pipeline.splats.arrays import write_arrays
+    from pipeline.splats.first import first_gaussians
+
     config = job.section(Init)
-    manifest = Manifest.read(job.inputs["views"] / "images.json")
-    sparse = job.inputs["model"] / "sparse" / "0"
-    model = read_model(sparse)
+    manifest, model = read_manifest(job, "views"), input_model(job)
     views = load_views(manifest, model, job.section(Views), job.section(Split))
-    train = [view for view in views if not view.is_test]
-    if not train:
+    training = [view for view in views if not view.is_test]
+    if not training:
         raise UserError(
             "no photograph has a pose: there is nothing to train on",
             fix="check that the poses name the photographs, or set poses: ignore",
@@ -30,40 +50,32 @@ def run(job: Job) -> None:
     points = model.points
     if config.method != "random" and len(points) == 0:
         job.decide("the given poses come without points: triangulating them")
+        triangulated = job.scratch / "triangulation"
         report = triangulate(
             manifest,
-            sparse,
-            job.scratch / "triangulation",
+            job.inputs["model"] / "sparse" / "0",
+            triangulated,
             job.section(Features),
             job.section(Matches),
             threads=job.threads,
             seed=job.seed,
         )
-        for text in report.decisions:
-            job.decide(text)
-        for text in report.warnings:
-            job.warn(text)
-        points = read_model(job.scratch / "triangulation" / "sparse" / "0").points
+        job.tell(report.decisions, report.warnings)
+        points = read_model(triangulated / "sparse" / "0").points
         job.counters["triangulated_points"] = len(points)
-    method = config.method
-    if method != "random" and len(points) < MIN_POINTS:
-        job.warn(f"only {len(points)} sparse points: starting from random Gaussians instead")
-        method = "random"
-    if method == "random":
-        first = gaussians_random(train, config, 0, job.seed)
-    else:
-        import numpy as np
-
-        first = gaussians_from_points(points, np.array([v.centre for v in train]), config, 0)
-    write_arrays(job.out / "gaussians.npz", first.arrays())
-    job.decide(f"{len(first)} Gaussians from {'random places' if method == 'random' else 'points'}")
-    job.counters |= {
-        "num_gaussians": len(first),
-        "points": len(points),
-        "dropped": first.num_dropped,
-        "thinned": first.num_thinned,
-    }
+    first = first_gaussians(points, training, config, job.seed)
+    write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
+    job.tell(first.decisions, first.warnings)
+    job.counters |= first.counters
 
 
-if __name__ == "__main__":
-    main("init", run, __doc__)
+SPEC = StageSpec(
+    name="init",
+    work=work,
+    decide=decide,
+    inputs={"views": VIEWS, "model": MODEL},
+    options=("init", "views", "split", "features", "matches"),
+    packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
+    seeded=True,
+    memory_mb=3000,
+)

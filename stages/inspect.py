@@ -1,28 +1,42 @@
-"""Look at the scene folder thoroughly once: which photographs are whole, which poses came along.
+"""Read the scene folder once: which photographs are whole, which poses are given.
 
-Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses were given and
-``truth`` where the scene has ``sparse_gt``, ``gcp_list.txt`` where it has that, and
-``georeference.json`` where given poses were moved.
+Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses are given, ``truth`` where the
+scene has ``sparse_gt``, ``gcp_list.txt`` where it has that, and ``georeference.json`` where given
+poses were moved.
 """
 
-from pathlib import Path
+from __future__ import annotations
 
-from pipeline.config.schema import Config, Inspect, Views
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from pipeline.config.schema import Config
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model, write_model
-from pipeline.scene.gcp import GCP_FILE, read_ground_control
-from pipeline.scene.given import GEOREFERENCE, load_given
-from pipeline.scene.scan import scan
-from pipeline.scene.verify import verify_photos
-from stages.command import main
+from pipeline.runtime.section import read_section
+from pipeline.scene.stage import StagePlan, StageSpec
+
+if TYPE_CHECKING:
+    from pipeline.scene.plan import Plan
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    config = Config(poses=job.key["poses"], inspect=job.section(Inspect), views=job.section(Views))
-    cache = job.out.parents[2] / "scan.json"
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    reason = f"{len(scan.photos)} photographs"
+    return StagePlan(run=True, reason=reason, decisions=[scan.image_folder_reason])
+
+
+def work(job: Job) -> None:
+    from pipeline.scene.colmap import read_model, write_model
+    from pipeline.scene.gcp import GCP_FILE, read_ground_control
+    from pipeline.scene.given import GEOREFERENCE, load_given
+    from pipeline.scene.scan import scan
+    from pipeline.scene.verify import verify_photos
+
+    config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])
-    found = scan(folder, folder.name, config, cache=cache)
+    found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
     for text in found.warnings:
         job.warn(text)
     manifest, warnings = verify_photos(
@@ -48,12 +62,26 @@ def run(job: Job) -> None:
                 f"so that {', '.join(f'{v:.9g}' for v in given.origin)} is the new one (frame.json)"
             )
     if found.ground_control is not None and found.poses is None:
-        # Malformed, it is told now and not after hours.
+        # A malformed file is reported now and not after hours.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])
         write_bytes(job.out / GCP_FILE, found.ground_control.read_bytes())
     if found.truth is not None:
         write_model(job.out / "truth", read_model(found.truth))
 
 
-if __name__ == "__main__":
-    main("inspect", run, __doc__)
+def facts(plan: Plan) -> dict[str, Any]:
+    return {
+        "folder": plan.folder,
+        "fingerprint": plan.facts["fingerprint"],
+        "truth": plan.facts["truth_digest"],
+    }
+
+
+SPEC = StageSpec(
+    name="inspect",
+    work=work,
+    decide=decide,
+    options=("poses", "inspect", "views.masks"),
+    memory_mb=2000,
+    facts=facts,
+)

@@ -1,16 +1,28 @@
 """Match and verify pairs of photographs. Output: ``database.db`` (COLMAP's)."""
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from pipeline.config.schema import Matches, Sfm
 from pipeline.runtime.job import Job
-from pipeline.scene.manifest import Manifest
-from pipeline.sfm.matching import match_features
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
+from stages.workflow.inputs import PHOTOS, read_manifest
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    manifest = Manifest.read(job.inputs["photos"] / "images.json")
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    return unless_posed(scan, "pairs to find poses by", [settled.why["matches.pairs"]])
+
+
+def work(job: Job) -> None:
+    from pipeline.sfm.matching import match_features
+
     report = match_features(
-        manifest,
+        read_manifest(job, "photos"),
         job.inputs["features"],
         job.section(Matches),
         job.section(Sfm),
@@ -24,5 +36,13 @@ def run(job: Job) -> None:
     job.timings["num_cached"] = job.counters.pop("num_cached")
 
 
-if __name__ == "__main__":
-    main("matches", run, __doc__)
+SPEC = StageSpec(
+    name="matches",
+    work=work,
+    decide=decide,
+    inputs={"photos": PHOTOS, "features": ("features",)},
+    options=("matches", "sfm.camera_model", "sfm.share_cameras"),
+    packages=("pycolmap",),
+    seeded=True,
+    memory_mb=3000,
+)

@@ -1,21 +1,64 @@
 """Given poses adjusted to their own tracks. Outputs: ``sparse/0`` (a COLMAP model in the given
 world) and, where the given poses were moved, ``georeference.json``."""
 
+from __future__ import annotations
+
 import shutil
+from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
 from pipeline.runtime.job import Job
-from pipeline.scene.given import GEOREFERENCE
-from pipeline.sfm.given import refine_given
-from stages.command import main
+from pipeline.scene.posefiles import SHARED_BY
+from pipeline.scene.stage import StagePlan, StageSpec
+from stages.workflow.inputs import GIVEN
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
+
+# A photograph with fewer known points is left behind when the others are adjusted to theirs.
+MIN_TRACKED = 20
 
 
-def run(job: Job) -> None:
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    poses, freed = scan.poses, settled.config.sfm.refine_principal_point
+    if poses is None:
+        return StagePlan(run=False, reason="no poses are given; sfm adjusts its own")
+    if settled.config.poses == "keep":
+        return StagePlan(run=False, reason="the given poses are kept, as configured (poses: keep)")
+    if freed == "no":
+        return StagePlan(run=False, reason="principal points are held, as configured")
+    if poses.tracked < MIN_TRACKED:
+        few = f"a photograph with {poses.tracked} tracked points" if poses.tracked else "no tracks"
+        return StagePlan(run=False, reason=f"the given poses come with {few} to adjust them to")
+    if not poses.centred and freed != "yes":
+        text = f"no camera of {SHARED_BY} photographs has its principal point exactly in the middle"
+        return StagePlan(run=False, reason=text)
+    return StagePlan(
+        run=True,
+        reason="the given principal points stand in the middle, where nobody looked for them"
+        if poses.centred
+        else "principal points are freed, as configured",
+        decisions=["poses, points and lenses adjusted to the given tracks, where that pays"],
+    )
+
+
+def work(job: Job) -> None:
+    from pipeline.scene.given import GEOREFERENCE
+    from pipeline.sfm.given import refine_given
+
     given = job.inputs["model"]
     job.record(refine_given(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0"))
     if (given / GEOREFERENCE).is_file():
         shutil.copy(given / GEOREFERENCE, job.out)
 
 
-if __name__ == "__main__":
-    main("refine", run, __doc__)
+SPEC = StageSpec(
+    name="refine",
+    work=work,
+    decide=decide,
+    inputs={"model": GIVEN},
+    options=("sfm.refine_radial", "sfm.refine_principal_point"),
+    packages=("pycolmap", "numpy", "scipy"),
+    memory_mb=4000,
+)

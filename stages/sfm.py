@@ -1,19 +1,46 @@
 """Camera poses and sparse points. Outputs: ``sparse/0`` (a COLMAP model), ``georeference.json``
-(what frame it is in) and ``other_models`` where there are any."""
+(its frame) and ``other_models`` where there are any."""
 
-from pipeline.config.schema import Sfm
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.config.schema import Config, Sfm
 from pipeline.runtime.job import Job
-from pipeline.scene.gcp import GCP_FILE
-from pipeline.scene.manifest import Manifest
-from pipeline.sfm.mapping import reconstruct
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
+from stages.workflow.inputs import PHOTOS, read_manifest
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
-    manifest = Manifest.read(job.inputs["photos"] / "images.json")
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    config, why = settled.config, settled.why
+    reason = "no poses are given"
+    if config.poses == "ignore":
+        reason = "poses are found anew, as configured (poses: ignore)"
+    choices = [why[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")]
+    return unless_posed(scan, reason, [*choices, _frame(scan, config)])
+
+
+def _frame(scan: Scan, config: Config) -> str:
+    wanted, control = config.sfm.georeference, scan.ground_control is not None
+    if wanted in ("auto", "gcp") and control:
+        return "the scene's frame from the ground control points in gcp_list.txt"
+    if wanted in ("auto", "gps") and scan.num_gps:
+        return f"the scene's frame from GPS in {scan.num_gps} photographs, if it says enough"
+    ignored = ", as configured" if wanted == "none" else ": neither GPS nor ground control points"
+    return f"the scene's frame level and of unit size{ignored}"
+
+
+def work(job: Job) -> None:
+    from pipeline.scene.gcp import GCP_FILE
+    from pipeline.sfm.mapping import reconstruct
+
     control = job.inputs["inspect"] / GCP_FILE
     report = reconstruct(
-        manifest,
+        read_manifest(job, "photos"),
         job.inputs["matches"] / "database.db",
         job.section(Sfm),
         job.out,
@@ -24,5 +51,13 @@ def run(job: Job) -> None:
     job.record(report)
 
 
-if __name__ == "__main__":
-    main("sfm", run, __doc__)
+SPEC = StageSpec(
+    name="sfm",
+    work=work,
+    decide=decide,
+    inputs={"photos": PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
+    options=("sfm",),
+    packages=("pycolmap", "numpy", "scipy"),
+    seeded=True,
+    memory_mb=4000,
+)

@@ -1,20 +1,40 @@
-"""Pictures and masks as pinhole cameras see them.
+"""Images and masks as pinhole cameras see them.
 
-Outputs: ``images/``, ``masks/``, ``images.json`` and ``sparse/0``.
+Outputs: ``images/``, ``masks/``, ``depths/``, ``images.json`` and ``sparse/0``.
 """
 
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
 from pipeline.config.schema import Undistort, Views
-from pipeline.photos.undistort import undistort
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model
-from pipeline.scene.manifest import Manifest
-from stages.command import main
+from pipeline.scene.stage import StagePlan, StageSpec
+from stages.workflow.inputs import PHOTOS, POSES, input_model, read_manifest
+
+if TYPE_CHECKING:
+    from pipeline.scene.scan import Scan
+    from pipeline.scene.settle import Settled
 
 
-def run(job: Job) -> None:
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    if scan.poses is not None:
+        models = ", ".join(scan.poses.models)
+        if scan.poses.pinhole:
+            return StagePlan(run=False, reason=f"the given cameras are pinhole already ({models})")
+        return StagePlan(run=True, reason=f"the given cameras distort ({models})")
+    model = settled.config.sfm.camera_model
+    if model in ("PINHOLE", "SIMPLE_PINHOLE"):
+        return StagePlan(run=False, reason=f"{model} cameras do not distort")
+    return StagePlan(run=True, reason=f"{model} cameras distort")
+
+
+def work(job: Job) -> None:
+    from pipeline.photos.undistort import undistort
+
     report = undistort(
-        Manifest.read(job.inputs["photos"] / "images.json"),
-        read_model(job.inputs["model"] / "sparse" / "0"),
+        read_manifest(job, "photos"),
+        input_model(job),
         job.section(Undistort),
         job.section(Views),
         job.out,
@@ -25,5 +45,11 @@ def run(job: Job) -> None:
     job.counters = {"undistorted": len(report.manifest.photos)}
 
 
-if __name__ == "__main__":
-    main("undistort", run, __doc__)
+SPEC = StageSpec(
+    name="undistort",
+    work=work,
+    decide=decide,
+    inputs={"photos": PHOTOS, "model": POSES},
+    options=("undistort", "views.max_long_side_px"),
+    packages=("opencv-contrib-python-headless",),
+)

@@ -151,9 +151,9 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
     (scene / "plan.json").write_text(json.dumps(plan))
     config = Config().model_dump(mode="json")
     config["split"]["holdout_every"], config["train"]["background"] = 2, "black"
-    (scene / "evaluate").mkdir()
-    key = {"config": {name: config[name] for name in ("views", "split", "train", "evaluate")}}
-    (scene / "evaluate" / "stage.json").write_text(json.dumps({"key": key}))
+    (scene / "train").mkdir()
+    key = {"config": {name: config[name] for name in ("views", "split", "train")}}
+    (scene / "train" / "stage.json").write_text(json.dumps({"key": key}))
     (folder / "elsewhere").mkdir()
     monkeypatch.chdir(folder / "elsewhere")
     found = measured(folder / "model.ply", scene)

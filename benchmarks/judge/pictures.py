@@ -13,9 +13,9 @@ from pipeline.config.schema import Config, Matches, Sfm
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import read_stage
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.plan import make_plan
 from pipeline.scene.posefiles import truth_folder
 from pipeline.scene.scan import scan
+from pipeline.scene.settle import settle
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper
@@ -85,20 +85,18 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
         return _finished(folder, work)
     config = Config(poses="ignore", seed=seed)
     found = scan(folder, folder.name, config, cache=None)
-    plan = make_plan(found, config)
+    settled = settle(found, config).config
     manifest = found.manifest
     features = work / "features"
-    extract_features(manifest, plan.config.features, features, cache=work / "cache", threads=1)
-    run_isolated(
-        _match, manifest, features, plan.config.matches, plan.config.sfm, work / "matches", seed
-    )
-    mapper = plan.config.sfm.mapper
+    extract_features(manifest, settled.features, features, cache=work / "cache", threads=1)
+    run_isolated(_match, manifest, features, settled.matches, settled.sfm, work / "matches", seed)
+    mapper = settled.sfm.mapper
     assert mapper != "auto"
     return Matched(
         work / "matches" / "database.db",
         len(manifest.photos),
         mapper,
-        plan.config.sfm.min_registered_share,
+        settled.sfm.min_registered_share,
         truth_folder(folder),
     )
 

@@ -18,8 +18,8 @@ from pipeline.scene.given import load_given
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction
 from pipeline.scene.names import NameIndex
-from pipeline.scene.plan import make_plan
 from pipeline.scene.scan import Scan, scan
+from pipeline.scene.settle import settle
 from pipeline.scene.verify import verify_photos
 
 REFERENCE = "pycolmap"
@@ -107,7 +107,7 @@ def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]
 def settled(scene: Scene, raw: Mapping[str, Any]) -> Config:
     """What the plan makes of these options for the scene, its poses to be found anew."""
     config = scene_config({**raw, "poses": "ignore"}, scene.name)
-    return make_plan(scene.scan, config).config
+    return settle(scene.scan, config).config
 
 
 def _settled(scene: Scene, preset: str, mapper: str, pairs: str) -> Config:

@@ -263,6 +263,7 @@ class Train(Section):
         "fit, and pictures that do not fit beside them are read from disk as they are needed. "
         "Without it they are where training would take over three quarters of the memory that the "
         "machine, or its container, has; that changes no result.",
+        json_schema_extra={"decides_result": False},
     )
     sh_degree: Annotated[int, Field(ge=0, le=3)] = Field(3, description="Spherical harmonics.")
     sh_interval: Positive = Field(1000, description="Steps between one SH degree and the next.")

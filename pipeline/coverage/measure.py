@@ -23,7 +23,9 @@ from pipeline.metrics.evaluate import Protocol, reference, to_bytes
 from pipeline.photos.load import load_view, resize_area
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.progress import track
+from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import View
+from pipeline.scene.views import scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.render import Render, render_view
 
@@ -75,6 +77,15 @@ class World:
     unit: str | None
 
 
+def world_of(
+    views: Sequence[View], manifest: Manifest, georeference: Mapping[str, Any] | None
+) -> World:
+    """The frame of the views: up as their photographs were held, and metres where the model's
+    ``georeference.json`` says so."""
+    unit = str((georeference or {}).get("unit", ""))
+    return World(scene_up(views, manifest), "m" if unit.startswith("metres") else None)
+
+
 def measure_coverage(
     out: Path,
     gaussians: Gaussians,
@@ -82,15 +93,16 @@ def measure_coverage(
     protocol: Protocol,
     train: Train,
     evaluation: Mapping[str, Any],
+    renders: Path,
     world: World,
     threads: int,
 ) -> dict[str, Any]:
-    """Write ``coverage.json`` and ``coverage/*.png`` into the folder of an evaluation.
+    """Write ``coverage.json`` and ``coverage/*.png`` into the folder ``out``.
 
     Args:
-        out: with ``renders/``.
         views: all with a pose.
         evaluation: what ``evaluate_views`` returned.
+        renders: folder of the renders that it names.
 
     Returns:
         The content of ``coverage.json``.
@@ -116,7 +128,7 @@ def measure_coverage(
         return _written(out, result | {"reason": "the scene shows no surface"})
     beyond = float(np.percentile(depths, 95))
     surface, nearest = _surface(_evenly(eyes, MAX_SAMPLED), eyes, beyond)
-    asked = _held_out(out, protocol, evaluation, eyes, draw, beyond, nearest)
+    asked = _held_out(evaluation, renders, protocol, eyes, draw, beyond, nearest)
     # All photographs that there are: nobody need take a held-out one again.
     known = [*eyes, *(item.eye for item in asked)]
     cameras = [*training, *(_named(views, item.eye.view.name) for item in asked)]
@@ -191,9 +203,9 @@ def _surface(
 
 
 def _held_out(
-    out: Path,
-    protocol: Protocol,
     evaluation: Mapping[str, Any],
+    renders: Path,
+    protocol: Protocol,
     eyes: Sequence[Eye],
     draw: Draw,
     beyond: float,
@@ -209,7 +221,7 @@ def _held_out(
         picture, evidence = trust_picture(eye, eyes, beyond)
         pixels = load_view(view.image, view.mask, view.width, view.height)
         photo = reference(pixels, protocol.background)
-        with Image.open(out / "renders" / item["render"]) as render:
+        with Image.open(renders / item["render"]) as render:
             error = ((np.asarray(render) / 255.0 - photo / 255.0) ** 2).mean(axis=2)
         height, width = eye.depth.shape
         opaque, counts = None, eye.counts

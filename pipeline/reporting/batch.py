@@ -12,7 +12,6 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.config.runs import Run
-from pipeline.scene.plan import STAGES
 from pipeline.scene.protocols import benchmark_scene
 
 PUBLISHED = Path(__file__).with_name("published.json")
@@ -73,9 +72,9 @@ class Spread:
     count: int
 
 
-def row(result: Result) -> dict[str, Any]:
-    """One line of ``benchmark.csv``: the run, how it ended, quality, and each stage's time and
-    memory (empty where a stage was skipped). Units stand in the names."""
+def row(result: Result, stages: Sequence[str] = ()) -> dict[str, Any]:
+    """One line of ``benchmark.csv``: the run, how it ended, quality, and the time and memory of
+    each of ``stages`` (empty where it was skipped). Units stand in the names."""
     m = result.metrics
     protocol = m.get("protocol") or {}
     pose = m.get("pose_error") or {}
@@ -105,7 +104,7 @@ def row(result: Result) -> dict[str, Any]:
         "peak_rss_mb": max((s["peak_rss_mb"] for s in ran.values()), default=None),
         "warnings": len(m["warnings"]) if result.ok else None,
     }
-    for stage in STAGES:
+    for stage in stages:
         for fact in _TIMES:
             line[f"{stage}_{fact}"] = ran[stage][fact] if stage in ran else None
     return line | {name: result.machine.get(name) for name in MACHINE}
@@ -116,16 +115,16 @@ def _sum(values: Iterable[float]) -> float | None:
     return round(sum(found), 3) if found else None
 
 
-def as_csv(results: Sequence[Result]) -> str:
-    """``benchmark.csv``: a header and a line a run."""
+def as_csv(results: Sequence[Result], stages: Sequence[str] = ()) -> str:
+    """``benchmark.csv``: a header and a line a run, with columns for these stages."""
     text = io.StringIO()
-    writer = csv.DictWriter(text, list(row(results[0])), lineterminator="\n")
+    writer = csv.DictWriter(text, list(row(results[0], stages)), lineterminator="\n")
     writer.writeheader()
-    writer.writerows(row(result) for result in results)
+    writer.writerows(row(result, stages) for result in results)
     return text.getvalue()
 
 
-def as_json(results: Sequence[Result]) -> dict[str, Any]:
+def as_json(results: Sequence[Result], stages: Sequence[str] = ()) -> dict[str, Any]:
     """``benchmark.json``: the rows, the means over seeds by scene and configuration, the means
     over the scenes that every configuration finished, and what others published."""
     means = {
@@ -134,7 +133,7 @@ def as_json(results: Sequence[Result]) -> dict[str, Any]:
     }
     scenes, over = by_config(results)
     return {
-        "runs": [row(result) for result in results],
+        "runs": [row(result, stages) for result in results],
         "scenes": means,
         "configs": {config: _plain(spreads) for config, spreads in over.items()},
         "configs_over_scenes": scenes,

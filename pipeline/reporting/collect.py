@@ -43,7 +43,7 @@ def collect_metrics(
             counters[name] = record["counters"]
             known = plan["warnings"]
             warnings += [f"{name}: {text}" for text in record["warnings"] if text not in known]
-            run = json.loads((folder / name / "run.json").read_text())
+            run = read_json(folder / name / "run.json")
         stages[name] = _timing(run) | {"skipped": False, "reason": step["reason"]}
     sfm, refined = counters.get("sfm", {}), counters.get("refine", {})
     photos = counters["inspect"]["photos"]
@@ -69,6 +69,10 @@ def collect_metrics(
         "seed": own_run["seed"],
         "warnings": warnings,
     }
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())
 
 
 def _timing(run: dict[str, Any] | None) -> dict[str, Any]:

@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from pipeline.reporting.text import escape
-from pipeline.scene.plan import STAGES
 
 _BOX_W, _BOX_H = 92, 34
 _GAP_X, _GAP_Y = 26, 16
@@ -38,7 +37,7 @@ def plan_svg(plan: Mapping[str, Any]) -> str:
         its reason and decisions as a tooltip.
     """
     stages: dict[str, Mapping[str, Any]] = {
-        name: plan["stages"][name] for name in STAGES if name in plan["stages"]
+        name: plan["stages"][name] for name in plan.get("order", plan["stages"])
     }
     edges = _edges(stages)
     places, columns, lanes = _places(stages, edges)

@@ -30,7 +30,6 @@ from pipeline.reporting.dag import plan_svg
 from pipeline.reporting.pictures import shrunk, upright
 from pipeline.reporting.style import CSS
 from pipeline.reporting.text import MISSING, count, duration, escape, fixed
-from pipeline.scene.plan import STAGES
 
 _POLICY = "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
@@ -90,12 +89,14 @@ class Batch:
         renders: run's name -> a held-out view of it.
         photos: scene -> the photograph of that view.
         plans: scene -> ``plan.json`` of its first run.
+        stages: names in the order of the DAG.
     """
 
     results: Sequence[Result]
     renders: Mapping[str, Thumbnail] = field(default_factory=dict)
     photos: Mapping[str, Thumbnail] = field(default_factory=dict)
     plans: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    stages: Sequence[str] = ()
 
 
 def index_html(batch: Batch) -> str:
@@ -105,7 +106,7 @@ def index_html(batch: Batch) -> str:
     sections = [
         ("means", "Configurations", _configs(results)),
         *((f"scene-{i}", scene, _scene(batch, scene)) for i, scene in enumerate(scenes)),
-        ("stages", "Time and memory", _stages(results)),
+        ("stages", "Time and memory", _stages(results, batch.stages)),
         ("published", "Published numbers", _sources(results, scenes)),
     ]
     sections = [section for section in sections if section[2]]
@@ -362,10 +363,10 @@ def _table(
     )
 
 
-def _stages(results: Sequence[Result]) -> str:
+def _stages(results: Sequence[Result], order: Sequence[str]) -> str:
     """Wall time of each stage of each run; CPU time and memory as tooltips."""
     done = [r for r in results if r.ok]
-    stages = [s for s in STAGES if any(not _stage(r, s)["skipped"] for r in done)]
+    stages = [s for s in order if any(not _stage(r, s)["skipped"] for r in done)]
     if not done:
         return ""
     heads = "".join(f'<th class="number" scope="col">{escape(s)}</th>' for s in stages)

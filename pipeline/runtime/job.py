@@ -31,7 +31,7 @@ import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import PackageNotFoundError, version
@@ -47,6 +47,7 @@ from pipeline.runtime.machine import machine_facts
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.runtime.native import native_facts
 from pipeline.runtime.progress import Console, write_progress_to
+from pipeline.runtime.section import read_section
 
 SIDE_CARS = ("stage.json", "run.json", ".stage.json")
 
@@ -59,12 +60,13 @@ class Job:
 
     Attributes:
         stage, scene: names.
-        key: the stage's key as a parsed JSON object (see ``stages.wiring.stage_key``).
+        key: the stage's key as a parsed JSON object (see ``pipeline.scene.keys``).
         inputs: folder of each input role ("photos", "model", ...).
         out: write outputs here; it becomes the stage's folder when ``run`` returns.
         scratch: survives a kill and is found again by a run with the same identity.
         shared_cache: survives changed options; for content-addressed per-image results.
         threads: native threads to use; never changes a result.
+        memory_mb: that the stage may use, None where nothing was said; never changes a result.
         counters, decisions, warnings: recorded in ``stage.json``; fill them in.
         published: extra declared outputs: file in ``out`` -> path where it is wanted as well.
         timings: recorded in ``run.json``.
@@ -79,6 +81,7 @@ class Job:
     scratch: Path
     shared_cache: Path
     threads: int
+    memory_mb: int | None
     logs: Path
     counters: dict[str, Any] = field(default_factory=dict)
     decisions: list[str] = field(default_factory=list)
@@ -92,18 +95,21 @@ class Job:
         return int(self.key["seed"])
 
     def section(self, model: type[S]) -> S:
-        """The validated config section of type ``model``; only sections in the key exist."""
-        return model.model_validate(self.key["config"][model.__name__.lower()])
+        """The config section of type ``model``, with the options that the stage declares."""
+        return read_section(model, self.key["config"][model.__name__.lower()])
 
     def record(self, report: Any) -> None:
         """Take over a report (a dataclass): its ``decisions`` and ``warnings`` are told and kept,
         its other fields become counters."""
         facts = asdict(report)
-        for text in facts.pop("decisions", []):
-            self.decide(text)
-        for text in facts.pop("warnings", []):
-            self.warn(text)
+        self.tell(facts.pop("decisions", []), facts.pop("warnings", []))
         self.counters |= facts
+
+    def tell(self, decisions: Sequence[str], warnings: Sequence[str]) -> None:
+        for text in decisions:
+            self.decide(text)
+        for text in warnings:
+            self.warn(text)
 
     def warn(self, text: str) -> None:
         print(f"warning: {text}", file=sys.stderr, flush=True)
@@ -125,6 +131,7 @@ class Request:
     threads: int
     log: Path | None
     publish: dict[str, Path]
+    memory_mb: int | None = None
 
 
 def run_stage(request: Request, work: Callable[[Job], None]) -> int:
@@ -194,6 +201,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
             scratch=scratch,
             shared_cache=scratch_root / f"{request.stage}-cache",
             threads=request.threads,
+            memory_mb=request.memory_mb,
             logs=scene_folder / "logs" if request.log is None else request.log.parent,
         )
         # Temporary files belong on the results' disk, where a kill leaves them to be found.

@@ -5,6 +5,7 @@ from __future__ import annotations
 import ast
 import hashlib
 import re
+from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
 
@@ -12,7 +13,13 @@ ROOT = Path(__file__).resolve().parents[2]
 
 # These decide how work is run and described, never what comes out of it; the values of the
 # options themselves stand in the stage's key.
-NEUTRAL = ("pipeline.runtime", "pipeline.config")
+NEUTRAL = (
+    "pipeline.runtime",
+    "pipeline.config",
+    "pipeline.scene.plan",
+    "pipeline.scene.settle",
+    "pipeline.scene.stage",
+)
 
 # Modules whose C++ is compiled where it runs, and its folder.
 NATIVE = {"pipeline.raster": "pipeline/raster/csrc", "pipeline.sfm.nearest": "pipeline/sfm/csrc"}
@@ -65,7 +72,7 @@ def _imports(module: str) -> tuple[str, ...]:
     tree = _tree(module)
     if tree is None:
         return ()
-    for node in ast.walk(tree):
+    for node in _runtime_nodes(tree):
         if isinstance(node, ast.Import):
             found += [alias.name for alias in node.names]
         elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
@@ -75,6 +82,15 @@ def _imports(module: str) -> tuple[str, ...]:
     # A package's __init__ runs before its modules do.
     parents = [n.rpartition(".")[0] for n in ours if "." in n]
     return tuple(sorted({*ours, *(p for p in parents if _file_of(p))}))
+
+
+def _runtime_nodes(tree: ast.AST) -> Iterator[ast.AST]:
+    """All nodes but those below ``if TYPE_CHECKING:``."""
+    for node in ast.iter_child_nodes(tree):
+        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
+            continue
+        yield node
+        yield from _runtime_nodes(node)
 
 
 @cache

@@ -78,6 +78,20 @@ def _pixels(scan: Scan, config: Config) -> int:
     return sum(width * height for width, height in sizes)
 
 
+def resolution_line(scan: Scan, config: Config) -> str:
+    """What the plan says of the size of the views."""
+    (width, height), *others = scan.sizes
+    cap = config.views.max_long_side_px
+    small_width, small_height = view_size(width, height, cap)
+    share = small_width / width
+    text = f"views of {small_width}x{small_height} pixels, {share:.3g} of the photographs"
+    if (small_width, small_height) == (width, height):
+        text = f"views of {width}x{height} pixels, as photographed"
+    if others:
+        text += f" (the commonest of {len(others) + 1} sizes; none above {cap} px)"
+    return text
+
+
 def memory_line(scan: Scan, config: Config) -> str:
     """What the plan says of ``training_memory_mb``."""
     limit = config.train.memory_mb

@@ -141,7 +141,7 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
 
 
 def _finished(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
-    record = folder / "evaluate" / "stage.json"
+    record = folder / "train" / "stage.json"
     try:
         sections = json.loads(record.read_text())["key"]["config"]
         views = Views.model_validate(sections["views"])

@@ -96,6 +96,7 @@ def train(
     *,
     seed: int,
     threads: int,
+    memory_mb: int | None = None,
     checkpoint_dir: Path,
     journal: Path | None = None,
     on_log: Callable[[str], None] | None = None,
@@ -107,6 +108,9 @@ def train(
 
     Args:
         threads: of the native operators; torch itself runs on one, so that sums are the same.
+        memory_mb: that training may use: images that do not fit beside the Gaussians are read from
+            a temporary file. None: three quarters of the machine's, or its container's, memory,
+            which is the limit in any case. Changes no result.
         journal: file for how it goes, second by second (``training.journal``).
         on_log: called with one line for each warning, and for the instruction set, the compiler
             and the time a step takes.
@@ -124,15 +128,15 @@ def train(
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _Run(inputs, config, seed, threads, checkpoint_dir, on_log).train(journal)
+        return _Run(inputs, config, seed, threads, memory_mb, checkpoint_dir, on_log).train(journal)
     finally:
         torch.set_num_threads(torch_threads)
 
 
-def shelf_for(views: Sequence[View], config: Train) -> Shelf:
+def shelf_for(views: Sequence[View], config: Train, limit_mb: int | None) -> Shelf:
     """Memory for the views' pixels where they fit beside the Gaussians, else a file."""
     pixels = sum(view.width * view.height for view in views)
-    limit = machine_mb() if config.memory_mb is None else config.memory_mb
+    limit = min(machine_mb(), limit_mb or math.inf)
     fits = memory_mb(pixels, config.density.max_gaussians) <= limit
     return MemoryShelf() if fits else DiskShelf()
 
@@ -146,6 +150,7 @@ class _Run:
         config: Train,
         seed: int,
         threads: int,
+        memory_mb: int | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
     ):
@@ -164,7 +169,11 @@ class _Run:
             inputs = replace(inputs, depths=None)
         self.identity = identity_of(inputs, config, seed)
         self.targets = Targets(
-            inputs.views, threads, config.salt_and_pepper, seed, shelf_for(inputs.views, config)
+            inputs.views,
+            threads,
+            config.salt_and_pepper,
+            seed,
+            shelf_for(inputs.views, config, memory_mb),
         )
         self.inputs = self.without_hidden_views(inputs)
         gains = self.inputs.gains

@@ -38,7 +38,15 @@ def measured(folder: Path, *, threads: int = 1, held_out: bool = True) -> dict:
         scene, protocol, Evaluate(lpips_net="none"), TRAIN, folder / "renders", threads=threads
     )
     measure_coverage(
-        folder, scene, views, protocol, TRAIN, evaluation, World(UP, None), threads=threads
+        folder,
+        scene,
+        views,
+        protocol,
+        TRAIN,
+        evaluation,
+        folder / "renders",
+        World(UP, None),
+        threads=threads,
     )
     return json.loads((folder / "coverage.json").read_text())
 

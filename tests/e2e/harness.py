@@ -142,6 +142,7 @@ def model_digests(project: Path, scene: str) -> dict[str, str]:
     files = [
         *(folder / "export").rglob("*"),
         *(folder / "evaluate").rglob("*"),
+        *(folder / "coverage").rglob("*"),
         folder / "train" / "gaussians.npz",
         folder / "train" / "curve.json",
     ]

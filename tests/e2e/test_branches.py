@@ -11,7 +11,7 @@ from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakema
 
 pytestmark = pytest.mark.slow
 
-ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "export", "report"}
+ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "coverage", "export", "report"}
 PINHOLE = ("--distortion", "none")
 SFM = {"features", "matches", "sfm"}
 

@@ -76,7 +76,7 @@ def test_an_export_option_never_retrains(project):
 def test_a_training_option_keeps_the_poses(project):
     config = TINY | {"train": TINY["train"] | {"lr_scales": 0.004}}
     done = snakemake(project, "-n", TARGET, config=config)
-    assert rules_run(done) == {"train", "evaluate", "export", "report"}
+    assert rules_run(done) == {"train", "evaluate", "coverage", "export", "report"}
 
 
 def test_a_touched_photograph_and_a_comment_rerun_nothing(project):
@@ -154,7 +154,7 @@ def test_the_commands_of_the_readme_are_commands(project):
 )
 def test_kill_9_and_again_gives_the_same_result(project, finished, stage, ready):
     folder = project / "results/tiny"
-    order = ["sfm", "undistort", "init", "train", "evaluate", "export", "report"]
+    order = ["sfm", "undistort", "init", "train", "evaluate", "coverage", "export", "report"]
     for name in order[order.index(stage) :]:
         shutil.rmtree(folder / name, ignore_errors=True)
     (folder / "metrics.json").unlink()

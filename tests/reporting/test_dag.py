@@ -4,19 +4,15 @@ import xml.etree.ElementTree as ET
 
 from pipeline.config.schema import Config
 from pipeline.reporting.dag import plan_svg
-from pipeline.scene.plan import STAGES, Plan, StagePlan
-from stages.wiring import public_plan
+from pipeline.scene.plan import public_plan
+from stages.workflow.registry import STAGES
+from tests.plans import full_plan
 
 SVG = "{http://www.w3.org/2000/svg}"
 
 
 def plan(*skipped: str) -> dict:
-    stages = {
-        name: StagePlan(run=name not in skipped, reason=f"why {name} <&", decisions=["so"])
-        for name in STAGES
-    }
-    shown = Plan(scene="fox", stages=stages, warnings=[], config=Config(), facts={})
-    return public_plan(shown)
+    return public_plan(full_plan(Config(), skipped=skipped))
 
 
 def drawn(found: dict) -> tuple[dict[str, tuple[float, float]], ET.Element]:
@@ -50,11 +46,11 @@ def test_skipped_stages_stand_below_with_their_reason():
 
 
 def test_arrows_are_what_feeds_what_and_no_more():
-    """All run: a chain, and evaluate and export side by side between train and report."""
+    """All run: a chain, and export beside coverage between train and report."""
     boxes, root = drawn(plan())
-    assert boxes["evaluate"][0] == boxes["export"][0]
+    assert boxes["coverage"][0] == boxes["export"][0]
     heads = [p for p in root.iter(f"{SVG}path") if p.get("class") == "head"]
-    assert len(heads) == len(STAGES)  # ten of the chain, one around export, one to refine
+    assert len(heads) == len(STAGES)  # the chain of eleven, around export, and to refine
     assert len([p for p in drawn(plan("decode"))[1].iter(f"{SVG}path")]) == 2 * (len(STAGES) - 1)
 
 

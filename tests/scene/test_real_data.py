@@ -7,8 +7,8 @@ import pytest
 
 from pipeline.config.schema import Config
 from pipeline.scene.given import load_given
-from pipeline.scene.plan import make_plan
 from pipeline.scene.scan import Scan, scan
+from tests.plans import make_plan
 
 DATA = Path(__file__).parents[3] / "shared" / "data"
 

@@ -20,12 +20,14 @@ from pipeline.config import schema
 from pipeline.runtime import processor, targets
 from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
-from pipeline.scene.plan import make_plan
+from pipeline.scene.keys import stage_key
+from pipeline.scene.plan import upstream
 from pipeline.scene.scan import scan
 from pipeline.sfm import nearest as near
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
-from stages.wiring import ROLES, stage_key
+from stages.workflow.registry import STAGES
+from tests.plans import make_plan
 from tests.sfm import corner, jobs
 from tests.tools import need
 
@@ -220,14 +222,11 @@ def run_stages(scene: Path, results: Path) -> dict[str, dict]:
     """run.json of the stages up to matches, run as Snakemake runs them."""
     config = schema.Config(features=FEATURES)
     found = scan(scene, "corner", config, cache=None)
-    plan = make_plan(found, config)
+    plan = make_plan(found, config, str(scene))
     for stage in ("inspect", "features", "matches"):
-        inputs = {
-            role: next(name for name in fillers if plan.runs(name))
-            for role, fillers in ROLES[stage].items()
-        }
-        command = [sys.executable, "-m", f"stages.{stage}", "--out", str(results / stage)]
-        command += ["--key", stage_key(stage, plan, str(scene), found.fingerprint)]
+        inputs = upstream(STAGES[stage], plan)
+        command = [sys.executable, "-m", "stages", stage, "--out", str(results / stage)]
+        command += ["--key", stage_key(STAGES[stage], plan)]
         command += ["--threads", "2"]
         command += ["--input", *(f"{role}={results / name}" for role, name in inputs.items())]
         subprocess.run(command, check=True, capture_output=True, cwd=Path(__file__).parents[2])

@@ -36,12 +36,14 @@ def run(
     seed: int = 3,
     said: list[str] | None = None,
     journal: Path | None = None,
+    memory_mb: int | None = None,
 ) -> TrainResult:
     return train(
         Inputs(scene.views if views is None else views, scene.initial, scene.extent),
         config or tiny_config(),
         seed=seed,
         threads=threads,
+        memory_mb=memory_mb,
         checkpoint_dir=folder,
         journal=journal,
         on_log=None if said is None else said.append,
@@ -97,10 +99,10 @@ def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) ->
 
 def test_pictures_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
     config = tiny_config(coarse_until=0.3)
-    little = config.model_copy(update={"memory_mb": 1})
-    assert isinstance(trainer.shelf_for(scene.views, config), MemoryShelf)
-    assert isinstance(trainer.shelf_for(scene.views, little), DiskShelf)
-    assert_same(run(scene, tmp_path / "a", config), run(scene, tmp_path / "b", little))
+    assert isinstance(trainer.shelf_for(scene.views, config, None), MemoryShelf)
+    assert isinstance(trainer.shelf_for(scene.views, config, 1), DiskShelf)
+    little = run(scene, tmp_path / "b", config, memory_mb=1)
+    assert_same(run(scene, tmp_path / "a", config), little)
 
 
 def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:

@@ -1,22 +1,21 @@
-"""What the train stage tells training."""
+"""What is prepared of a scene for its training, and what is said of the training."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
-from typing import Any, cast
+from typing import Any
 
 import numpy as np
 import pytest
 
 from pipeline.config.schema import Train
-from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction
+from pipeline.training import scene as stage
 from pipeline.training.depth import SCALE_SHARE, KnownDepths
 from pipeline.training.inputs import Inputs
-from stages import train as stage
 from tests.training.conftest import ball, camera_at
 
 
@@ -40,30 +39,32 @@ def test_the_scene_is_as_large_as_what_is_seen(
         return lambda *_, **__: value
 
     monkeypatch.setattr(stage, "train", train)
-    monkeypatch.setattr(stage, "load_views", always(views))
-    monkeypatch.setattr(stage, "read_model", always(None))
-    monkeypatch.setattr(stage, "choose_gains", always({}))
+    monkeypatch.setattr(stage, "_choose_gains", always({}))
     monkeypatch.setattr(stage, "scene_extent", always(50.0))
     monkeypatch.setattr(stage, "point_depths", lambda training, _: [known] * len(training))
-    monkeypatch.setattr(Manifest, "read", always(Manifest(scene="street", photos=())))
-    ball(5, 0).save(tmp_path / "gaussians.npz")
-    job = SimpleNamespace(
-        inputs={"views": tmp_path, "model": tmp_path, "init": tmp_path},
-        section=lambda model: Train(depth_weight=0.0) if model is Train else model(),
-        seed=0, threads=1, scratch=tmp_path, logs=tmp_path,
-    )  # fmt: skip
     with pytest.raises(Told):
-        stage.run(cast(Job, job))
+        stage.train_scene(
+            views,
+            Manifest(scene="street", photos=()),
+            Reconstruction({}, {}),
+            ball(5, 0),
+            Train(depth_weight=0.0),
+            seed=0,
+            threads=1,
+            memory_mb=None,
+            checkpoint_dir=tmp_path,
+            logs=tmp_path,
+        )
     assert [view.name for view in told[0].views] == ["1", "2"]
     assert told[0].extent == 50.0
     assert told[0].size == pytest.approx(SCALE_SHARE * 4.0)
 
 
-def test_a_training_too_short_to_look_at_its_photographs_says_so() -> None:
-    assert stage.too_few_looks(600, 200, 60.0, None) is None
-    by_steps = stage.too_few_looks(150, 200, 60.0, None)
-    assert by_steps is not None and "150 steps are 0.8 looks at each of 200 photographs" in by_steps
+def test_a_training_too_short_for_its_views_says_so() -> None:
+    assert stage.too_few_epochs(600, 200, 60.0, None) is None
+    by_steps = stage.too_few_epochs(150, 200, 60.0, None)
+    assert by_steps is not None and "150 steps are 0.8 epochs over 200 training views" in by_steps
     assert by_steps.endswith("raise train.steps")
-    by_clock = stage.too_few_looks(100, 200, 240.0, 4.0)
+    by_clock = stage.too_few_epochs(100, 200, 240.0, 4.0)
     assert by_clock is not None and "did in 4 minutes, 2.4 s a step" in by_clock
     assert "raise train.budget_minutes" in by_clock

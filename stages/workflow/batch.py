@@ -17,6 +17,7 @@ from pipeline.reporting.data import ranked
 from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
 from pipeline.runtime.atomic import write_json, write_text
 from pipeline.scene.manifest import Manifest
+from stages.workflow.registry import STAGES
 
 
 def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
@@ -28,8 +29,8 @@ def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
         results: the folder of the runs.
     """
     found = [result_of(outcome, results) for outcome in outcomes]
-    write_text(results / "benchmark.csv", as_csv(found))
-    write_json(results / "benchmark.json", as_json(found))
+    write_text(results / "benchmark.csv", as_csv(found, list(STAGES)))
+    write_json(results / "benchmark.json", as_json(found, list(STAGES)))
     write_text(results / "index.html", index_html(batch_of(found, results)))
 
 
@@ -74,7 +75,7 @@ def batch_of(found: list[Result], results: Path) -> Batch:
             pixels = load_view(photo.path, None, width, height)
             background = tuple(result.metrics["protocol"]["background"])
             photos[scene] = thumbnail(reference(pixels, background), photo.orientation, name)
-    return Batch(found, renders, photos, plans)
+    return Batch(found, renders, photos, plans, list(STAGES))
 
 
 def read_json(path: Path) -> Any:
@@ -82,7 +83,7 @@ def read_json(path: Path) -> Any:
 
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("stages.batch", description=__doc__)
+    parser = argparse.ArgumentParser("stages.workflow.batch", description=__doc__)
     parser.add_argument("--results", type=Path, required=True, help="the folder of the runs")
     parser.add_argument("--outcomes", required=True, help="how each run ended (JSON), or - (stdin)")
     args = parser.parse_args()

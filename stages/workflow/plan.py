@@ -11,7 +11,7 @@ from pipeline.reporting.dag import plan_svg
 from pipeline.runtime.atomic import write_json, write_text
 
 if __name__ == "__main__":
-    parser = argparse.ArgumentParser("stages.plan", description=__doc__)
+    parser = argparse.ArgumentParser("stages.workflow.plan", description=__doc__)
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--picture", type=Path, required=True)
     parser.add_argument("--plan", required=True, help="the plan as JSON")

@@ -2,19 +2,13 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-from types import SimpleNamespace
-from typing import cast
-
 import numpy as np
 import pytest
 
-from pipeline.runtime.atomic import write_json
-from pipeline.runtime.job import Job
+from pipeline.coverage.measure import world_of
 from pipeline.scene.given import Given
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Reconstruction, View
-from stages.evaluate import world_of
 
 MOVED = Given(Reconstruction({}, {}), np.array([1e5, 0.0, 0.0])).sidecar()
 LEVEL = {"method": "level", "unit": "90% of the cameras lie within 1 of their mean"}
@@ -25,11 +19,8 @@ LEVEL = {"method": "level", "unit": "90% of the cameras lie within 1 of their me
     [(None, None), (LEVEL, None), (MOVED, None), ({"method": "gps", "unit": "metres"}, "m")],
 )
 def test_metres_are_spoken_of_only_where_they_are_known(
-    tmp_path: Path, placed: dict[str, object] | None, unit: str | None
+    placed: dict[str, object] | None, unit: str | None
 ) -> None:
-    if placed is not None:
-        write_json(tmp_path / "georeference.json", placed)
-    job = cast(Job, SimpleNamespace(inputs={"poses": tmp_path}))
     view = View("a.jpg", "a.jpg", None, 4, 3, 4.0, 4.0, 2.0, 1.5, np.eye(4), False)
     photo = Photo(name="a.jpg", path="a.jpg", width=4, height=3, digest="")
-    assert world_of(job, Manifest(scene="s", photos=(photo,)), [view]).unit == unit
+    assert world_of([view], Manifest(scene="s", photos=(photo,)), placed).unit == unit

@@ -6,7 +6,7 @@ import os
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NoReturn
@@ -18,9 +18,11 @@ from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
-from pipeline.scene.plan import Plan, describe, make_plan
+from pipeline.scene.keys import stage_key
+from pipeline.scene.plan import Plan, describe, make_plan, public_plan, upstream
 from pipeline.scene.scan import scan
-from stages.wiring import public_plan, stage_key, upstream
+from pipeline.scene.stage import StageSpec
+from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
 # Written when a batch ends with failures and an input of the next one's tables from then on, so
@@ -68,58 +70,66 @@ class SnakemakeProject:
 
     # --- one scene ------------------------------------------------------------------------
 
-    def inputs(self, stage: str) -> Callable[[Any], dict[str, str]]:
+    @property
+    def stages(self) -> Iterable[StageSpec]:
+        """The declarations of all stages, in the order of the DAG."""
+        return STAGES.values()
+
+    def inputs(self, spec: StageSpec) -> Callable[[Any], dict[str, str]]:
         """Input function: role -> the ``stage.json`` that fills it."""
         return lambda wildcards: {
             role: str(folder / "stage.json")
-            for role, folder in self._inputs(stage, wildcards.scene).items()
+            for role, folder in self._inputs(spec, wildcards.scene).items()
         }
 
-    def folders(self, stage: str) -> Callable[[Any], list[str]]:
+    def folders(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""
         return lambda wildcards: [
-            f"{role}={folder}" for role, folder in self._inputs(stage, wildcards.scene).items()
+            f"{role}={folder}" for role, folder in self._inputs(spec, wildcards.scene).items()
         ]
 
-    def published(self, *names: str) -> Callable[[Any], list[str]]:
+    def published(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: outputs of a stage that stand in the scene's own folder as well."""
-        return lambda wildcards: [f"{name}={RESULTS / wildcards.scene / name}" for name in names]
+        return lambda wildcards: [
+            f"{name}={RESULTS / wildcards.scene / name}" for name in spec.publishes
+        ]
 
-    def key(self, stage: str) -> Callable[[Any], str]:
+    def key(self, spec: StageSpec) -> Callable[[Any], str]:
         """Params function: the stage's key."""
-        return lambda wildcards: stage_key(stage, *self._plan(wildcards.scene))
+        return lambda wildcards: stage_key(spec, self._plan(wildcards.scene))
 
-    def training_memory(self, wildcards: Any) -> int:
-        """Resources function: MB to ask a cluster for, what is configured, or half more than the
-        plan's rough estimate."""
-        plan = self._plan(wildcards.scene)[0]
-        return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
+    def memory_mb(self, spec: StageSpec) -> Callable[[Any], int]:
+        """Resources function: MB that the stage may use and a cluster reserves."""
+        declared = spec.memory_mb
+        if isinstance(declared, int):
+            return lambda wildcards: declared
+        return lambda wildcards: declared(self._plan(wildcards.scene))
 
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
-        return canonical(public_plan(self._plan(wildcards.scene)[0]))
+        return canonical(public_plan(self._plan(wildcards.scene)))
 
-    def _inputs(self, stage: str, name: str) -> dict[str, Path]:
-        plan = self._plan(name)[0]
-        return {role: RESULTS / name / source for role, source in upstream(stage, plan).items()}
+    def _inputs(self, spec: StageSpec, name: str) -> dict[str, Path]:
+        sources = upstream(spec, self._plan(name))
+        return {role: RESULTS / name / source for role, source in sources.items()}
 
-    def _plan(self, name: str) -> tuple[Plan, str, str]:
-        """The run's plan, folder and fingerprint; a UserError ends Snakemake."""
+    def _plan(self, name: str) -> Plan:
+        """The run's plan; a UserError ends Snakemake."""
         try:
             return self._make_plan(name)
         except UserError as error:
             _exit(error)
 
-    def _scan_and_plan(self, name: str) -> tuple[Plan, str, str]:
+    def _scan_and_plan(self, name: str) -> Plan:
         run = parse_run(name, self._project.configs, self._scenes)
         config = scene_config(self._raw, run.scene, run.config, run.seed)
         folder = self._root / run.scene
         found = scan(folder, run.scene, config, cache=RESULTS / name / ".scratch" / "scan.json")
-        plan = make_plan(found, config)
+        plan = make_plan(found, config, STAGES, str(folder))
         first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
-        return plan, str(folder), found.fingerprint
+        return plan
 
     # --- all of them ----------------------------------------------------------------------
 
@@ -157,7 +167,7 @@ class SnakemakeProject:
         runs, left_out = self._batch
         return canonical(
             {
-                "source": stage_source_hash("stages.batch"),
+                "source": stage_source_hash("stages.workflow.batch"),
                 "published": file_digest(PUBLISHED),
                 "outcomes": [_outcome(run, left_out.get(run)) for run in runs],
             }
@@ -179,7 +189,7 @@ class SnakemakeProject:
                 _outcome(run, left_out[run]) if run in left_out else self._ended(run)
                 for run in runs
             ]
-            command = [sys.executable, "-m", "stages.batch", "--results", str(RESULTS)]
+            command = [sys.executable, "-m", "stages.workflow.batch", "--results", str(RESULTS)]
             text = canonical({"outcomes": outcomes})
             subprocess.run([*command, "--outcomes", "-"], input=text, text=True, check=False)
             lost = [outcome for outcome in outcomes if outcome["status"] != "ok"]
@@ -189,11 +199,11 @@ class SnakemakeProject:
 
     def _ended(self, run: Run) -> dict[str, Any]:
         """How a run of the batch ended."""
-        plan, *origin = self._make_plan(run.name)
+        plan = self._make_plan(run.name)
         for stage in filter(plan.runs, plan.stages):
             folder = RESULTS / run.name
-            key = stage_key(stage, plan, *origin)
-            if not is_current(folder / stage, key, self._inputs(stage, run.name)):
+            key = stage_key(STAGES[stage], plan)
+            if not is_current(folder / stage, key, self._inputs(STAGES[stage], run.name)):
                 log = folder / "logs" / f"{stage}.log"
                 if not self._began(log):
                     return _outcome(run, "another failure stopped the batch", "not run", stage)

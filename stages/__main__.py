@@ -1,24 +1,20 @@
-"""The command line that every stage shares: ``python -m stages.<stage>``.
-
-Snakemake calls it; by hand it is seldom needed. ``--help`` says what the arguments are.
-"""
+"""Run one stage: ``python -m stages STAGE``. Snakemake calls it; by hand it is seldom needed."""
 
 from __future__ import annotations
 
 import argparse
+import importlib
 import json
 import sys
-from collections.abc import Callable
 from pathlib import Path
-from typing import NoReturn
 
-from pipeline.runtime.job import Job, Request, run_stage
+from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.machine import usable_cores
 
 
-def main(stage: str, work: Callable[[Job], None], description: str | None) -> NoReturn:
-    """Parse the command line, run ``work`` as ``stage`` and exit with its code."""
-    parser = argparse.ArgumentParser(f"stages.{stage}", description=description)
+def main() -> int:
+    parser = argparse.ArgumentParser("stages", description=__doc__)
+    parser.add_argument("stage", help="its name")
     parser.add_argument("--out", type=Path, required=True, help="the stage's folder")
     parser.add_argument("--key", required=True, help="the stage's key (canonical JSON)")
     parser.add_argument(
@@ -27,20 +23,26 @@ def main(stage: str, work: Callable[[Job], None], description: str | None) -> No
     parser.add_argument(
         "--publish", nargs="*", default=[], metavar="FILE=PATH", help="extra copies of outputs"
     )
-    parser.add_argument("--threads", type=int, default=usable_cores())
+    parser.add_argument("--threads", type=int, default=usable_cores(), help="native threads")
+    parser.add_argument("--memory-mb", type=int, help="memory that the stage may use, in MB")
     parser.add_argument("--log", type=Path, help="also write messages here")
     args = parser.parse_args()
     request = Request(
-        stage=stage,
+        stage=args.stage,
         key=json.loads(args.key),
         inputs=_pairs(args.input),
         out=args.out,
         threads=max(1, args.threads),
         log=args.log,
         publish=_pairs(args.publish),
+        memory_mb=args.memory_mb,
     )
-    sys.exit(run_stage(request, work))
+    return run_stage(request, importlib.import_module(f"stages.{args.stage}").SPEC.work)
 
 
 def _pairs(items: list[str]) -> dict[str, Path]:
     return {name: Path(path) for name, _, path in (item.partition("=") for item in items)}
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,1 @@
+"""The files that a finished scene is handed on as."""

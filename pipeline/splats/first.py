@@ -1,0 +1,50 @@
+"""The first Gaussians of a training, from sparse points or at random."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from pipeline.config.schema import Init
+from pipeline.scene.model import Points, View
+from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
+
+# Fewer sparse points than this say too little about the scene to start from.
+MIN_POINTS = 100
+
+
+@dataclass(frozen=True)
+class FirstGaussians:
+    """The Gaussians with what is recorded of them."""
+
+    gaussians: InitGaussians
+    counters: dict[str, Any]
+    decisions: list[str]
+    warnings: list[str] = field(default_factory=list)
+
+
+def first_gaussians(
+    points: Points, training: Sequence[View], config: Init, seed: int
+) -> FirstGaussians:
+    """Gaussians at the sparse ``points``, or at random where ``config`` says so or there are fewer
+    than ``MIN_POINTS``."""
+    method, warnings = config.method, []
+    if method != "random" and len(points) < MIN_POINTS:
+        warnings = [f"only {len(points)} sparse points: starting from random Gaussians instead"]
+        method = "random"
+    if method == "random":
+        first = gaussians_random(list(training), config, 0, seed)
+    else:
+        centres = np.array([view.centre for view in training])
+        first = gaussians_from_points(points, centres, config, 0)
+    source = "random places" if method == "random" else "points"
+    counters = {
+        "num_gaussians": len(first),
+        "points": len(points),
+        "dropped": first.num_dropped,
+        "thinned": first.num_thinned,
+    }
+    return FirstGaussians(first, counters, [f"{len(first)} Gaussians from {source}"], warnings)

@@ -1,0 +1,225 @@
+"""A scene's training: its inputs from the photographs, the training itself, and the report."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.config.schema import Train
+from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.model import Reconstruction, View, with_poses
+from pipeline.scene.views import scene_extent
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training import journal
+from pipeline.training.depth import KnownDepths, point_depths, scene_scale
+from pipeline.training.depth_maps import add_maps
+from pipeline.training.floaters import air_depths
+from pipeline.training.inputs import Inputs
+from pipeline.training.lenses import changed_by, with_lenses
+from pipeline.training.poses import followed, moved_by
+from pipeline.training.trainer import TrainResult, train
+
+# Standard deviation in stops from which photographs count as differently exposed: cameras that hold
+# their exposure show 0 to 0.1, collections from the internet 0.5.
+EXPOSURES_DIFFER = 0.2
+# Epochs (passes over the training views) below which no scene is sharp.
+MIN_EPOCHS = 3.0
+FITS = {
+    "factor": "depths in a unit of their own",
+    "depth": "depths up to factor and shift",
+    "inverse": "inverse depths up to factor and shift",
+}
+
+
+@dataclass
+class TrainedScene:
+    """A finished training.
+
+    Attributes:
+        model: the reconstruction with refined cameras, None where none was refined.
+        gains: each view's exposure gains by name; empty where photographs are exposed alike.
+        decisions, warnings, counters: recorded in ``stage.json``.
+        timings: recorded in ``run.json``.
+    """
+
+    result: TrainResult
+    model: Reconstruction | None
+    gains: dict[str, list[float]]
+    decisions: list[str]
+    warnings: list[str]
+    counters: dict[str, Any]
+    timings: dict[str, Any]
+
+
+@dataclass
+class _Notes:
+    decisions: list[str] = field(default_factory=list)
+    warnings: list[str] = field(default_factory=list)
+    counters: dict[str, Any] = field(default_factory=dict)
+
+
+def train_scene(
+    views: list[View],
+    manifest: Manifest,
+    model: Reconstruction,
+    initial: Gaussians,
+    config: Train,
+    *,
+    seed: int,
+    threads: int,
+    memory_mb: int | None,
+    checkpoint_dir: Path,
+    logs: Path,
+) -> TrainedScene:
+    """Train on the views that are not test views.
+
+    Args:
+        memory_mb: that training may use; see ``trainer.train``.
+        checkpoint_dir: where a killed training is resumed from.
+        logs: folder of the training journal.
+
+    Raises:
+        UserError: see ``trainer.train``.
+    """
+    notes = _Notes()
+    has_alpha = any(photo.alpha for photo in manifest.photos)
+    gains = {} if has_alpha else _choose_gains(views, model, config, notes)
+    inputs = _inputs(views, manifest, model, initial, gains, config, notes)
+    start = time.perf_counter()
+    result = train(
+        inputs,
+        config,
+        seed=seed,
+        threads=threads,
+        memory_mb=memory_mb,
+        checkpoint_dir=checkpoint_dir,
+        journal=logs / journal.NAME,
+        on_log=lambda text: print(text, file=sys.stderr, flush=True),
+    )
+    # Seconds that earlier, killed processes spent on this training.
+    earlier = max(0.0, result.seconds - (time.perf_counter() - start))
+    _describe(result, len(inputs.views), config, notes)
+    refined = model
+    if result.lenses is not None:
+        refined = with_lenses(refined, result.lenses)
+        notes.decisions.append(changed_by(result.lenses))
+    if result.poses is not None:
+        refined = with_poses(refined, followed(views, result.poses))
+        notes.decisions.append(moved_by(views, result.poses))
+    notes.counters |= {
+        "num_gaussians": len(result.gaussians),
+        "steps": result.steps,
+        "known_depths": sum(map(len, inputs.depths or ())),
+        **result.counters,
+    }
+    timings = {
+        "ms_per_step": round(1e3 * result.seconds / result.steps, 3),
+        "curve_seconds": result.curve_seconds,
+        "earlier_s": round(earlier, 3),
+    }
+    return TrainedScene(
+        result=result,
+        model=None if refined is model else refined,
+        gains=gains,
+        decisions=notes.decisions,
+        warnings=notes.warnings,
+        counters=notes.counters,
+        timings=timings,
+    )
+
+
+def _inputs(
+    views: list[View],
+    manifest: Manifest,
+    model: Reconstruction,
+    initial: Gaussians,
+    gains: Mapping[str, list[float]],
+    config: Train,
+    notes: _Notes,
+) -> Inputs:
+    training = [view for view in views if not view.is_test]
+    points = point_depths(training, model)
+    extent = scene_extent(views)
+    return Inputs(
+        views=training,
+        initial=initial,
+        extent=extent,
+        scale=scene_scale(extent, points),
+        gains=np.array([gains[view.name] for view in training]) if gains else None,
+        depths=_known_depths(training, manifest, points, notes) if config.depth_weight else None,
+        air=air_depths(points),
+    )
+
+
+def _known_depths(
+    views: list[View], manifest: Manifest, points: list[KnownDepths], notes: _Notes
+) -> list[KnownDepths]:
+    """Depths of the sparse points and of the user's depth maps, by view."""
+    maps = {photo.name: photo.depth for photo in manifest.photos}
+    known, kinds, refused = add_maps(views, points, [maps[view.name] for view in views])
+    if kinds:
+        fits = ", ".join(f"{count} as {FITS[kind]}" for kind, count in kinds.items())
+        notes.decisions.append(f"depth maps fitted to the sparse points: {fits}")
+    if refused:
+        notes.warnings.append(
+            f"depth maps of {len(refused)} views do not fit the sparse points, or see too few of "
+            f"them, and are left out: {', '.join(refused[:5])}"
+        )
+    notes.counters["depth_maps"] = sum(kinds.values())
+    return known
+
+
+def _choose_gains(
+    views: list[View], model: Reconstruction, config: Train, notes: _Notes
+) -> dict[str, list[float]]:
+    """Each view's gains by name; empty where the photographs are exposed alike."""
+    if config.exposure == "off":
+        return {}
+    if config.exposure == "auto":
+        spread = measure_exposures(sample_views(views), model).spread
+        notes.counters["exposure_spread_stops"] = round(spread, 4)
+        if spread < EXPOSURES_DIFFER:
+            return {}
+    found = measure_exposures(views, model)
+    notes.decisions.append(
+        f"exposures differ by {found.spread:.2f} stops: renders are compared through gains that "
+        f"were measured in {found.measured} of {len(views)} photographs"
+    )
+    return {v.name: gain.tolist() for v, gain in zip(views, found.gains, strict=True)}
+
+
+def _describe(result: TrainResult, num_views: int, config: Train, notes: _Notes) -> None:
+    notes.warnings += result.warnings
+    minutes = config.budget_minutes
+    if few := too_few_epochs(result.steps, num_views, result.seconds, minutes):
+        notes.warnings.append(few)
+    if minutes is not None:
+        notes.decisions.append(
+            f"{result.steps} steps fitted into {minutes:g} minutes; the number depends on the "
+            "machine and its load, so another run gives other bits"
+        )
+    if unseen := result.counters["unseen"]:
+        notes.decisions.append(f"{unseen} Gaussians that no training photograph sees are left out")
+    if floaters := result.counters["floaters"]:
+        notes.decisions.append(f"{floaters} floaters close to a single camera were removed")
+
+
+def too_few_epochs(steps: int, views: int, seconds: float, minutes: float | None) -> str | None:
+    """The warning about a training too short for its number of views; None where it is not."""
+    if steps >= MIN_EPOCHS * views:
+        return None
+    epochs = f"{steps} steps are {steps / views:.1f} epochs over {views} training views"
+    if minutes is None:
+        return f"{epochs}, too few for a sharp scene: raise train.steps"
+    return (
+        f"{epochs}, too few for a sharp scene: all that this machine did in {minutes:g} minutes, "
+        f"{seconds / steps:.2g} s a step; raise train.budget_minutes or lower "
+        "views.max_long_side_px, and see that nothing else keeps the machine busy"
+    )

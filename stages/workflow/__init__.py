@@ -1,0 +1,1 @@
+"""What binds the stages to Snakemake."""

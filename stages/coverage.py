@@ -7,17 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Split, Train
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import (
-    DRAWING_OPTIONS,
-    MODEL,
-    POSES,
-    VIEWS,
-    georeference,
-    read_json,
-    read_manifest,
-    trained_gaussians,
-    trained_views,
-)
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -32,16 +22,16 @@ def work(job: Job) -> None:
     from pipeline.coverage.measure import measure_coverage, world_of
     from pipeline.metrics.evaluate import choose_protocol
 
-    views, train = trained_views(job), job.section(Train)
+    views, train = inputs.trained_views(job), job.section(Train)
     measure_coverage(
         job.out,
-        trained_gaussians(job),
+        inputs.trained_gaussians(job),
         views,
         choose_protocol(views, job.section(Split), train),
         train,
-        read_json(job.inputs["evaluate"] / "evaluation.json"),
+        inputs.read_json(job.inputs["evaluate"] / "evaluation.json"),
         job.inputs["evaluate"] / "renders",
-        world_of(views, read_manifest(job, "views"), georeference(job)),
+        world_of(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
         threads=job.threads,
     )
 
@@ -50,14 +40,8 @@ SPEC = StageSpec(
     name="coverage",
     work=work,
     decide=decide,
-    inputs={
-        "views": VIEWS,
-        "model": MODEL,
-        "train": ("train",),
-        "evaluate": ("evaluate",),
-        "poses": POSES,
-    },
-    options=("views", "split", *DRAWING_OPTIONS),
+    inputs={**inputs.TRAINED, "evaluate": ("evaluate",)},
+    options=("views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
     memory_mb=3000,
 )

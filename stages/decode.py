@@ -6,13 +6,12 @@ developed images, and ``georeference.json`` where the given poses were moved.
 
 from __future__ import annotations
 
-import shutil
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Decode
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import input_model, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -36,17 +35,16 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.photos.raw import develop
     from pipeline.scene.colmap import write_model
-    from pipeline.scene.given import GEOREFERENCE, renamed
+    from pipeline.scene.given import renamed
 
-    manifest = read_manifest(job, "photos")
+    manifest = inputs.read_manifest(job, "photos")
     report = develop(manifest, job.section(Decode), job.out, threads=job.threads)
     for text in report.warnings:
         job.warn(text)
     if (job.inputs["photos"] / "sparse" / "0").is_dir():
-        given = renamed(input_model(job, "photos"), report.manifest)
+        given = renamed(inputs.input_model(job, "photos"), report.manifest)
         write_model(job.out / "sparse" / "0", given)
-    if (job.inputs["photos"] / GEOREFERENCE).is_file():
-        shutil.copy(job.inputs["photos"] / GEOREFERENCE, job.out)
+    inputs.copy_georeference(job, "photos")
     job.counters = {"developed": len(report.manifest.photos)}
 
 

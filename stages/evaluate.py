@@ -10,22 +10,15 @@ from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import (
-    DRAWING_OPTIONS,
-    MODEL,
-    POSES,
-    VIEWS,
-    input_model,
-    read_json,
-    trained_gaussians,
-    trained_model,
-    trained_views,
-)
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.plan import Plan
     from pipeline.scene.scan import Scan
     from pipeline.scene.settle import Settled
+
+# With refined cameras, those of test views are fitted to their photographs before the measurement.
+FIT_OPTIONS = ("train.refine_poses", "train.ssim_weight")
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -43,22 +36,22 @@ def work(job: Job) -> None:
     from pipeline.scene.colmap import read_model
 
     train = job.section(Train)
-    protocol = choose_protocol(trained_views(job), job.section(Split), train)
+    protocol = choose_protocol(inputs.trained_views(job), job.section(Split), train)
     evaluation = evaluate_views(
-        trained_gaussians(job),
+        inputs.trained_gaussians(job),
         protocol,
         job.section(Evaluate),
         train,
         job.out / "renders",
-        gains=read_json(job.inputs["train"] / "exposure.json"),
+        gains=inputs.read_json(job.inputs["train"] / "exposure.json"),
         threads=job.threads,
     )
     job.tell([], evaluation.pop("warnings"))
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
-        estimated = trained_model(job) if train.refine_poses else input_model(job, "poses")
-        evaluation["pose_error"] = asdict(pose_error(estimated, read_model(truth)))
+        error = pose_error(inputs.trained_model(job), read_model(truth))
+        evaluation["pose_error"] = asdict(error)
     write_json(job.out / "evaluation.json", evaluation)
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
@@ -77,21 +70,8 @@ SPEC = StageSpec(
     name="evaluate",
     work=work,
     decide=decide,
-    inputs={
-        "views": VIEWS,
-        "model": MODEL,
-        "train": ("train",),
-        "poses": POSES,
-        "inspect": ("inspect",),
-    },
-    options=(
-        "evaluate",
-        "views",
-        "split",
-        *DRAWING_OPTIONS,
-        "train.refine_poses",
-        "train.ssim_weight",
-    ),
+    inputs={**inputs.TRAINED, "inspect": ("inspect",)},
+    options=("evaluate", "views", "split", *inputs.DRAWING_OPTIONS, *FIT_OPTIONS),
     packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
     memory_mb=3000,
     facts=facts,

@@ -13,17 +13,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Export, Split, Train, Views
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import (
-    DRAWING_OPTIONS,
-    MODEL,
-    POSES,
-    VIEWS,
-    georeference,
-    read_manifest,
-    trained_gaussians,
-    trained_model,
-    trained_views,
-)
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -41,14 +31,18 @@ def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
     from pipeline.scene.views import load_views
 
-    manifest, model, split = read_manifest(job, "views"), trained_model(job), job.section(Split)
+    manifest, model, split = (
+        inputs.read_manifest(job, "views"),
+        inputs.trained_model(job),
+        job.section(Split),
+    )
     scene = ExportScene(
-        trained=trained_gaussians(job),
+        trained=inputs.trained_gaussians(job),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
-        drawn=trained_views(job),
-        georeference=georeference(job),
+        drawn=inputs.trained_views(job),
+        georeference=inputs.georeference(job),
         folder=job.inputs["train"].parent / job.stage,
     )
     report = export_scene(
@@ -61,7 +55,7 @@ SPEC = StageSpec(
     name="export",
     work=work,
     decide=decide,
-    inputs={"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES},
-    options=("export", "views", "split", *DRAWING_OPTIONS),
+    inputs=inputs.TRAINED,
+    options=("export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Features
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
-from stages.workflow.inputs import PHOTOS, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -27,7 +27,7 @@ def work(job: Job) -> None:
     from pipeline.sfm.features import extract_features
 
     report = extract_features(
-        read_manifest(job, "photos"),
+        inputs.read_manifest(job, "photos"),
         job.section(Features),
         job.out,
         cache=job.shared_cache,
@@ -42,7 +42,7 @@ SPEC = StageSpec(
     name="features",
     work=work,
     decide=decide,
-    inputs={"photos": PHOTOS},
+    inputs={"photos": inputs.PHOTOS},
     options=("features",),
     packages=("opencv-contrib-python-headless", "pycolmap"),
     memory_mb=3000,

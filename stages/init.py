@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Features, Init, Matches, Split, Views
+from pipeline.config.schema import Features, Init, Matches
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import MODEL, VIEWS, input_model, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -33,26 +33,23 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.scene.colmap import read_model
-    from pipeline.scene.views import load_views
     from pipeline.sfm.triangulation import triangulate
     from pipeline.splats.arrays import write_arrays
     from pipeline.splats.first import first_gaussians
 
     config = job.section(Init)
-    manifest, model = read_manifest(job, "views"), input_model(job)
-    views = load_views(manifest, model, job.section(Views), job.section(Split))
-    training = [view for view in views if not view.is_test]
+    training = [view for view in inputs.input_views(job) if not view.is_test]
     if not training:
         raise UserError(
             "no photograph has a pose: there is nothing to train on",
             fix="check that the poses name the photographs, or set poses: ignore",
         )
-    points = model.points
+    points = inputs.input_model(job).points
     if config.method != "random" and len(points) == 0:
         job.decide("the given poses come without points: triangulating them")
         triangulated = job.scratch / "triangulation"
         report = triangulate(
-            manifest,
+            inputs.read_manifest(job, "views"),
             job.inputs["model"] / "sparse" / "0",
             triangulated,
             job.section(Features),
@@ -73,7 +70,7 @@ SPEC = StageSpec(
     name="init",
     work=work,
     decide=decide,
-    inputs={"views": VIEWS, "model": MODEL},
+    inputs={"views": inputs.VIEWS, "model": inputs.MODEL},
     options=("init", "views", "split", "features", "matches"),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Config
-from pipeline.runtime.atomic import write_bytes, write_json
+from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.runtime.section import read_section
 from pipeline.scene.stage import StagePlan, StageSpec
@@ -30,20 +30,17 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.scene.colmap import read_model, write_model
     from pipeline.scene.gcp import GCP_FILE, read_ground_control
-    from pipeline.scene.given import GEOREFERENCE, load_given
+    from pipeline.scene.given import load_given
     from pipeline.scene.scan import scan
     from pipeline.scene.verify import verify_photos
 
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])
     found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
-    for text in found.warnings:
-        job.warn(text)
     manifest, warnings = verify_photos(
         found.manifest, threads=job.threads, min_photos=config.inspect.min_images
     )
-    for text in warnings:
-        job.warn(text)
+    job.tell([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
     job.counters = {
         "photos": len(manifest.photos),
@@ -51,16 +48,9 @@ def work(job: Job) -> None:
     }
     if found.poses is not None:
         given = load_given(found.model_copy(update={"manifest": manifest}))
-        write_model(job.out / "sparse" / "0", given.model)
+        job.tell(given.write(job.out), [])
         job.counters["given_poses"] = len(given.model.images)
         job.counters["given_points"] = len(given.model.points)
-        moved = given.sidecar()
-        if moved is not None:
-            write_json(job.out / GEOREFERENCE, moved)
-            job.decide(
-                "the given poses are too far from their origin for float32: everything is moved "
-                f"so that {', '.join(f'{v:.9g}' for v in given.origin)} is the new one (frame.json)"
-            )
     if found.ground_control is not None and found.poses is None:
         # A malformed file is reported now and not after hours.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Matches, Sfm
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
-from stages.workflow.inputs import PHOTOS, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -22,7 +22,7 @@ def work(job: Job) -> None:
     from pipeline.sfm.matching import match_features
 
     report = match_features(
-        read_manifest(job, "photos"),
+        inputs.read_manifest(job, "photos"),
         job.inputs["features"],
         job.section(Matches),
         job.section(Sfm),
@@ -40,7 +40,7 @@ SPEC = StageSpec(
     name="matches",
     work=work,
     decide=decide,
-    inputs={"photos": PHOTOS, "features": ("features",)},
+    inputs={"photos": inputs.PHOTOS, "features": ("features",)},
     options=("matches", "sfm.camera_model", "sfm.share_cameras"),
     packages=("pycolmap",),
     seeded=True,

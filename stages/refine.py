@@ -3,14 +3,13 @@ world) and, where the given poses were moved, ``georeference.json``."""
 
 from __future__ import annotations
 
-import shutil
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
 from pipeline.runtime.job import Job
 from pipeline.scene.posefiles import SHARED_BY
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import GIVEN
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -44,20 +43,18 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.scene.given import GEOREFERENCE
     from pipeline.sfm.given import refine_given
 
     given = job.inputs["model"]
     job.record(refine_given(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0"))
-    if (given / GEOREFERENCE).is_file():
-        shutil.copy(given / GEOREFERENCE, job.out)
+    inputs.copy_georeference(job, "model")
 
 
 SPEC = StageSpec(
     name="refine",
     work=work,
     decide=decide,
-    inputs={"model": GIVEN},
+    inputs={"model": inputs.GIVEN},
     options=("sfm.refine_radial", "sfm.refine_principal_point"),
     packages=("pycolmap", "numpy", "scipy"),
     memory_mb=4000,

@@ -3,24 +3,15 @@
 from __future__ import annotations
 
 import time
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Report, Split, Train
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job, run_facts
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import (
-    MODEL,
-    POSES,
-    VIEWS,
-    read_manifest,
-    trained_gaussians,
-    trained_model,
-    trained_views,
-)
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.plan import Plan
     from pipeline.scene.scan import Scan
     from pipeline.scene.settle import Settled
 
@@ -31,14 +22,14 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.metrics.evaluate import choose_protocol
-    from pipeline.reporting.collect import collect_metrics, read_json
+    from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.headline import headline
     from pipeline.reporting.page import write_report
     from pipeline.reporting.scene import SceneResults, report_data
 
     start = time.perf_counter()
-    plan, views, train = job.key["plan"], trained_views(job), job.section(Train)
-    evaluation = read_json(job.inputs["evaluate"] / "evaluation.json")
+    plan, views, train = job.key["plan"], inputs.trained_views(job), job.section(Train)
+    evaluation = inputs.read_json(job.inputs["evaluate"] / "evaluation.json")
     own = run_facts(job, time.perf_counter() - start)
     results = job.inputs["inspect"].parent
     metrics = collect_metrics(job.scene, plan, results, evaluation, own)
@@ -48,10 +39,10 @@ def work(job: Job) -> None:
         metrics=metrics,
         plan=plan,
         folders=job.inputs,
-        manifest=read_manifest(job, "views"),
-        model=trained_model(job),
+        manifest=inputs.read_manifest(job, "views"),
+        model=inputs.trained_model(job),
         views=views,
-        gaussians=trained_gaussians(job),
+        gaussians=inputs.trained_gaussians(job),
         protocol=choose_protocol(views, job.section(Split), train),
         antialias=train.antialias,
     )
@@ -60,31 +51,17 @@ def work(job: Job) -> None:
     job.decide(headline(metrics))
 
 
-def facts(plan: Plan) -> dict[str, Any]:
-    from pipeline.scene.plan import public_plan
-
-    return {"plan": public_plan(plan)}
-
-
 SPEC = StageSpec(
     name="report",
     work=work,
     decide=decide,
-    inputs={
-        "views": VIEWS,
-        "model": MODEL,
-        "inspect": ("inspect",),
-        "poses": POSES,
-        "train": ("train",),
-        "evaluate": ("evaluate",),
-        "coverage": ("coverage",),
-        "export": ("export",),
-    },
+    inputs=inputs.TRAINED
+    | {name: (name,) for name in ("inspect", "evaluate", "coverage", "export")},
     options=("report", "views", "split", "train.antialias", "train.background"),
     seeded=True,
     publishes={
         "metrics.json": "pipeline/reporting/captions/metrics.rst",
         "report.html": "pipeline/reporting/captions/page.rst",
     },
-    facts=facts,
+    shows_plan=True,
 )

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Config, Sfm
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
-from stages.workflow.inputs import PHOTOS, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -40,7 +40,7 @@ def work(job: Job) -> None:
 
     control = job.inputs["inspect"] / GCP_FILE
     report = reconstruct(
-        read_manifest(job, "photos"),
+        inputs.read_manifest(job, "photos"),
         job.inputs["matches"] / "database.db",
         job.section(Sfm),
         job.out,
@@ -55,7 +55,7 @@ SPEC = StageSpec(
     name="sfm",
     work=work,
     decide=decide,
-    inputs={"photos": PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
+    inputs={"photos": inputs.PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
     options=("sfm",),
     packages=("pycolmap", "numpy", "scipy"),
     seeded=True,

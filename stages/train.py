@@ -5,11 +5,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Config, Split, Train, Views
+from pipeline.config.schema import Train
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import MODEL, VIEWS, input_model, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.plan import Plan
@@ -18,42 +18,33 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    from pipeline.scene.budget import memory_line, resolution_line
+    from pipeline.scene.budget import length_line, memory_line, resolution_line
 
     config, why = settled.config, settled.why
-    minutes = config.train.budget_minutes
     decisions = [
         resolution_line(scan, config),
         why["train.density.max_gaussians"],
         why["train.background"],
         why["train.depth_weight"],
-        _masks(scan, config),
+        why["views.masks"],
         memory_line(scan, config),
     ]
     return StagePlan(
         run=True,
-        reason=f"{config.train.steps} steps" if minutes is None else f"{minutes:g} minutes",
+        reason=length_line(config),
         decisions=[text for text in decisions if text],
     )
 
 
-def _masks(scan: Scan, config: Config) -> str:
-    if config.views.masks == "ignore":
-        return "masks ignored, as configured"
-    return f"masks in {scan.num_masks} photographs" if scan.num_masks else ""
-
-
 def work(job: Job) -> None:
     from pipeline.scene.colmap import write_model
-    from pipeline.scene.views import load_views
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.scene import train_scene
 
-    manifest, model = read_manifest(job, "views"), input_model(job)
     trained = train_scene(
-        load_views(manifest, model, job.section(Views), job.section(Split)),
-        manifest,
-        model,
+        inputs.input_views(job),
+        inputs.read_manifest(job, "views"),
+        inputs.input_model(job),
         Gaussians.load(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
         seed=job.seed,
@@ -73,15 +64,14 @@ def work(job: Job) -> None:
 
 def memory_mb(plan: Plan) -> int:
     """The configured limit, or half more than the plan's rough estimate."""
-    estimate = round(1.5 * plan.facts["training_memory_mb"])
-    return plan.config.train.memory_mb or estimate
+    return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
 
 
 SPEC = StageSpec(
     name="train",
     work=work,
     decide=decide,
-    inputs={"views": VIEWS, "model": MODEL, "init": ("init",)},
+    inputs={"views": inputs.VIEWS, "model": inputs.MODEL, "init": ("init",)},
     options=("train", "views", "split"),
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Undistort, Views
 from pipeline.runtime.job import Job
 from pipeline.scene.stage import StagePlan, StageSpec
-from stages.workflow.inputs import PHOTOS, POSES, input_model, read_manifest
+from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.scene.scan import Scan
@@ -33,8 +33,8 @@ def work(job: Job) -> None:
     from pipeline.photos.undistort import undistort
 
     report = undistort(
-        read_manifest(job, "photos"),
-        input_model(job),
+        inputs.read_manifest(job, "photos"),
+        inputs.input_model(job),
         job.section(Undistort),
         job.section(Views),
         job.out,
@@ -49,7 +49,7 @@ SPEC = StageSpec(
     name="undistort",
     work=work,
     decide=decide,
-    inputs={"photos": PHOTOS, "model": POSES},
+    inputs={"photos": inputs.PHOTOS, "model": inputs.POSES},
     options=("undistort", "views.max_long_side_px"),
     packages=("opencv-contrib-python-headless",),
 )

@@ -92,6 +92,12 @@ def resolution_line(scan: Scan, config: Config) -> str:
     return text
 
 
+def length_line(config: Config) -> str:
+    """What the plan says of the length of training."""
+    minutes = config.train.budget_minutes
+    return f"{config.train.steps} steps" if minutes is None else f"{minutes:g} minutes"
+
+
 def memory_line(scan: Scan, config: Config) -> str:
     """What the plan says of ``training_memory_mb``."""
     limit = config.train.memory_mb

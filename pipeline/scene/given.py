@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
+from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.llff import read_poses_bounds
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.model import Camera, Points, Posed, Reconstruction
@@ -57,6 +59,20 @@ class Given:
             "rotation": np.eye(3).tolist(),
             "translation": (-self.origin).tolist(),
         }
+
+    def write(self, folder: Path) -> list[str]:
+        """Write ``sparse/0`` and, where the poses were moved, ``georeference.json`` into
+        ``folder``; returns the sentence that says so."""
+        write_model(folder / "sparse" / "0", self.model)
+        moved = self.sidecar()
+        if moved is None:
+            return []
+        write_json(folder / GEOREFERENCE, moved)
+        origin = ", ".join(f"{value:.9g}" for value in self.origin)
+        return [
+            "the given poses are too far from their origin for float32: everything is moved so "
+            f"that {origin} is the new one (frame.json)"
+        ]
 
 
 def load_given(scan: Scan) -> Given:

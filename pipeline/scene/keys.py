@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.config.options import select
 from pipeline.runtime.job import canonical
 from pipeline.runtime.source import stage_source_hash
-from pipeline.scene.plan import Plan
+from pipeline.scene.plan import Plan, public_plan
 from pipeline.scene.stage import StageSpec
 
 # Asked again for every run of a batch.
@@ -32,4 +32,6 @@ def stage_key(spec: StageSpec, plan: Plan) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
+    if spec.shows_plan:
+        key["plan"] = public_plan(plan)
     return canonical(key | spec.facts(plan))

@@ -81,7 +81,8 @@ def settle(scan: Scan, config: Config) -> Settled:
         },
     )
     why = {path: reason for path, (_, reason) in chosen.items()}
-    return Settled(settled, why | {"train.density.max_gaussians": budget_reason})
+    why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
+    return Settled(settled, why)
 
 
 def _pairs(scan: Scan, config: Config) -> Choice:
@@ -161,6 +162,12 @@ def _background(scan: Scan, config: Config) -> Choice:
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
     few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
     return "black", f"black background: {few}"
+
+
+def _masks(scan: Scan, config: Config) -> str:
+    if config.views.masks == "ignore":
+        return "masks ignored, as configured"
+    return f"masks in {scan.num_masks} photographs" if scan.num_masks else ""
 
 
 def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:

@@ -62,6 +62,7 @@ class StageSpec:
         memory_mb: what a cluster reserves, MB; a function where it depends on the plan.
         publishes: outputs that are copied to ``results/<scene>/``, and their captions in
             Snakemake's report.
+        shows_plan: whether the stage reads the plan (``Job.key["plan"]``, the content of plan.json).
         facts: what else decides the result, beside code, options, packages, seed and inputs.
     """
 
@@ -74,6 +75,7 @@ class StageSpec:
     seeded: bool = False
     memory_mb: int | Callable[[Plan], int] = 2000
     publishes: Mapping[str, str] = field(default_factory=dict)
+    shows_plan: bool = False
     facts: Callable[[Plan], dict[str, Any]] = _none
 
     @property

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Split, Views
 from pipeline.runtime.job import Job
 from pipeline.scene.colmap import has_model, read_model
+from pipeline.scene.given import GEOREFERENCE
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.model import Reconstruction, View
 from pipeline.scene.views import load_views
@@ -22,6 +24,8 @@ VIEWS = ("undistort", *PHOTOS)
 GIVEN = ("decode", "inspect")
 POSES = ("sfm", "refine", *GIVEN)
 MODEL = ("undistort", *POSES)
+# What stages after training read.
+TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
 # How Gaussians are drawn outside training.
 DRAWING_OPTIONS = ("train.sh_degree", "train.antialias", "train.background")
@@ -38,8 +42,14 @@ def input_model(job: Job, role: str = "model") -> Reconstruction:
 def georeference(job: Job) -> dict[str, Any] | None:
     """The frame of the poses (``georeference.json``); None where the stage that gave them recorded
     none."""
-    file = job.inputs["poses"] / "georeference.json"
+    file = job.inputs["poses"] / GEOREFERENCE
     return read_json(file) if file.is_file() else None
+
+
+def copy_georeference(job: Job, role: str) -> None:
+    """Hand on the frame of the poses, where the input of this role has one."""
+    if (job.inputs[role] / GEOREFERENCE).is_file():
+        shutil.copy(job.inputs[role] / GEOREFERENCE, job.out)
 
 
 def read_json(file: Path) -> Any:
@@ -53,6 +63,11 @@ def trained_model(job: Job) -> Reconstruction:
     return read_model(refined) if has_model(refined) else input_model(job)
 
 
+def input_views(job: Job) -> list[View]:
+    """All views, with the cameras that training starts from."""
+    return _views(job, input_model(job))
+
+
 def trained_gaussians(job: Job) -> Gaussians:
     from pipeline.splats.gaussians import Gaussians
 
@@ -61,5 +76,9 @@ def trained_gaussians(job: Job) -> Gaussians:
 
 def trained_views(job: Job) -> list[View]:
     """All views, with the cameras of ``trained_model``."""
+    return _views(job, trained_model(job))
+
+
+def _views(job: Job, model: Reconstruction) -> list[View]:
     manifest = read_manifest(job, "views")
-    return load_views(manifest, trained_model(job), job.section(Views), job.section(Split))
+    return load_views(manifest, model, job.section(Views), job.section(Split))

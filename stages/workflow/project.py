@@ -76,11 +76,17 @@ class SnakemakeProject:
         return STAGES.values()
 
     def inputs(self, spec: StageSpec) -> Callable[[Any], dict[str, str]]:
-        """Input function: role -> the ``stage.json`` that fills it."""
-        return lambda wildcards: {
-            role: str(folder / "stage.json")
-            for role, folder in self._inputs(spec, wildcards.scene).items()
-        }
+        """Input function: role -> the ``stage.json`` that fills it, and ``plan.json`` for a stage
+        that shows the plan."""
+
+        def files(wildcards: Any) -> dict[str, str]:
+            sources = self._inputs(spec, wildcards.scene)
+            found = {role: str(folder / "stage.json") for role, folder in sources.items()}
+            if spec.shows_plan:
+                found["plan"] = str(RESULTS / wildcards.scene / "plan.json")
+            return found
+
+        return files
 
     def folders(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""

@@ -50,8 +50,9 @@ def work(job: Job) -> None:
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():
-        error = pose_error(inputs.trained_model(job), read_model(truth))
-        evaluation["pose_error"] = asdict(error)
+        refined = train.refine_poses
+        model = inputs.trained_model(job) if refined else inputs.input_model(job, "poses")
+        evaluation["pose_error"] = asdict(pose_error(model, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")

@@ -44,7 +44,7 @@ $(VENV)/watch $(VENV)/dev: $(VENV)/product
 	@touch $@
 
 extension: $(VENV)/product
-	@$(BIN)/python -m pipeline.raster.build
+	@$(BIN)/python -m pipeline.render.cpu.build
 	@$(BIN)/python -m pipeline.sfm.nearest
 
 setup: extension $(VENV)/watch
@@ -61,7 +61,7 @@ test: setup $(VENV)/dev
 	@$(BIN)/python -m pytest tests -n 2 --dist worksteal
 
 # What a C++ compiler can change; CXX chooses it.
-NATIVE_TESTS := tests/raster tests/sfm/test_matching.py tests/training
+NATIVE_TESTS := tests/render tests/sfm/test_matching.py tests/training
 test-native: setup $(VENV)/dev
 	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
 

@@ -22,23 +22,24 @@ from PIL import Image
 from scipy.stats import spearmanr
 
 from pipeline.config.schema import Density, Init, Train
-from pipeline.coverage.sight import Draw, open_eye
+from pipeline.coverage.probe_views import Draw, open_eye
 from pipeline.coverage.trust import trust_picture
 from pipeline.coverage.viewpoints import COUNT, Viewpoint, propose
 from pipeline.demo.cameras import lens, look_at, orbit
 from pipeline.demo.render import Rays, rays, render
 from pipeline.demo.scene import OBJECTS, shadow_maps
 from pipeline.demo.sensor import srgb, to_bytes
+from pipeline.geometry.cameras import Camera
 from pipeline.metrics.image import psnr
 from pipeline.photos.load import load_rgb, resize_area
-from pipeline.raster import RasterOptions
-from pipeline.scene.model import Camera, Points, Posed, View
-from pipeline.scene.views import scene_extent
+from pipeline.render import RasterOptions
+from pipeline.render.views import Render, near_plane, render_view
+from pipeline.scene.reconstruction import Points, Posed
+from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
-from pipeline.training.inputs import Inputs
-from pipeline.training.render import Render, near_plane, render_view
-from pipeline.training.trainer import train
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop.trainer import train
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])

@@ -18,16 +18,15 @@ from PIL import Image
 
 from pipeline.config.schema import Density, Train
 from pipeline.demo.cameras import lens, orbit
+from pipeline.plan.training_memory import memory_mb
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.memory import peak_memory_mb
-from pipeline.scene.memory import memory_mb
-from pipeline.scene.model import View
-from pipeline.scene.views import scene_extent
+from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import trainer
-from pipeline.training.inputs import Inputs
-from pipeline.training.trainer import train
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop import trainer
+from pipeline.training.loop.trainer import train
 
 PIXELS_ACROSS = 3.0  # of a Gaussian's 3-sigma radius
 

@@ -15,9 +15,9 @@ from tempfile import TemporaryDirectory
 
 from benchmarks.surface import align, measure, true_points
 from pipeline.config.schema import Split, Train, Views
+from pipeline.io.colmap import read_model
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.runtime.memory import peak_memory_mb
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
 from pipeline.splats.gaussians import Gaussians

@@ -46,9 +46,9 @@ class Mutant:
     tests: tuple[str, ...]
 
 
-_CSRC = "pipeline/raster/csrc"
-_KERNELS = ("tests/raster/test_kernels.py",)
-_LOSS = ("tests/raster/test_loss_adam.py",)
+_CSRC = "pipeline/render/cpu/csrc"
+_KERNELS = ("tests/render/cpu/test_kernels.py",)
+_LOSS = ("tests/render/cpu/test_loss_adam.py",)
 
 MUTANTS: dict[str, Mutant] = {
     "half_gradient": Mutant(
@@ -143,25 +143,25 @@ MUTANTS: dict[str, Mutant] = {
         _KERNELS,
     ),
     "rates_swapped": Mutant(
-        "pipeline/training/trainer.py",
+        "pipeline/training/loop/trainer.py",
         "log_scales=config.lr_scales * factor",
         "log_scales=config.lr_quats * factor",
         "the scales' learning rate taken from the rotations",
-        ("tests/training/test_first_step.py",),
+        ("tests/training/loop/test_first_step.py",),
     ),
     "decay_off_by_one": Mutant(
-        "pipeline/training/schedule.py",
+        "pipeline/training/loop/schedule.py",
         "t = (step - 1) / max(1, self.steps - 1)",
         "t = step / max(1, self.steps - 1)",
         "the means' learning rate one step ahead",
-        ("tests/training/test_schedule.py",),
+        ("tests/training/loop/test_schedule.py",),
     ),
     "unseen_kept": Mutant(
-        "pipeline/training/state.py",
+        "pipeline/training/loop/state.py",
         "seen = self.adam.last > before",
         "seen = self.adam.last > before - 10**6",
         "what no photograph saw kept",
-        ("tests/training/test_trainer.py",),
+        ("tests/training/loop/test_trainer.py",),
     ),
     "scene_by_cameras": Mutant(
         "stages/train.py",
@@ -171,53 +171,53 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/stages/test_train.py",),
     ),
     "late_reset": Mutant(
-        "pipeline/training/schedule.py",
+        "pipeline/training/loop/schedule.py",
         "step + self.reset_interval <= self.refine_stop",
         "step <= self.refine_stop",
         "an opacity reset with nothing after it to recover in",
-        ("tests/training/test_schedule.py",),
+        ("tests/training/loop/test_schedule.py",),
     ),
     "split_grows": Mutant(
         "pipeline/training/density/gradient.py",
         "result.log_scales[children] -= math.log(SPLIT_SHRINK)",
         "result.log_scales[children] += math.log(SPLIT_SHRINK)",
         "halves of a split larger than the whole",
-        ("tests/training/test_density.py",),
+        ("tests/training/density/test_density.py",),
     ),
     "halves_together": Mutant(
         "pipeline/training/density/gradient.py",
         "far[len(far) // 2 :] *= -1",
         "",
         "both halves of a split on one side",
-        ("tests/training/test_density.py",),
+        ("tests/training/density/test_density.py",),
     ),
     "pulled_at_go": Mutant(
         "pipeline/training/density/gradient.py",
         "idle & (opacity < RECYCLED_OPACITY)",
         "kept & (opacity < RECYCLED_OPACITY)",
         "what is faint recycled though the loss pulls at it",
-        ("tests/training/test_density.py",),
+        ("tests/training/density/test_density.py",),
     ),
     "alpha_unasked": Mutant(
-        "pipeline/training/trainer.py",
+        "pipeline/training/loop/trainer.py",
         "return asked, None",
         "return None, None",
         "what alpha and masks ask for left out of the steps",
-        ("tests/training/test_trainer.py",),
+        ("tests/training/loop/test_trainer.py",),
     ),
     "ndc": Mutant(
         "pipeline/training/density/gradient.py",
         "pull[:, 0] * (0.5 * width)",
         "pull[:, 0] * width",
         "the pull on a mean measured in widths rather than in NDC",
-        ("tests/training/test_density.py",),
+        ("tests/training/density/test_density.py",),
     ),
     "exposure_gradient": Mutant(
-        "pipeline/training/trainer.py",
+        "pipeline/training/loop/trainer.py",
         "d_color = loss.grad if gain is None else loss.grad * gain",
         "d_color = loss.grad",
         "exposure left out of the gradient",
-        ("tests/training/test_first_step.py",),
+        ("tests/training/loop/test_first_step.py",),
     ),
     "exposure_free": Mutant(
         "pipeline/photos/exposure.py",
@@ -227,7 +227,7 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/photos/test_exposure.py",),
     ),
     "split_off_by_one": Mutant(
-        "pipeline/scene/model.py",
+        "pipeline/scene/views.py",
         "return every > 0 and index % every == 0",
         "return every > 0 and index % every == 1",
         "held out: the second of every eight views instead of the first",
@@ -255,25 +255,25 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/sfm/test_features.py",),
     ),
     "resized_centre": Mutant(
-        "pipeline/scene/model.py",
+        "pipeline/geometry/cameras.py",
         "np.array([fx * sx, fy * sy, cx * sx, cy * sy, *rest])",
         "np.array([fx * sx, fy * sy, cx * sx - 0.5, cy * sy - 0.5, *rest])",
         "the principal point half a pixel off in reduced pictures",
         ("tests/scene/test_views.py",),
     ),
     "opengl_axes": Mutant(
-        "pipeline/scene/transforms.py",
+        "pipeline/io/transforms.py",
         "_FLIP_YZ = np.diag([1.0, -1.0, -1.0])",
         "_FLIP_YZ = np.diag([-1.0, -1.0, 1.0])",
         "transforms.json's axes taken for others",
-        ("tests/scene/test_transforms.py",),
+        ("tests/io/test_transforms.py",),
     ),
     "quaternion": Mutant(
-        "pipeline/scene/rotations.py",
+        "pipeline/geometry/rotations.py",
         "[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],",
         "[1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)],",
         "a row of a rotation transposed",
-        ("tests/scene/test_colmap.py",),
+        ("tests/io/test_colmap.py",),
     ),
     "spacing": Mutant(
         "pipeline/splats/init.py",
@@ -283,18 +283,18 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/splats/test_init.py",),
     ),
     "ply_order": Mutant(
-        "pipeline/splats/ply.py",
+        "pipeline/io/ply.py",
         "sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),",
         "sh[:, 1:].reshape(count, len(rest)),",
         "PLY's colours coefficient by coefficient instead of channel by channel",
-        ("tests/splats/test_ply.py",),
+        ("tests/io/test_ply.py",),
     ),
     "spz_rounding": Mutant(
-        "pipeline/splats/spz.py",
+        "pipeline/io/spz.py",
         "to_bytes((log_scales + np.log(shrink) + 10) * 16),",
         "to_bytes((log_scales + np.log(shrink) + 10) * 16 - 0.5),",
         "SPZ's scales cut off instead of rounded",
-        ("tests/splats/test_spz.py",),
+        ("tests/io/test_spz.py",),
     ),
     "psnr_peak": Mutant(
         "pipeline/metrics/image.py",
@@ -311,28 +311,28 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/metrics/test_image.py",),
     ),
     "pose_scale": Mutant(
-        "pipeline/metrics/pose.py",
+        "pipeline/geometry/similarity.py",
         "return scale, rotation, mean_target - scale * rotation @ mean_source",
         "return scale, rotation, mean_target - rotation @ mean_source",
         "the scale left out of an alignment's shift",
         ("tests/metrics/test_pose.py",),
     ),
     "one_place": Mutant(
-        "pipeline/training/shelf.py",
+        "pipeline/training/data/image_store.py",
         "begin = self._end\n",
         "begin = 0\n",
         "pictures on disk written over one another",
-        ("tests/training/test_targets.py",),
+        ("tests/training/data/test_targets.py",),
     ),
     "two_views": Mutant(
-        "pipeline/training/floaters.py",
+        "pipeline/training/density/floaters.py",
         "(found > MOST * total)",
         "(found > 0.0 * total)",
         "what two views agree on taken for a floater",
-        ("tests/training/test_floaters.py",),
+        ("tests/training/density/test_floaters.py",),
     ),
     "given_world": Mutant(
-        "pipeline/sfm/given.py",
+        "pipeline/sfm/refine_given.py",
         "        apply(model, fitted[0])",
         "        pass",
         "adjusted poses in a world turned from the given one",

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.metrics.evaluate import choose_protocol, to_bytes
+from pipeline.metrics.evaluate import choose_protocol
 from pipeline.metrics.image import psnr
+from pipeline.plan.posed_scene import posed_scene
+from pipeline.render.views import render_view, to_bytes
 from pipeline.reporting.space import upright_camera
-from pipeline.scene.cameras import posed_scene
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import render_view
 
 FLAGS = [
     "--headless=new",

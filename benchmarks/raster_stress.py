@@ -15,7 +15,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.raster import RasterCamera, RasterOptions, backward, forward, twin
+from pipeline.render import RasterCamera, RasterOptions, backward, forward, reference
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import Progress
 
@@ -182,9 +182,11 @@ def run(name: str, call: int, tally: Tally) -> None:
     d_color = torch.from_numpy(rng.standard_normal((height, width, 3)).astype(np.float32))
 
     leaves = [t.double().requires_grad_() for t in scene]
-    projection = twin.project(*leaves, camera, options)  # type: ignore[call-arg, arg-type]
-    colors = twin.sh_colors(leaves[0][projection.index], leaves[4][projection.index], camera, 3)
-    image = twin.blend(projection, colors, camera, options)
+    projection = reference.project(*leaves, camera, options)  # type: ignore[call-arg, arg-type]
+    colors = reference.sh_colors(
+        leaves[0][projection.index], leaves[4][projection.index], camera, 3
+    )
+    image = reference.blend(projection, colors, camera, options)
     sure = image.margin > MARGIN
     d_color *= sure[..., None]
     found = backward(drawn, d_color, camera=True)

@@ -11,8 +11,9 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from pipeline.demo.scene import OBJECTS, distance, trace
-from pipeline.metrics.pose import umeyama
-from pipeline.scene.model import Reconstruction, View
+from pipeline.geometry.similarity import umeyama
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
 

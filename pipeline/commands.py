@@ -13,22 +13,17 @@ from typing import Any
 from PIL import Image
 
 from pipeline.config.schema import Evaluate
-from pipeline.metrics.evaluate import (
-    BLACK,
-    NO_GAINS,
-    WHITE,
-    choose_protocol,
-    evaluate_views,
-    to_bytes,
-)
-from pipeline.raster import RasterOptions
+from pipeline.io.camera_files import choose_views, read_cameras
+from pipeline.io.splat_files import check_suffix, read_gaussians, write_gaussians
+from pipeline.metrics.evaluate import BLACK, NO_GAINS, WHITE, choose_protocol, evaluate_views
+from pipeline.plan.posed_scene import posed_scene
+from pipeline.render import RasterOptions
+from pipeline.render.views import near_plane, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
-from pipeline.scene.cameras import camera_views, choose_views, posed_scene, read_cameras
-from pipeline.scene.views import scene_extent
-from pipeline.splats.files import check_suffix, prepare, read_gaussians, write_gaussians
-from pipeline.training.render import near_plane, render_view
+from pipeline.scene.views import camera_views, scene_extent
+from pipeline.splats.reduce import prepare
 
 
 @dataclass(frozen=True)

@@ -165,7 +165,7 @@ def _library_finding(topic: str, built: native.Built | None) -> Finding:
 
 
 def _rasterizer() -> native.NativeLibrary:
-    from pipeline.raster.build import library
+    from pipeline.render.cpu.build import library
 
     return library()
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Decode
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -33,9 +33,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.io.colmap import write_model
     from pipeline.photos.raw import develop
-    from pipeline.scene.colmap import write_model
-    from pipeline.scene.given import renamed
+    from pipeline.plan.given_poses import renamed
 
     manifest = inputs.read_manifest(job, "photos")
     report = develop(manifest, job.section(Decode), job.out, threads=job.threads)

@@ -7,15 +7,15 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.plan import Plan
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.plan import Plan
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 # With refined cameras, those of test views are fitted to their photographs before the measurement.
 FIT_OPTIONS = ("train.refine_poses", "train.ssim_weight")
@@ -31,9 +31,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.io.colmap import read_model
     from pipeline.metrics.evaluate import choose_protocol, evaluate_views
     from pipeline.metrics.pose import pose_error
-    from pipeline.scene.colmap import read_model
 
     train = job.section(Train)
     protocol = choose_protocol(inputs.trained_views(job), job.section(Split), train)

@@ -11,13 +11,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Export, Split, Train, Views
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 # Exported cameras are those of the images as they are, at any size of training.
 FULL_SIZE = Views(max_long_side_px=2**31)

@@ -5,14 +5,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Features, Init, Matches
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -32,7 +32,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.scene.colmap import read_model
+    from pipeline.io.colmap import read_model
     from pipeline.sfm.triangulation import triangulate
     from pipeline.splats.arrays import write_arrays
     from pipeline.splats.first import first_gaussians

@@ -11,15 +11,15 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Config
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.runtime.section import read_section
-from pipeline.scene.stage import StagePlan, StageSpec
 
 if TYPE_CHECKING:
-    from pipeline.scene.plan import Plan
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.plan import Plan
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -28,11 +28,11 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.scene.colmap import read_model, write_model
-    from pipeline.scene.gcp import GCP_FILE, read_ground_control
-    from pipeline.scene.given import load_given
-    from pipeline.scene.scan import scan
-    from pipeline.scene.verify import verify_photos
+    from pipeline.io.colmap import read_model, write_model
+    from pipeline.io.gcp import GCP_FILE, read_ground_control
+    from pipeline.photos.verify import verify_photos
+    from pipeline.plan.given_poses import load_given
+    from pipeline.plan.scan import scan
 
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])

@@ -6,14 +6,14 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
+from pipeline.io.posefiles import SHARED_BY
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
-from pipeline.scene.posefiles import SHARED_BY
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 # A photograph with fewer known points is left behind when the others are adjusted to theirs.
 MIN_TRACKED = 20
@@ -43,7 +43,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.sfm.given import refine_given
+    from pipeline.sfm.refine_given import refine_given
 
     given = job.inputs["model"]
     job.record(refine_given(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0"))

@@ -6,13 +6,13 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Config, Sfm
+from pipeline.plan.stage import StagePlan, StageSpec, unless_posed
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec, unless_posed
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -35,7 +35,7 @@ def _frame(scan: Scan, config: Config) -> str:
 
 
 def work(job: Job) -> None:
-    from pipeline.scene.gcp import GCP_FILE
+    from pipeline.io.gcp import GCP_FILE
     from pipeline.sfm.mapping import reconstruct
 
     control = job.inputs["inspect"] / GCP_FILE

@@ -6,19 +6,19 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Train
+from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
-from pipeline.scene.stage import StagePlan, StageSpec
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.scene.plan import Plan
-    from pipeline.scene.scan import Scan
-    from pipeline.scene.settle import Settled
+    from pipeline.plan.plan import Plan
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    from pipeline.scene.budget import length_line, memory_line, resolution_line
+    from pipeline.plan.budget import length_line, memory_line, resolution_line
 
     config, why = settled.config, settled.why
     decisions = [
@@ -37,7 +37,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.scene.colmap import write_model
+    from pipeline.io.colmap import write_model
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.scene import train_scene
 

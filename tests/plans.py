@@ -1,10 +1,10 @@
 """Plans for tests: of a scan, and of a scene that needs every stage."""
 
 from pipeline.config.schema import Config
-from pipeline.scene import plan as plans
-from pipeline.scene.plan import Plan
-from pipeline.scene.scan import Scan
-from pipeline.scene.stage import StagePlan
+from pipeline.plan import plan as plans
+from pipeline.plan.plan import Plan
+from pipeline.plan.scan import Scan
+from pipeline.plan.stage import StagePlan
 from stages.workflow.registry import STAGES
 
 

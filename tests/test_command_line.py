@@ -14,18 +14,17 @@ from PIL import Image
 
 from pipeline.__main__ import main
 from pipeline.config.schema import Config
-from pipeline.metrics.evaluate import to_bytes
-from pipeline.raster import RasterOptions
-from pipeline.scene.cameras import camera_views
-from pipeline.scene.colmap import write_model
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import write_model
+from pipeline.io.ply import write_splat_ply
+from pipeline.io.splat_files import read_gaussians
+from pipeline.io.transforms import write_transforms
+from pipeline.render import RasterOptions
+from pipeline.render.views import near_plane, render_view, to_bytes
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
-from pipeline.scene.transforms import write_transforms
-from pipeline.scene.views import scene_extent
-from pipeline.splats.files import read_gaussians
+from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.views import camera_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.ply import write_splat_ply
-from pipeline.training.render import near_plane, render_view
 from tests.splats.samples import sample
 
 SIZE = 48

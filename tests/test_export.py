@@ -12,13 +12,14 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Config, ExportFormat
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import read_model, write_model
+from pipeline.io.splat_files import read_gaussians
+from pipeline.io.transforms import read_frames, read_transforms
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import read_model, write_model
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
-from pipeline.scene.transforms import read_frames, read_transforms
-from pipeline.splats.files import read_gaussians
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 from pipeline.surface.outputs import DRAWN
 from stages.export import WRITERS, run
 from tests.splats.samples import sample

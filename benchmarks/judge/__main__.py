@@ -20,7 +20,7 @@ from benchmarks.judge.pictures import PICTURES, Matched, match_folder, write_pic
 from benchmarks.judge.truth import Grade, Truth, grade
 from benchmarks.judge.world import write
 from pipeline.config.schema import Sfm
-from pipeline.scene.colmap import read_model
+from pipeline.io.colmap import read_model
 from pipeline.sfm.escalation import Attempt, map_until_good
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper

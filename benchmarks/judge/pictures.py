@@ -10,12 +10,12 @@ from pathlib import Path
 from typing import Literal
 
 from pipeline.config.schema import Config, Matches, Sfm
+from pipeline.io.posefiles import truth_folder
+from pipeline.plan.scan import scan
+from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import read_stage
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.posefiles import truth_folder
-from pipeline.scene.scan import scan
-from pipeline.scene.settle import settle
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper
@@ -54,8 +54,8 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
     from pipeline.demo.render import rays, render
     from pipeline.demo.scene import OBJECTS
     from pipeline.demo.sensor import srgb, to_bytes
-    from pipeline.scene.colmap import write_model
-    from pipeline.scene.model import Reconstruction
+    from pipeline.io.colmap import write_model
+    from pipeline.scene.reconstruction import Reconstruction
 
     look = PICTURES[name]
     names = [f"view_{i:03d}.png" for i in range(VIEWS)]

@@ -9,9 +9,9 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics.pose import umeyama
-from pipeline.scene.model import Reconstruction
-from pipeline.scene.names import NameIndex
+from pipeline.geometry.similarity import umeyama
+from pipeline.io.names import NameIndex
+from pipeline.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 Grade = Literal["good", "weak", "failed"]

@@ -17,8 +17,9 @@ import pycolmap
 from numpy.typing import NDArray
 
 from pipeline.demo.cameras import look_at
+from pipeline.geometry.cameras import Camera
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.reconstruction import Posed, Reconstruction
 
 Array = NDArray[np.float64]
 Triple = Array | tuple[float, float, float]

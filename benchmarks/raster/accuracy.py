@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.raster.measure import BACKGROUND, Step
 from benchmarks.raster.scenes import synthetic
-from pipeline.raster import RasterOptions, backward, forward, twin
+from pipeline.render import RasterOptions, backward, forward, reference
 
 WINDOW = 32  # pixels
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -39,10 +39,10 @@ def accuracy(step: Step) -> Accuracy:
 
     inputs = [g[rows].double().requires_grad_() for g in scene.gaussians]
     means, log_scales, quats, logits, sh = inputs
-    projection = twin.project(means, log_scales, quats, logits, sh, camera, options)
-    colors = twin.sh_colors(means[projection.index], sh[projection.index], camera, 3)
+    projection = reference.project(means, log_scales, quats, logits, sh, camera, options)
+    colors = reference.sh_colors(means[projection.index], sh[projection.index], camera, 3)
     moved = replace(projection, means2d=projection.means2d - torch.tensor([left, top]))
-    image = twin.blend(moved, colors, replace(camera, width=w, height=h), options)
+    image = reference.blend(moved, colors, replace(camera, width=w, height=h), options)
     window = (slice(top, top + h), slice(left, left + w))
     sure = image.margin > 1e-5
     error = (step.drawn.color[window] - image.color.detach()).abs().amax(-1)[sure]
@@ -74,7 +74,7 @@ def twin_ratio(threads: int) -> TwinRatio:
 
     def in_torch() -> None:
         means, scales, quats, logits, sh = (g.clone().requires_grad_() for g in scene.gaussians)
-        out = twin.render(means, scales, quats, logits, sh, scene.camera, options)
+        out = reference.render(means, scales, quats, logits, sh, scene.camera, options)
         (out.color * weight).sum().backward()
 
     def in_kernels() -> None:

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.raster.measure import BACKGROUND, MIN_TURNS, Spread
 from benchmarks.raster.scenes import Scene
-from pipeline.raster import RasterOptions, forward
+from pipeline.render import RasterOptions, forward
 
 
 @dataclass(frozen=True)

@@ -6,7 +6,7 @@ import subprocess
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.raster import build
+from pipeline.render.cpu import build
 from pipeline.runtime.machine import machine_facts
 
 # The compiler's macro of each instruction set, best first, and float32 lanes of its registers.

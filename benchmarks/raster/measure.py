@@ -13,7 +13,8 @@ import torch
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import Scene
 from pipeline.config.schema import Train
-from pipeline.raster import RasterOptions, build, forward
+from pipeline.render import RasterOptions, forward
+from pipeline.render.cpu import build
 
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT, SQUARE_WEIGHT = Train().ssim_weight, Train().square_weight

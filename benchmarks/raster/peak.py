@@ -8,7 +8,7 @@ import tempfile
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.raster import build
+from pipeline.render.cpu import build
 
 # peak.cpp names its instruction sets itself: neither the target nor the kernels' flags matter.
 FLAGS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared", "-pthread"]

@@ -8,11 +8,11 @@ from pathlib import Path
 import numpy as np
 import torch
 
-from pipeline.raster import RasterCamera
-from pipeline.scene.colmap import read_model
-from pipeline.scene.model import Camera
-from pipeline.splats.order import morton_order
-from pipeline.splats.ply import read_splat_ply
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import read_model
+from pipeline.io.ply import read_splat_ply
+from pipeline.render import RasterCamera
+from pipeline.splats.morton import morton_order
 
 MOST_VIEWS = 16  # of a trained model, spread over its images
 

@@ -18,11 +18,12 @@ from numpy.typing import NDArray
 
 from benchmarks.sfm.measure import Cost, measured
 from pipeline.config.schema import Sfm
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.reconstruction import Posed, Reconstruction
 from pipeline.sfm.isolate import run_isolated
 
 Array = NDArray[np.float64]

@@ -23,12 +23,12 @@ from numpy.typing import NDArray
 from benchmarks.sfm.measure import Cost, measured, our_features, our_mapping, our_matches
 from benchmarks.sfm.scenes import MAPPERS, Scene, load_scene, settled
 from pipeline.config.schema import Config
-from pipeline.metrics.pose import umeyama
+from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
+from pipeline.geometry.similarity import umeyama
+from pipeline.io.colmap import read_model
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction
-from pipeline.scene.rotations import quat_to_rotation, rotation_to_quat
+from pipeline.scene.reconstruction import Reconstruction
 from pipeline.sfm.isolate import run_isolated
 
 Array = NDArray[np.float64]
@@ -79,9 +79,9 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
     from pipeline.splats.init import gaussians_from_points
-    from pipeline.training.depth import point_depths, scene_scale
-    from pipeline.training.inputs import Inputs
-    from pipeline.training.trainer import train
+    from pipeline.training.data.inputs import Inputs
+    from pipeline.training.data.known_depths import point_depths, scene_scale
+    from pipeline.training.loop.trainer import train
 
     pinhole = folder / "pinhole"
     model = read_model(folder / "sparse" / "0")
@@ -110,10 +110,10 @@ def _compare(
 ) -> dict[tuple[Name, Name], Likeness]:
     """Render the same views from all models, and compare each two."""
     from pipeline.metrics.image import psnr, ssim
-    from pipeline.raster import RasterOptions
+    from pipeline.render import RasterOptions
+    from pipeline.render.views import near_plane, render_view
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
-    from pipeline.training.render import near_plane, render_view
 
     models = {name: read_model(folder / "pinhole/sparse/0") for name, folder in folders.items()}
     first = next(iter(folders))

@@ -12,10 +12,10 @@ from typing import Any
 
 from benchmarks.sfm.scenes import REFERENCE, Configuration, Scene
 from pipeline.config.schema import Config
+from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import PoseError, pose_error
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import peak_memory_mb
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.isolate import run_isolated
 

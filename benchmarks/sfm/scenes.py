@@ -12,15 +12,15 @@ from typing import Any
 from pipeline.config.load import scene_config
 from pipeline.config.presets import PRESETS
 from pipeline.config.schema import Config
+from pipeline.io.colmap import read_model
+from pipeline.io.names import NameIndex
+from pipeline.photos.verify import verify_photos
+from pipeline.plan.given_poses import load_given
+from pipeline.plan.scan import Scan, scan
+from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
-from pipeline.scene.given import load_given
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction
-from pipeline.scene.names import NameIndex
-from pipeline.scene.scan import Scan, scan
-from pipeline.scene.settle import settle
-from pipeline.scene.verify import verify_photos
+from pipeline.scene.reconstruction import Reconstruction
 
 REFERENCE = "pycolmap"
 MAPPERS = ("incremental", "global")

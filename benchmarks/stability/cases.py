@@ -18,11 +18,12 @@ from pipeline.demo.render import rays, render
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import srgb, to_bytes
 from pipeline.demo.write import DemoSpec, write_demo
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.rotations import quat_to_rotation
+from pipeline.io.colmap import read_model, write_model
 from pipeline.photos.load import load_rgb
 from pipeline.runtime.atomic import write_json
-from pipeline.scene.colmap import read_model, write_model
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
-from pipeline.scene.rotations import quat_to_rotation
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 
 Array = NDArray[np.float64]
 Pixels = NDArray[Any]

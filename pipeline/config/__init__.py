@@ -1,0 +1,1 @@
+"""Options: schemas, presets, and how a run's configuration is put together."""

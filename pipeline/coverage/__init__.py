@@ -1,0 +1,1 @@
+"""What the photographs of a scene did not see."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.coverage.sight import Bools, Eye, look_for
+from pipeline.coverage.probe_views import Bools, Eye, look_for
 from pipeline.coverage.trust import Evidence
 from pipeline.splats.gaussians import Gaussians
 

@@ -15,19 +15,18 @@ from PIL import Image
 
 from pipeline.config.schema import Train
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.sight import Bools, Doubles, Draw, Eye, Floats, open_eye, points_of
+from pipeline.coverage.probe_views import Bools, Doubles, Draw, Eye, Floats, open_eye, points_of
+from pipeline.coverage.summary import describe
 from pipeline.coverage.trust import LITTLE, gather, trust_picture
 from pipeline.coverage.viewpoints import Outlook, propose
-from pipeline.coverage.words import describe
-from pipeline.metrics.evaluate import Protocol, reference, to_bytes
+from pipeline.metrics.evaluate import Protocol, reference
 from pipeline.photos.load import load_view, resize_area
+from pipeline.render.views import Render, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import View
-from pipeline.scene.views import scene_up
+from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import Render, render_view
 
 T = TypeVar("T")
 

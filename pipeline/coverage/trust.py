@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.coverage.sight import Eye, Floats, Points, Sighting, look_for, points_of
+from pipeline.coverage.probe_views import Eye, Floats, Points, Sighting, look_for, points_of
 
 #: Pixels of the asking camera by which a point that nothing has measured may be off.
 UNKNOWN_PIXELS = 50.0

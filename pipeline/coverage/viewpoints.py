@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.coverage.sight import (
+from pipeline.coverage.probe_views import (
     Bools,
     Doubles,
     Draw,
@@ -20,7 +20,7 @@ from pipeline.coverage.sight import (
 )
 from pipeline.coverage.trust import gather, trust
 from pipeline.runtime.progress import track
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 
 COUNT = 5
 #: A viewpoint that would raise the mean trust of its surroundings by less is not worth the way.

@@ -1,0 +1,1 @@
+"""A ray-traced scene with exact truth."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scene.model import Camera, Posed
+from pipeline.geometry.cameras import Camera
+from pipeline.scene.reconstruction import Posed
 
 Array = NDArray[np.float64]
 

@@ -9,8 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.demo.scene import BACKGROUND, Thing, shade, trace
-from pipeline.photos.distortion import normalised
-from pipeline.scene.model import Camera, Posed
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import normalised
+from pipeline.scene.reconstruction import Posed
 
 Array = NDArray[np.float64]
 

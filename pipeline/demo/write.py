@@ -22,13 +22,14 @@ from pipeline.demo.render import Rays, rays, render
 from pipeline.demo.scene import OBJECTS, VISITOR, Thing
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
 from pipeline.demo.shapes import Sphere
-from pipeline.photos.distortion import normalised, pixels
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import normalised, pixels
+from pipeline.io.colmap import write_model
 from pipeline.runtime.atomic import replace_folder, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.progress import Progress
-from pipeline.scene.colmap import write_model
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
 Poses = Literal["none", "colmap", "transforms"]

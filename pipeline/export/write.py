@@ -8,20 +8,20 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.schema import Export, Split, Train
+from pipeline.io.colmap import write_model
+from pipeline.io.frame_json import describe_frame
+from pipeline.io.gltf import write_gltf
+from pipeline.io.ply import write_points_ply, write_splat_ply
+from pipeline.io.splat import write_splat
+from pipeline.io.spz import unfit, write_spz
+from pipeline.io.transforms import write_transforms
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.runtime.atomic import write_json
-from pipeline.scene.colmap import write_model
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View
-from pipeline.scene.transforms import write_transforms
-from pipeline.scene.views import scene_up
-from pipeline.splats.files import prepare
-from pipeline.splats.frame import describe_frame
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.gltf import write_gltf
-from pipeline.splats.ply import write_points_ply, write_splat_ply
-from pipeline.splats.splat import write_splat
-from pipeline.splats.spz import unfit, write_spz
+from pipeline.splats.reduce import prepare
 
 # Share of the Gaussians that may not fit into a format without a warning: some specks always fail.
 TOLERATED_SHARE = 0.05

@@ -1,0 +1,1 @@
+"""Image quality, pose errors and the evaluation of views."""

@@ -18,14 +18,13 @@ from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
-from pipeline.raster import RasterOptions
+from pipeline.render import RasterOptions
+from pipeline.render.views import near_plane, render_view, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
-from pipeline.scene.model import View
-from pipeline.scene.views import scene_extent
+from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.poses import fit_pose
-from pipeline.training.render import near_plane, render_view
+from pipeline.training.cameras.fit_pose import fit_pose
 
 #: Training views that are rendered, too: what the model makes of pictures that it has seen.
 NUM_SEEN = 8
@@ -242,11 +241,6 @@ def reference(pixels: ViewPixels, background: tuple[float, float, float]) -> NDA
         return pixels.rgb
     alpha = pixels.alpha[..., None] / 255.0
     return to_bytes(pixels.rgb / 255.0 * alpha + np.array(background) * (1 - alpha))
-
-
-def to_bytes(image: Any) -> NDArray[np.uint8]:
-    """[0, 1] floats to 8 bit, rounded."""
-    return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)
 
 
 def _describe(

@@ -7,8 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scene.model import Reconstruction
-from pipeline.scene.names import NameIndex
+from pipeline.geometry.similarity import umeyama
+from pipeline.io.names import NameIndex
+from pipeline.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
 
@@ -42,30 +43,6 @@ class PoseError:
     auc: dict[float, float] | None
     num_common: int
     num_truth: int
-
-
-def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """The similarity with the least squared distances: ``target ~ scale * R @ source + t``.
-
-    Umeyama 1991, equations 38-43. Collinear or coincident points leave the rotation (and, where
-    all sources coincide, the scale) undetermined: then one of the minimisers is returned, and
-    scale 1 for coincident sources.
-
-    Args:
-        source, target: (N, 3), N >= 1.
-
-    Returns:
-        scale (>= 0), R (3, 3) a proper rotation, t (3,).
-    """
-    source, target = np.asarray(source, np.float64), np.asarray(target, np.float64)
-    mean_source, mean_target = source.mean(0), target.mean(0)
-    centred_source, centred_target = source - mean_source, target - mean_target
-    u, d, vt = np.linalg.svd(centred_target.T @ centred_source / len(source))
-    signs = np.array([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
-    rotation = u @ np.diag(signs) @ vt
-    variance = float((centred_source**2).sum() / len(source))
-    scale = max(float(d @ signs) / variance, 0.0) if variance > 0 else 1.0
-    return scale, rotation, mean_target - scale * rotation @ mean_source
 
 
 def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:

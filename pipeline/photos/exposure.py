@@ -16,7 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.photos.load import load_view
-from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
 
 #: Stops a unit of log2 in display values: sRGB's curve is near a power of 1 / 2.2.
 GAMMA = 2.2

@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io import heif
+from pipeline.io.names import suffix_of
 from pipeline.runtime.errors import UserError
-from pipeline.scene import heif
-from pipeline.scene.names import suffix_of
 
 Picture = NDArray[Any]
 FIX = "Replace the file by a whole one, or remove it from the folder."

@@ -16,11 +16,11 @@ import rawpy
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Decode
+from pipeline.io.photofile import digest_of
 from pipeline.photos.naming import rename
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.photofile import digest_of
 
 DEMOSAIC = {
     "linear": rawpy.DemosaicAlgorithm.LINEAR,

@@ -11,7 +11,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config import schema
-from pipeline.photos.distortion import fold_radius, normalised, pixels
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import fold_radius, normalised, pixels
+from pipeline.io.colmap import write_model
+from pipeline.io.photofile import digest_of
 from pipeline.photos.load import (
     Picture,
     load_mask,
@@ -25,10 +28,8 @@ from pipeline.photos.load import (
 from pipeline.photos.naming import rename
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
-from pipeline.scene.colmap import write_model
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
-from pipeline.scene.photofile import digest_of
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 from pipeline.scene.views import view_size
 
 ROWS_AT_ONCE = 256

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pipeline.config.runs import Run
-from pipeline.scene.protocols import benchmark_scene
+from pipeline.plan.protocols import benchmark_scene
 
 PUBLISHED = Path(__file__).with_name("published.json")
 

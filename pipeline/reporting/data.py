@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
 

@@ -9,8 +9,8 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.io.spz import encode_spz
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.spz import encode_spz
 
 # Gaussians that tell how far all of them can be compressed, and what that may err by.
 _SAMPLE = 20_000

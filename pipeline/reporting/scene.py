@@ -16,7 +16,8 @@ from pipeline.reporting.collect import read_json
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
 from pipeline.runtime.job import read_stage
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
 

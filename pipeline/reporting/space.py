@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipeline.reporting.data import ReportData, TrainedScene
 from pipeline.reporting.fit import Packed, fit
 from pipeline.reporting.text import count, escape
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
 

@@ -1,0 +1,1 @@
+"""How work is run: stages' folders and keys, progress, errors, native libraries."""

@@ -60,7 +60,7 @@ class Job:
 
     Attributes:
         stage, scene: names.
-        key: the stage's key as a parsed JSON object (see ``pipeline.scene.keys``).
+        key: the stage's key as a parsed JSON object (see ``pipeline.plan.keys``).
         inputs: folder of each input role ("photos", "model", ...).
         out: write outputs here; it becomes the stage's folder when ``run`` returns.
         scratch: survives a kill and is found again by a run with the same identity.

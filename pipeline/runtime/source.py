@@ -16,13 +16,16 @@ ROOT = Path(__file__).resolve().parents[2]
 NEUTRAL = (
     "pipeline.runtime",
     "pipeline.config",
-    "pipeline.scene.plan",
-    "pipeline.scene.settle",
-    "pipeline.scene.stage",
+    "pipeline.plan.plan",
+    "pipeline.plan.settle",
+    "pipeline.plan.stage",
 )
 
 # Modules whose C++ is compiled where it runs, and its folder.
-NATIVE = {"pipeline.raster": "pipeline/raster/csrc", "pipeline.sfm.nearest": "pipeline/sfm/csrc"}
+NATIVE = {
+    "pipeline.render": "pipeline/render/cpu/csrc",
+    "pipeline.sfm.nearest": "pipeline/sfm/csrc",
+}
 
 _COMMENT = re.compile(r'//[^\n]*|/\*.*?\*/|("(?:\\.|[^"\\])*")', re.S)
 

@@ -1,0 +1,1 @@
+"""A scene as plain values: photographs, cameras, poses, points, views."""

@@ -2,17 +2,56 @@
 
 from __future__ import annotations
 
+import posixpath
 from collections.abc import Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config import schema
+from pipeline.geometry.up_direction import up_direction
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View, is_held_out
+from pipeline.scene.reconstruction import Reconstruction
 
-# How much columns of pictures count beside their rows, where up is sought.
-COLUMN_WEIGHT = 0.02
+
+@dataclass(frozen=True)
+class View:
+    """A pinhole view ready for training or evaluation.
+
+    Attributes:
+        name: the photograph's name.
+        image, mask: files; the mask's non-zero pixels count; None where there is none.
+        width, height: pixels of the target resolution (the file may be larger).
+        fx, fy, cx, cy: pixels, at the target resolution.
+        world_to_camera: (4, 4) float64.
+        is_test: held out.
+        camera_id: key into ``Reconstruction.cameras``; views of one camera share its lens.
+    """
+
+    name: str
+    image: str
+    mask: str | None
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    world_to_camera: NDArray[np.float64]
+    is_test: bool
+    camera_id: int = 0
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) the camera's centre in the world."""
+        return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
+
+
+def is_held_out(index: int, every: int) -> bool:
+    """The field's split (Mip-NeRF360): of the views sorted by name, each ``every``-th from the
+    first is held out; 0 holds out none."""
+    return every > 0 and index % every == 0
 
 
 def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
@@ -68,42 +107,6 @@ def load_views(
     return result
 
 
-def up_direction(
-    rotations: NDArray[np.float64], orientations: Sequence[int]
-) -> NDArray[np.float64]:
-    """(3,) unit vector of the world that the cameras together hold up.
-
-    People tilt cameras up and down and roll them little, so up is what is perpendicular to the
-    rows of all pictures; as far as these leave it open (a camera that does not turn), what the
-    pictures' columns point to on average.
-
-    Args:
-        rotations: (N, 3, 3) world to camera.
-        orientations: the photographs' EXIF orientations, 1 to 8: a camera held upright has its
-            sensor's rows run down the photograph.
-
-    Without cameras, or where they disagree entirely, it is -y: up for a camera at the identity.
-    """
-    # Where the picture's top is on the sensor. Source: EXIF 2.3, tag Orientation.
-    top = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
-    total, rows, ahead = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
-    for rotation, orientation in zip(rotations, orientations, strict=True):
-        right, down = top.get(orientation, (0, -1))
-        column = right * rotation[0] + down * rotation[1]
-        row = np.cross(column, rotation[2])
-        total += column
-        rows += np.outer(row, row) / len(rotations)
-        ahead += rotation[2]
-    length = float(np.linalg.norm(total))
-    # Cameras that look straight down hold nothing up, but from above.
-    upwards = total - 0.5 * ahead
-    if length < 1e-6 or np.linalg.norm(upwards) < 1e-6:
-        return np.array([0.0, -1.0, 0.0])
-    mean = total / length
-    _, axes = np.linalg.eigh(rows + COLUMN_WEIGHT * (np.eye(3) - np.outer(mean, mean)))
-    return np.asarray(axes[:, 0] * np.sign(axes[:, 0] @ upwards))
-
-
 def scene_extent(views: list[View]) -> float:
     """1.1 times the largest distance of a training camera from their mean, in world units.
 
@@ -126,3 +129,29 @@ def scene_up(views: Sequence[View], manifest: Manifest) -> NDArray[np.float64]:
     orientation = {photo.name: photo.orientation for photo in manifest.photos}
     rotations = np.stack([view.world_to_camera[:3, :3] for view in views])
     return up_direction(rotations, [orientation[view.name] for view in views])
+
+
+def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]:
+    """The model's images as views without photographs, sorted by name, lens distortion left out;
+    a folder that they all lie in is left out of their names.
+
+    Args:
+        max_long_side: pixels; larger views are reduced to it.
+    """
+    folders = {posixpath.dirname(image.name) for image in model.images.values()}
+    mixed = len({posixpath.isabs(folder) for folder in folders}) != 1
+    shared = "" if mixed else posixpath.commonpath(folders)
+    views = []
+    for image in sorted(model.images.values(), key=lambda image: image.name):
+        camera = model.cameras[image.camera_id]
+        width, height = view_size(camera.width, camera.height, max_long_side or 2**31)
+        fx, fy, cx, cy = camera.resized(width, height).pinhole
+        pose = image.world_to_camera
+        name = image.name[len(shared) :].lstrip("/")
+        views.append(View(name, "", None, width, height, fx, fy, cx, cy, pose, False))
+    return views
+
+
+def reduced_size(view: View, factor: int) -> tuple[int, int]:
+    """(width, height) of a view at 1 / ``factor``, rounded."""
+    return max(1, round(view.width / factor)), max(1, round(view.height / factor))

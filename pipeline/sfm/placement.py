@@ -10,11 +10,12 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipeline.geometry.similarity import Similarity
+from pipeline.geometry.up_direction import up_direction
+from pipeline.io.gcp import GCP_FILE, read_ground_control
 from pipeline.runtime.errors import UserError
-from pipeline.scene.gcp import GCP_FILE, read_ground_control
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.views import up_direction
-from pipeline.sfm.georeference import Cameras, Frame, Similarity, from_gcp, from_gps, level
+from pipeline.sfm.georeference import Cameras, Frame, from_gcp, from_gps, level
 
 Georeference = Literal["auto", "gps", "gcp", "none"]
 

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import pycolmap
 
-from pipeline.scene.posefiles import SHARED_BY
+from pipeline.io.posefiles import SHARED_BY
 
 # A freed parameter is kept where the robust cost falls by this share at least. On real sets with
 # known cameras the ones that are there gain 0.5% to 8%, the ones that are not 0.01% to 0.1%.

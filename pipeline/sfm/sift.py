@@ -8,10 +8,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io import heif
+from pipeline.io.names import suffix_of
 from pipeline.runtime.errors import UserError
-from pipeline.scene import heif
 from pipeline.scene.manifest import Photo
-from pipeline.scene.names import suffix_of
 from pipeline.sfm.keypoints import Keypoints, root_sift
 
 # COLMAP's peak threshold (0.02 / 3); OpenCV divides this value by its layers. Half of OpenCV's

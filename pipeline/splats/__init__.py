@@ -1,0 +1,1 @@
+"""Gaussians as values: the first ones, their order, and fewer of them."""

@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from pipeline.config.schema import Init
-from pipeline.scene.model import Points, View
+from pipeline.scene.reconstruction import Points
+from pipeline.scene.views import View
 from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
 
 # Fewer sparse points than this say too little about the scene to start from.

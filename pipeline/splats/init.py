@@ -13,10 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Init
+from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import Points, View
-from pipeline.scene.rotations import rotation_to_quat
-from pipeline.scene.views import scene_extent
+from pipeline.scene.reconstruction import Points
+from pipeline.scene.views import View, scene_extent
 
 # The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient.
 SH_C0 = 0.28209479177387814

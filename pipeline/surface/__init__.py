@@ -1,0 +1,1 @@
+"""Meshes, depth maps and videos of a trained scene."""

@@ -12,15 +12,14 @@ import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.metrics.evaluate import to_bytes
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
-from pipeline.raster import RasterOptions
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.progress import track
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import render_view
 
 #: Pixels of less opacity have no depth.
 MIN_ALPHA = 0.5

@@ -10,18 +10,17 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics.evaluate import to_bytes
-from pipeline.raster import RasterOptions
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_view, to_bytes
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import track
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, Pictures, write_depths, write_renders
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
 from pipeline.surface.video import write_video
-from pipeline.training.render import render_view
 
 DRAWN = frozenset(("renders", "depths", "mesh", "video"))
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
 

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.surface.depth import DepthMap
 
 #: Voxels along a block's side.

@@ -14,17 +14,17 @@ import numpy as np
 from pipeline.config.schema import Train
 from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View, with_poses
-from pipeline.scene.views import scene_extent
+from pipeline.scene.reconstruction import Reconstruction, with_poses
+from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import journal
-from pipeline.training.depth import KnownDepths, point_depths, scene_scale
-from pipeline.training.depth_maps import add_maps
-from pipeline.training.floaters import air_depths
-from pipeline.training.inputs import Inputs
-from pipeline.training.lenses import changed_by, with_lenses
-from pipeline.training.poses import followed, moved_by
-from pipeline.training.trainer import TrainResult, train
+from pipeline.training.cameras.lenses import changed_by, with_lenses
+from pipeline.training.cameras.poses import followed, moved_by
+from pipeline.training.data.depth_maps import add_maps
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
+from pipeline.training.density.floaters import air_depths
+from pipeline.training.loop import metrics_log
+from pipeline.training.loop.trainer import TrainResult, train
 
 # Standard deviation in stops from which photographs count as differently exposed: cameras that hold
 # their exposure show 0 to 0.1, collections from the internet 0.5.
@@ -100,7 +100,7 @@ def train_scene(
         threads=threads,
         memory_mb=memory_mb,
         checkpoint_dir=checkpoint_dir,
-        journal=logs / journal.NAME,
+        journal=logs / metrics_log.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
     # Seconds that earlier, killed processes spent on this training.

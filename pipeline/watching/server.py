@@ -9,13 +9,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.metrics.evaluate import to_bytes
-from pipeline.raster import RasterOptions
+from pipeline.geometry.rotations import quat_to_rotation
+from pipeline.geometry.up_direction import up_direction
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_view, to_bytes
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import View
-from pipeline.scene.rotations import quat_to_rotation
-from pipeline.scene.views import up_direction
-from pipeline.training.render import render_view
+from pipeline.scene.views import View
 from pipeline.watching.source import Source
 
 # Pixels of the longer side while the camera moves; then the picture is made anew in full.

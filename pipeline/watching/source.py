@@ -6,15 +6,15 @@ import contextlib
 from dataclasses import dataclass
 from pathlib import Path
 
+from pipeline.io.camera_files import read_cameras
+from pipeline.io.splat_files import read_gaussians
+from pipeline.render.views import near_plane
 from pipeline.runtime.errors import UserError
-from pipeline.scene.cameras import camera_views, read_cameras
-from pipeline.scene.views import scene_extent
-from pipeline.splats.files import read_gaussians
+from pipeline.scene.views import camera_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.checkpoint import PATTERN, newest
-from pipeline.training.journal import NAME, read_journal
-from pipeline.training.render import near_plane
-from pipeline.training.state import gaussians_of
+from pipeline.training.checkpoints.checkpoint import PATTERN, newest
+from pipeline.training.loop.metrics_log import NAME, read_journal
+from pipeline.training.loop.state import gaussians_of
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runtime.errors import UserError
-from pipeline.training.journal import NAME, read_journal
+from pipeline.training.loop.metrics_log import NAME, read_journal
 
 SCALARS = {
     "loss": "train/loss",

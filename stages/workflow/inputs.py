@@ -8,12 +8,12 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Split, Views
+from pipeline.io.colmap import has_model, read_model
+from pipeline.plan.given_poses import GEOREFERENCE
 from pipeline.runtime.job import Job
-from pipeline.scene.colmap import has_model, read_model
-from pipeline.scene.given import GEOREFERENCE
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction, View
-from pipeline.scene.views import load_views
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View, load_views
 
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians

@@ -13,15 +13,15 @@ from typing import Any, NoReturn
 
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, parse_run
+from pipeline.plan.keys import stage_key
+from pipeline.plan.plan import Plan, describe, make_plan, public_plan, upstream
+from pipeline.plan.scan import scan
+from pipeline.plan.stage import StageSpec
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
-from pipeline.scene.keys import stage_key
-from pipeline.scene.plan import Plan, describe, make_plan, public_plan, upstream
-from pipeline.scene.scan import scan
-from pipeline.scene.stage import StageSpec
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")

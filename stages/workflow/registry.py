@@ -6,7 +6,7 @@ import importlib
 import pkgutil
 from pathlib import Path
 
-from pipeline.scene.stage import StageSpec
+from pipeline.plan.stage import StageSpec
 
 
 def _declared() -> dict[str, StageSpec]:

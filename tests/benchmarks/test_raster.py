@@ -14,10 +14,11 @@ from benchmarks.raster.measure import Step
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import synthetic, trained
 from benchmarks.raster.tables import PAGE, rewritten
-from pipeline.scene.colmap import write_model
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import write_model
+from pipeline.io.ply import write_splat_ply
+from pipeline.scene.reconstruction import Posed, Reconstruction
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.ply import write_splat_ply
 
 
 def test_every_operator_of_a_step_is_timed() -> None:

@@ -6,7 +6,8 @@ import numpy as np
 
 from benchmarks.stability.__main__ import Outcome, table
 from benchmarks.stability.cases import CASES, TURN, exposed, similar
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.geometry.cameras import Camera
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 
 
 def test_every_reference_is_a_case_before_its_own() -> None:

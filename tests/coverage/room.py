@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from pipeline.coverage.sight import Draw
-from pipeline.raster import RasterOptions
-from pipeline.scene.model import View
+from pipeline.coverage.probe_views import Draw
+from pipeline.render import RasterOptions
+from pipeline.render.views import Render, render_view
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.render import Render, render_view
 
 UP = np.array([0.0, -1.0, 0.0])
 

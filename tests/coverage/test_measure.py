@@ -11,7 +11,8 @@ from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.coverage.measure import World, measure_coverage
-from pipeline.metrics.evaluate import choose_protocol, evaluate_views, to_bytes
+from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
 from tests.coverage.room import UP, camera, drawer, wall
 

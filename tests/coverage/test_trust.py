@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.sight import Points, look_for, open_eye, points_of
+from pipeline.coverage.probe_views import Points, look_for, open_eye, points_of
 from pipeline.coverage.trust import gather, trust, trust_picture
 from pipeline.splats.gaussians import concat
 from tests.coverage.room import blobs, camera, drawer, wall

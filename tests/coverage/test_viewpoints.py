@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 
-from pipeline.coverage.sight import open_eye
+from pipeline.coverage.probe_views import open_eye
+from pipeline.coverage.summary import describe
 from pipeline.coverage.viewpoints import Viewpoint, propose
-from pipeline.coverage.words import describe
 from pipeline.splats.gaussians import Gaussians, concat
 from tests.coverage.room import UP, blobs, camera, drawer, wall
 

@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from pipeline.coverage.measure import world_of
-from pipeline.scene.given import Given
+from pipeline.plan.given_poses import Given
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Reconstruction, View
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
 
 MOVED = Given(Reconstruction({}, {}), np.array([1e5, 0.0, 0.0])).sidecar()
 LEVEL = {"method": "level", "unit": "90% of the cameras lie within 1 of their mean"}

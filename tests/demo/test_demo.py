@@ -19,13 +19,14 @@ from pipeline.demo.cameras import LENSES
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.shapes import Box, Cylinder, Shape, Sphere
 from pipeline.demo.write import DemoSpec, write_demo
-from pipeline.photos.distortion import normalised, pixels
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import normalised, pixels
+from pipeline.io.colmap import read_model
 from pipeline.photos.load import load_mask, load_rgb, load_rgba
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.reconstruction import Posed, Reconstruction
 
 SPEC = DemoSpec(
     views=4, width=160, height=120, format="png", distortion="opencv", poses="colmap", seed=3

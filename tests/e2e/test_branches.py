@@ -6,7 +6,7 @@ import json
 
 import pytest
 
-from pipeline.scene.colmap import read_model
+from pipeline.io.colmap import read_model
 from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
 
 pytestmark = pytest.mark.slow

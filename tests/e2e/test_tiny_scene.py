@@ -82,10 +82,10 @@ def test_a_training_option_keeps_the_poses(project):
 def test_a_touched_photograph_and_a_comment_rerun_nothing(project):
     for photo in (project / "data/tiny/images").iterdir():
         photo.touch()
-    for name in ("training/trainer.py", "sfm/mapping.py", "scene/colmap.py"):
+    for name in ("training/loop/trainer.py", "sfm/mapping.py", "io/colmap.py"):
         file = project / "pipeline" / name
         file.write_text("# A comment.\n" + file.read_text() + "\n# Another.\n")
-    kernel = next((project / "pipeline/raster/csrc").glob("*.h"))
+    kernel = next((project / "pipeline/render/cpu/csrc").glob("*.h"))
     kernel.write_text("// A comment.\n" + kernel.read_text())
     done = snakemake(project, TARGET, config=TINY)
     assert rules_run(done) == set()
@@ -167,7 +167,7 @@ def test_kill_9_and_again_gives_the_same_result(project, finished, stage, ready)
 
 
 def test_training_goes_on_from_its_last_checkpoint(project, finished):
-    trainer = project / "pipeline/training/trainer.py"
+    trainer = project / "pipeline/training/loop/trainer.py"
     text = trainer.read_text()
     often = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.2")
     assert often != text

@@ -10,7 +10,7 @@ from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.evaluate import NUM_SEEN, choose_protocol, diagnose, evaluate_views, reference
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
 SIZE = 32

@@ -9,8 +9,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.metrics.pose import auc_of_errors, pose_error, umeyama
-from pipeline.scene.model import Posed, Reconstruction
+from pipeline.geometry.similarity import umeyama
+from pipeline.metrics.pose import auc_of_errors, pose_error
+from pipeline.scene.reconstruction import Posed, Reconstruction
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:

@@ -6,8 +6,10 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pipeline.geometry.cameras import Camera
 from pipeline.photos.exposure import measure_exposures, sample_views
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction, View
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.views import View
 
 SIZE, POINTS = 64, 400
 

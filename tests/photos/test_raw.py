@@ -13,11 +13,11 @@ from pipeline.demo.cameras import orbit
 from pipeline.demo.render import rays, render
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng
+from pipeline.geometry.cameras import Camera
 from pipeline.photos.load import load_rgb
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera
 
 DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "raw"
 TAKEN = "2026:01:01 12:00:00"

@@ -13,13 +13,14 @@ from pipeline.demo.cameras import lens, orbit
 from pipeline.demo.render import rays, render
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import srgb, to_bytes
-from pipeline.photos.distortion import pixels
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import pixels
+from pipeline.io.colmap import read_model
 from pipeline.photos.load import load_mask, load_rgb, load_rgba, resize_area
 from pipeline.photos.undistort import pinhole_camera, undistort
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 
 SIZE = (160, 120)
 

@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
 

@@ -10,6 +10,7 @@ from statistics import fmean
 import pytest
 
 from pipeline.config.runs import Run
+from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
 from pipeline.reporting.batch import (
     PUBLISHED,
     Result,
@@ -21,7 +22,6 @@ from pipeline.reporting.batch import (
 )
 from pipeline.reporting.charts import Dot, pareto_front, trade_off_chart
 from pipeline.reporting.index import Batch, Thumbnail, index_html
-from pipeline.scene.protocols import MIP_NERF_360, benchmark_scene
 
 
 def metrics(psnr: float, seconds: float = 10.0, photos: int = 20, **more) -> dict:

@@ -3,8 +3,8 @@
 import xml.etree.ElementTree as ET
 
 from pipeline.config.schema import Config
+from pipeline.plan.plan import public_plan
 from pipeline.reporting.dag import plan_svg
-from pipeline.scene.plan import public_plan
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan
 

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.io.spz import decode_spz, encode_spz
 from pipeline.reporting.fit import fit, prominence
 from pipeline.reporting.page import report_html
 from pipeline.reporting.pictures import upright
@@ -21,8 +22,7 @@ from pipeline.reporting.space import (
     viewer_data,
     viewer_script,
 )
-from pipeline.scene.model import View
-from pipeline.splats.spz import decode_spz, encode_spz
+from pipeline.scene.views import View
 from tests.reporting.made import gaussians, report, ring, trained
 
 VIEWER = Path(__file__).parents[2] / "pipeline" / "reporting" / "viewer"

@@ -18,11 +18,11 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from benchmarks.page import FLAGS
-from pipeline.raster import RasterOptions
+from pipeline.io.ply import write_splat_ply
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
-from pipeline.splats.ply import write_splat_ply
-from pipeline.training.render import render_view
 from tests.reporting.made import gaussians, report, trained
 
 CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)

@@ -7,17 +7,17 @@ from pipeline.runtime import source
 
 @pytest.fixture
 def project(tmp_path, monkeypatch):
-    for folder in ("pipeline/raster/csrc", "pipeline/runtime", "stages"):
+    for folder in ("pipeline/render/cpu/csrc", "pipeline/runtime", "stages"):
         (tmp_path / folder).mkdir(parents=True)
-    for folder in ("pipeline", "pipeline/raster", "pipeline/runtime", "stages"):
+    for folder in ("pipeline", "pipeline/render", "pipeline/runtime", "stages"):
         (tmp_path / folder / "__init__.py").write_text("")
     files = {
         "pipeline/a.py": "X = 1\n",
         "pipeline/b.py": "Y = 1\n",
         "pipeline/runtime/log.py": "Z = 1\n",
-        "pipeline/raster/csrc/kernel.cpp": 'int f() { return 1; } // "one"\n',
+        "pipeline/render/cpu/csrc/kernel.cpp": 'int f() { return 1; } // "one"\n',
         "stages/work.py": "from pipeline.a import X\nimport pipeline.runtime.log\n",
-        "stages/draw.py": "import pipeline.raster\n",
+        "stages/draw.py": "import pipeline.render\n",
     }
     for name, text in files.items():
         (tmp_path / name).write_text(text)
@@ -59,7 +59,7 @@ def test_code_that_the_stage_imports_changes_the_hash(project):
 def test_kernels_count_without_their_comments(project):
     root, hash_of = project
     before = hash_of("draw")
-    kernel = root / "pipeline/raster/csrc/kernel.cpp"
+    kernel = root / "pipeline/render/cpu/csrc/kernel.cpp"
     kernel.write_text("/* one\n */ int f() {\n  return 1; }\n")
     assert hash_of("draw") == before
     kernel.write_text("int f() { return 2; }\n")

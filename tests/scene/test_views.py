@@ -4,9 +4,11 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Split, Views
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.up_direction import up_direction
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
-from pipeline.scene.views import load_views, scene_extent, up_direction, view_size
+from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.views import load_views, scene_extent, view_size
 
 
 def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruction]:

@@ -9,8 +9,9 @@ from pathlib import Path
 import cv2
 import numpy as np
 
+from pipeline.geometry.cameras import Camera
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.model import Camera, Posed, Reconstruction
+from pipeline.scene.reconstruction import Posed, Reconstruction
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 _TEXTURE = 512

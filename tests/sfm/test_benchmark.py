@@ -18,7 +18,7 @@ from benchmarks.sfm.scenes import configurations, load_scene
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import Posed, Reconstruction
+from pipeline.scene.reconstruction import Posed, Reconstruction
 
 ERROR = PoseError(0.1, 0.1, 0.02, 0.02, 0.004, 5.0, 1.0, {1.0: 0.9, 5.0: 1.0, 10.0: 1.0}, 8, 8)
 

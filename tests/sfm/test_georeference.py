@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.geometry.geodesy import to_ecef, to_enu
+from pipeline.geometry.similarity import Similarity
+from pipeline.io.gcp import GroundControl, read_ground_control
 from pipeline.runtime.errors import UserError
-from pipeline.scene.gcp import GroundControl, read_ground_control
-from pipeline.scene.geodesy import to_ecef, to_enu
-from pipeline.sfm.georeference import Cameras, Frame, Similarity, from_gcp, from_gps, level
+from pipeline.sfm.georeference import Cameras, Frame, from_gcp, from_gps, level
 
 ORIGIN = np.array([47.37, 8.54, 410.0])
 METRES_A_DEGREE = 111_194.0

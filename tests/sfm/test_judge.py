@@ -65,7 +65,8 @@ def test_models_that_register_all_and_are_wrong_are_called_failed(case, tmp_path
 def test_the_truth_finds_the_similarity_that_most_views_share():
     """Half of the views right and half folded by half a turn: a mean would blame all of them."""
     from benchmarks.judge.truth import grade
-    from pipeline.scene.model import Camera, Posed, Reconstruction
+    from pipeline.geometry.cameras import Camera
+    from pipeline.scene.reconstruction import Posed, Reconstruction
 
     rng = np.random.default_rng(0)
     camera = Camera("SIMPLE_PINHOLE", 100, 100, np.array([90.0, 50, 50]))

@@ -17,12 +17,12 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.config import schema
+from pipeline.plan.keys import stage_key
+from pipeline.plan.plan import upstream
+from pipeline.plan.scan import scan
 from pipeline.runtime import processor, targets
 from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
-from pipeline.scene.keys import stage_key
-from pipeline.scene.plan import upstream
-from pipeline.scene.scan import scan
 from pipeline.sfm import nearest as near
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated

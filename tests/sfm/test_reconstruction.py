@@ -10,9 +10,9 @@ import numpy as np
 import pytest
 
 from pipeline.config import schema
+from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import read_model, write_model
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.judge import Evidence, judge

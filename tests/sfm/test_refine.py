@@ -10,9 +10,10 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Sfm
+from pipeline.geometry.cameras import Camera
+from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
-from pipeline.scene.colmap import read_model, write_model
-from pipeline.scene.model import Camera, Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 from pipeline.sfm.isolate import run_isolated
 from tests.sfm import corner
 from tests.sfm.jobs import digests
@@ -68,7 +69,7 @@ def adjusted(given: Reconstruction, folder: Path, **options: Any) -> tuple[Any, 
 
 
 def _refine(sparse: Path, config: Sfm, out: Path) -> Any:
-    from pipeline.sfm.given import refine_given
+    from pipeline.sfm.refine_given import refine_given
 
     return refine_given(sparse, config, out)
 

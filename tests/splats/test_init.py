@@ -8,9 +8,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.schema import Init
+from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.runtime.errors import UserError
-from pipeline.scene.model import Points, View
-from pipeline.scene.rotations import quat_to_rotation
+from pipeline.scene.reconstruction import Points
+from pipeline.scene.views import View
 from pipeline.splats.init import (
     MAX_ANGLE,
     SH_C0,

@@ -8,9 +8,9 @@ import pytest
 
 from pipeline.config.options import option_paths, select
 from pipeline.config.schema import Config, Split, Train, Views
+from pipeline.plan.keys import stage_key
+from pipeline.plan.plan import Plan, upstream
 from pipeline.runtime.section import read_section
-from pipeline.scene.keys import stage_key
-from pipeline.scene.plan import Plan, upstream
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan
 

@@ -8,7 +8,7 @@ import numpy as np
 
 from pipeline.demo.cameras import lens, look_at, orbit
 from pipeline.demo.scene import OBJECTS, trace
-from pipeline.scene.model import View
+from pipeline.scene.views import View
 from pipeline.surface.depth import DepthMap
 
 

@@ -13,10 +13,10 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Density, Train
-from pipeline.scene.model import View
+from pipeline.render.views import render_view
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training import trainer
-from pipeline.training.render import render_view
+from pipeline.training.loop import trainer
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
 NUM_VIEWS = 6

@@ -12,10 +12,10 @@ import pytest
 
 from pipeline.config.schema import Train
 from pipeline.scene.manifest import Manifest
-from pipeline.scene.model import Reconstruction
+from pipeline.scene.reconstruction import Reconstruction
 from pipeline.training import scene as stage
-from pipeline.training.depth import SCALE_SHARE, KnownDepths
-from pipeline.training.inputs import Inputs
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.data.known_depths import SCALE_SHARE, KnownDepths
 from tests.training.conftest import ball, camera_at
 
 

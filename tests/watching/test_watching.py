@@ -11,14 +11,15 @@ import numpy as np
 import pytest
 
 from pipeline.__main__ import main
+from pipeline.geometry.cameras import Camera
+from pipeline.geometry.rotations import rotation_to_quat
+from pipeline.io.colmap import write_model
+from pipeline.io.ply import write_splat_ply
 from pipeline.runtime.errors import UserError
-from pipeline.scene.colmap import write_model
-from pipeline.scene.model import Camera, Posed, Reconstruction
-from pipeline.scene.rotations import rotation_to_quat
-from pipeline.splats.ply import write_splat_ply
-from pipeline.training import checkpoint
-from pipeline.training.checkpoint import Checkpoint
-from pipeline.training.journal import NAME
+from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.training.checkpoints import checkpoint
+from pipeline.training.checkpoints.checkpoint import Checkpoint
+from pipeline.training.loop.metrics_log import NAME
 from pipeline.watching.server import Page, Room, picture_size
 from pipeline.watching.source import Source
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, ball, camera_at

@@ -9,7 +9,7 @@ __all__ = ["Changes", "GradientDensity", "McmcDensity", "Strategy", "make_strate
 
 
 def make_strategy(config: Density, scale: float) -> Strategy:
-    """What ``config.strategy`` names; ``scale`` is ``training.depth.scene_scale``."""
+    """What ``config.strategy`` names; ``scale`` is ``training.data.known_depths.scene_scale``."""
     if config.strategy == "mcmc":
         return McmcDensity(config, scale)
     return GradientDensity(config, scale)

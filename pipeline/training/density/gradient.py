@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Density
-from pipeline.raster import Forward, Gradients
+from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.strategy import Changes, not_finite, rotations
-from pipeline.training.optimiser import Adam
+from pipeline.training.optimisers.adam import Adam
 
 # A sampled split makes two, each this much smaller: 0.8 N with N = 2 (3DGS).
 SPLIT_SHRINK = 1.6
@@ -39,7 +39,8 @@ class GradientDensity:
 
     Attributes:
         config: thresholds and the budget.
-        scale: the scene's size (``training.depth.scene_scale``), for thresholds on scales.
+        scale: the scene's size (``training.data.known_depths.scene_scale``), for thresholds on
+            scales.
         gradient_sum: (N,) float32, summed norms of the gradient of the projected mean, in
             normalised device coordinates (so that it doesn't depend on the resolution).
         seen: (N,) float32, number of steps in which the Gaussian was visible.

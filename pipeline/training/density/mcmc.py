@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.config.schema import Density
-from pipeline.raster import Forward, Gradients
+from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density.strategy import Changes, not_finite, rotations
-from pipeline.training.optimiser import Adam
+from pipeline.training.optimisers.adam import Adam
 
 # More copies of one Gaussian in one refinement than this change nothing any more (the paper's code
 # has 51).
@@ -36,9 +36,9 @@ MAX_OPACITY = 1 - 1e-6
 class McmcDensity:
     """Attributes:
     config: growth, threshold of the useless, weights of the regularisers.
-    scale: the scene's size (``training.depth.scene_scale``). The paper's cost of scales and its
-        noise count in the world's unit; here they count in that size, so that the unit does not
-        matter.
+    scale: the scene's size (``training.data.known_depths.scene_scale``). The paper's cost of
+        scales and its noise count in the world's unit; here they count in that size, so that the
+        unit does not matter.
     """
 
     config: Density

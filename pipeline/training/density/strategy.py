@@ -10,9 +10,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.raster import Forward, Gradients
+from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.optimiser import Adam
+from pipeline.training.optimisers.adam import Adam
 
 
 @dataclass

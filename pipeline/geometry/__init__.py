@@ -1,0 +1,1 @@
+"""Rotations, similarities, camera models and places on the ground."""

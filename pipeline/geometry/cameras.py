@@ -1,0 +1,79 @@
+"""COLMAP's camera models, and one camera's intrinsics."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+# COLMAP's camera models: name -> (id in binary files, names of the parameters in order).
+# Source: COLMAP's documentation, "Camera Models".
+CAMERA_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
+    "SIMPLE_PINHOLE": (0, ("f", "cx", "cy")),
+    "PINHOLE": (1, ("fx", "fy", "cx", "cy")),
+    "SIMPLE_RADIAL": (2, ("f", "cx", "cy", "k")),
+    "RADIAL": (3, ("f", "cx", "cy", "k1", "k2")),
+    "OPENCV": (4, ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2")),
+    "OPENCV_FISHEYE": (5, ("fx", "fy", "cx", "cy", "k1", "k2", "k3", "k4")),
+    "FULL_OPENCV": (
+        6,
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+    ),
+    "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k")),
+    "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+}
+
+
+@dataclass(frozen=True)
+class Camera:
+    """One camera's intrinsics.
+
+    Attributes:
+        model: a name in ``CAMERA_MODELS``.
+        width, height: pixels.
+        params: float64, in the model's order; focal lengths and principal point in pixels.
+    """
+
+    model: str
+    width: int
+    height: int
+    params: NDArray[np.float64]
+
+    @property
+    def is_pinhole(self) -> bool:
+        """True for a perspective camera without any distortion term."""
+        if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
+            return True
+        distortion = self.params[len(self.intrinsics_names) :]
+        return "FISHEYE" not in self.model and not np.any(distortion)
+
+    @property
+    def intrinsics_names(self) -> tuple[str, ...]:
+        names = CAMERA_MODELS[self.model][1]
+        return names[:3] if names[0] == "f" else names[:4]
+
+    @property
+    def pinhole(self) -> tuple[float, float, float, float]:
+        """(fx, fy, cx, cy) in pixels."""
+        p = [float(v) for v in self.params]
+        if self.intrinsics_names[0] == "f":
+            return p[0], p[0], p[1], p[2]
+        return p[0], p[1], p[2], p[3]
+
+    def resized(self, width: int, height: int) -> Camera:
+        """The same camera for its image resized to ``width`` x ``height`` pixels."""
+        sx, sy = width / self.width, height / self.height
+        fx, fy, cx, cy = self.pinhole
+        rest = self.params[len(self.intrinsics_names) :]
+        if self.intrinsics_names[0] == "f" and abs(sx - sy) < 1e-9 * sx:
+            params = np.array([fx * sx, cx * sx, cy * sy, *rest])
+            return Camera(self.model, width, height, params)
+        model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
+            self.model, self.model
+        )
+        if model == "OPENCV" and len(rest) < 4:
+            rest = np.concatenate([rest, np.zeros(4 - len(rest))])
+        if self.model.endswith("RADIAL_FISHEYE"):
+            model, rest = "OPENCV_FISHEYE", np.concatenate([rest, np.zeros(4 - len(rest))])
+        return Camera(model, width, height, np.array([fx * sx, fy * sy, cx * sx, cy * sy, *rest]))

@@ -1,0 +1,1 @@
+"""File formats: COLMAP, transforms.json, LLFF, EXIF, ground control, Gaussians."""

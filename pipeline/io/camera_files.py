@@ -1,0 +1,79 @@
+"""Cameras without photographs, from any file or folder that holds some."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+
+from pipeline.io.colmap import has_model, read_model
+from pipeline.io.names import PICTURE_SUFFIXES, NameIndex
+from pipeline.io.photofile import read_facts
+from pipeline.io.transforms import Frame, find_transforms, read_frames, read_transforms
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
+
+STAGES_WITH_MODEL = ("train", "undistort", "sfm", "refine", "decode", "inspect")
+
+
+def read_cameras(path: Path) -> Reconstruction:
+    """The cameras in a COLMAP model's folder, in a scene or results folder that holds one
+    (``sparse/0``), or in a ``transforms.json``; no photograph is needed.
+
+    Raises:
+        UserError: none found, or malformed.
+    """
+    is_results = (path / "plan.json").is_file()
+    roots = [path / name for name in STAGES_WITH_MODEL] if is_results else [path]
+    for root in roots:
+        for folder in (root, root / "sparse" / "0", root / "sparse"):
+            if has_model(folder):
+                return read_model(folder)
+    if path.is_file() or find_transforms(path):
+        sizes = {frame.path: _size(frame) for frame in read_frames(path)}
+        return read_transforms(path, sizes)
+    raise UserError(
+        "expected a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) or a "
+        "transforms.json, found neither",
+        file=path,
+        fix="name the folder or file that holds the cameras",
+    )
+
+
+def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[View]:
+    """The views of these names, with or without suffix.
+
+    Raises:
+        UserError: there is none of a name.
+    """
+    by_name = {view.name: view for view in views}
+    index = NameIndex(by_name)
+    chosen = []
+    for name in names:
+        found = index.find(name)
+        if found is None:
+            some = ", ".join(list(by_name)[:5])
+            raise UserError(
+                f"expected a view named {name!r}, found {len(views)} others ({some}, ...)",
+                file=source,
+                fix="name one of them",
+            )
+        chosen.append(by_name[found])
+    return chosen
+
+
+def _size(frame: Frame) -> tuple[int, int]:
+    """Pixels of a frame's picture: as the file says, else as its picture, if it is there, says."""
+    width, height = frame.fields.get("w"), frame.fields.get("h")
+    if isinstance(width, int | float) and isinstance(height, int | float):
+        return round(width), round(height)
+    for suffix in ("", *sorted(PICTURE_SUFFIXES)):
+        picture = frame.file.parent / (frame.path + suffix)
+        if picture.is_file():
+            facts = read_facts(picture)
+            return facts.width, facts.height
+    raise UserError(
+        f"{frame.source}: expected the picture's size (w and h) or the picture, found neither",
+        file=frame.file,
+        fix="add w and h to the file, in pixels",
+    )

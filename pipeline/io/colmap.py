@@ -1,0 +1,139 @@
+"""COLMAP sparse models, binary and text, read and written with numpy alone.
+
+Layouts: COLMAP's documentation, "Output Format". Only what a ``Reconstruction`` holds is kept:
+keypoints that no point uses, and rigs and frames, are dropped (every image keeps its own pose,
+which is what ``images.bin`` stores in all versions of the format).
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
+from pipeline.io import colmap_binary, colmap_text
+from pipeline.io.colmap_records import POINT2D, REMEDY, Keypoints, PointTable, Tracks
+from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Points, Reconstruction
+
+__all__ = ["has_model", "quat_to_rotation", "read_model", "rotation_to_quat", "write_model"]
+
+
+def has_model(folder: Path) -> bool:
+    """True where ``read_model`` would find a model to read."""
+    return _suffix(folder) is not None
+
+
+def read_model(folder: Path) -> Reconstruction:
+    """Read ``cameras``, ``images`` and, where it exists, ``points3D`` from ``folder``.
+
+    Binary files are preferred to text ones, as COLMAP does. Points come sorted by their id.
+
+    Raises:
+        UserError: no model, malformed or truncated files, unknown camera models, poses or
+            intrinsics that are not finite, images of unknown cameras, tracks of unknown images.
+    """
+    suffix = _suffix(folder)
+    if suffix is None:
+        raise UserError(
+            "expected a COLMAP model (cameras and images, both .bin or both .txt), found none",
+            file=folder,
+            fix=REMEDY,
+        )
+    form = colmap_binary if suffix == ".bin" else colmap_text
+    cameras = form.read_cameras(folder / f"cameras{suffix}")
+    images, keypoints = form.read_images(folder / f"images{suffix}", cameras)
+    points_file = folder / f"points3D{suffix}"
+    if not points_file.exists():
+        return Reconstruction(cameras, images)
+    table = form.read_points(points_file)
+    return Reconstruction(cameras, images, _points(points_file, table, keypoints))
+
+
+def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> None:
+    """Write ``model`` as a COLMAP model; the same model gives the same bytes.
+
+    Points get the ids 1, 2, ... in their order; an image's keypoints are those of its tracks.
+    Observations at unknown pixels are left out, as the format cannot say "unknown". Files of
+    another model in ``folder`` are removed. COLMAP's own text reader ends an image's name at the
+    first space: write binary where names may hold one.
+
+    Raises:
+        ValueError: an image name the format cannot hold.
+    """
+    form, suffix = (colmap_text, ".txt") if text else (colmap_binary, ".bin")
+    keypoints, tracks = _index_tracks(model)
+    for name in (image.name for image in model.images.values()):
+        if not name or any(c in name for c in "\0\n\r"):
+            raise ValueError(f"a COLMAP model cannot hold the image name {name!r}")
+    files = {
+        "cameras": form.cameras_bytes(model),
+        "images": form.images_bytes(model, keypoints),
+        "points3D": form.points_bytes(model.points, tracks),
+    }
+    for stem in ("cameras", "images", "points3D", "rigs", "frames"):
+        for other in (".bin", ".txt"):
+            (folder / f"{stem}{other}").unlink(missing_ok=True)
+    for stem, data in files.items():
+        write_bytes(folder / f"{stem}{suffix}", data)
+
+
+def _suffix(folder: Path) -> str | None:
+    for suffix in (".bin", ".txt"):
+        if all((folder / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")):
+            return suffix
+    return None
+
+
+def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float64]]) -> Points:
+    """Sort by id and look the observations' pixels up."""
+    if not np.isfinite(table.xyz).all():
+        bad = int(table.ids[~np.isfinite(table.xyz).all(1)][0])
+        raise UserError(f"point {bad}: its position is not finite", file=file, fix=REMEDY)
+    xy = np.full((len(table.image), 2), np.nan)
+    order = np.argsort(table.image, kind="stable")
+    numbers, starts = np.unique(table.image[order], return_index=True)
+    for number, start, stop in zip(numbers, starts, [*starts[1:], len(order)], strict=False):
+        rows = order[start:stop]
+        seen = keypoints.get(int(number))
+        if seen is None:
+            raise UserError(
+                f"a track names image id {number}, which is not in the model",
+                file=file,
+                fix=REMEDY,
+            )
+        known = rows[table.index[rows] < len(seen)]
+        xy[known] = seen[table.index[known]]
+    by_id = np.argsort(table.ids, kind="stable")
+    if len(by_id) and np.any(np.diff(table.ids[by_id]) == 0):
+        raise UserError("a point id stands there twice", file=file, fix=REMEDY)
+    length = table.length[by_id]
+    old_start = (np.cumsum(table.length) - table.length)[by_id]
+    start = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
+    rows = np.repeat(old_start - start[:-1], length) + np.arange(start[-1])
+    return Points(
+        table.xyz[by_id], table.rgb[by_id], table.error[by_id], start, table.image[rows], xy[rows]
+    )
+
+
+def _index_tracks(model: Reconstruction) -> tuple[Keypoints, Tracks]:
+    """For writing: the images' keypoints and the points' tracks into them."""
+    points = model.points
+    rows = np.flatnonzero(np.isfinite(points.track_xy).all(axis=1))
+    owner = np.repeat(np.arange(len(points)), points.track_length)[rows]
+    image = points.track_image_id[rows]
+    seen = np.zeros(len(rows), POINT2D)
+    seen["xy"], seen["point"] = points.track_xy[rows], owner + 1
+    by_image = np.argsort(image, kind="stable")
+    numbers, starts = np.unique(image[by_image], return_index=True)
+    ends = [*starts[1:].tolist(), len(rows)]
+    keypoints: Keypoints = {number: seen[:0] for number in model.images}
+    index = np.empty(len(rows), np.int64)
+    for number, start, end in zip(numbers.tolist(), starts.tolist(), ends, strict=False):
+        of_image = by_image[start:end]
+        keypoints[number] = seen[of_image]
+        index[of_image] = np.arange(end - start)
+    return keypoints, Tracks(np.bincount(owner, minlength=len(points)), image, index)

@@ -1,0 +1,108 @@
+"""What COLMAP's binary and text files share: records and their checks."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.cameras import CAMERA_MODELS, Camera
+from pipeline.geometry.rotations import quat_to_rotation
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Posed
+
+REMEDY = "export the model again from COLMAP (binary or text), or set poses: ignore"
+POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
+"""A keypoint as binary files hold it."""
+Keypoints = dict[int, NDArray[np.void]]
+"""For writing: each image's keypoints (``POINT2D``), by image id."""
+
+
+@dataclass(frozen=True)
+class Tracks:
+    """For writing: length (P,) and, one after another, the tracks' image ids and keypoint indices
+    (M,)."""
+
+    length: NDArray[np.int64]
+    image: NDArray[np.int64]
+    index: NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class PointTable:
+    """points3D as stored: ids (P,), xyz (P, 3), rgb (P, 3), error (P,), length (P,) and, one
+    after another, the tracks' image ids and keypoint indices (M,)."""
+
+    ids: NDArray[np.int64]
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    error: NDArray[np.float64]
+    length: NDArray[np.int64]
+    image: NDArray[np.int64]
+    index: NDArray[np.int64]
+
+
+def make_camera(
+    file: Path, number: int, name: str, width: int, height: int, p: list[float]
+) -> Camera:
+    names = CAMERA_MODELS[name][1]
+    if len(p) != len(names):
+        raise UserError(
+            f"camera {number}: {name} has {len(names)} parameters ({', '.join(names)}), "
+            f"found {len(p)}",
+            file=file,
+            fix=REMEDY,
+        )
+    camera = Camera(name, width, height, np.array(p, np.float64))
+    if not (0 < width < 2**31 and 0 < height < 2**31):
+        raise UserError(f"camera {number}: impossible size {width}x{height}", file=file, fix=REMEDY)
+    if not np.isfinite(camera.params).all() or min(camera.pinhole[:2]) <= 0:
+        raise UserError(
+            f"camera {number}: expected finite parameters and a positive focal length, found {p}",
+            file=file,
+            fix=REMEDY,
+        )
+    return camera
+
+
+def make_posed(
+    file: Path, name: str, camera_id: int, quat: list[float], shift: list[float]
+) -> Posed:
+    q, t = np.array(quat, np.float64), np.array(shift, np.float64)
+    norm = math.hypot(*quat)
+    if not (1e-12 < norm < 1e12) or not np.isfinite(t).all():
+        raise UserError(
+            f"image {name}: expected a finite pose, found quaternion {quat}, translation {shift}",
+            file=file,
+            fix=f"remove {name} from the model, or set poses: ignore",
+        )
+    return Posed(name, camera_id, quat_to_rotation(q), t)
+
+
+def add_image(
+    file: Path,
+    images: dict[int, Posed],
+    cameras: dict[int, Camera],
+    number: int,
+    image: Posed,
+) -> None:
+    if image.camera_id not in cameras:
+        raise UserError(
+            f"image {image.name} belongs to camera {image.camera_id}, which is not in the model",
+            file=file,
+            fix=REMEDY,
+        )
+    if number in images:
+        raise UserError(f"image id {number} stands there twice", file=file, fix=REMEDY)
+    images[number] = image
+
+
+def unknown_model(file: Path, number: int, found: str) -> UserError:
+    return UserError(
+        f"camera {number}: unknown camera model {found}; known are {', '.join(CAMERA_MODELS)}",
+        file=file,
+        fix="undistort in COLMAP first (colmap image_undistorter), or set poses: ignore",
+    )

@@ -1,0 +1,120 @@
+"""Finding pictures in folders, and the masks and depth maps that belong to them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path, PurePosixPath
+
+from pipeline.io.names import PHOTO_SUFFIXES, PICTURE_SUFFIXES, UNREAD_SUFFIXES, suffix_of
+
+# Folders of a scene that hold pictures which are no photographs, or smaller copies of them.
+COMPANION_FOLDERS = frozenset({"masks", "depths", "sparse", "sparse_gt", "colmap", "stereo"})
+_DEPTH_SUFFIXES = PICTURE_SUFFIXES | {".npy", ".npz", ".exr", ".pfm"}
+
+
+@dataclass(frozen=True)
+class PhotoFolder:
+    """A folder of photographs in a scene.
+
+    Attributes:
+        path: relative to the scene folder, "." for itself.
+        base: the folder of full-size photographs that given poses speak of.
+        reason: why this one.
+        names: its pictures, relative to it, sorted.
+        masks: mask files that the pose file names, relative to the scene folder, by picture.
+    """
+
+    path: str
+    base: str
+    reason: str
+    names: list[str]
+    masks: dict[str, str] = field(default_factory=dict)
+
+
+def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) -> list[str]:
+    """Names of the files with a photograph's suffix, relative to ``folder``, sorted.
+
+    Hidden files and folders, and subfolders of masks, depth maps and models, are passed over.
+    Pictures of a kind this program does not read add one warning for the folder.
+    """
+    names: list[str] = []
+    unread: list[str] = []
+    seen: set[str] = set()
+    for where, subfolders, files in os.walk(folder, followlinks=True):
+        real = os.path.realpath(where)
+        subfolders[:] = [
+            name
+            for name in sorted(subfolders)
+            if recursive and real not in seen and name[0] != "." and not _is_companion(name)
+        ]
+        if real in seen:  # A link back to a folder above.
+            continue
+        seen.add(real)
+        prefix = Path(where).relative_to(folder)
+        for name in files:
+            if not _is_text(name):
+                shown = os.fsencode(name).decode(errors="replace")
+                warnings.append(f"{where}: {shown} is left out: its name is not UTF-8; rename it")
+                continue
+            suffix = suffix_of(name)
+            if name[0] != "." and suffix in PHOTO_SUFFIXES:
+                names.append((prefix / name).as_posix())
+            elif suffix in UNREAD_SUFFIXES:
+                unread.append((prefix / name).as_posix())
+    if unread:
+        kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
+        warnings.append(
+            f"{folder}: {len(unread)} {kinds} pictures are left out (first: {min(unread)}): "
+            "convert them to JPEG or PNG, keeping their EXIF (HEIC is read where pillow-heif is "
+            "installed)"
+        )
+    return sorted(names)
+
+
+def _is_text(name: str) -> bool:
+    try:
+        name.encode()
+    except UnicodeEncodeError:
+        return False
+    return True
+
+
+def relative_folders(folder: Path) -> list[str]:
+    """Names of the folder's subfolders that may hold photographs, sorted."""
+    return sorted(
+        path.name
+        for path in folder.iterdir()
+        if path.is_dir() and path.name[0] != "." and not _is_companion(path.name)
+    )
+
+
+def companions(folder: Path, candidates: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
+    """Masks or depth maps by photograph, from the first of the ``candidates`` that exists.
+
+    ``a/b.jpg`` has ``a/b.png`` (any suffix) or, as COLMAP has it, ``a/b.jpg.png``.
+    """
+    for candidate in candidates:
+        root = folder / candidate
+        if not root.is_dir():
+            continue
+        index: dict[str, Path] = {}
+        for where, _, files in os.walk(root):
+            for file in sorted(files):
+                if file[0] != "." and suffix_of(file) in _DEPTH_SUFFIXES:
+                    path = Path(where) / file
+                    index.setdefault(_key(path.relative_to(root).as_posix()), path)
+        found = {name: index.get(name.casefold()) or index.get(_key(name)) for name in names}
+        return {name: path for name, path in found.items() if path is not None}
+    return {}
+
+
+def _is_companion(name: str) -> bool:
+    stem, _, step = name.rpartition("_")
+    plain = stem if stem and step.isdecimal() else name
+    return plain.casefold() in COMPANION_FOLDERS
+
+
+def _key(name: str) -> str:
+    return PurePosixPath(name).with_suffix("").as_posix().casefold()

@@ -1,0 +1,293 @@
+"""Binary glTF (.glb) with KHR_gaussian_splatting: Gaussians as a glTF scene's points.
+
+Programs that do not know the extension show a coloured point cloud. glTF is y up with its front
+towards +z, so the PLY's frame (y down, z ahead) is turned by half a turn about z, as other
+programs do it. Source: github.com/KhronosGroup/glTF, KHR_gaussian_splatting, README.md.
+"""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from pydantic import BaseModel, Field, ValidationError
+
+from pipeline.io.splat_codec import logit, read_file, sigmoid, to_bytes
+from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.errors import UserError
+from pipeline.splats.gaussians import Gaussians, concat
+from pipeline.splats.init import SH_C0
+
+_NAME = "KHR_gaussian_splatting"
+_HEADER, _CHUNK = struct.Struct("<4sII"), struct.Struct("<I4s")
+_TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_COEFFICIENTS = tuple(f"SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1))
+_FIX = "write the file again as .glb without compression and without node transforms, or use a PLY"
+# Of a Gaussian: float positions and colour, everything else in bytes.
+_LEAST_BYTES = 32
+# Float32 opacities this near to 0 and 1 are read as if this far from them.
+_OPACITY_MARGIN = 1e-6
+
+
+def write_gltf(path: Path, gaussians: Gaussians) -> None:
+    """Write a .glb file, which appears whole or not at all.
+
+    Raises:
+        UserError: no Gaussians, or more than the format's 4 GiB hold.
+    """
+    count = len(gaussians)
+    if not 0 < count * (192 + 48) < 2**32 - 2**20:
+        raise UserError(
+            f"a .glb file holds 1 to 17 million Gaussians, these are {count}",
+            file=path,
+            fix="leave out fewer, or more, faint ones (min_opacity)",
+        )
+    means, log_scales, quats, logits, sh = half_turn(gaussians).arrays().values()
+    opacity = sigmoid(logits)
+    rgba = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacity[:, None]], 1)
+    norm = np.linalg.norm(quats, axis=1, keepdims=True)
+    columns: dict[str, NDArray[Any]] = {
+        "POSITION": means,
+        "COLOR_0": to_bytes(rgba * 255),
+        f"{_NAME}:ROTATION": np.where(norm > 0, quats / np.maximum(norm, 1e-30), (1, 0, 0, 0))[
+            :, [1, 2, 3, 0]
+        ],
+        f"{_NAME}:SCALE": np.exp(log_scales),
+        f"{_NAME}:OPACITY": opacity[:, None],
+    }
+    for k, name in enumerate(_COEFFICIENTS[: sh.shape[1]]):
+        columns[f"{_NAME}:{name}"] = sh[:, k]
+    accessors: list[dict[str, Any]] = []
+    parts: list[bytes] = []
+    for values in columns.values():
+        is_bytes = values.dtype == np.uint8
+        parts.append(np.asarray(values, "u1" if is_bytes else "<f4").tobytes())
+        accessors.append(
+            {
+                "bufferView": len(accessors),
+                "componentType": 5121 if is_bytes else 5126,
+                "count": count,
+                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+            }
+        )
+        if is_bytes:
+            accessors[-1]["normalized"] = True
+    accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
+    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    extension = {
+        "kernel": "ellipse",
+        "colorSpace": "srgb_rec709_display",
+        "projection": "perspective",
+        "sortingMethod": "cameraDistance",
+    }
+    primitive = {
+        "attributes": {name: i for i, name in enumerate(columns)},
+        "mode": 0,
+        "extensions": {_NAME: extension},
+    }
+    document = {
+        "asset": {"version": "2.0", "generator": "splatmake"},
+        "extensionsUsed": [_NAME],
+        "scene": 0,
+        "scenes": [{"nodes": [0]}],
+        "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [primitive]}],
+        "accessors": accessors,
+        "bufferViews": [
+            {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": 34962}
+            for start, part in zip(starts, parts, strict=False)
+        ],
+        "buffers": [{"byteLength": starts[-1]}],
+    }
+    text = json.dumps(document, separators=(",", ":"), allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    size = _HEADER.size + 2 * _CHUNK.size + len(text) + starts[-1]
+    head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
+    write_bytes(path, b"".join([head, _CHUNK.pack(starts[-1], b"BIN\0"), *parts]))
+
+
+def read_gltf(path: Path) -> Gaussians:
+    """Read the Gaussians of all primitives of a .glb file, in the PLY's frame.
+
+    Raises:
+        UserError: the file is missing, cut short, malformed, holds no Gaussians, or holds them
+            compressed or moved by nodes.
+    """
+    data = read_file(path, "a .glb file")
+    try:
+        text, body = _chunks(data)
+        document = _Document.model_validate_json(text)
+        if any(node.moves for node in document.nodes):
+            raise ValueError("expected Gaussians where they are, found nodes that move them")
+        primitives = [p for mesh in document.meshes for p in mesh.primitives if p.is_splats]
+        if not primitives:
+            raise ValueError(f"expected Gaussians ({_NAME}), found none")
+        parts: list[Gaussians] = []
+        for primitive in primitives:
+            parts.append(_gaussians(document, body, primitive.attributes))
+            # Primitives that share their numbers would make much of a small file.
+            if sum(map(len, parts)) * _LEAST_BYTES > len(body):
+                raise ValueError("expected each Gaussian once, found primitives that share them")
+    except ValidationError as error:
+        first = error.errors()[0]
+        where = ".".join(str(part) for part in first["loc"])
+        what = f"expected glTF, found {where or 'text'}: {first['msg']}"[:300]
+        raise UserError(what, file=path, fix=_FIX) from None
+    except ValueError as error:
+        raise UserError(str(error), file=path, fix=_FIX) from None
+    degree = max(part.sh_degree for part in parts)
+    return half_turn(concat([part.with_sh_degree(degree) for part in parts]))
+
+
+class _View(BaseModel):
+    buffer: Literal[0]
+    byteOffset: int = Field(0, ge=0)
+    byteLength: int = Field(ge=0)
+    byteStride: int | None = Field(None, ge=4, le=252)
+
+
+class _Accessor(BaseModel):
+    bufferView: int = Field(ge=0)
+    byteOffset: int = Field(0, ge=0)
+    componentType: int
+    count: int = Field(ge=1)
+    type: str
+    normalized: bool = False
+    sparse: None = None
+
+
+class _Node(BaseModel):
+    matrix: list[float] | None = None
+    translation: list[float] = [0, 0, 0]
+    rotation: list[float] = [0, 0, 0, 1]
+    scale: list[float] = [1, 1, 1]
+
+    @property
+    def moves(self) -> bool:
+        turned = self.rotation[:3] != [0, 0, 0]
+        placed = self.translation != [0, 0, 0] or self.scale != [1, 1, 1]
+        return placed or turned or self.matrix not in (None, np.eye(4).ravel().tolist())
+
+
+class _Primitive(BaseModel):
+    attributes: dict[str, int]
+    extensions: dict[str, Any] = {}
+
+    @property
+    def is_splats(self) -> bool:
+        return _NAME in self.extensions
+
+
+class _Mesh(BaseModel):
+    primitives: list[_Primitive]
+
+
+class _Document(BaseModel):
+    """The parts of a glTF document that place Gaussians."""
+
+    nodes: list[_Node] = []
+    meshes: list[_Mesh] = []
+    accessors: list[_Accessor] = []
+    bufferViews: list[_View] = []
+
+
+def _chunks(data: bytes) -> tuple[bytes, memoryview]:
+    """The JSON text and the binary chunk."""
+    if len(data) < _HEADER.size or data[:4] != b"glTF":
+        raise ValueError("expected a .glb file, found something else")
+    _, version, size = _HEADER.unpack_from(data)
+    if version != 2 or size != len(data):
+        raise ValueError(f"expected glTF 2 of {size} bytes, found {version} of {len(data)} bytes")
+    chunks: dict[bytes, memoryview] = {}
+    at = _HEADER.size
+    while at + _CHUNK.size <= size:
+        length, kind = _CHUNK.unpack_from(data, at)
+        at += _CHUNK.size
+        if at + length > size:
+            raise ValueError(f"expected a chunk of {length} bytes, found {size - at}")
+        chunks.setdefault(kind, memoryview(data)[at : at + length])
+        at += length
+    if b"JSON" not in chunks:
+        raise ValueError("expected a chunk of JSON, found none")
+    return bytes(chunks[b"JSON"]), chunks.get(b"BIN\0", memoryview(b""))
+
+
+def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]) -> Gaussians:
+    def column(name: str, width: int) -> NDArray[np.float32]:
+        if name not in attributes:
+            raise ValueError(f"expected the attribute {name}, found none (compressed?)")
+        values = _values(document, body, attributes[name])
+        if values.shape != (len(values), width) or not np.isfinite(values).all():
+            raise ValueError(f"{name}: expected {width} finite numbers for each Gaussian")
+        return values
+
+    degree = max((d for d in range(4) if f"{_NAME}:SH_DEGREE_{d}_COEF_0" in attributes), default=0)
+    names = _COEFFICIENTS[: (degree + 1) ** 2]
+    scale = column(f"{_NAME}:SCALE", 3)
+    if scale.min() < 0:
+        log_scales = scale  # Drafts of the extension had logarithms.
+    else:
+        with np.errstate(divide="ignore"):
+            log_scales = np.log(scale)
+    arrays: dict[str, NDArray[Any]] = {
+        "means": column("POSITION", 3),
+        "log_scales": log_scales,
+        "quats": column(f"{_NAME}:ROTATION", 4)[:, [3, 0, 1, 2]],
+        "opacity_logits": logit(column(f"{_NAME}:OPACITY", 1)[:, 0], _OPACITY_MARGIN),
+    }
+    coefficients = [column(f"{_NAME}:{name}", 3) for name in names]
+    if any(len(values) != len(scale) for values in (*arrays.values(), *coefficients)):
+        raise ValueError("expected attributes of one length, found several")
+    return Gaussians.from_arrays(arrays | {"sh": np.stack(coefficients, 1)})
+
+
+def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.float32]:
+    """(count, width) values of an accessor, integers normalised where it says so."""
+    if not 0 <= index < len(document.accessors):
+        raise ValueError(f"expected accessor {index}, found none")
+    accessor = document.accessors[index]
+    if accessor.bufferView >= len(document.bufferViews):
+        raise ValueError(f"expected buffer view {accessor.bufferView}, found none")
+    view = document.bufferViews[accessor.bufferView]
+    if accessor.componentType not in _TYPES or accessor.type not in _WIDTHS:
+        raise ValueError(f"accessor {index}: {accessor.componentType} {accessor.type} is not known")
+    dtype, width = np.dtype(_TYPES[accessor.componentType]), _WIDTHS[accessor.type]
+    row = dtype.itemsize * width
+    stride = view.byteStride or row
+    inside = accessor.byteOffset + (accessor.count - 1) * stride + row
+    if inside > view.byteLength or view.byteOffset + view.byteLength > len(body):
+        raise ValueError(f"accessor {index}: expected {inside} bytes, found fewer")
+    table: NDArray[Any] = np.ndarray(
+        (accessor.count, width),
+        dtype,
+        body,
+        view.byteOffset + accessor.byteOffset,
+        (stride, dtype.itemsize),
+    )
+    if accessor.normalized and dtype.kind != "f":
+        return np.maximum(table / np.float32(np.iinfo(dtype).max), -1).astype(np.float32)
+    return table.astype(np.float32)
+
+
+def half_turn(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians turned by 180 degrees about z, twice what they were.
+
+    x and y change their signs, and so does every harmonic of odd order, which is every
+    coefficient of odd index. Turning quaternions is a product with k.
+    """
+    signs = torch.ones(gaussians.sh.shape[1], 1)
+    signs[1::2] = -1
+    w, x, y, z = gaussians.quats.unbind(1)
+    return Gaussians(
+        gaussians.means * torch.tensor([-1.0, -1.0, 1.0]),
+        gaussians.log_scales,
+        torch.stack([-z, -y, x, w], 1),
+        gaussians.opacity_logits,
+        gaussians.sh * signs,
+    )

@@ -1,0 +1,86 @@
+"""``poses_bounds.npy`` of LLFF: one row of 17 numbers a photograph, sorted by name.
+
+A row is a 3x5 matrix (camera to world, then height, width and focal length in pixels) followed
+by the nearest and farthest depth. The matrix's axes are down, right, backward.
+Source: the LLFF repository's README, "Using your own poses without running COLMAP".
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.cameras import Camera
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Posed, Reconstruction
+
+_FIX = "export the poses again with as many rows as photographs, or set poses: ignore"
+
+
+def read_poses_bounds(
+    path: Path, names: Sequence[str]
+) -> tuple[Reconstruction, NDArray[np.float64]]:
+    """Read LLFF poses.
+
+    Args:
+        path: the ``.npy`` file.
+        names: the photographs, sorted as LLFF sorts them: row i is photograph i.
+
+    Returns:
+        The reconstruction (SIMPLE_PINHOLE cameras of the file's size, no points) and (N, 2) near
+        and far depths in world units.
+
+    Raises:
+        UserError: not such a file, another number of rows, values that are not finite, no
+            rotation.
+    """
+    rows = read_rows(path)
+    if len(rows) != len(names):
+        raise UserError(
+            f"holds {len(rows)} poses, but there are {len(names)} photographs",
+            file=path,
+            fix=_FIX,
+        )
+    cameras: dict[int, Camera] = {}
+    numbers: dict[tuple, int] = {}
+    images: dict[int, Posed] = {}
+    for i, name in enumerate(names):
+        matrix = rows[i, :15].reshape(3, 5)
+        down, right, backward, centre, (height, width, focal) = matrix.T
+        rotation = np.stack([right, down, -backward])
+        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+            raise UserError(f"row {i} ({name}): not a rotation", file=path, fix=_FIX)
+        if min(height, width) < 1 or focal <= 0:
+            raise UserError(
+                f"row {i} ({name}): expected positive height, width and focal length, found "
+                f"{height:g}, {width:g}, {focal:g}",
+                file=path,
+                fix=_FIX,
+            )
+        camera_id = numbers.setdefault((width, height, focal), len(numbers) + 1)
+        params = np.array([focal, width / 2, height / 2])
+        cameras[camera_id] = Camera("SIMPLE_PINHOLE", round(width), round(height), params)
+        images[i + 1] = Posed(name, camera_id, rotation, -rotation @ centre)
+    return Reconstruction(cameras, images), rows[:, 15:]
+
+
+def read_rows(path: Path) -> NDArray[np.float64]:
+    """The file's (N, 17) numbers, checked to be finite.
+
+    Raises:
+        UserError: not such a file.
+    """
+    try:
+        rows = np.load(path, allow_pickle=False)
+        rows = np.asarray(rows, np.float64)
+    except (ValueError, TypeError, OSError, EOFError, SyntaxError) as error:
+        raise UserError(f"not a NumPy array of numbers ({error})", file=path, fix=_FIX) from None
+    if rows.ndim != 2 or rows.shape[1] != 17:
+        raise UserError(f"expected N x 17 numbers, found shape {rows.shape}", file=path, fix=_FIX)
+    bad = np.flatnonzero(~np.isfinite(rows).all(1))
+    if len(bad):
+        raise UserError(f"row {bad[0]}: holds values that are not finite", file=path, fix=_FIX)
+    return rows

@@ -1,0 +1,50 @@
+"""Photographs' file names: known kinds, and matching names that differ only in suffix."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import PurePosixPath
+
+from pipeline.io import heif
+
+PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+# Camera makers' RAW formats that LibRaw reads.
+RAW_SUFFIXES = frozenset(
+    """
+    .3fr .ari .arw .bay .cap .cr2 .cr3 .crw .dcr .dcs .dng .drf .eip .erf .fff .gpr .iiq .k25 .kdc
+    .mdc .mef .mos .mrw .nef .nrw .orf .pef .ptx .raf .raw .rw2 .rwl .rwz .sr2 .srf .srw .x3f
+    """.split()  # noqa: SIM905
+)
+# Pictures this program does not read; named in a warning.
+_HEIF = heif.HEIF_SUFFIXES if heif.installed() else frozenset[str]()
+UNREAD_SUFFIXES = (heif.HEIF_SUFFIXES | {".avif", ".jxl", ".jp2", ".gif"}) - _HEIF
+PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES | _HEIF
+
+
+def suffix_of(name: str) -> str:
+    """The name's suffix in lower case, with the dot."""
+    return PurePosixPath(name).suffix.lower()
+
+
+def stem_key(name: str) -> str:
+    """The name without folder prefix "./" and photograph's suffix, case folded.
+
+    Other dots stay: "./train/r_0.5" and "train/R_0.5.png" are the same photograph.
+    """
+    path = PurePosixPath(name)
+    stem = path.with_suffix("") if path.suffix.lower() in PHOTO_SUFFIXES else path
+    return stem.as_posix().casefold()
+
+
+class NameIndex:
+    """Finds a photograph by its name, or else by the name without suffix."""
+
+    def __init__(self, names: Iterable[str]):
+        self._exact = set(names)
+        self._by_stem: dict[str, str] = {}
+        for name in sorted(self._exact):
+            self._by_stem.setdefault(stem_key(name), name)
+
+    def find(self, name: str) -> str | None:
+        plain = PurePosixPath(name).as_posix()
+        return plain if plain in self._exact else self._by_stem.get(stem_key(name))

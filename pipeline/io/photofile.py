@@ -1,0 +1,283 @@
+"""What a picture file says about itself: size, depth, EXIF; without decoding its pixels."""
+
+from __future__ import annotations
+
+import contextlib
+import datetime
+import hashlib
+import math
+import warnings
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from PIL import ExifTags, Image
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.io import heif
+from pipeline.io.names import RAW_SUFFIXES, suffix_of
+from pipeline.runtime.errors import UserError
+
+Image.MAX_IMAGE_PIXELS = None  # The user's own photographs: 200 megapixels are no attack.
+
+_BASE, _GPS, _IFD = ExifTags.Base, ExifTags.GPS, ExifTags.IFD
+FULL_FRAME_DIAGONAL_MM = 43.27
+# Focal lengths over the longer side: from a 180 degree lens to a 35 mm equivalent of 700 mm.
+_FOCAL_RANGE = (0.25, 20.0)
+# Difference of aspect ratios above which a picture counts as cropped; rounding stays below.
+CROPPED = 0.02
+# Resized pictures often keep a focal plane resolution that is no longer true; beyond this it is
+# more likely wrong than a tele lens.
+_FOCAL_PLANE_RANGE = (0.3, 4.0)
+_MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
+
+
+class FileFacts(BaseModel):
+    """A picture file's own account of itself; see ``manifest.Photo`` for the fields."""
+
+    model_config = ConfigDict(frozen=True)
+
+    digest: str
+    width: int
+    height: int
+    raw: bool = False
+    alpha: bool = False
+    bits: int = 8
+    orientation: int = 1
+    body: str = ""
+    lens: str = ""
+    focal_mm: float | None = None
+    focal_px: float | None = None
+    gps: tuple[float, float, float] | None = None
+    taken: str | None = None
+
+    @property
+    def camera_group(self) -> str:
+        size = f"{self.width}x{self.height}"
+        if not (self.body or self.lens or self.focal_mm):
+            return size
+        focal = f"{self.focal_mm:g} mm" if self.focal_mm else "?"
+        return " | ".join([self.body or "?", self.lens or "?", focal, size])
+
+
+def digest_of(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def read_facts(path: Path) -> FileFacts:
+    """Look at a photograph's header, and at its alpha where it has one.
+
+    Raises:
+        UserError: the file cannot be read, or is no picture of a kind this program reads.
+    """
+    try:
+        digest = digest_of(path)
+        if suffix_of(path.name) in RAW_SUFFIXES:
+            return _raw_facts(path, digest)
+        if suffix_of(path.name) in heif.HEIF_SUFFIXES:
+            heif.register()
+        with _quiet(), Image.open(path) as image:
+            width, height = image.size
+            if _bits(image) > 16:
+                raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
+            exif = _exif_of(lambda: _header_exif(image))
+            return FileFacts(
+                digest=digest,
+                width=width,
+                height=height,
+                alpha=_sees_through(image),
+                bits=_bits(image),
+                **_exif_facts(exif, width, height),
+            )
+    except OSError as error:
+        reason = error.strerror or "no picture header found"
+    except (ValueError, SyntaxError, OverflowError) as error:
+        reason = str(error)
+    raise UserError(
+        f"cannot be read as a photograph: {reason}",
+        file=path,
+        fix="replace the file by a whole one, or remove it from the folder",
+    )
+
+
+def _raw_facts(path: Path, digest: str) -> FileFacts:
+    import rawpy  # Only scenes with RAW files pay for it.
+
+    try:
+        with rawpy.imread(str(path)) as raw:
+            width, height = int(raw.sizes.iwidth), int(raw.sizes.iheight)
+            focal_mm, stamp = float(raw.other.focal_length), raw.other.timestamp
+            lens = str(raw.lens.model).strip()
+    except rawpy.LibRawError as error:
+        words = [a.decode() if isinstance(a, bytes) else str(a) for a in error.args]
+        raise ValueError(f"LibRaw says {' '.join(words)}") from None
+
+    def load() -> Image.Exif:
+        exif = Image.Exif()
+        with open(path, "rb") as file:
+            exif.load_from_fp(file)
+        return exif
+
+    facts = _exif_facts(_exif_of(load), width, height)
+    # Not every maker's format is a TIFF; LibRaw knows the rest.
+    if facts["focal_mm"] is None and _plausible(focal_mm):
+        facts["focal_mm"] = focal_mm
+    if facts["taken"] is None and stamp.year > 1980:
+        facts["taken"] = stamp.isoformat()
+    facts["lens"] = facts["lens"] or lens
+    return FileFacts(digest=digest, width=width, height=height, raw=True, bits=16, **facts)
+
+
+def _sees_through(image: Image.Image) -> bool:
+    """Whether a pixel is less than opaque: a channel for it alone says nothing."""
+    if "A" not in image.mode:
+        return "transparency" in image.info
+    try:
+        return bool(np.asarray(image.getchannel("A")).min() < 255)
+    except (OSError, SyntaxError, ValueError):
+        return True  # what reads the pixels will say what is wrong with them
+
+
+def _bits(image: Image.Image) -> int:
+    """Bits a channel as stored (PIL opens 16-bit RGB as 8-bit)."""
+    tags = getattr(image, "tag_v2", None)
+    if tags is not None:
+        return int(max(tags.get(258, (8,))))
+    tile = getattr(image, "tile", None)
+    raw_mode = tile[0][3] if tile else ""
+    raw_mode = raw_mode[0] if isinstance(raw_mode, tuple) else raw_mode
+    return 16 if "16" in str(raw_mode) or "16" in image.mode or image.mode == "I" else 8
+
+
+# --- EXIF ---------------------------------------------------------------------------------
+
+
+@contextlib.contextmanager
+def _quiet() -> Iterator[None]:
+    """PIL warns of damaged EXIF; what is damaged is simply missing here."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        yield
+
+
+def _header_exif(image: Image.Image) -> Image.Exif:
+    """EXIF before the pixels: PIL would decode a whole PNG to look for it behind them."""
+    if image.format != "PNG":
+        return image.getexif()
+    exif = Image.Exif()
+    exif.load(image.info.get("exif", b""))
+    return exif
+
+
+def _exif_of(load: Any) -> Mapping[int, Any]:
+    """All tags, the EXIF and GPS folders' among them; what is damaged is missing."""
+    tags: dict[int, Any] = {}
+    # A damaged EXIF block is no reason to lose the photograph, and PIL's readers raise nearly
+    # anything on one.
+    with contextlib.suppress(Exception), _quiet():
+        exif = load()
+        tags.update(exif)
+        tags.update(exif.get_ifd(_IFD.Exif))
+        tags[_IFD.GPSInfo] = dict(exif.get_ifd(_IFD.GPSInfo))
+    return tags
+
+
+def _exif_facts(tags: Mapping[int, Any], width: int, height: int) -> dict[str, Any]:
+    orientation = tags.get(_BASE.Orientation, 1)
+    make, model = _text(tags.get(_BASE.Make)), _text(tags.get(_BASE.Model))
+    focal_mm = _float(tags.get(_BASE.FocalLength))
+    return {
+        "orientation": orientation if orientation in range(1, 9) else 1,
+        "body": _body(make, model),
+        "lens": _text(tags.get(_BASE.LensModel)),
+        "focal_mm": focal_mm if _plausible(focal_mm) else None,
+        "focal_px": focal_pixels(tags, width, height),
+        "gps": _gps(tags.get(_IFD.GPSInfo) or {}),
+        "taken": _taken(tags),
+    }
+
+
+def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | None:
+    """Focal length in pixels of a ``width`` x ``height`` picture, or None if EXIF won't tell.
+
+    The 35 mm equivalent compares diagonals (CIPA DCG-001); else the focal length in mm over the
+    pixel pitch that FocalPlaneXResolution gives at the size EXIF says the picture had. A picture
+    of another shape than EXIF says was cropped since, and nobody knows by how much: None.
+    """
+    longer = max(width, height)
+    taken_width = _float(tags.get(_BASE.ExifImageWidth))
+    taken_height = _float(tags.get(_BASE.ExifImageHeight))
+    if not (_plausible(taken_width) and _plausible(taken_height)):
+        taken_width, taken_height = width, height
+    taken_longer, taken_shorter = max(taken_width, taken_height), min(taken_width, taken_height)
+    if abs(taken_longer / taken_shorter * min(width, height) / longer - 1) > CROPPED:
+        return None
+    equivalent = _float(tags.get(_BASE.FocalLengthIn35mmFilm))
+    if _plausible(equivalent):
+        focal = equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
+        if _FOCAL_RANGE[0] <= focal / longer <= _FOCAL_RANGE[1]:
+            return focal
+    focal_mm = _float(tags.get(_BASE.FocalLength))
+    resolution = _float(tags.get(_BASE.FocalPlaneXResolution))
+    unit = _MM_PER_UNIT.get(tags.get(_BASE.FocalPlaneResolutionUnit, 2), 25.4)
+    if _plausible(focal_mm) and _plausible(resolution):
+        focal = focal_mm * resolution / unit * longer / taken_longer
+        if _FOCAL_PLANE_RANGE[0] <= focal / longer <= _FOCAL_PLANE_RANGE[1]:
+            return focal
+    return None
+
+
+def _plausible(value: float) -> bool:
+    return math.isfinite(value) and value > 0
+
+
+def _float(value: Any) -> float:
+    """A number, NaN where there is none."""
+    try:
+        return float(value)
+    except (TypeError, ValueError, ZeroDivisionError):
+        return math.nan
+
+
+def _body(make: str, model: str) -> str:
+    """Make and model, the make once: "NIKON CORPORATION", "NIKON D60" is a NIKON D60."""
+    brand = make.split(" ")[0].casefold()
+    return model if model.casefold().startswith(brand) else f"{make} {model}".strip()
+
+
+def _text(value: Any) -> str:
+    return str(value).replace("\0", "").strip() if isinstance(value, str) else ""
+
+
+def _taken(tags: Mapping[int, Any]) -> str | None:
+    for tag in (_BASE.DateTimeOriginal, _BASE.DateTimeDigitized):
+        try:
+            moment = datetime.datetime.strptime(_text(tags.get(tag)), "%Y:%m:%d %H:%M:%S")
+        except ValueError:
+            continue
+        digits = _text(tags.get(_BASE.SubsecTimeOriginal))
+        fraction = f".{digits}" if digits.isdecimal() else ""
+        return moment.isoformat() + fraction
+    return None
+
+
+def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
+    def degrees(value: Any, reference: Any, negative: str) -> float:
+        if not isinstance(value, tuple | list) or len(value) != 3:
+            return math.nan
+        d, m, s = (_float(part) for part in value)
+        # Some writers leave the seconds 0/0.
+        total = d + (m if math.isfinite(m) else 0.0) / 60 + (s if math.isfinite(s) else 0.0) / 3600
+        return -total if _text(reference).upper().startswith(negative) else total
+
+    latitude = degrees(tags.get(_GPS.GPSLatitude), tags.get(_GPS.GPSLatitudeRef), "S")
+    longitude = degrees(tags.get(_GPS.GPSLongitude), tags.get(_GPS.GPSLongitudeRef), "W")
+    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
+        return None
+    altitude = _float(tags.get(_GPS.GPSAltitude))
+    below = tags.get(_GPS.GPSAltitudeRef) in (1, b"\x01")
+    altitude = altitude if math.isfinite(altitude) else 0.0
+    return latitude, longitude, -altitude if below else altitude

@@ -1,0 +1,65 @@
+""".splat files: 32 bytes a Gaussian and no header, what the first browser viewers load.
+
+Position and scale (linear) are float32, colour and opacity 8 bits each, rotation wxyz in steps of
+1/128. Higher spherical harmonics have no place. Source: github.com/antimatter15/splat, README.md.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_bytes
+from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.errors import UserError
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import SH_C0
+
+_ROW = np.dtype(
+    [("mean", "<f4", 3), ("scale", "<f4", 3), ("rgb", "u1", 3), ("alpha", "u1"), ("quat", "u1", 4)]
+)
+
+
+def write_splat(path: Path, gaussians: Gaussians) -> None:
+    """Write a .splat file, which appears whole or not at all; colours outside [0, 1] are cut."""
+    means, log_scales, quats, logits, sh = gaussians.arrays().values()
+    norm = np.linalg.norm(quats, axis=1, keepdims=True)
+    table = np.zeros(len(gaussians), _ROW)
+    table["mean"] = means
+    table["scale"] = np.exp(log_scales)
+    table["rgb"] = to_bytes((0.5 + SH_C0 * sh[:, 0]) * 255)
+    table["alpha"] = to_bytes(sigmoid(logits) * 255)
+    table["quat"] = to_bytes(quats / np.maximum(norm, 1e-12) * 128 + 128)
+    write_bytes(path, table.tobytes())
+
+
+def read_splat(path: Path) -> Gaussians:
+    """Read a .splat file as Gaussians of SH degree 0.
+
+    The format has no header to check: other bytes are known by their number, or by values that
+    cannot be.
+
+    Raises:
+        UserError: the file is missing, is cut short, or holds something else.
+    """
+    data = read_file(path, "a .splat file")
+    fix = "write the file again, or get a whole copy of it"
+    if len(data) % _ROW.itemsize:
+        what = f"expected {_ROW.itemsize} bytes for each Gaussian, found {len(data)} in all"
+        raise UserError(what, file=path, fix=fix)
+    table = np.frombuffer(data, _ROW)
+    if not np.isfinite(table["mean"]).all() or not (np.float64(table["scale"]) >= 0).all():
+        what = "expected a .splat file, found positions or scales that cannot be"
+        raise UserError(what, file=path, fix=fix)
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(table["scale"])
+    return Gaussians.from_arrays(
+        {
+            "means": table["mean"],
+            "log_scales": log_scales,
+            "quats": table["quat"] / 128 - 1,
+            "opacity_logits": logit_of_byte(table["alpha"]),
+            "sh": ((table["rgb"] / 255 - 0.5) / SH_C0)[:, None],
+        }
+    )

@@ -1,0 +1,223 @@
+"""SPZ files, Niantic's compressed Gaussians: a fraction of a PLY, and what browser viewers load.
+
+One gzip stream: a header of 16 bytes, then one section an attribute, all Gaussians in each.
+Coordinates are written unconverted, in the PLY's frame, as programs that turn PLY into SPZ do.
+Source of the layout: github.com/nianticlabs/spz, README.md. docs/formats.md states what
+quantisation leaves.
+"""
+
+from __future__ import annotations
+
+import gzip
+import struct
+import zlib
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_bytes
+from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.errors import UserError
+from pipeline.splats.gaussians import Gaussians
+
+_MAGIC = 0x5053474E  # "NGSP"
+_HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, 0
+_ANTIALIASED, _HAS_EXTENSIONS = 1, 2
+# Bytes of the DC coefficient a unit: less than a colour's, so that they reach beyond [0, 1].
+_DC_STEPS = 0.15 * 255
+# Higher coefficients keep all 8 bits. With 5 and 4, as other encoders have it, renders agree with
+# the unquantised Gaussians' at 35 to 39 dB instead of 53 to 57, for half of the bytes.
+_HIGHER = (0, 3, 8, 15, 24)  # SH coefficients above DC by degree; ours end at 3
+# Positions have 24 bits; more of them than this behind the point tell nothing.
+_MAX_FRACTION_BITS = 20
+# Gaussians farther than this many times the usual distance are strays: they are drawn nearer, so
+# that the rest keeps its resolution.
+_FAR = 512.0
+# Of sizes: a byte, in sixteenths.
+_LOG_SCALES = (-10.0, 255 / 16 - 10)
+_QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller parts lie within 1 / sqrt(2).
+# Niantic's own reader refuses more.
+MAX_GAUSSIANS = 10_000_000
+_FIX = "write the file again as SPZ version 3, or get a whole copy of it"
+
+
+def write_spz(path: Path, gaussians: Gaussians, *, antialias: bool = False) -> None:
+    """Write ``encode_spz`` to a file that appears whole or not at all."""
+    write_bytes(path, encode_spz(gaussians, antialias=antialias))
+
+
+def read_spz(path: Path) -> Gaussians:
+    """Read a file by ``decode_spz``.
+
+    Raises:
+        UserError: also where it cannot be read.
+    """
+    return decode_spz(read_file(path, "an SPZ file"), file=path)
+
+
+def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
+    """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
+
+    Args:
+        antialias: the Gaussians were trained with Mip-Splatting's opacity compensation, and
+            viewers should render them so.
+
+    Raises:
+        UserError: more Gaussians than readers of the format take.
+    """
+    count = len(gaussians)
+    if count > MAX_GAUSSIANS:
+        raise UserError(
+            f"an SPZ file holds up to {MAX_GAUSSIANS} Gaussians, these are {count}",
+            fix="leave faint ones out (min_opacity), or write a PLY",
+        )
+    means, log_scales, quats, logits, sh = (
+        array.astype(np.float64) for array in gaussians.arrays().values()
+    )
+    bits, shrink = _grid(means)
+    steps = np.rint(means * shrink * 2.0**bits).astype("<i4")
+    header = _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
+    sections = (
+        steps.reshape(-1, 1).view(np.uint8)[:, :3],
+        to_bytes(sigmoid(logits) * 255),
+        to_bytes(sh[:, 0] * _DC_STEPS + 127.5),
+        to_bytes((log_scales + np.log(shrink) + 10) * 16),
+        _pack_quats(quats),
+        to_bytes(sh[:, 1:] * 128 + 128),
+    )
+    return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
+
+
+def unfit(gaussians: Gaussians) -> int:
+    """How many Gaussians SPZ cannot hold in this unit: larger or smaller than its range of sizes,
+    or smaller than half a step of its places."""
+    means, log_scales = (a.astype(np.float64) for a in list(gaussians.arrays().values())[:2])
+    bits, shrink = _grid(means)
+    longest = log_scales.max(axis=1, initial=-np.inf) + np.log(shrink[:, 0])
+    least = max(_LOG_SCALES[0], -(bits + 1) * np.log(2.0))
+    return int(((longest < least) | (longest > _LOG_SCALES[1])).sum())
+
+
+def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
+    """The Gaussians in the bytes of an SPZ file, version 2 or 3, axes unconverted.
+
+    SH degree 4 is cut to 3, and extensions are passed over. Opacities of exactly 0 and 1, whose
+    logits are infinite, are read a quarter of a step inside.
+
+    Args:
+        file: named in errors.
+
+    Raises:
+        UserError: no SPZ file, of another version, cut short, or not what its header says.
+    """
+
+    def wrong(what: str) -> UserError:
+        return UserError(what, file=file, fix=_FIX)
+
+    if data[:4] == struct.pack("<I", _MAGIC):
+        raise wrong("expected SPZ version 2 or 3, found version 4 or later")
+    stream = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16)
+    try:
+        head = stream.decompress(data, _HEADER.size)
+        if len(head) < _HEADER.size:
+            raise wrong(f"expected an SPZ header of {_HEADER.size} bytes, found {len(head)}")
+        magic, version, count, degree, bits, flags, _ = _HEADER.unpack(head)
+        if magic != _MAGIC:
+            raise wrong("expected an SPZ file, found gzip of something else")
+        if version not in (2, 3):
+            raise wrong(f"expected SPZ version 2 or 3, found version {version}")
+        if count > MAX_GAUSSIANS or degree >= len(_HIGHER) or bits > 24:
+            raise wrong(
+                f"expected up to {MAX_GAUSSIANS} Gaussians, SH degree 0 to 4 and 0 to 24 fraction "
+                f"bits, found {count}, {degree} and {bits}"
+            )
+        higher = _HIGHER[degree]
+        widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * higher)
+        expected = count * sum(widths)
+        # One byte more than expected: no more memory than the header asks for, whatever follows.
+        body = stream.decompress(stream.unconsumed_tail, expected + 1)
+    except zlib.error as error:
+        raise wrong(f"expected an SPZ file (gzip), could not read it: {error}") from None
+    if len(body) < expected:
+        raise wrong(f"expected {expected} bytes of {count} Gaussians, found {len(body)}")
+    if not flags & _HAS_EXTENSIONS:
+        if len(body) > expected:
+            raise wrong(f"expected {expected} bytes of {count} Gaussians, found more")
+        if not stream.eof:  # The checksum is at the end.
+            raise wrong("expected a whole gzip stream, found its end missing")
+
+    table = np.frombuffer(body, np.uint8, expected)
+    ends = count * np.cumsum(widths)
+    fixed, alphas, dc, scales, quats, rest = (
+        part.reshape(count, width)
+        for part, width in zip(np.split(table, ends[:-1]), widths, strict=True)
+    )
+    sh = np.empty((count, min(higher, _HIGHER[3]) + 1, 3), np.float32)
+    sh[:, 0] = (dc - np.float32(127.5)) / np.float32(_DC_STEPS)
+    sh[:, 1:] = (rest.reshape(count, higher, 3)[:, : sh.shape[1] - 1] - np.float32(128)) / 128
+    arrays = {
+        "means": _unpack_positions(fixed) * 2.0**-bits,
+        "log_scales": scales / 16.0 - 10,
+        "quats": _unpack_three(quats) if version == 2 else _unpack_quats(quats),
+        "opacity_logits": logit_of_byte(alphas[:, 0]),
+        "sh": sh,
+    }
+    return Gaussians.from_arrays(arrays)
+
+
+def _grid(means: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
+    """Bits behind the point, as many as leave room for the scene; and (N, 1) what each Gaussian
+    is shrunk by towards the origin, 1 but for strays. Mean and size shrink alike, so that a stray
+    looks the same from the origin."""
+    distance = np.abs(means).max(axis=1, initial=0.0)
+    reach = min(distance.max(initial=0.0), _FAR * float(np.median(distance))) if len(means) else 0.0
+    whole = int(np.ceil(np.log2(reach))) if reach > 0 else 0
+    bits = int(np.clip(23 - whole, 0, _MAX_FRACTION_BITS))
+    limit = (2**23 - 1) * 2.0**-bits
+    return bits, (limit / np.maximum(distance, limit))[:, None]
+
+
+def _unpack_positions(fixed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 9) bytes to (N, 3) integers of 24 bits, signed."""
+    padded = np.zeros((len(fixed), 3, 4), np.uint8)
+    padded[:, :, 1:] = fixed.reshape(-1, 3, 3)
+    return (padded.view("<i4")[:, :, 0] >> 8).astype(np.float64)
+
+
+def _pack_quats(quats: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """(N, 4) wxyz to (N, 4) bytes: 2 bits name the largest part, of the other three (in the order
+    xyzw, from the top) a sign bit and 9 bits of magnitude each follow."""
+    norm = np.linalg.norm(quats, axis=1, keepdims=True)
+    q = np.where(norm > 0, quats / np.where(norm > 0, norm, 1), (1.0, 0, 0, 0))[:, [1, 2, 3, 0]]
+    largest = np.abs(q).argmax(1)
+    rows = np.arange(len(q))
+    # q and -q are one rotation: the part left out is taken as positive.
+    q = np.where(q[rows, largest, None] < 0, -q, q)
+    magnitude = np.rint(np.abs(q) * _QUAT_STEPS).clip(0, 511).astype(np.uint32)
+    code = magnitude | ((q < 0).astype(np.uint32) << np.uint32(9))
+    packed = largest.astype("<u4")
+    for part in range(4):
+        packed = np.where(part == largest, packed, packed << np.uint32(10) | code[:, part])
+    return packed.astype("<u4").reshape(-1, 1).view(np.uint8)
+
+
+def _unpack_quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """The inverse of ``_pack_quats``."""
+    left = np.ascontiguousarray(packed).view("<u4")[:, 0]
+    largest = left >> np.uint32(30)
+    q = np.zeros((len(left), 4))
+    for part in (3, 2, 1, 0):
+        stored = part != largest
+        value = (left & np.uint32(511)) / _QUAT_STEPS
+        q[:, part] = np.where(stored, np.where(left & np.uint32(512), -value, value), 0)
+        left = np.where(stored, left >> np.uint32(10), left)
+    q[np.arange(len(q)), largest] = np.sqrt(np.maximum(0, 1 - (q * q).sum(1)))
+    return q[:, [3, 0, 1, 2]]
+
+
+def _unpack_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 3) bytes of xyz, as version 2 has them, to (N, 4) wxyz."""
+    xyz = packed / 127.5 - 1
+    w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(1, keepdims=True)))
+    return np.concatenate([w, xyz], 1)

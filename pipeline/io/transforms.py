@@ -1,0 +1,347 @@
+"""``transforms.json``: cameras as instant-ngp, nerfstudio and the NeRF-synthetic scenes keep them.
+
+``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z backward); turning y
+and z over gives COLMAP's. nerfstudio may have moved the world by ``applied_transform`` and
+scaled it by ``applied_scale`` after COLMAP; both are undone, so that poses are in the world the
+camera solver worked in. Source: nerfstudio's documentation, "Data conventions".
+"""
+
+from __future__ import annotations
+
+import json
+import math
+import os
+import posixpath
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.cameras import Camera
+from pipeline.io.names import NameIndex
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.views import View
+
+SPLITS = ("train", "test", "val")
+_FLIP_YZ = np.diag([1.0, -1.0, -1.0])
+_PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
+_FIX = "correct the file, export it again, or set poses: ignore"
+# Largest deviation from a rotation that printing with few digits explains.
+_ROTATION_TOLERANCE = 1e-2
+
+
+@dataclass(frozen=True)
+class Frame:
+    """One frame as written.
+
+    Attributes:
+        path: relative to the folder of the json, often without suffix.
+        mask: likewise, or None.
+        rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
+        fields: the frame's and the file's intrinsics, the frame's winning.
+        source: "FILE: frames[i]", for messages.
+    """
+
+    path: str
+    mask: str | None
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    fields: Mapping[str, Any]
+    file: Path
+    source: str
+
+
+def find_transforms(folder: Path) -> list[Path]:
+    """The pose files of a scene: transforms.json, else those of the splits; may be empty."""
+    single = folder / "transforms.json"
+    if single.is_file():
+        return [single]
+    split = [folder / f"transforms_{name}.json" for name in SPLITS]
+    return [path for path in split if path.is_file()]
+
+
+def read_frames(path: Path) -> list[Frame]:
+    """All frames of a scene folder's (or one file's) transforms, each path once.
+
+    Raises:
+        UserError: no or malformed JSON, missing fields, matrices that are not finite poses.
+    """
+    files = [path] if path.is_file() else find_transforms(path)
+    if not files:
+        raise UserError("expected a transforms.json, found none", file=path, fix=_FIX)
+    frames: dict[str, Frame] = {}
+    for file in files:
+        for frame in _frames_of(file):
+            frames.setdefault(frame.path, frame)
+    return list(frames.values())
+
+
+def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconstruction:
+    """Poses of the frames whose photographs exist.
+
+    Args:
+        path: a scene folder or one file.
+        sizes: width and height of each photograph by its path relative to the folder of the
+            json. Frames of other photographs are left out; a suffix missing in the file, or
+            another than the photograph's, does not matter. Where the file does not say what
+            size its intrinsics are for, they are for the photograph's.
+
+    Returns:
+        Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
+
+    Raises:
+        UserError: as ``read_frames``, and for intrinsics that are missing or impossible.
+    """
+    index = NameIndex(sizes)
+    cameras: dict[tuple, int] = {}
+    by_id: dict[int, Camera] = {}
+    images: dict[int, Posed] = {}
+    found = {name: frame for frame in read_frames(path) if (name := index.find(frame.path))}
+    for number, (name, frame) in enumerate(sorted(found.items()), 1):
+        camera = _camera(frame, *sizes[name])
+        key = (camera.model, camera.width, camera.height, *camera.params.tolist())
+        camera_id = cameras.setdefault(key, len(cameras) + 1)
+        by_id[camera_id] = camera
+        images[number] = Posed(name, camera_id, frame.rotation, frame.translation)
+    return Reconstruction(by_id, images)
+
+
+def write_transforms(
+    path: Path, views: Sequence[View], folder: Path, *, points: str | None = None
+) -> None:
+    """Write pinhole cameras as nerfstudio and instant-ngp read them, held-out views as test and
+    validation; ``read_transforms`` reads the same poses and intrinsics back.
+
+    Args:
+        path: the json; it appears whole or not at all.
+        folder: where the json will be in the end; pictures are named relative to it.
+        points: a point cloud to start from, relative to ``folder``.
+    """
+
+    def relative(file: str) -> str:
+        # Folders that are links are resolved: ".." leads out of what they point to.
+        parent, name = os.path.split(file)
+        inside = os.path.relpath(os.path.realpath(parent), os.path.realpath(folder))
+        return (Path(inside) / name).as_posix()
+
+    frames: list[dict[str, Any]] = []
+    intrinsics: list[dict[str, Any]] = []
+    for view in views:
+        to_world = np.eye(4)
+        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ _FLIP_YZ
+        to_world[:3, 3] = view.centre
+        frames.append(
+            {"file_path": relative(view.image), "transform_matrix": to_world.tolist()}
+            | ({"mask_path": relative(view.mask)} if view.mask else {})
+        )
+        # OPENCV without distortion is a pinhole that every reader knows.
+        intrinsics.append(
+            {"camera_model": "OPENCV", "w": view.width, "h": view.height}
+            | {"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy}
+            | {"k1": 0.0, "k2": 0.0, "p1": 0.0, "p2": 0.0}
+        )
+    content: dict[str, Any] = {"frames": frames}
+    if intrinsics and all(entry == intrinsics[0] for entry in intrinsics):
+        content |= intrinsics[0]
+    else:
+        for frame, entry in zip(frames, intrinsics, strict=True):
+            frame |= entry
+    held_out = [f["file_path"] for f, view in zip(frames, views, strict=True) if view.is_test]
+    if held_out:
+        content["train_filenames"] = [
+            f["file_path"] for f, view in zip(frames, views, strict=True) if not view.is_test
+        ]
+        content["val_filenames"] = content["test_filenames"] = held_out
+    if points is not None:
+        content["ply_file_path"] = points
+    write_json(path, content)
+
+
+def frame_camera_model(frame: Frame) -> str:
+    """The COLMAP camera model the frame's intrinsics need."""
+    names = frame.fields
+    model = str(names.get("camera_model", "")).upper()
+    if model == "OPENCV_FISHEYE" or names.get("is_fisheye"):
+        return "OPENCV_FISHEYE"
+    if model and model not in _PERSPECTIVE:
+        raise UserError(
+            f"{frame.source}: camera_model {model} is not supported; expected "
+            f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE",
+            file=frame.file,
+            fix="convert the photographs to perspective or fisheye ones, or set poses: ignore",
+        )
+    if any(_number(frame, name, 0.0) for name in ("k3", "k4", "k5", "k6")):
+        return "FULL_OPENCV"
+    if any(_number(frame, name, 0.0) for name in ("k1", "k2", "p1", "p2")):
+        return "OPENCV"
+    return "PINHOLE"
+
+
+def _frames_of(file: Path) -> list[Frame]:
+    try:
+        content = json.loads(file.read_bytes())
+    except UnicodeDecodeError as error:
+        raise UserError(f"expected UTF-8 text: {error}", file=file, fix=_FIX) from None
+    except json.JSONDecodeError as error:
+        raise UserError(
+            f"line {error.lineno}, column {error.colno}: not valid JSON ({error.msg})",
+            file=file,
+            fix=_FIX,
+        ) from None
+    except RecursionError:
+        raise UserError("not valid JSON (nested too deeply)", file=file, fix=_FIX) from None
+    listed = content.get("frames") if isinstance(content, dict) else None
+    if not isinstance(listed, list):
+        raise UserError("expected an object with a list 'frames'", file=file, fix=_FIX)
+    moved = _applied_transform(file, content)
+    shared = {key: value for key, value in content.items() if key != "frames"}
+    return [_frame(file, i, entry, shared, moved) for i, entry in enumerate(listed)]
+
+
+def _frame(
+    file: Path, i: int, entry: Any, shared: Mapping[str, Any], moved: NDArray[np.float64]
+) -> Frame:
+    source = f"frames[{i}]"
+    path = entry.get("file_path") if isinstance(entry, dict) else None
+    if not isinstance(path, str) or not path:
+        raise UserError(f"{source}.file_path: expected a file name", file=file, fix=_FIX)
+    source = f"{source} ({path})"
+    matrix = _matrix(file, f"{source}.transform_matrix", entry.get("transform_matrix"))
+    scale = np.cbrt(max(np.linalg.det(moved[:3, :3]), 1e-300))
+    to_world = np.linalg.inv(moved) @ matrix
+    # Of the inverse of a similarity only its turn may touch the camera's axes.
+    axes = to_world[:3, :3] * scale
+    u, _, vt = np.linalg.svd(axes)
+    turn = u @ vt
+    if np.abs(turn - axes).max() > _ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+        raise UserError(
+            f"{source}.transform_matrix: its upper left 3x3 part is not a rotation",
+            file=file,
+            fix=_FIX,
+        )
+    rotation = _FLIP_YZ @ turn.T
+    mask = entry.get("mask_path")
+    return Frame(
+        path=_relative(file, path),
+        mask=_relative(file, mask) if isinstance(mask, str) and mask else None,
+        rotation=rotation,
+        translation=-rotation @ to_world[:3, 3],
+        fields={**shared, **entry},
+        file=file,
+        source=source,
+    )
+
+
+def _relative(file: Path, path: str) -> str:
+    """``path`` relative to the folder of ``file``, "./" and "x/.." taken out; absolute, or
+    beginning with "..", only where it leads outside."""
+    plain = posixpath.normpath(path.replace("\\", "/"))
+    if not posixpath.isabs(plain):
+        return plain
+    folder = str(file.parent.resolve())
+    return posixpath.relpath(plain, folder) if plain.startswith(folder + "/") else plain
+
+
+def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
+    """A finite 4x4 (or 3x4, completed) matrix."""
+    try:
+        matrix = np.array(value, np.float64)
+    except (TypeError, ValueError, OverflowError):
+        matrix = np.zeros(0)
+    if matrix.shape not in ((4, 4), (3, 4)):
+        raise UserError(f"{where}: expected 4x4 numbers", file=file, fix=_FIX)
+    if not np.isfinite(matrix).all():
+        raise UserError(f"{where}: holds values that are not finite", file=file, fix=_FIX)
+    full = np.eye(4)
+    full[:3] = matrix[:3]
+    return full
+
+
+def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.float64]:
+    """(4, 4) similarity that took the solver's world to the file's."""
+    moved = np.eye(4)
+    if "applied_transform" in content:
+        moved = _matrix(file, "applied_transform", content["applied_transform"])
+    scale = content.get("applied_scale", 1.0)
+    if not _is_number(scale) or scale <= 0:
+        raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
+    moved[:3] *= scale
+    # A volume: a millionth of the axes' cube is flat, whatever their unit.
+    size = float(np.abs(moved[:3, :3]).max())
+    if not np.linalg.det(moved[:3, :3]) > 1e-6 * size**3:
+        raise UserError("applied_transform: expected a similarity", file=file, fix=_FIX)
+    return moved
+
+
+def _is_number(value: Any) -> bool:
+    """A finite number; JSON's integers may be larger than any float."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300  # False for NaN.
+
+
+def _number(frame: Frame, name: str, default: float) -> float:
+    value = frame.fields.get(name, default)
+    if not _is_number(value):
+        raise UserError(
+            f"{frame.source}: {name} is {str(value)[:40]!r}, expected a finite number",
+            file=frame.file,
+            fix=_FIX,
+        )
+    return float(value)
+
+
+def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
+    """The frame's camera, of the photograph's size where it does not give its own."""
+    width = round(_number(frame, "w", photo_width))
+    height = round(_number(frame, "h", photo_height))
+    if width <= 0 or height <= 0:
+        raise UserError(
+            f"{frame.source}: impossible size {width}x{height}", file=frame.file, fix=_FIX
+        )
+    fx = _focal(frame, "fl_x", "camera_angle_x", width)
+    fy = _focal(frame, "fl_y", "camera_angle_y", height)
+    if fx is None and fy is None:
+        raise UserError(
+            f"{frame.source}: no focal length: expected fl_x or camera_angle_x",
+            file=frame.file,
+            fix=_FIX,
+        )
+    params = [fx or fy, fy or fx, _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)]
+    model = frame_camera_model(frame)
+    rest = {
+        "PINHOLE": (),
+        "OPENCV": ("k1", "k2", "p1", "p2"),
+        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
+        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
+    }[model]
+    params += [_number(frame, name, 0.0) for name in rest]
+    return Camera(model, width, height, np.array(params, np.float64))
+
+
+def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:
+    """Focal length in pixels from itself or from the field of view in radians."""
+    if length in frame.fields:
+        focal = _number(frame, length, 0.0)
+        if focal <= 0:
+            raise UserError(
+                f"{frame.source}: {length} is {focal}, expected a positive number",
+                file=frame.file,
+                fix=_FIX,
+            )
+        return focal
+    if angle in frame.fields:
+        view = _number(frame, angle, 0.0)
+        if not 0 < view < math.pi:
+            raise UserError(
+                f"{frame.source}: {angle} is {view}, expected radians between 0 and pi",
+                file=frame.file,
+                fix=_FIX,
+            )
+        return 0.5 * side / math.tan(0.5 * view)
+    return None

@@ -1,0 +1,101 @@
+"""The thorough look: every photograph decoded once, before anything is built on it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+
+from PIL import Image
+
+from pipeline.io import heif
+from pipeline.io.names import suffix_of
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.progress import track
+from pipeline.scene.manifest import Manifest, Photo
+
+
+def verify_photos(
+    manifest: Manifest, *, threads: int, min_photos: int = 1
+) -> tuple[Manifest, list[str]]:
+    """Decode all photographs and leave the broken ones out.
+
+    Args:
+        manifest: the photographs to look at.
+        threads: how many at once; does not change the result.
+        min_photos: fewer good ones than this is an error.
+
+    Returns:
+        The manifest without them (its warnings extended), and one warning each, one more where
+        photographs are copies of others.
+
+    Raises:
+        UserError: fewer than ``min_photos`` are whole; every broken one is named.
+    """
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        results = pool.map(_fault_of, manifest.photos)
+        faults = list(track(results, "checking photographs", len(manifest.photos), "photos"))
+    good = tuple(
+        photo for photo, fault in zip(manifest.photos, faults, strict=True) if fault is None
+    )
+    warnings = [
+        f"{photo.path}: left out: {fault}"
+        for photo, fault in zip(manifest.photos, faults, strict=True)
+        if fault is not None
+    ]
+    if len(good) < min_photos:
+        raise UserError(
+            f"only {len(good)} of {len(faults)} photographs can be decoded, at least "
+            f"{min_photos} are needed" + "".join(f"\n  {line}" for line in warnings),
+            file=Path(manifest.photos[0].path).parent if manifest.photos else None,
+            fix="replace the broken files by whole ones, or lower inspect.min_images",
+        )
+    warnings += _copies(good)
+    update = {"photos": good, "warnings": (*manifest.warnings, *warnings)}
+    return manifest.model_copy(update=update), warnings
+
+
+def _copies(photos: Sequence[Photo]) -> list[str]:
+    """A warning where files are the same to the byte."""
+    first: dict[str, str] = {}
+    pairs = [
+        f"{photo.name} = {first[photo.digest]}"
+        for photo in photos
+        if first.setdefault(photo.digest, photo.name) != photo.name
+    ]
+    if not pairs:
+        return []
+    some = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
+    return [
+        f"copies of other photographs: {len(pairs)} ({some}): one that is held out while "
+        "training sees its copy makes the measures too good; remove the copies"
+    ]
+
+
+def _fault_of(photo: Photo) -> str | None:
+    """What keeps the photograph from being decoded; None if nothing does."""
+    decode: Callable[[str], None] = _decode_raw if photo.raw else _decode
+    try:
+        decode(photo.path)
+    except MemoryError:
+        raise
+    # PIL's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error, ...; LibRaw
+    # its own. Whatever it is, the file does not decode.
+    except Exception as error:
+        text = str(error).strip() or type(error).__name__
+        return f"cannot be decoded ({text})"
+    return None
+
+
+def _decode(path: str) -> None:
+    if suffix_of(path) in heif.HEIF_SUFFIXES:
+        heif.register()
+    with Image.open(path) as image:
+        image.load()
+
+
+def _decode_raw(path: str) -> None:
+    import rawpy  # Only scenes with RAW files pay for it.
+
+    with rawpy.imread(path) as raw:
+        raw.unpack()

@@ -1,0 +1,1 @@
+"""What a folder of photographs holds, and which stages and budgets it needs."""

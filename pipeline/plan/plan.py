@@ -1,0 +1,143 @@
+"""What a scene needs and what it does not.
+
+``make_plan`` is pure: the same scan, config and stages give the same plan. Snakemake's jobs are the
+stages that run; their settings are ``Plan.config``.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Mapping, Sequence
+from typing import Any
+
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.config.schema import Config
+from pipeline.plan.budget import training_memory_mb
+from pipeline.plan.scan import Scan
+from pipeline.plan.settle import gps_extent_m, settle
+from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.scene.views import view_size
+
+# A plan is for people, and travels on a command line.
+FACTS_SHOWN = 20
+
+
+class Plan(BaseModel):
+    """A scene's stages in the order of the DAG, its settled config and what they rest on.
+
+    Attributes:
+        folder: the scene's, as seen from the working directory.
+    """
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    scene: str
+    stages: dict[str, StagePlan]
+    warnings: list[str]
+    config: Config
+    facts: dict[str, Any]
+    folder: str = ""
+
+    def runs(self, stage: str) -> bool:
+        return self.stages[stage].run
+
+
+def make_plan(
+    scan: Scan, config: Config, stages: Mapping[str, StageSpec], folder: str = ""
+) -> Plan:
+    """Decide which of ``stages`` the scene needs. ``Plan.config`` has no "auto" left that can be
+    settled now.
+
+    Raises:
+        UserError: see ``settle``.
+    """
+    settled = settle(scan, config)
+    decided = {name: spec.decide(scan, settled) for name, spec in stages.items()}
+    running = {name for name, stage in decided.items() if stage.run}
+    for name in running:
+        sources = sorted(set(_upstream(stages[name], running).values()))
+        decided[name] = decided[name].model_copy(update={"inputs": sources})
+    return Plan(
+        scene=scan.manifest.scene,
+        stages=decided,
+        warnings=_some(scan.warnings),
+        config=settled.config,
+        facts=_facts(scan, settled.config),
+        folder=folder,
+    )
+
+
+def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:
+    """Role -> the stage that fills it, for a scene with this plan."""
+    return _upstream(spec, {name for name, stage in plan.stages.items() if stage.run})
+
+
+def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
+    return {
+        role: next(name for name in candidates if name in running)
+        for role, candidates in spec.inputs.items()
+    }
+
+
+def public_plan(plan: Plan) -> dict[str, Any]:
+    """The content of ``plan.json``: every stage with run or skip, the reasons, the stages that it
+    reads, facts, warnings; and ``order``, the stages in the order of the DAG."""
+    shown = plan.model_dump(mode="json", exclude={"config", "folder"})
+    return shown | {"order": list(plan.stages)}
+
+
+def describe(plan: Plan) -> str:
+    """The plan as a table for the terminal."""
+    lines = [f"{plan.scene}: {plan.facts['photographs']} photographs"]
+    for name, stage in plan.stages.items():
+        lines.append(f"  {name:<10} {'run ' if stage.run else 'skip'}  {stage.reason}")
+        if stage.run:
+            lines += [f"  {'':<10}       - {decision}" for decision in stage.decisions]
+    lines += [f"  warning: {warning}" for warning in plan.warnings]
+    return "\n".join(lines)
+
+
+def _some(warnings: Sequence[str]) -> list[str]:
+    """The first warnings, and how many more there are; the inspect stage keeps them all."""
+    rest = len(warnings) - FACTS_SHOWN
+    return [*warnings[:FACTS_SHOWN], *([f"and {rest} more like these"] if rest > 0 else [])]
+
+
+def _commonest(counts: Counter[str]) -> dict[str, int]:
+    """The commonest and their counts; the rest together."""
+    ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    rest = sum(count for _, count in ordered[FACTS_SHOWN:])
+    return dict(ordered[:FACTS_SHOWN]) | ({"others": rest} if rest else {})
+
+
+def _facts(scan: Scan, config: Config) -> dict[str, Any]:
+    photos = scan.photos
+    width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
+    sizes = Counter(f"{photo.width}x{photo.height}" for photo in photos)
+    groups = Counter(photo.camera_group for photo in photos)
+    return {
+        "photographs": len(photos),
+        "raw": scan.num_raw,
+        "alpha": scan.num_alpha,
+        "masks": scan.num_masks,
+        "depths": scan.num_depths,
+        "gps": scan.num_gps,
+        "ground_control": scan.ground_control is not None,
+        "gps_extent_m": round(gps_extent_m(scan), 1),
+        "focal_priors": scan.num_focal,
+        "turned_by_exif": sum(photo.orientation != 1 for photo in photos),
+        "bits": max(photo.bits for photo in photos),
+        "sizes": _commonest(sizes),
+        "camera_groups": _commonest(groups),
+        "ordered": scan.ordered,
+        "image_folder": scan.image_folder,
+        "view_size": [width, height],
+        "training_memory_mb": training_memory_mb(scan, config),
+        "given_poses": None
+        if scan.poses is None
+        else scan.poses.model_dump(mode="json", exclude={"names"}),
+        "truth": "sparse_gt" if scan.truth is not None else None,
+        "truth_digest": scan.truth_digest,
+        "fingerprint": scan.fingerprint,
+    }

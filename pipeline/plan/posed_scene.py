@@ -1,0 +1,130 @@
+"""Cameras from wherever they stand, for rendering and evaluating outside the pipeline's DAG."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+from pipeline.config.schema import Config, Split, Train, Views
+from pipeline.io.camera_files import STAGES_WITH_MODEL
+from pipeline.io.colmap import read_model
+from pipeline.plan.given_poses import load_given
+from pipeline.plan.scan import scan
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Manifest
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View, load_views
+
+# Folders of a finished scene, those nearest to training first.
+_WITH_PHOTOS = ("undistort", "decode", "inspect")
+
+
+@dataclass(frozen=True)
+class PosedScene:
+    """Views with photographs, and the settings they were, or are to be, used with.
+
+    Attributes:
+        gains: file of each photograph's exposure gains (``exposure.json``), None without one.
+        warnings: what its photographs or poses lack.
+    """
+
+    views: list[View]
+    split: Split
+    train: Train
+    gains: Path | None
+    warnings: tuple[str, ...]
+
+
+def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
+    """The views to measure a model on.
+
+    Args:
+        folder: a finished scene (``results/NAME``), whose settings hold; or photographs with
+            poses, as the pipeline takes them as input.
+        max_long_side: of views, pixels; None: the finished scene's, else the photographs' own.
+        every: each this-many-th view counts as held out, 0 none; None: the finished scene's
+            setting, else the default.
+
+    Raises:
+        UserError: no such scene, no poses, cameras with lens distortion.
+    """
+    if (folder / "plan.json").is_file():
+        return _finished(folder, max_long_side, every)
+    side = Views(max_long_side_px=max_long_side or 2**31)
+    split = Split() if every is None else Split(holdout_every=every)
+    found = scan(folder, folder.name, Config(views=side), cache=None)
+    if found.poses is None:
+        raise UserError(
+            "expected photographs with poses (a COLMAP model in sparse/0, transforms.json or "
+            "poses_bounds.npy), found no poses",
+            file=folder,
+            fix="add them, or give a finished scene's results folder",
+        )
+    model = load_given(found).model
+    _check_pinhole(model, folder)
+    views = load_views(found.manifest, model, side, split)
+    train = Train(background="white" if found.num_alpha else "black")
+    return PosedScene(views, split, train, None, found.warnings)
+
+
+def _finished(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
+    record = folder / "train" / "stage.json"
+    try:
+        sections = json.loads(record.read_text())["key"]["config"]
+        views = Views.model_validate(sections["views"])
+        split = Split.model_validate(sections["split"])
+        train = Train.model_validate(sections["train"])
+    except (OSError, ValueError, KeyError) as error:
+        raise UserError(
+            f"expected a finished scene, could not read its settings: {error}",
+            file=record,
+            fix=f"run snakemake {folder}/metrics.json with this version of the program",
+        ) from None
+    if max_long_side is not None:
+        views = views.model_copy(update={"max_long_side_px": max_long_side})
+    if every is not None:
+        split = split.model_copy(update={"holdout_every": every})
+    photos = _first(folder, _WITH_PHOTOS, "images.json")
+    model = read_model(_first(folder, STAGES_WITH_MODEL, "sparse/0"))
+    _check_pinhole(model, folder)
+    # Photographs that no stage copied are named as seen from where Snakemake ran.
+    root = folder.absolute().parent.parent
+    found = [
+        replace(view, image=_from(root, view.image), mask=view.mask and _from(root, view.mask))
+        for view in load_views(Manifest.read(photos), model, views, split)
+    ]
+    gains = folder / "train" / "exposure.json"
+    return PosedScene(found, split, train, gains if gains.is_file() else None, ())
+
+
+def _first(folder: Path, stages: tuple[str, ...], name: str) -> Path:
+    """The file or folder ``name`` of the first of the stages that the scene's plan runs and that
+    made one."""
+    planned = json.loads((folder / "plan.json").read_text())["stages"]
+    for stage in stages:
+        path = folder / stage / name
+        if planned.get(stage, {}).get("run") and path.exists():
+            return path
+    raise UserError(
+        f"expected a finished scene, found no {name}",
+        file=folder,
+        fix=f"run snakemake {folder}/metrics.json",
+    )
+
+
+def _from(root: Path, file: str) -> str:
+    return file if Path(file).exists() else str(root / file)
+
+
+def _check_pinhole(model: Reconstruction, source: Path) -> None:
+    for image in model.images.values():
+        camera = model.cameras[image.camera_id]
+        if not camera.is_pinhole:
+            raise UserError(
+                f"{image.name}: its {camera.model} camera has lens distortion, which renders have "
+                "not",
+                file=source,
+                fix="undistort the photographs first: run the pipeline on them and give its "
+                "results folder",
+            )

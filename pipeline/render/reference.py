@@ -1,0 +1,479 @@
+"""The rasterizer in plain torch, one function per operator: slow, readable, in any float dtype.
+
+Read this to learn the method; tests hold the C++ kernels to it. It follows "3D Gaussian Splatting
+for Real-Time Radiance Field Rendering" (Kerbl et al. 2023) and the projection of "EWA Splatting"
+(Zwicker et al. 2002). Every function is differentiable by autograd. Memory grows with pixels times
+Gaussians: small scenes only.
+
+N Gaussians, V visible ones among them, an image of H x W pixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+
+from pipeline.render.types import FrameAdam, RasterCamera, RasterOptions, RenderOutput, ShAdam
+
+# The same numbers, with their reasons, are in csrc/constants.h.
+DILATION = 0.3
+ALPHA_MIN = 1 / 255
+ALPHA_MAX = 0.999
+TRANSMITTANCE_MIN = 1e-4
+FRUSTUM_MARGIN = 0.3
+QUAT_NORM2_MIN = 1e-8
+COMPENSATION_MIN = 2.5e-5
+COVARIANCE_MAX = 1e30
+SH_MAX = 1e6
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The visible Gaussians on the image plane, in the order of their index.
+
+    Attributes:
+        index: (V,) int64 index among the N.
+        means2d: (V, 2) pixels.
+        conics: (V, 3) the inverse 2D covariance's xx, xy, yy, in 1/px^2.
+        depths: (V,) camera z.
+        opacities: (V,) in (0, 1), the compensation included.
+        radii: (N,) pixels; 0 for what is not visible.
+        num_dropped: Gaussians left out because a value is not finite or degenerate.
+    """
+
+    index: torch.Tensor
+    means2d: torch.Tensor
+    conics: torch.Tensor
+    depths: torch.Tensor
+    opacities: torch.Tensor
+    radii: torch.Tensor
+    num_dropped: int
+
+
+def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
+    """(N, 4) quaternions wxyz of any length -> (N, 3, 3) rotations (Kerbl et al. 2023, eq. 10)."""
+    w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
+    rows = [
+        1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
+        2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x),
+        2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y),
+    ]  # fmt: skip
+    return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
+
+
+def moved(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
+    """The camera after a ``change`` (10,), whose gradient at zero is ``CameraGradients``.
+
+    A point at x in the camera's frame comes to exp([r]) x + t, r and t the first six values ([r]:
+    the matrix of the cross product with r, radians; t in the world's unit); the others add to
+    fx, fy, cx, cy, in pixels. The fields of what is returned are tensors.
+    """
+    skew = torch.zeros(3, 3, dtype=change.dtype)
+    skew = skew.index_put(
+        (torch.tensor([2, 0, 1, 1, 2, 0]), torch.tensor([1, 2, 0, 2, 0, 1])),
+        torch.cat([change[:3], -change[:3]]),
+    )
+    left = torch.eye(4, dtype=change.dtype)
+    left = torch.cat([torch.cat([torch.linalg.matrix_exp(skew), change[3:6, None]], 1), left[3:]])
+    pinhole = [camera.fx, camera.fy, camera.cx, camera.cy]
+    intrinsics: list[Any] = [value + change[6 + i] for i, value in enumerate(pinhole)]
+    fx, fy, cx, cy = intrinsics
+    pose = left @ camera.world_to_camera.to(change.dtype)
+    return RasterCamera(camera.width, camera.height, fx, fy, cx, cy, pose)
+
+
+def project(
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quats: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    camera: RasterCamera,
+    options: RasterOptions,
+) -> Projection:
+    """World Gaussians -> 2D Gaussians on the image plane.
+
+    Covariance in 3D: Sigma = R S S^T R^T (Kerbl et al., eq. 6). On the image, to first order about
+    the centre: Sigma' = J W Sigma W^T J^T (Zwicker et al., eq. 31) with W the camera's rotation and
+
+        J = [[fx / z, 0, -fx u / z], [0, fy / z, -fy v / z]],  u = x / z, v = y / z.
+
+    u and v are clamped in J to the image plus 0.3 tan(fov / 2) on each side (for a centred
+    principal point: 1.3 tan(fov / 2)), where the first order stops being one. Dilation by 0.3 px^2
+    is a low-pass filter; `antialias` keeps the energy by scaling the opacity with
+    sqrt(det Sigma' / det(Sigma' + 0.3 I)) (Yu et al. 2024, "Mip-Splatting", eq. 9).
+
+    Visible: z > near, opacity at least 1/255 and the ellipse {alpha >= 1/255} has a bounding box
+    that holds a pixel centre.
+    """
+    dtype = means.dtype
+    pose = camera.world_to_camera.to(dtype)
+    ok = torch.isfinite(means).all(-1) & torch.isfinite(log_scales).all(-1)
+    ok &= torch.isfinite(quats).all(-1) & torch.isfinite(opacity_logits)
+    ok &= (quats.double() ** 2).sum(-1) >= QUAT_NORM2_MIN
+    index = torch.nonzero(ok).squeeze(-1)
+    cam = means[index] @ pose[:3, :3].T + pose[:3, 3]
+    in_front = cam[:, 2] > options.near
+    index, cam = index[in_front], cam[in_front]
+    x, y, z = cam.unbind(-1)
+
+    tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
+    u = (x / z).clamp(
+        -camera.cx / camera.fx - FRUSTUM_MARGIN * tan_x,
+        (camera.width - camera.cx) / camera.fx + FRUSTUM_MARGIN * tan_x,
+    )
+    v = (y / z).clamp(
+        -camera.cy / camera.fy - FRUSTUM_MARGIN * tan_y,
+        (camera.height - camera.cy) / camera.fy + FRUSTUM_MARGIN * tan_y,
+    )
+    zero = torch.zeros_like(z)
+    jacobian = torch.stack(
+        [camera.fx / z, zero, -camera.fx * u / z, zero, camera.fy / z, -camera.fy * v / z], -1
+    ).reshape(-1, 2, 3)
+    axes = rotation_from_quat(quats[index]) * log_scales[index].exp().unsqueeze(-2)
+    half = jacobian @ pose[:3, :3] @ axes
+    cov = half @ half.mT
+    xx, xy, yy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
+    # |a|^2 |b|^2 - (a.b)^2 = |a x b|^2 (Lagrange): nothing cancels for a needle.
+    det_plain = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+    det = det_plain + DILATION * (xx + yy + DILATION)
+    xx, yy = xx + DILATION, yy + DILATION
+    opacities = torch.sigmoid(opacity_logits[index])
+    if options.antialias:
+        opacities = opacities * (det_plain / det).clamp(min=COMPENSATION_MIN).sqrt()
+    means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
+
+    with torch.no_grad():
+        active = sh[index, : (options.sh_degree + 1) ** 2]
+        sound = (det > 0) & (xx < COVARIANCE_MAX) & (yy < COVARIANCE_MAX)
+        sound &= torch.isfinite(means2d).all(-1)
+        # Half the axes of the ellipse {alpha >= 1/255}: x^T conic x <= 2 ln(255 opacity).
+        reach2 = 2 * torch.log(opacities / ALPHA_MIN)
+        extent = torch.stack([xx, yy], -1).mul(reach2.clamp(min=0).unsqueeze(-1)).sqrt()
+        size = torch.tensor([camera.width, camera.height], dtype=dtype)
+        first = (means2d - extent - 0.5).ceil().clamp(min=0)
+        last = torch.minimum((means2d + extent - 0.5).floor(), size - 1)
+        visible = sound & (reach2 > 0) & (first <= last).all(-1)
+        good_color = (active.abs() <= SH_MAX).all(-1).all(-1)
+        dropped = int((~ok).sum() + (~sound).sum() + (visible & ~good_color).sum())
+        visible &= good_color
+        mid = 0.5 * (xx + yy)
+        longest = mid + (0.25 * (xx - yy) ** 2 + xy * xy).sqrt()
+        radii = torch.zeros(means.shape[0], dtype=dtype)
+        radii[index[visible]] = (reach2 * longest).sqrt()[visible]
+    conics = torch.stack([yy / det, -xy / det, xx / det], -1)
+    return Projection(
+        index[visible], means2d[visible], conics[visible], z[visible], opacities[visible], radii,
+        dropped,
+    )  # fmt: skip
+
+
+def sh_basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
+    """Real spherical harmonics of unit (V, 3) directions, degree 0 to 3 -> (V, (degree + 1)^2).
+
+    Ordered and signed as in 3DGS (the Condon-Shortley phase included); the polynomials are those
+    of Sloan 2013, "Efficient Spherical Harmonic Evaluation".
+    """
+    x, y, z = directions.unbind(-1)
+    xx, yy, zz = x * x, y * y, z * z
+    terms = [torch.full_like(x, 0.28209479177387814)]
+    if degree > 0:
+        c = 0.4886025119029199
+        terms += [-c * y, c * z, -c * x]
+    if degree > 1:
+        c = 1.0925484305920792
+        terms += [c * x * y, -c * y * z, 0.31539156525252005 * (2 * zz - xx - yy)]
+        terms += [-c * x * z, 0.5 * c * (xx - yy)]
+    if degree > 2:
+        terms += [
+            -0.5900435899266435 * y * (3 * xx - yy),
+            2.890611442640554 * x * y * z,
+            -0.4570457994644658 * y * (4 * zz - xx - yy),
+            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
+            -0.4570457994644658 * x * (4 * zz - xx - yy),
+            1.445305721320277 * z * (xx - yy),
+            -0.5900435899266435 * x * (xx - 3 * yy),
+        ]
+    return torch.stack(terms, -1)
+
+
+class _NotNegative(torch.autograd.Function):
+    """max(0, x), whose gradient under 0 is not lost if a step against it would raise x. 3DGS drops
+    it (``RasterOptions.black_stays``): what has once become black in all views stays so."""
+
+    @staticmethod
+    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+        ctx.save_for_backward(x)
+        return x.clamp(min=0)
+
+    @staticmethod
+    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+        (x,) = ctx.saved_tensors
+        return torch.where(x > 0, grad, grad.clamp(max=0))
+
+
+def sh_colors(
+    means: torch.Tensor, sh: torch.Tensor, camera: RasterCamera, degree: int, stays: bool = False
+) -> torch.Tensor:
+    """(V, 3) RGB seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
+
+    The direction runs from the camera's centre to the Gaussian's; its dependence on the mean is
+    part of the gradient. Where the clamp holds, only a gradient that would raise the colour passes
+    (``_NotNegative``); with ``stays`` none.
+    """
+    pose = camera.world_to_camera.to(means.dtype)
+    center = -pose[:3, :3].T @ pose[:3, 3]
+    basis = sh_basis(F.normalize(means - center, dim=-1, eps=1e-30), degree)
+    colors = (basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5
+    if stays:
+        return torch.relu(colors)
+    clamped: torch.Tensor = _NotNegative.apply(colors)
+    return clamped
+
+
+@dataclass(frozen=True)
+class Blend:
+    """A blended image, and how near each pixel came to one of the method's thresholds.
+
+    Attributes:
+        color: (H, W, 3), the background included.
+        alpha, depth, median_depth: (H, W), see RenderOutput.
+        margin: (H, W) the smallest relative distance to a cut-off (alpha at 1/255 and at its
+            maximum, transmittance at its minimum): other roundings may decide otherwise there.
+        pairs: number of contributing (pixel, Gaussian) pairs.
+    """
+
+    color: torch.Tensor
+    alpha: torch.Tensor
+    depth: torch.Tensor
+    median_depth: torch.Tensor
+    margin: torch.Tensor
+    pairs: int
+
+
+def blend(
+    projection: Projection, colors: torch.Tensor, camera: RasterCamera, options: RasterOptions
+) -> Blend:
+    """Front to back alpha compositing (Kerbl et al. 2023, eq. 3).
+
+        alpha_i = min(opacity_i exp(-d^T conic_i d / 2), 0.999), left out below 1/255
+        T_i = prod_{j < i} (1 - alpha_j),  C = sum_i T_i alpha_i c_i + T_n background
+
+    in order of depth, equal depths by index. A pixel stops before the Gaussian that would take its
+    transmittance below 1e-4. Gradients go to the first ``gradients_per_pixel`` that a pixel draws.
+    """
+    dtype, height, width = colors.dtype, camera.height, camera.width
+    order = torch.sort(projection.depths.detach().float(), stable=True).indices
+    center, conic = projection.means2d[order], projection.conics[order]
+    depth, color = projection.depths[order], colors[order]
+    grid_y, grid_x = torch.meshgrid(
+        torch.arange(height, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5,
+        indexing="ij",
+    )  # fmt: skip
+    dx = grid_x.reshape(-1, 1) - center[:, 0]
+    dy = grid_y.reshape(-1, 1) - center[:, 1]
+    power = -0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) - conic[:, 1] * dx * dy
+    raw = projection.opacities[order] * power.exp()
+    alpha = torch.where(raw >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
+    # Transmittance never grows, so "has not stopped" is one comparison with the running product.
+    alive = torch.cumprod(1 - alpha, 1) >= TRANSMITTANCE_MIN
+    drawn = torch.where(alive, alpha, torch.zeros_like(alpha))
+    beyond = torch.cumsum(drawn > 0, 1) > (options.gradients_per_pixel or math.inf)
+    drawn = torch.where(beyond, drawn.detach(), drawn)
+    after = torch.cumprod(1 - drawn, 1)
+    before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
+    weight = before * drawn
+
+    def composed(values: torch.Tensor) -> torch.Tensor:
+        if not beyond.any():
+            return weight @ values
+        return (weight * ~beyond) @ values + (weight * beyond) @ values.detach()
+
+    rgb = composed(color)
+    opaque = weight.sum(1)
+    if options.background is not None:
+        rgb = rgb + (1 - opaque).unsqueeze(-1) * torch.tensor(options.background, dtype=dtype)
+    with torch.no_grad():
+        crossing = (before >= 0.5) & (after < 0.5)
+        median = (crossing * depth).sum(1)
+        running = torch.cumprod(1 - alpha, 1)
+        reached = torch.cat([torch.ones_like(alive[:, :1]), alive[:, :-1]], 1)
+        near_cut = torch.minimum((raw / ALPHA_MIN - 1).abs(), (raw / ALPHA_MAX - 1).abs())
+        near_stop = (running / TRANSMITTANCE_MIN - 1).abs()
+        margin = torch.where(reached, torch.minimum(near_cut, near_stop), 1.0)
+        margin = (
+            torch.cat([torch.ones_like(margin[:, :1]), margin], 1).amin(1)
+            if (margin.shape[1])
+            else torch.ones(height * width, dtype=dtype)
+        )
+    shape = (height, width)
+    return Blend(
+        rgb.reshape(height, width, 3), opaque.reshape(shape), composed(depth).reshape(shape),
+        median.reshape(shape), margin.reshape(shape), int((drawn > 0).sum()),
+    )  # fmt: skip
+
+
+def render(
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quats: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    camera: RasterCamera,
+    options: RasterOptions,
+) -> RenderOutput:
+    """Draw a view, differentiably. Same signature as ``pipeline.render.render``."""
+    projection = project(means, log_scales, quats, opacity_logits, sh, camera, options)
+    colors = sh_colors(
+        means[projection.index],
+        sh[projection.index],
+        camera,
+        options.sh_degree,
+        options.black_stays,
+    )
+    image = blend(projection, colors, camera, options)
+    return RenderOutput(
+        image.color, image.alpha, image.depth, image.median_depth, projection.radii,
+        len(projection.index), projection.num_dropped,
+    )  # fmt: skip
+
+
+SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
+SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
+
+
+def l1_ssim(
+    rendered: torch.Tensor,
+    target: torch.Tensor,
+    ssim_weight: float,
+    mask: torch.Tensor | None = None,
+    square_weight: float = 0.0,
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+    """(1 - w) E + w (1 - SSIM) -> (loss, E, ssim), scalars. E is the mean of |d| + k d^2: with
+    k = 0, as in 3DGS, L1. Squares make what is far off, a highlight say, count for more.
+
+    SSIM (Wang et al. 2004, eq. 13) in an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the
+    image, its mean over pixels and channels. Values in [0, 1]. With a mask (true = left out), the
+    render's masked pixels are replaced by the target's, and both means are over the others.
+    """
+    dtype = rendered.dtype
+    goal = target.to(dtype) / 255 if target.dtype == torch.uint8 else target.to(dtype)
+    keep = torch.ones(rendered.shape[:2], dtype=dtype)
+    if mask is not None:
+        keep = 1 - mask.to(dtype)
+        rendered = torch.where(mask.bool().unsqueeze(-1), goal, rendered)
+    count = keep.sum() * 3
+    if count == 0:
+        zero = (rendered * 0).sum()
+        return zero, zero, zero + 1
+    steps = torch.arange(SSIM_WINDOW, dtype=dtype) - SSIM_WINDOW // 2
+    window = torch.exp(-(steps**2) / (2 * SSIM_SIGMA**2))
+    window = window / window.sum()
+    kernel = torch.outer(window, window)[None, None]
+
+    def blur(image: torch.Tensor) -> torch.Tensor:
+        planes = image.permute(2, 0, 1).unsqueeze(1)
+        return F.conv2d(planes, kernel, padding=SSIM_WINDOW // 2).squeeze(1).permute(1, 2, 0)
+
+    mu_x, mu_y = blur(rendered), blur(goal)
+    var_x = blur(rendered * rendered) - mu_x**2
+    var_y = blur(goal * goal) - mu_y**2
+    cov = blur(rendered * goal) - mu_x * mu_y
+    ssim_map = ((2 * mu_x * mu_y + SSIM_C1) * (2 * cov + SSIM_C2)) / (
+        (mu_x**2 + mu_y**2 + SSIM_C1) * (var_x + var_y + SSIM_C2)
+    )
+    d = rendered - goal
+    error = ((d.abs() + square_weight * d * d) * keep.unsqueeze(-1)).sum() / count
+    ssim = (ssim_map * keep.unsqueeze(-1)).sum() / count
+    return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
+
+
+def adam_step(
+    param: torch.Tensor,
+    grad: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    lr: float | Sequence[float],
+    step: int,
+    beta1: float = 0.9,
+    beta2: float = 0.999,
+    eps: float = 1e-15,
+) -> None:
+    """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
+    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment."""
+    pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
+    repeats = -(-param.numel() // len(pattern))
+    rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
+    exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
+    squares = grad.square()
+    if exp_avg_sq.shape != grad.shape:
+        squares = squares.mean(1, keepdim=True)
+    exp_avg_sq.mul_(beta2).add_(squares, alpha=1 - beta2)
+    denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
+    param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
+
+
+def frame_adam(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    d_means: torch.Tensor,
+    d_quats: torch.Tensor,
+    adam: FrameAdam,
+) -> None:
+    """Adam over means (N, 3) and quaternions (N, 4) in each Gaussian's own frame; all in place, of
+    one float type.
+
+    A mean is moved by way of y, mean = R S y with S = diag(scales), whose gradient is
+    S R^T dL/dmean: the mean of N(mean, R S S R^T) has the identity for Fisher information there
+    (the metric of Amari 1998). A quaternion q is moved by way of t, q (1 + t_x i + t_y j + t_z k),
+    half the angles about the axes. R, S and q are those before the step."""
+    norm = quats.norm(dim=1, keepdim=True)
+    turns = norm.square() >= QUAT_NORM2_MIN
+    plain = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    unit = torch.where(turns, quats / norm.where(turns, torch.ones_like(norm)), plain)
+    frame = rotation_from_quat(unit) * log_scales.exp()[:, None, :]
+    w, x, y, z = unit.unbind(1)
+    tangents = torch.stack(
+        [torch.stack(t, 1) for t in ((-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))], 2
+    )  # (N, 4, 3): q i, q j, q k
+    tangents = torch.where(turns[..., None], tangents * norm[..., None], 0.0)
+    for param, grad, axes, exp_avg, exp_avg_sq, rate in (
+        (means, d_means, frame, adam.mean_avg, adam.mean_avg_sq, adam.mean_rate),
+        (quats, d_quats, tangents, adam.turn_avg, adam.turn_avg_sq, adam.turn_rate),
+    ):
+        own = torch.zeros_like(exp_avg)
+        own_grad = torch.einsum("nij,ni->nj", axes, grad)
+        adam_step(
+            own, own_grad, exp_avg, exp_avg_sq, rate, adam.step, adam.beta1, adam.beta2, adam.eps
+        )
+        param.add_(torch.einsum("nij,nj->ni", axes, own))
+
+
+def sh_adam(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:
+    """Adam over the harmonics (N, K, 3) of the Gaussians that the view asks of, ``asked`` (N,)
+    bool; all in place, of sh's type but for ``adam.last``.
+
+    n steps without a gradient multiply the moments by beta1^n and beta2^n, and move the parameter
+    by m / sqrt(v) times r + r^2 + ... + r^n, r = beta1 / sqrt(beta2); the bias corrections and
+    rates of the present step are taken for all of them. What is left then is a usual step.
+    """
+    rows = torch.nonzero(asked)[:, 0]
+    missed = (adam.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
+    rates = torch.full(sh.shape[1:], adam.rate, dtype=sh.dtype)
+    rates[0] = adam.rate0
+    ratio = adam.beta1 / math.sqrt(adam.beta2)
+    drift = ratio * (1 - ratio**missed) / (1 - ratio)
+    m, v, p = adam.exp_avg[rows], adam.exp_avg_sq[rows], sh[rows]
+    scale = math.sqrt(1 - adam.beta2**adam.step)
+    p -= rates / (1 - adam.beta1**adam.step) * drift * m / (v.sqrt() / scale + adam.eps)
+    m, v = m * adam.beta1**missed, v * adam.beta2**missed
+    betas = adam.beta1, adam.beta2
+    adam_step(p, grad[rows], m, v, rates.flatten().tolist(), adam.step, *betas, adam.eps)
+    sh[rows], adam.exp_avg[rows], adam.exp_avg_sq[rows] = p, m, v
+    adam.last[rows] = adam.step

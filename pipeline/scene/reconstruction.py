@@ -1,0 +1,106 @@
+"""Cameras, posed images and points, as plain values: what COLMAP calls a reconstruction.
+
+One convention everywhere (COLMAP's): world to camera, x right, y down, z forward, pixel
+centres at half integers. Other conventions are converted where files are read and written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, field, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.cameras import Camera
+
+
+@dataclass(frozen=True)
+class Posed:
+    """One image with its pose.
+
+    Attributes:
+        name: file name relative to the image folder, with "/" between folders.
+        camera_id: key into ``Reconstruction.cameras``.
+        rotation: (3, 3) float64, world to camera.
+        translation: (3,) float64, world to camera, in the world's unit.
+    """
+
+    name: str
+    camera_id: int
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) the camera's centre in the world."""
+        return -self.rotation.T @ self.translation
+
+    @property
+    def world_to_camera(self) -> NDArray[np.float64]:
+        """(4, 4) float64."""
+        matrix = np.eye(4)
+        matrix[:3, :3], matrix[:3, 3] = self.rotation, self.translation
+        return matrix
+
+
+@dataclass(frozen=True)
+class Points:
+    """Sparse points, structure of arrays.
+
+    Attributes:
+        xyz: (P, 3) float64, world.
+        rgb: (P, 3) uint8.
+        error: (P,) float64, mean reprojection error in pixels; -1 where unknown.
+        track_start: (P + 1,) int64; point p is seen in ``track_image_id[start[p]:start[p + 1]]``.
+        track_image_id: (M,) int64, keys into ``Reconstruction.images``.
+        track_xy: (M, 2) float64 pixels of the observations, NaN where unknown.
+    """
+
+    xyz: NDArray[np.float64]
+    rgb: NDArray[np.uint8]
+    error: NDArray[np.float64]
+    track_start: NDArray[np.int64]
+    track_image_id: NDArray[np.int64]
+    track_xy: NDArray[np.float64]
+
+    @staticmethod
+    def empty() -> Points:
+        return Points(
+            np.zeros((0, 3)),
+            np.zeros((0, 3), np.uint8),
+            np.zeros(0),
+            np.zeros(1, np.int64),
+            np.zeros(0, np.int64),
+            np.zeros((0, 2)),
+        )
+
+    def __len__(self) -> int:
+        return len(self.xyz)
+
+    @property
+    def track_length(self) -> NDArray[np.int64]:
+        """(P,) number of images that see each point."""
+        return np.diff(self.track_start)
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """Cameras and images by COLMAP id, and points."""
+
+    cameras: dict[int, Camera]
+    images: dict[int, Posed]
+    points: Points = field(default_factory=Points.empty)
+
+    def by_name(self) -> dict[str, Posed]:
+        return {image.name: image for image in self.images.values()}
+
+
+def with_poses(model: Reconstruction, poses: Mapping[str, NDArray[np.float64]]) -> Reconstruction:
+    """The model with other poses, (4, 4) world to camera by name; those not named stay."""
+
+    def moved(image: Posed) -> Posed:
+        pose = poses.get(image.name, image.world_to_camera)
+        return replace(image, rotation=pose[:3, :3], translation=pose[:3, 3])
+
+    return replace(model, images={key: moved(image) for key, image in model.images.items()})

@@ -1,0 +1,1 @@
+"""Camera refinement: poses and lenses that train with the Gaussians."""

@@ -1,0 +1,1 @@
+"""Checkpoints, and which run each is of."""

@@ -1,0 +1,1 @@
+"""What training reads: images, depths, the first Gaussians."""

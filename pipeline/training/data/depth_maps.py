@@ -1,0 +1,168 @@
+"""Depth maps that the user brings, brought to the scene's unit and sampled.
+
+A sensor's maps are right up to a factor (millimetres, say); a network's up to factor and shift, of
+the depth or, as most, of its inverse. Which it is, and the numbers, the sparse points of each view
+tell: of three fits the one that meets them best is taken, the simplest of about equal ones.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.photos.load import load_depth
+from pipeline.scene.views import View
+from pipeline.training.data.known_depths import KnownDepths
+
+#: Samples a view: dense enough for walls, and a few more than the points of most views.
+SAMPLES = 3000
+#: Fewer points tell nothing about a map.
+MIN_POINTS = 12
+#: Median error of the logarithm at the points beyond which a map is not believed.
+MAX_ERROR = 0.1
+#: A fit with more freedom must be this much better, and a good one is not bettered: points and
+#: pixels err as much themselves.
+BETTER, GOOD = 0.8, 0.03
+#: Neighbouring pixels that differ by more than this share are an edge, whose place is uncertain.
+EDGE = 0.05
+#: Pairs of points that a line is laid through.
+PAIRS = 300
+
+Array = NDArray[np.float64]
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How a map's values v become camera z.
+
+    Attributes:
+        kind: "factor": z = a v; "depth": z = a v + b; "inverse": 1 / z = a v + b.
+        error: median of |log(z / known z)| over the points.
+    """
+
+    kind: str
+    a: float
+    b: float
+    error: float
+
+    def depth(self, values: Array) -> Array:
+        """Camera z of map values; not a number where the fit has none."""
+        line = self.a * values + self.b
+        with np.errstate(divide="ignore", invalid="ignore"):
+            z = 1.0 / line if self.kind == "inverse" else line
+        return np.where(line > 0, z, np.nan)
+
+
+def fit_map(values: Array, z: Array) -> Fit | None:
+    """How ``values`` (M,) of a map at points become their depths ``z`` (M,); None if they don't."""
+    usable = np.isfinite(values) & (values > 0)
+    values, z = values[usable], z[usable]
+    if len(z) < MIN_POINTS:
+        return None
+    best: Fit | None = None
+    for kind in ("factor", "depth", "inverse"):
+        a, b = _solve(kind, values, z)
+        fit = Fit(kind, a, b, 0.0)
+        off = np.abs(np.log(fit.depth(values) / z))
+        # What the fit has no depth for counts as far off.
+        fit = Fit(kind, a, b, float(np.median(np.where(np.isfinite(off), off, np.inf))))
+        if best is None or (best.error > GOOD and fit.error < BETTER * best.error):
+            best = fit
+    return best if best is not None and best.error <= MAX_ERROR else None
+
+
+def map_depths(
+    view: View, path: str, points: KnownDepths
+) -> tuple[KnownDepths, Fit] | tuple[None, None]:
+    """Samples of the depth map ``path`` of ``view``, fitted to the depths of its ``points``.
+
+    Returns:
+        the samples, each of weight 1, and the fit; None where points and map do not agree.
+
+    Raises:
+        UserError: the file is no depth map that can be read, or not of the view's shape.
+    """
+    full = load_depth(path, view.width / view.height)
+    height, width = full.shape
+
+    def at(xy: Array) -> Array:
+        column = (xy[:, 0] * (width / view.width)).astype(int).clip(0, width - 1)
+        row = (xy[:, 1] * (height / view.height)).astype(int).clip(0, height - 1)
+        return full[row, column]
+
+    fit = fit_map(at(points.xy), points.z.astype(np.float64))
+    if fit is None:
+        return None, None
+    step = max(1.0, np.sqrt(view.width * view.height / SAMPLES))
+    x, y = np.meshgrid(
+        np.arange(step / 2, view.width, step), np.arange(step / 2, view.height, step)
+    )
+    xy = np.stack([x.ravel(), y.ravel()], 1)
+    values = at(xy)
+    around = np.stack([at(xy + offset) for offset in ((1, 0), (-1, 0), (0, 1), (0, -1))])
+    with np.errstate(invalid="ignore"):
+        smooth = (np.abs(around - values) < EDGE * values).all(0)
+        z = fit.depth(values)
+        usable = smooth & np.isfinite(z) & (values > 0)
+    ones = np.ones(int(usable.sum()), np.float32)
+    return KnownDepths(xy[usable], z[usable].astype(np.float32), ones), fit
+
+
+def merged(points: KnownDepths, samples: KnownDepths) -> KnownDepths:
+    """Both, every observation counting by its own weight."""
+    return KnownDepths(
+        np.concatenate([points.xy, samples.xy]),
+        np.concatenate([points.z, samples.z]),
+        np.concatenate([points.weight, samples.weight]),
+    )
+
+
+def add_maps(
+    views: Sequence[View], points: Sequence[KnownDepths], paths: Sequence[str | None]
+) -> tuple[list[KnownDepths], dict[str, int], list[str]]:
+    """``points`` with the samples of the views' depth maps.
+
+    Returns:
+        known depths by view; how many maps each kind of fit took; names of views whose maps
+        the points contradict.
+    """
+    known, kinds, refused = list(points), dict.fromkeys(("factor", "depth", "inverse"), 0), []
+    for index, (view, path) in enumerate(zip(views, paths, strict=True)):
+        if path is None:
+            continue
+        samples, fit = map_depths(view, path, points[index])
+        if samples is None or fit is None:
+            refused.append(view.name)
+            continue
+        kinds[fit.kind] += 1
+        known[index] = merged(points[index], samples)
+    return known, {kind: count for kind, count in kinds.items() if count}, refused
+
+
+def _solve(kind: str, values: Array, z: Array) -> tuple[float, float]:
+    """a and b by the pair of points whose line suits the median point best, then by least squares
+    of relative errors over the points that this line meets."""
+    if kind == "factor":
+        return float(np.exp(np.median(np.log(z / values)))), 0.0
+    target = 1.0 / z if kind == "inverse" else z
+    first, second = np.random.Generator(np.random.PCG64(0)).integers(len(z), size=(2, PAIRS))
+    apart = values[first] != values[second]
+    if not apart.any():
+        return 0.0, 0.0
+    first, second = first[apart], second[apart]
+    a = (target[first] - target[second]) / (values[first] - values[second])
+    b = target[first] - a * values[first]
+    off = np.abs((a[:, None] * values + b[:, None]) / target - 1.0)
+    median = np.median(off, axis=1)
+    best = int(median.argmin())
+    met = off[best] <= max(3 * float(median[best]), 1e-9)
+    # The normal equations, in plain sums: BLAS sums by the number of threads.
+    u, w = values[met] / target[met], 1.0 / target[met]
+    uu, uw, ww, u1, w1 = (float(term.sum()) for term in (u * u, u * w, w * w, u, w))
+    scale = uu * ww - uw * uw
+    if scale <= 0:
+        return float(a[best]), float(b[best])
+    return (ww * u1 - uw * w1) / scale, (uu * w1 - uw * u1) / scale

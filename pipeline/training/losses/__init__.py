@@ -1,0 +1,1 @@
+"""Terms of the loss, as gradients on the rendered images."""

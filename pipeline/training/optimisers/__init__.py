@@ -1,0 +1,1 @@
+"""Adam over Gaussians, and over the parameters of single cameras."""

@@ -1,0 +1,84 @@
+"""Every camera model agrees with pycolmap, and its inverse with itself."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from pipeline.geometry.cameras import CAMERA_MODELS, Camera
+from pipeline.geometry.distortion import distort, fold_radius, normalised, pixels, undistort
+
+PARAMS = {
+    "SIMPLE_PINHOLE": [400, 320, 240],
+    "PINHOLE": [400, 410, 318, 243],
+    "SIMPLE_RADIAL": [400, 320, 240, -0.12],
+    "RADIAL": [400, 320, 240, -0.15, 0.04],
+    "OPENCV": [400, 410, 318, 243, -0.2, 0.06, 0.002, -0.003],
+    "OPENCV_FISHEYE": [300, 305, 318, 243, 0.02, -0.01, 0.003, -0.0005],
+    "FULL_OPENCV": [400, 410, 318, 243, 0.3, 0.02, 0.001, -0.002, 0.01, 0.5, 0.05, 0.002],
+    "SIMPLE_RADIAL_FISHEYE": [300, 320, 240, 0.03],
+    "RADIAL_FISHEYE": [300, 320, 240, 0.03, -0.01],
+}
+
+
+def camera(model: str) -> Camera:
+    return Camera(model, 640, 480, np.array(PARAMS[model], dtype=np.float64))
+
+
+def grid() -> np.ndarray:
+    x, y = np.meshgrid(np.linspace(-0.75, 0.75, 13), np.linspace(-0.55, 0.55, 9))
+    return np.stack([x, y], axis=-1).reshape(-1, 2)
+
+
+def test_all_models_project_and_unproject_as_pycolmap_does() -> None:
+    # A process of its own: pycolmap's libpng must not meet cv2's.
+    script = """
+import json, sys, numpy as np, pycolmap
+data = json.load(sys.stdin)
+out = {}
+for model, params in data["params"].items():
+    c = pycolmap.Camera(model=model, width=640, height=480, params=params)
+    rays = np.array([[x, y, 1.0] for x, y in data["points"]])
+    xy = np.asarray(c.img_from_cam(rays))
+    out[model] = [xy.tolist(), np.asarray(c.cam_from_img(xy)).tolist()]
+json.dump(out, sys.stdout)
+"""
+    points = grid()
+    answer = subprocess.run(
+        [sys.executable, "-c", script],
+        input=json.dumps({"params": PARAMS, "points": points.tolist()}),
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    truth = json.loads(answer.stdout)
+    assert set(truth) == set(CAMERA_MODELS)
+    for model, (xy, back) in truth.items():
+        np.testing.assert_allclose(pixels(camera(model), points), xy, atol=1e-8, err_msg=model)
+        ours = normalised(camera(model), np.array(xy))
+        np.testing.assert_allclose(ours, np.array(back)[:, :2], atol=1e-6, err_msg=model)
+        np.testing.assert_allclose(ours, points, atol=1e-8, err_msg=model)
+
+
+@pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE"])
+def test_points_beyond_the_fold_have_no_inverse(model: str) -> None:
+    start = [400.0, 320, 240] if model == "SIMPLE_RADIAL" else [300.0, 300, 320, 240]
+    rest = [-0.3] if model == "SIMPLE_RADIAL" else [-0.3, 0, 0, 0]
+    params = [*start, *rest]
+    strong = Camera(model, 640, 480, np.array(params))
+    radius = fold_radius(strong)
+    edge = distort(strong, np.array([[radius, 0.0]]))[0, 0]
+    inside = undistort(strong, np.array([[edge * 0.98, 0.0]]))
+    assert 0 < inside[0, 0] < radius
+    assert np.isnan(undistort(strong, np.array([[edge * 1.02, 0.0]]))).all()
+
+
+def test_fisheye_has_no_normalised_point_at_ninety_degrees() -> None:
+    lens = Camera("OPENCV_FISHEYE", 640, 480, np.array([200.0, 200, 320, 240, 0, 0, 0, 0]))
+    points = normalised(lens, np.array([[320 + 200 * 1.5, 240.0], [320 + 200 * 1.58, 240.0]]))
+    np.testing.assert_allclose(points[0], [np.tan(1.5), 0], rtol=1e-9)
+    assert np.isnan(points[1]).all()

@@ -1,0 +1,62 @@
+"""HEIC pictures, where pillow-heif is installed: seen, described and read as JPEGs are."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from pipeline.config.schema import Config
+from pipeline.io import heif
+from pipeline.photos.load import load_rgba
+from pipeline.photos.verify import verify_photos
+from pipeline.plan.scan import scan
+from pipeline.runtime.errors import UserError
+from pipeline.sfm.sift import Picture
+
+pytestmark = pytest.mark.skipif(
+    not heif.installed(), reason="pillow-heif is not installed: pip install pillow-heif"
+)
+
+
+def write(path: Path, orientation: int = 1, blue: int = 255) -> np.ndarray:
+    """A picture that changes slowly (60, 80, 3), and with EXIF."""
+    heif.register()
+    y, x = np.mgrid[:60, :80]
+    rgb = np.stack([3 * x, 4 * y, blue - 2 * x], 2).astype(np.uint8)
+    exif = Image.Exif()
+    exif[0x0110], exif[0x0112] = "PHONE 7", orientation
+    exif.get_ifd(0x8769)[0xA405] = 26
+    Image.fromarray(rgb).save(path, format="HEIF", quality=95, exif=exif.tobytes())
+    return rgb
+
+
+def test_a_scene_of_heic_pictures_is_seen_described_and_read(tmp_path: Path) -> None:
+    pictures = [write(tmp_path / "a.heic"), write(tmp_path / "b.HEIC", blue=200)]
+    found = scan(tmp_path, "s", Config(), cache=None)
+    assert [photo.name for photo in found.photos] == ["a.heic", "b.HEIC"]
+    photo = found.photos[0]
+    assert (photo.width, photo.height, photo.alpha, photo.bits) == (80, 60, False, 8)
+    assert "PHONE 7" in photo.camera_group and photo.focal_px is not None
+    assert verify_photos(found.manifest, threads=1)[1] == []
+    rgb, alpha = load_rgba(photo.path)
+    assert alpha is None and np.abs(rgb.astype(int) - pictures[0]).mean() < 3
+    assert np.array_equal(Picture(photo, 1000).rgb, rgb)
+
+
+def test_size_and_pixels_agree_where_the_phone_was_held_upright(tmp_path: Path) -> None:
+    write(tmp_path / "a.heic", orientation=6)
+    write(tmp_path / "b.heic", orientation=6)
+    photo = scan(tmp_path, "s", Config(), cache=None).photos[0]
+    assert load_rgba(photo.path)[0].shape == (photo.height, photo.width, 3)
+    assert Picture(photo, 1000).rgb.shape == (photo.height, photo.width, 3)
+
+
+def test_a_broken_one_is_told(tmp_path: Path) -> None:
+    write(tmp_path / "a.heic")
+    (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:300])
+    with pytest.raises(UserError) as error:
+        load_rgba(tmp_path / "a.heic")
+    assert "a.heic" in str(error.value)

@@ -1,0 +1,101 @@
+"""Files of Gaussians by suffix, made fit to render; what export does before it writes."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.io.splat_files import SUFFIXES, read_gaussians, write_gaussians
+from pipeline.runtime.errors import UserError
+from pipeline.splats.morton import in_morton_order
+from pipeline.splats.reduce import prepare
+from tests.splats.samples import Within, sample
+
+#: The coarsest of the formats.
+ALL = Within(2**-19, 0.032, 0.5001 / 255, 0.91, 0.014, 0.5001 / 128)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_format_is_written_and_read_by_its_suffix(tmp_path, suffix) -> None:
+    path = tmp_path / f"a{suffix.upper()}"
+    write_gaussians(path, sample(20, 0))
+    warnings: list[str] = []
+    ALL.check(read_gaussians(path, warnings), sample(20, 0))
+    assert not warnings
+
+
+@pytest.mark.parametrize(
+    "change",
+    [{"means": np.float32(1)}, {"sh": np.zeros(3)}, {"sh": np.zeros((5, 25, 3))}, {"quats": "w"}],
+)
+def test_an_archive_of_something_else_is_an_error(tmp_path, change) -> None:
+    np.savez(tmp_path / "a.npz", **(sample(5).arrays() | change))
+    with pytest.raises(UserError, match="Gaussians"):
+        read_gaussians(tmp_path / "a.npz", [])
+
+
+def test_an_unknown_suffix_is_an_error(tmp_path) -> None:
+    with pytest.raises(UserError, match=r"'\.obj'"):
+        write_gaussians(tmp_path / "a.obj", sample())
+    with pytest.raises(UserError, match=r"\.ply, \.spz"):
+        read_gaussians(tmp_path / "a", [])
+
+
+def test_gaussians_that_are_no_numbers_are_left_out_and_told(tmp_path) -> None:
+    gaussians = sample(10, 1)
+    gaussians.means[2, 1] = np.nan
+    gaussians.sh[3, 1, 0] = np.inf
+    gaussians.quats[4] = 0
+    gaussians.opacity_logits[5] = np.nan
+    gaussians.opacity_logits[6] = np.inf  # Fully opaque.
+    gaussians.log_scales[7, 2] = -np.inf  # Flat.
+    write_gaussians(tmp_path / "a.ply", gaussians)
+    warnings: list[str] = []
+    found = read_gaussians(tmp_path / "a.ply", warnings)
+    assert torch.equal(found.means, gaussians.means[[0, 1, 6, 7, 8, 9]])
+    assert all(tensor.isfinite().all() for tensor in found.tensors().values())
+    assert found.opacity_logits[2].sigmoid() == 1 and found.log_scales[3, 2] < -20
+    assert len(warnings) == 1 and "4 of 10" in warnings[0]
+
+
+def test_nothing_to_render_is_an_error(tmp_path) -> None:
+    gaussians = sample(3)
+    gaussians.means[:] = np.nan
+    write_gaussians(tmp_path / "a.ply", gaussians)
+    with pytest.raises(UserError, match="none that can be rendered"):
+        read_gaussians(tmp_path / "a.ply", [])
+
+
+def test_faint_gaussians_and_high_bands_are_left_out() -> None:
+    gaussians = sample(100)
+    found = prepare(gaussians, 1, 0.5, False)
+    kept = gaussians.opacity_logits >= 0
+    assert torch.equal(found.means, gaussians.means[kept])
+    assert torch.equal(found.sh, gaussians.sh[kept][:, :4])
+    assert prepare(sample(10, 0), 3, 0, False).sh_degree == 0
+    with pytest.raises(UserError, match="fainter"):
+        prepare(gaussians, 3, 1.0, False)
+
+
+def test_morton_order_is_a_permutation_that_brings_neighbours_together() -> None:
+    gaussians = sample(4000, 0)
+    found = in_morton_order(gaussians)
+    assert sorted(map(tuple, found.means.tolist())) == sorted(map(tuple, gaussians.means.tolist()))
+
+    def step(means: torch.Tensor) -> float:
+        return float((means[1:] - means[:-1]).norm(dim=1).median())
+
+    assert step(found.means) < 0.3 * step(gaussians.means)
+    # Rows stay together.
+    row = int((gaussians.means == found.means[17]).all(1).nonzero())
+    for name, tensor in found.tensors().items():
+        assert torch.equal(tensor[17], gaussians.tensors()[name][row])
+
+
+def test_morton_order_follows_the_curve() -> None:
+    corners = [[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]
+    gaussians = sample(8, 0)
+    gaussians.means[:] = torch.tensor(corners).float().flip(0)
+    assert in_morton_order(gaussians).means.tolist() == corners
+    assert len(in_morton_order(sample(0))) == 0 and len(in_morton_order(sample(1))) == 1

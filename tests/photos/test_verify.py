@@ -1,0 +1,55 @@
+"""Decoding every photograph once: broken ones are left out by name."""
+
+import pytest
+
+from pipeline.config.schema import Config
+from pipeline.photos.verify import verify_photos
+from pipeline.plan.scan import scan
+from pipeline.runtime.errors import UserError
+from tests.pictures import photos, picture
+from tests.plan.test_scan import write_dng
+
+
+@pytest.fixture
+def manifest(tmp_path):
+    photos(tmp_path, 3)
+    for name in ("cut_a.jpg", "cut_b.png", "cut_c.tif"):
+        file = picture(tmp_path / name)
+        file.write_bytes(file.read_bytes()[: file.stat().st_size * 2 // 3])
+    write_dng(tmp_path / "good.dng")
+    write_dng(tmp_path / "cut_d.dng")
+    data = (tmp_path / "cut_d.dng").read_bytes()
+    (tmp_path / "cut_d.dng").write_bytes(data[:-3000])
+    return scan(tmp_path, "s", Config(), cache=None).manifest
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_broken_photographs_are_left_out_by_name(manifest, threads):
+    broken = {"cut_a.jpg", "cut_b.png", "cut_c.tif", "cut_d.dng"}
+    # A header cut off is seen by the scan already.
+    there = {photo.name for photo in manifest.photos}
+    checked, warnings = verify_photos(manifest, threads=threads)
+    assert [photo.name for photo in checked.photos] == [
+        "good.dng",
+        "p00.jpg",
+        "p01.jpg",
+        "p02.jpg",
+    ]
+    assert len(warnings) == len(broken & there)
+    for name in broken:
+        assert sum(name in line for line in checked.warnings) == 1, name
+
+
+def test_too_few_left_is_an_error_that_names_them(manifest):
+    with pytest.raises(UserError, match=r"only 4 of \d photographs") as error:
+        verify_photos(manifest, threads=1, min_photos=5)
+    assert "cut_a.jpg" in str(error.value)
+
+
+def test_copies_are_named(tmp_path):
+    """A held-out photograph whose copy is trained on measures memory."""
+    files = photos(tmp_path, 3)
+    (tmp_path / "q.jpg").write_bytes(files[1].read_bytes())
+    manifest = scan(tmp_path, "s", Config(), cache=None).manifest
+    (warning,) = verify_photos(manifest, threads=1)[1]
+    assert "q.jpg = p01.jpg" in warning and warning.startswith("copies of other photographs: 1 (")

@@ -1,0 +1,414 @@
+"""The plan: what runs, what is skipped, what is settled; for each kind of scene."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.config.schema import Config
+from pipeline.io.colmap import read_model, write_model
+from pipeline.plan.plan import Plan, describe
+from pipeline.plan.scan import Scan, scan
+from pipeline.runtime.errors import UserError
+from pipeline.scene.reconstruction import Points, Reconstruction
+from stages.workflow.registry import STAGES
+from tests.io.test_llff import llff_row
+from tests.io.test_transforms import frame, write
+from tests.pictures import photos, picture
+from tests.plan.test_scan import write_dng, write_sparse
+from tests.plans import make_plan
+
+
+def look(folder: Path, **sections) -> Scan:
+    return scan(folder, folder.name, Config.model_validate(sections), cache=None)
+
+
+def plan_of(folder: Path, **sections) -> Plan:
+    return make_plan(look(folder, **sections), Config.model_validate(sections))
+
+
+def skipped(plan: Plan) -> list[str]:
+    return [name for name, stage in plan.stages.items() if not stage.run]
+
+
+def many(folder: Path, count: int, **changes) -> Scan:
+    """A scan of ``count`` photographs without as many files: ``changes`` map a field of Photo
+    to a function of the index."""
+    photos(folder / "images", 2)
+    few = look(folder)
+    pictures = tuple(
+        few.photos[0].model_copy(
+            update={
+                "name": f"p{i:04d}.jpg",
+                **{field: value(i) for field, value in changes.items()},
+            }
+        )
+        for i in range(count)
+    )
+    return few.model_copy(update={"manifest": few.manifest.model_copy(update={"photos": pictures})})
+
+
+def test_photographs_alone_need_everything_but_raw(tmp_path):
+    photos(tmp_path / "images", 3)
+    plan = plan_of(tmp_path)
+    assert list(plan.stages) == list(STAGES)
+    assert skipped(plan) == ["decode", "refine"]
+    assert all(stage.reason for stage in plan.stages.values())
+
+
+def test_raw_needs_decode(tmp_path):
+    for i in range(2):
+        write_dng(tmp_path / f"{i}.dng")
+    assert skipped(plan_of(tmp_path)) == ["refine"]
+
+
+@pytest.mark.parametrize("model, undistort", [("PINHOLE", []), ("SIMPLE_RADIAL", ["undistort"])])
+def test_given_colmap_poses(tmp_path, model, undistort):
+    files = photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", [path.name for path in files], (64, 48), model)
+    plan = plan_of(tmp_path)
+    runs = {"features", "matches", "sfm", "decode", "undistort"} - set(skipped(plan))
+    assert sorted(runs) == undistort
+    assert "3 cameras" in plan.stages["sfm"].reason and model in plan.stages["undistort"].reason
+    assert "1 sparse points" in plan.stages["init"].reason
+    ignoring = plan_of(tmp_path, poses="ignore")
+    assert skipped(ignoring) == ["decode", "refine"] and "ignore" in ignoring.stages["sfm"].reason
+
+
+def posed(folder: Path, *, tracks: int, size: tuple[int, int] = (64, 48), count: int = 5) -> Path:
+    """Photographs of 64 x 48 pixels, and a model for ``size`` with so many points in each."""
+    names = [path.name for path in photos(folder / "images", count)]
+    sparse = folder / "sparse" / "0"
+    write_sparse(sparse, names, size)
+    model = read_model(sparse)
+    points = Points(
+        np.zeros((tracks, 3)),
+        np.zeros((tracks, 3), np.uint8),
+        np.zeros(tracks),
+        np.arange(tracks + 1) * count,
+        np.tile(model.points.track_image_id, tracks),
+        np.tile(model.points.track_xy, (tracks, 1)),
+    )
+    write_model(sparse, Reconstruction(model.cameras, model.images, points))
+    return folder
+
+
+def moved_centre(folder: Path) -> Path:
+    """A principal point that somebody looked for."""
+    sparse = folder / "sparse" / "0"
+    model = read_model(sparse)
+    model.cameras[1].params[2] += 0.25
+    write_model(sparse, model)
+    return folder
+
+
+def test_given_poses_with_tracks_and_a_centre_that_nobody_looked_for_are_refined(tmp_path):
+    plan = plan_of(posed(tmp_path, tracks=20, size=(128, 96)))
+    assert skipped(plan) == ["decode", "features", "matches", "sfm", "undistort"]
+    assert "middle" in plan.stages["refine"].reason
+
+
+@pytest.mark.parametrize(
+    "change, options, why",
+    [
+        ({"tracks": 20}, {"poses": "keep"}, "poses: keep"),
+        ({"tracks": 20}, {"sfm": {"refine_principal_point": "no"}}, "held"),
+        ({"tracks": 19}, {}, "19 tracked points"),
+        ({"tracks": 0}, {}, "no tracks"),
+        ({"tracks": 20, "count": 4}, {}, "no camera of 5"),
+    ],
+)
+def test_given_poses_that_gain_nothing_are_not_refined(tmp_path, change, options, why):
+    plan = plan_of(posed(tmp_path, **change), **options)
+    assert not plan.runs("refine") and why in plan.stages["refine"].reason
+
+
+def test_a_calibrated_lens_is_refined_on_demand_alone(tmp_path):
+    scene = moved_centre(posed(tmp_path, tracks=20))
+    assert "no camera of 5" in plan_of(scene).stages["refine"].reason
+    assert plan_of(scene, sfm={"refine_principal_point": "yes"}).runs("refine")
+
+
+def test_given_poses_without_points_are_triangulated(tmp_path):
+    picture(tmp_path / "train" / "a.png", mode="RGBA")
+    picture(tmp_path / "train" / "b.png", mode="RGBA")
+    frames = [frame(path=f"./train/{name}") for name in "ab"]
+    write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, "transforms_train.json")
+    plan = plan_of(tmp_path)
+    assert skipped(plan) == ["decode", "features", "matches", "refine", "sfm", "undistort"]
+    assert "triangulated" in plan.stages["init"].reason
+    assert plan.config.train.background == "white"
+    assert "random" in plan_of(tmp_path, init={"method": "random"}).stages["init"].reason
+
+
+def test_llff(tmp_path):
+    photos(tmp_path / "images", 2)
+    np.save(tmp_path / "poses_bounds.npy", [llff_row(np.eye(3), np.zeros(3), 48, 64, 50.0)] * 2)
+    assert skipped(plan_of(tmp_path)) == [
+        "decode",
+        "features",
+        "matches",
+        "refine",
+        "sfm",
+        "undistort",
+    ]
+
+
+@pytest.mark.parametrize("model, runs", [("PINHOLE", False), ("auto", True), ("OPENCV", True)])
+def test_undistort_follows_the_camera_model_of_sfm(tmp_path, model, runs):
+    photos(tmp_path / "images", 2)
+    plan = plan_of(tmp_path, sfm={"camera_model": model})
+    assert plan.runs("undistort") == runs and "cameras" in plan.stages["undistort"].reason
+
+
+def test_nothing_that_can_be_settled_stays_auto(tmp_path):
+    photos(tmp_path / "images", 3)
+    config = plan_of(tmp_path).config
+    assert config.inspect.image_folder == "images"
+    assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
+    assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
+    assert (config.init.method, config.train.background) == ("points", "black")
+
+
+def images(folder: Path) -> None:
+    photos(folder / "images", 2)
+
+
+def smaller_copy(folder: Path) -> None:
+    photos(folder / "images", 2, (1280, 960))
+    photos(folder / "images_2", 2, (960, 720))
+    write_sparse(folder / "sparse" / "0", ["p00.jpg", "p01.jpg"], (1280, 960))
+
+
+def plain(folder: Path) -> None:
+    photos(folder, 2)
+    photos(folder / "masks", 2, mode="L")
+    photos(folder / "thumbs", 2)
+
+
+def subfolders(folder: Path) -> None:
+    photos(folder / "left", 1)
+    photos(folder / "right", 1)
+    photos(folder / "masks" / "left", 1, mode="L")
+
+
+def lone_subfolder(folder: Path) -> None:
+    photos(folder / "input", 2)
+    photos(folder / "input" / "masks", 2, mode="L")
+
+
+def nerf_synthetic(folder: Path) -> None:
+    for split in ("train", "test"):
+        picture(folder / split / "r_0.png")
+        picture(folder / split / "r_0_depth.png")
+        content = {"camera_angle_x": 0.7, "frames": [frame(path=f"./{split}/r_0")]}
+        write(folder, content, f"transforms_{split}.json")
+
+
+def nerfstudio(folder: Path) -> None:
+    photos(folder / "scan_2024", 3)
+    frames = [frame(path=f"scan_2024/p0{i}.jpg") for i in range(2)]
+    write(folder, {"fl_x": 50, "frames": frames})
+
+
+@pytest.mark.parametrize(
+    "layout",
+    [images, smaller_copy, plain, subfolders, lone_subfolder, nerf_synthetic, nerfstudio],
+)
+@pytest.mark.parametrize("poses", ["auto", "ignore"])
+def test_a_settled_config_finds_the_same_scene(tmp_path, layout, poses):
+    """Stages look at the folder with the settled config and must see what the plan saw."""
+    layout(tmp_path)
+    first = look(tmp_path, poses=poses)
+    settled = make_plan(first, Config(poses=poses)).config
+    again = scan(tmp_path, tmp_path.name, settled, cache=None)
+    assert again.model_copy(update={"image_folder_reason": first.image_folder_reason}) == first
+    assert make_plan(again, settled).config == settled
+
+
+def test_what_the_user_sets_stays(tmp_path):
+    chosen = {
+        "matches": {"pairs": "sequential"},
+        "sfm": {"mapper": "global", "camera_model": "OPENCV", "share_cameras": "single"},
+        "train": {"background": "white"},
+        "init": {"method": "random"},
+    }
+    photos(tmp_path / "images", 2)
+    config = plan_of(tmp_path, **chosen).config.model_dump()
+    for section, values in chosen.items():
+        assert {key: config[section][key] for key in values} == values
+
+
+@pytest.mark.parametrize(
+    "count, changes, pairs, mapper",
+    [
+        (40, {}, "exhaustive", "incremental"),
+        (41, {}, "retrieval", "incremental"),
+        (151, {}, "retrieval", "incremental"),
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0)}, "spatial", "incremental"),
+        # GPS noise around one place sorts nothing.
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-6 * i, 0.0)}, "retrieval", "incremental"),
+        (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0) if i % 2 else None}, "retrieval", None),
+    ],
+)
+def test_pairs_and_mapper(tmp_path, count, changes, pairs, mapper):
+    plan = make_plan(many(tmp_path, count, **changes), Config())
+    assert plan.config.matches.pairs == pairs
+    assert any(pairs in line for line in plan.stages["matches"].decisions)
+    assert mapper is None or plan.config.sfm.mapper == mapper
+
+
+def test_ordered_photographs_are_matched_in_sequence(tmp_path):
+    seen = many(tmp_path, 90).model_copy(update={"ordered": "numbered like a video"})
+    assert make_plan(seen, Config()).config.matches.pairs == "sequential"
+
+
+@pytest.mark.parametrize(
+    "group, share, model",
+    [
+        (lambda i: "NIKON D60 | ? | 29 mm | 64x48", "group", "SIMPLE_RADIAL"),
+        (lambda i: f"Body {i % 4} | ? | 29 mm | 64x48", "image", "SIMPLE_RADIAL"),
+        (lambda i: f"{64 + i}x48", "image", "SIMPLE_RADIAL"),
+        (lambda i: f"{64 + i % 2}x48", "group", "SIMPLE_RADIAL"),
+        (lambda i: "X | 8mm Fisheye | 8 mm | 64x48", "group", "OPENCV_FISHEYE"),
+    ],
+)
+def test_cameras(tmp_path, group, share, model):
+    sfm = make_plan(many(tmp_path, 12, camera_group=group), Config()).config.sfm
+    assert (sfm.share_cameras, sfm.camera_model) == (share, model)
+
+
+def test_decisions_say_the_resolution_and_the_split(tmp_path):
+    photos(tmp_path / "images", 2, (72, 128))
+    plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"holdout_every": 5})
+    assert plan.facts["view_size"] == [54, 96]
+    assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
+    assert "one view in 5" in plan.stages["evaluate"].reason
+    assert "no view" in plan_of(tmp_path, split={"holdout_every": 0}).stages["evaluate"].reason
+
+
+def test_facts_and_warnings_go_with_the_plan(tmp_path):
+    files = photos(tmp_path / "images", 2)
+    (tmp_path / "images" / "x.jpg").write_text("no picture")
+    write_sparse(tmp_path / "sparse_gt", [path.name for path in files], (64, 48))
+    plan = plan_of(tmp_path)
+    assert plan.facts["photographs"] == 2 and plan.facts["truth"] == "sparse_gt"
+    assert any("x.jpg" in line for line in plan.warnings)
+    assert any("sparse_gt" in line for line in plan.stages["evaluate"].decisions)
+    assert Plan.model_validate_json(plan.model_dump_json()) == plan
+
+
+def test_description_names_every_stage_once(tmp_path):
+    photos(tmp_path / "images", 2)
+    plan = plan_of(tmp_path)
+    lines = describe(plan).splitlines()
+    for name, stage in plan.stages.items():
+        (line,) = [line for line in lines if line.split()[:1] == [name]]
+        assert line.split()[1] == ("run" if stage.run else "skip") and stage.reason in line
+
+
+def test_the_snakefile_can_afford_it():
+    """Planning imports nothing heavy: it happens at every start, before any job."""
+    program = (
+        "import sys, pipeline.plan.plan, pipeline.plan.given_poses, pipeline.scene.views;"
+        "print([m for m in ('torch', 'cv2', 'scipy', 'skimage', 'pycolmap', 'rawpy', 'tifffile')"
+        " if m in sys.modules])"
+    )
+    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True)
+    assert done.stdout.strip() == "[]", done.stderr
+
+
+@pytest.mark.parametrize(
+    "count, options, budget",
+    [
+        (2000, {}, 20_000),  # tiny views: the least
+        (2000, {"pixels_per_gaussian": 0.1}, 48_000),
+        (100, {"pixels_per_gaussian": 0.1}, 20_000),  # few photographs
+        (100, {"pixels_per_gaussian": 0.1, "max_gaussians": 500}, 500),
+    ],
+)
+def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, budget):
+    size = {"width": lambda i: 80, "height": lambda i: 60}
+    config = Config.model_validate({"train": {"density": options}})
+    plan = make_plan(many(tmp_path, count, **size), config)
+    assert plan.config.train.density.max_gaussians == budget
+    assert plan.config.init.max_points == budget // 2
+    assert any(f"at most {budget} Gaussians" in text for text in plan.stages["train"].decisions)
+    # What was settled settles to the same.
+    again = make_plan(many(tmp_path, count, **size), plan.config)
+    assert again.config == plan.config
+
+
+@pytest.mark.parametrize(
+    "count, wanted, weight", [(30, "auto", 0.03), (31, "auto", 0.0), (31, 0.5, 0.5), (9, 0.0, 0.0)]
+)
+def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
+    config = Config.model_validate({"train": {"depth_weight": wanted}})
+    plan = make_plan(many(tmp_path, count), config)
+    assert plan.config.train.depth_weight == weight
+    assert any("depths" in text for text in plan.stages["train"].decisions) == (
+        count != 31 or wanted != "auto"
+    )
+
+
+def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
+    some = many(tmp_path, 50, depth=lambda i: f"depths/{i}.png" if i < 30 else None)
+    plan = make_plan(some, Config())
+    assert plan.config.train.depth_weight == 0.3
+    assert any("30 depth maps" in text for text in plan.stages["train"].decisions)
+
+
+def test_a_run_of_minutes_gets_no_more_gaussians_than_it_can_train(tmp_path):
+    scan = many(tmp_path, 2000, width=lambda i: 80, height=lambda i: 60)
+    train = {"budget_minutes": 0.5, "density": {"pixels_per_gaussian": 0.1}}
+    plan = make_plan(scan, Config.model_validate({"train": train}))
+    assert plan.config.train.density.max_gaussians == 25_000
+    text = "at most 25000 Gaussians: 50000 for each of 0.5 minutes"
+    assert text in plan.stages["train"].decisions
+
+
+@pytest.mark.parametrize(
+    "minutes, budget", [(None, 200_000), (4, 200_000), (15, 750_000), (30, 800_000)]
+)
+def test_a_run_of_many_minutes_gets_two_gaussians_for_each_pixel(tmp_path, minutes, budget):
+    scan = many(tmp_path, 100, width=lambda i: 800, height=lambda i: 500)
+    plan = make_plan(scan, Config.model_validate({"train": {"budget_minutes": minutes}}))
+    assert plan.config.train.density.max_gaussians == budget
+
+
+def test_training_says_what_memory_it_takes(tmp_path):
+    size = {"width": lambda i: 800, "height": lambda i: 500}
+    density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
+    config = Config.model_validate({"train": {"density": density}})
+    plan = make_plan(many(tmp_path, 200, **size), config)
+    assert plan.facts["training_memory_mb"] == 400 + 300 + 2500
+    assert "about 3.2 GB of memory" in plan.stages["train"].decisions
+
+
+def test_memory_that_is_given_limits_gaussians_and_sends_pictures_to_disk(tmp_path):
+    """200 views of 300 MB in all and at most 1 000 000 Gaussians of 2500 MB."""
+    size = {"width": lambda i: 800, "height": lambda i: 500}
+    scan = many(tmp_path, 200, **size)
+    density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
+
+    def planned(megabytes: int) -> Plan:
+        train = {"memory_mb": megabytes, "density": density}
+        return make_plan(scan, Config.model_validate({"train": train}))
+
+    roomy, tight, small = planned(3200), planned(3199), planned(1400)
+    assert "about 3.2 GB of memory" in roomy.stages["train"].decisions
+    from_disk = "3.2 GB of memory, as configured: pictures are read from disk"
+    assert from_disk in tight.stages["train"].decisions
+    assert tight.config.train.density.max_gaussians == 1_000_000
+    assert small.config.train.density.max_gaussians == 400_000
+    held = "at most 400000 Gaussians: what 1400 MB of memory hold"
+    assert held in small.stages["train"].decisions
+    assert [plan.facts["training_memory_mb"] for plan in (roomy, tight, small)] == [
+        3200,
+        3199,
+        1400,
+    ]
+    with pytest.raises(UserError, match=r"train.memory_mb: 449 MB .* at least 450 are needed"):
+        planned(449)

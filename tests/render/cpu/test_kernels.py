@@ -1,0 +1,278 @@
+"""The C++ kernels against the float64 twin, and what they promise by themselves."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pipeline import render
+from pipeline.render import RasterOptions, reference
+from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
+
+CASES = [
+    (0, 300, (64, 48), RasterOptions()),
+    (1, 700, (97, 53), RasterOptions(background=(0.2, 0.5, 0.9))),
+    (2, 500, (71, 50), RasterOptions(antialias=True, sh_degree=1)),
+    (3, 200, (33, 17), RasterOptions(sh_degree=0, background=(1.0, 1.0, 1.0))),
+    (4, 300, (16, 80), RasterOptions(sh_degree=2, antialias=True, background=(0.0, 0.3, 0.0))),
+    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), gradients_per_pixel=4)),
+    (5, 60, (1, 1), RasterOptions()),
+    (6, 250, (130, 3), RasterOptions(near=3.5)),
+]
+
+
+def twin_image(scene: Scene, cam: render.RasterCamera, options: RasterOptions):
+    inputs = [t.double().requires_grad_() for t in scene]
+    projection = reference.project(*inputs, cam, options)
+    colors = reference.sh_colors(
+        inputs[0][projection.index], inputs[4][projection.index], cam, options.sh_degree
+    )
+    return inputs, projection, reference.blend(projection, colors, cam, options)
+
+
+@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES)
+def test_kernels_match_the_twin(
+    seed: int, count: int, size: tuple[int, int], options: RasterOptions
+) -> None:
+    """Colour to 2e-6, gradients to 1e-5, away from pixels where a cut-off hangs on a rounding."""
+    scene, cam = random_scene(seed, count), camera(*size, turned=seed % 2 == 1)
+    fwd = render.forward(*scene, cam, options)
+    inputs, projection, image = twin_image(scene, cam, options)
+    sure = image.margin > 1e-5
+    assert sure.double().mean() > 0.99
+    assert fwd.num_visible == len(projection.index) > 0
+    assert fwd.num_dropped == projection.num_dropped == 0
+    assert (fwd.color - image.color).abs().amax(-1)[sure].max() <= 2e-6
+    assert (fwd.alpha - image.alpha).abs()[sure].max() <= 2e-6
+    assert (fwd.depth - image.depth).abs()[sure].max() <= 2e-5
+    assert (fwd.median_depth - image.median_depth).abs()[sure].max() <= 1e-5
+    assert (fwd.radii - projection.radii).abs().max() <= 1e-4
+
+    gen = torch.Generator().manual_seed(seed + 100)
+    width, height = size
+    d_color = torch.randn(height, width, 3, generator=gen) * sure[..., None]
+    d_alpha = torch.randn(height, width, generator=gen) * sure
+    d_depth = torch.randn(height, width, generator=gen) * sure
+    for extra in ((None, None), (d_alpha, None), (d_alpha, d_depth)):
+        found = render.backward(fwd, d_color, *extra)
+        total = (image.color * d_color).sum()
+        for part, weight in zip((image.alpha, image.depth), extra, strict=True):
+            total = total + (0 if weight is None else (part * weight).sum())
+        wanted = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
+        for name, want in zip(NAMES, wanted, strict=False):
+            assert relative(getattr(found, name), want) <= 1e-5, name
+        assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_what_is_out_of_view_is_told_sixteen_at_a_time(seed: int) -> None:
+    """Clusters of 16 all about the camera, from grains to giants that just reach into the image:
+    what the quick look leaves out is what the twin does not see, and nothing else."""
+    gen = torch.Generator().manual_seed(seed)
+    clusters = 400
+    scene = random_scene(seed, 16 * clusters)
+    place = 6 * torch.randn(clusters, 3, generator=gen)
+    size = 10 ** (3 * torch.rand(clusters, generator=gen) - 2.5)
+
+    def each(values: torch.Tensor) -> torch.Tensor:
+        return values.repeat_interleave(16, 0)
+
+    shift = torch.randn(16 * clusters, 3, generator=gen) * each(size)[:, None]
+    scene[0][:] = each(place) + 0.3 * shift
+    scene[1][:] += each(size).log()[:, None] - math.log(0.07)
+    scene[2][:: 16 * 37] = 0.0  # no rotation: dropped, and counted, wherever it is
+    cam, options = camera(40, 30, turned=seed % 2 == 1), RasterOptions()
+    fwd = render.forward(*scene, cam, options)
+    wanted = reference.project(*(t.double() for t in scene), cam, options)
+    seen = torch.nonzero(fwd.radii)[:, 0]
+    assert torch.equal(seen, wanted.index)
+    assert fwd.num_dropped == wanted.num_dropped >= 10
+    whole = (fwd.radii.view(clusters, 16) > 0).sum(1)
+    assert (whole == 0).sum() > 100 and ((whole > 0) & (whole < 16)).sum() > 20
+
+
+@pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:6])
+def test_the_cameras_gradients_match_the_twin(
+    seed: int, count: int, size: tuple[int, int], options: RasterOptions
+) -> None:
+    """Ten sums over all Gaussians, in which much cancels: 1e-5 of what they are sums of."""
+    scene, cam = random_scene(seed, count, size=0.15), camera(*size, turned=seed % 2 == 1)
+    change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+    _, _, image = twin_image(scene, reference.moved(cam, change), options)
+    gen = torch.Generator().manual_seed(seed + 100)
+    sure = image.margin > 1e-5
+    d_color = torch.randn(*image.color.shape, generator=gen) * sure[..., None]
+    d_depth = torch.randn(*image.depth.shape, generator=gen) * sure
+    total = (image.color * d_color).sum() + (image.depth * d_depth).sum()
+    (wanted,) = torch.autograd.grad(total, change)
+    fwd = render.forward(*scene, cam, options)
+    found = [
+        render.backward(
+            render.forward(*scene, cam, replace(options, threads=threads)),
+            d_color,
+            d_depth=d_depth,
+            camera=True,
+        ).camera
+        for threads in (1, 3)
+    ]
+    assert found[0] is not None and found[1] is not None
+    parts = [torch.cat([f.rotation, f.translation, f.focal, f.principal]) for f in found]
+    assert torch.equal(*parts)
+    for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
+        assert relative(parts[0][part], wanted[part]) <= 1e-5, part
+    assert render.backward(fwd, d_color).camera is None
+
+
+def test_absolute_gradients_are_the_sum_of_each_pixels() -> None:
+    """AbsGS: |dL/d(mean2d)| pixel by pixel, which no sum of signed gradients gives."""
+    scene, cam, options = random_scene(7, 30, size=0.2), camera(19, 18), RasterOptions()
+    gen = torch.Generator().manual_seed(1)
+    d_color = torch.randn(18, 19, 3, generator=gen)
+    found = render.backward(render.forward(*scene, cam, options), d_color)
+    _, projection, image = twin_image(scene, cam, options)
+    per_pixel = (image.color * d_color).sum(-1).reshape(-1)
+    wanted = torch.zeros(len(projection.index), 2, dtype=torch.float64)
+    for value in per_pixel:
+        wanted += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
+    assert found.means2d_abs is not None
+    assert relative(found.means2d_abs[projection.index], wanted) <= 1e-5
+    assert (
+        render.backward(
+            render.forward(*scene, cam, options), d_color, means2d_abs=False
+        ).means2d_abs
+        is None
+    )
+
+
+def single(mean: tuple[float, float, float], sigma: float, opacity: float = 0.9) -> Scene:
+    logit = math.log(opacity / (1 - opacity))
+    sh = torch.full((1, 1, 3), 1.0)
+    return (
+        torch.tensor([mean]), torch.full((1, 3), math.log(sigma)),
+        torch.tensor([[1.0, 0.0, 0.0, 0.0]]), torch.tensor([logit]), sh,
+    )  # fmt: skip
+
+
+def test_pixel_centres_lie_at_half_integers() -> None:
+    """A Gaussian projected to (20.5, 10.5) peaks in column 20, row 10, alike on all sides."""
+    cam = render.RasterCamera(41, 33, 50.0, 50.0, 20.5, 10.5, torch.eye(4))
+    scene = single((0.0, 0.0, 2.0), 0.08)
+    alpha = render.forward(*scene, cam, RasterOptions(sh_degree=0)).alpha
+    assert divmod(int(alpha.argmax()), 41) == (10, 20)
+    assert abs(float(alpha[10, 20]) - 0.9) < 1e-6
+    around = torch.stack([alpha[9, 20], alpha[11, 20], alpha[10, 19], alpha[10, 21]])
+    assert (around - around[0]).abs().max() < 1e-6 and around[0] < 0.9
+
+
+def test_equal_depths_are_drawn_in_order_of_index() -> None:
+    first, second = single((0.0, 0.0, 2.0), 0.2), single((0.0, 0.0, 2.0), 0.2)
+    second[4].mul_(-1)  # dark
+    cam, options = camera(16, 16), RasterOptions(sh_degree=0)
+    bright = render.forward(*(torch.cat(p) for p in zip(first, second, strict=True)), cam, options)
+    dark = render.forward(*(torch.cat(p) for p in zip(second, first, strict=True)), cam, options)
+    assert bright.color.max() > 2 * dark.color.max()
+
+
+def test_results_are_bit_identical_for_any_number_of_threads() -> None:
+    for seed in range(100):
+        # Some large enough for each of three threads to have parts of its own
+        count, height = (1500, 110) if seed % 10 == 0 else (20 + 3 * seed, 40)
+        scene, cam = random_scene(seed, count), camera(30 + 7 * (seed % 29), height)
+        d_color = torch.randn(height, cam.width, 3, generator=torch.Generator().manual_seed(seed))
+        runs = []
+        for threads in (1, 2, 3):
+            fwd = render.forward(*scene, cam, RasterOptions(threads=threads))
+            g = render.backward(fwd, d_color)
+            assert g.means2d_abs is not None
+            loss = render.l1_ssim(fwd.color, d_color.abs(), 0.2, threads=threads)
+            param, m, v = scene[4].clone(), torch.zeros_like(scene[4]), torch.ones_like(scene[4])
+            render.adam_step(param, g.sh, m, v, 1e-2, 3, threads=threads)
+            means, quats, frames = scene[0].clone(), scene[2].clone(), torch.ones(4, *g.means.shape)
+            adam = render.FrameAdam(*frames, 1e-2, 1e-3, 3)
+            render.frame_adam(means, quats, scene[1], g.means, g.quats, adam, threads)
+            runs.append([
+                fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii, g.means,
+                g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d, g.means2d_abs,
+                loss.grad, torch.tensor([loss.loss, loss.error, loss.ssim]), param, m, v,
+                means, quats, frames,
+            ])  # fmt: skip
+        for other in runs[1:]:
+            assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
+
+
+def test_what_is_black_may_become_brighter_but_not_darker() -> None:
+    """A colour clamped at zero keeps the gradient that would raise it, and no other; with
+    ``black_stays`` none, which is 3DGS's way."""
+    cam, sh = camera(20, 20), torch.zeros(1, 1, 3)
+    sh[..., 0], sh[..., 1], sh[..., 2] = -5.0, -5.0, 0.5  # red and green under zero
+    scene = (
+        torch.tensor([[0.0, 0.0, 4.0]]), torch.full((1, 3), -1.0), torch.tensor([[1.0, 0, 0, 0]]),
+        torch.tensor([2.0]), sh,
+    )  # fmt: skip
+    fwd = render.forward(*scene, cam, RasterOptions(sh_degree=0))
+    assert fwd.color[..., :2].max() == 0 and fwd.color[..., 2].max() > 0.5
+    d_color = torch.ones(20, 20, 3) * torch.tensor([-1.0, 1.0, 1.0])  # brighter, darker, darker
+    found = render.backward(fwd, d_color).sh[0, 0]
+    assert found[0] < 0 and found[1] == 0 and found[2] > 0
+    assert found[0] == -found[2]
+    options = RasterOptions(sh_degree=0, black_stays=True)
+    stayed = render.backward(render.forward(*scene, cam, options), d_color).sh[0, 0]
+    assert stayed[0] == stayed[1] == 0 and stayed[2] == found[2]
+    leaf = sh.clone().requires_grad_()
+    (reference.render(*scene[:4], leaf, cam, options).color * d_color).sum().backward()
+    assert leaf.grad is not None
+    torch.testing.assert_close(stayed, leaf.grad[0, 0], rtol=1e-5, atol=1e-6)
+
+
+def test_autograd_face_gives_the_same_gradients() -> None:
+    scene, cam = random_scene(11, 150), camera(40, 30)
+    leaves = [t.clone().requires_grad_() for t in scene]
+    options = RasterOptions(background=(0.1, 0.2, 0.3))
+    out = render.render(*leaves, cam, options)
+    (out.color.square().sum() + out.depth.sum() + out.alpha.sum()).backward()
+    fwd = render.forward(*scene, cam, options)
+    ones = torch.ones(30, 40)
+    g = render.backward(fwd, 2 * fwd.color, ones, ones)
+    assert torch.equal(out.color, fwd.color) and torch.equal(out.median_depth, fwd.median_depth)
+    for name, leaf in zip(NAMES, leaves, strict=True):
+        assert leaf.grad is not None and torch.equal(leaf.grad, getattr(g, name)), name
+
+
+def test_a_step_against_the_gradient_lowers_the_loss() -> None:
+    """Forward and backward agree with each other: the loss falls as its gradient foretells."""
+    scene, cam = random_scene(12, 400), camera(64, 48)
+    target = render.forward(*random_scene(13, 400), cam, RasterOptions()).color
+
+    def loss(gaussians: Scene) -> tuple[float, render.Gradients]:
+        fwd = render.forward(*gaussians, cam, RasterOptions())
+        result = render.l1_ssim(fwd.color, target, 0.2)
+        return result.loss, render.backward(fwd, result.grad)
+
+    before, g = loss(scene)
+    grads = [getattr(g, name) for name in NAMES]
+    slope = float(sum((t.double() ** 2).sum() for t in grads))
+    rate = 0.002 / slope
+    after, _ = loss(tuple(t - rate * d for t, d in zip(scene, grads, strict=True)))  # type: ignore
+    assert after - before == pytest.approx(-0.002, rel=0.3)
+
+
+def test_bad_arguments_are_refused_with_their_name() -> None:
+    scene, cam = random_scene(0, 5), camera(8, 8)
+    with pytest.raises(ValueError, match="quats"):
+        render.forward(
+            scene[0], scene[1], scene[2][:, :3], scene[3], scene[4], cam, RasterOptions()
+        )
+    with pytest.raises(ValueError, match="means"):
+        render.forward(scene[0].double(), *scene[1:], cam, RasterOptions())
+    with pytest.raises(ValueError, match="sh_degree"):
+        render.forward(*scene[:4], scene[4][:, :9], cam, RasterOptions())
+    for change in ({"fx": 0.0}, {"width": 0}, {"cy": math.nan}):
+        broken = render.RasterCamera(**{**cam.__dict__, **change})
+        with pytest.raises(ValueError, match="camera"):
+            render.forward(*scene, broken, RasterOptions())
+    fwd = render.forward(*scene, cam, RasterOptions())
+    with pytest.raises(ValueError, match="d_color"):
+        render.backward(fwd, torch.zeros(8, 9, 3))

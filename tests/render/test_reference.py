@@ -1,0 +1,103 @@
+"""The twin is the reference: its derivatives hold against finite differences in float64."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pipeline.render import RasterOptions, reference
+from tests.render.scenes import camera, random_scene
+
+CAMERA = camera(11, 9, turned=True)
+
+
+def doubles(count: int = 6, seed: int = 3, size: float = 0.4) -> list[torch.Tensor]:
+    return [t.double().requires_grad_() for t in random_scene(seed, count, size=size)]
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_projection_has_the_right_gradient(antialias: bool) -> None:
+    options = RasterOptions(antialias=antialias)
+    scene = doubles()
+    # Off the image, so that the Jacobian's clamp is part of what is checked.
+    with torch.no_grad():
+        scene[0][0] = torch.tensor([6.0, 0.1, 4.0])
+        scene[0][1] = torch.tensor([0.1, -6.0, 4.0])
+        scene[1][:2] = 1.0
+
+    def outputs(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        p = reference.project(*inputs, scene[4].detach(), CAMERA, options)
+        return p.means2d, p.conics, p.depths, p.opacities
+
+    assert reference.project(*scene, CAMERA, options).index.tolist() == list(range(6))
+    assert torch.autograd.gradcheck(outputs, scene[:4], eps=1e-6, atol=1e-7)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_sh_colors_have_the_right_gradient(degree: int) -> None:
+    means, _, _, _, sh = doubles()
+    assert torch.autograd.gradcheck(
+        lambda m, s: reference.sh_colors(m, s, CAMERA, degree), [means, sh], eps=1e-6, atol=1e-8
+    )
+
+
+def test_a_moved_camera_has_the_right_gradient() -> None:
+    """Of the projection and of the colours, which see the camera's centre."""
+    scene = [t.detach() for t in doubles()]
+
+    def outputs(change: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        cam = reference.moved(CAMERA, change)
+        p = reference.project(*scene, cam, RasterOptions())
+        return p.means2d, p.conics, p.depths, reference.sh_colors(scene[0], scene[4], cam, 3)
+
+    change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+    assert torch.autograd.gradcheck(outputs, [change], eps=1e-6, atol=1e-7)
+    # A turn to the right by a quarter brings what is ahead to the left edge of the world.
+    quarter = torch.zeros(10, dtype=torch.float64)
+    quarter[1] = -torch.pi / 2
+    ahead = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
+    turned = reference.moved(camera(11, 9), quarter).world_to_camera
+    assert torch.allclose(turned @ ahead, torch.tensor([-1.0, 0, 0, 0], dtype=torch.float64))
+
+
+@pytest.mark.parametrize("background", [None, (0.2, 0.4, 0.9)])
+def test_blending_has_the_right_gradient(background: tuple[float, float, float] | None) -> None:
+    options = RasterOptions(background=background)
+    scene = doubles(size=0.15)
+    with torch.no_grad():
+        p = reference.project(*scene, CAMERA, options)
+        colors = reference.sh_colors(scene[0][p.index], scene[4][p.index], CAMERA, 3)
+        assert reference.blend(p, colors, CAMERA, options).margin.min() > 1e-4  # no cut-off is near
+
+    def image(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
+        moved = reference.Projection(p.index, *inputs[:4], p.radii, 0)
+        b = reference.blend(moved, inputs[4], CAMERA, options)
+        return b.color, b.alpha, b.depth
+
+    inputs = [p.means2d, p.conics, p.depths, p.opacities, colors]
+    inputs = [t.detach().clone().requires_grad_() for t in inputs]
+    assert torch.autograd.gradcheck(image, inputs, eps=1e-7, atol=1e-6)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_loss_has_the_right_gradient(masked: bool) -> None:
+    gen = torch.Generator().manual_seed(0)
+    rendered = torch.rand(7, 6, 3, generator=gen, dtype=torch.float64).requires_grad_()
+    target = torch.rand(7, 6, 3, generator=gen, dtype=torch.float64)
+    mask = torch.rand(7, 6, generator=gen) > 0.7 if masked else None
+    assert torch.autograd.gradcheck(
+        lambda r: reference.l1_ssim(r, target, 0.2, mask, 1.5)[0], [rendered], eps=1e-6, atol=1e-9
+    )
+
+
+def test_sh_basis_is_orthonormal() -> None:
+    """A wrong constant or sign in the basis shows as a broken inner product on the sphere."""
+    nodes, weights = (torch.tensor(v) for v in __import__("numpy").polynomial.legendre.leggauss(8))
+    phi = torch.arange(16, dtype=torch.float64) * (2 * torch.pi / 16)
+    z, angle = torch.meshgrid(nodes, phi, indexing="ij")
+    ring = (1 - z * z).sqrt()
+    directions = torch.stack([ring * angle.cos(), ring * angle.sin(), z], -1).reshape(-1, 3)
+    area = (weights[:, None] * torch.full_like(angle, 2 * torch.pi / 16)).reshape(-1)
+    basis = reference.sh_basis(directions, 3)
+    gram = basis.T @ (basis * area[:, None])
+    assert torch.allclose(gram, torch.eye(16, dtype=torch.float64), atol=1e-12)

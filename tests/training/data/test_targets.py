@@ -1,0 +1,154 @@
+"""Targets: alpha and masks survive the reduction, and the reduced camera sees the same scene."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from pipeline.config.schema import Train
+from pipeline.photos.load import resize_area
+from pipeline.render import RasterOptions, forward
+from pipeline.render.views import raster_camera
+from pipeline.scene.views import View, reduced_size
+from pipeline.training.data.image_store import DiskShelf, MemoryShelf
+from pipeline.training.data.targets import Targets, usable_factor
+from tests.training.conftest import TinyScene
+
+
+def view_of(path: Path, picture: np.ndarray, mask: np.ndarray | None = None) -> View:
+    Image.fromarray(picture).save(path)
+    mask_path = None
+    if mask is not None:
+        mask_path = str(path.with_suffix(".mask.png"))
+        Image.fromarray(mask).save(mask_path)
+    height, width = picture.shape[:2]
+    pose = np.eye(4)
+    return View("v", str(path), mask_path, width, height, 50.0, 50.0, 5.0, 5.0, pose, False)
+
+
+def test_hidden_colours_never_show(tmp_path: Path) -> None:
+    picture = np.full((8, 10, 4), 200, np.uint8)
+    picture[:4, :, 3] = 0
+    targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
+    assert targets.have_alpha
+    for factor in (1, 2, 4):
+        target = targets.get(0, factor)
+        over = target.over((1.0, 0.5, 0.0))
+        rows = over.shape[0] // 2
+        assert torch.allclose(over[:rows], torch.tensor([1.0, 0.5, 0.0]), atol=0.003)
+        visible = (200 * 200 / 255 + 55 * np.array([1.0, 0.5, 0.0])) / 255
+        assert np.allclose(over[rows:].numpy(), visible, atol=0.004)
+
+
+def test_opaque_alpha_is_no_alpha(tmp_path: Path) -> None:
+    picture = np.full((8, 10, 4), 255, np.uint8)
+    targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
+    assert not targets.have_alpha
+    assert targets.get(0, 1).over((0.3, 0.3, 0.3)).dtype == torch.uint8
+
+
+def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None:
+    picture = np.random.default_rng(0).integers(1, 255, (8, 8, 3), np.uint8)
+    mask = np.full((8, 8), 255, np.uint8)
+    mask[0, 0] = mask[6:, 4:] = 0
+    picture[0, 0] = 255
+    targets = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1)
+    ignored = targets.get(0, 2).ignored
+    assert ignored is not None
+    wanted = np.zeros((4, 4), bool)
+    wanted[3, 2:] = True
+    assert np.array_equal(ignored.numpy(), wanted)
+    assert not targets.get(0, 2).rgb[ignored].any()
+    counting = picture[:2, :2].reshape(4, 3)[1:]
+    assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
+    assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
+    thinning = targets.get(0, 1).thinning(0.5)
+    assert thinning is not None and targets.get(0, 1).thinning(0.0) is None
+    np.testing.assert_allclose(thinning, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+
+
+def test_what_is_asked_of_alpha_is_the_gradient_of_its_error_where_pixels_count(
+    tmp_path: Path,
+) -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
+    mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
+    target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
+    config = Train(alpha_weight=0.4, square_weight=2.5, masked_opacity=0.3)
+    alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
+    counts = torch.from_numpy(mask > 0)
+    error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
+    wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
+    (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
+    asked = target.alpha_gradient(alpha.detach(), config)
+    assert asked is not None and alpha.grad is not None
+    torch.testing.assert_close(asked, alpha.grad)
+    nothing = Train(alpha_weight=0.0, masked_opacity=0.0)
+    assert target.alpha_gradient(alpha.detach(), nothing) is None
+
+
+def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:
+    view = replace(scene.views[1], width=39, height=33, cx=18.0, cy=17.5)
+    options = RasterOptions(sh_degree=1, threads=1)
+    soft = scene.truth.clone()
+    soft.log_scales += 1.0  # large, so that the dilation by 0.3 pixels hardly shows
+    full = forward(*soft.parameters(), raster_camera(view), options).color.numpy()
+    small = forward(*soft.parameters(), raster_camera(view, 2), options).color.numpy()
+    width, height = reduced_size(view, 2)
+    assert small.shape == (height, width, 3)
+    difference = np.abs(small - resize_area(full, width, height)).mean()
+    shifted = np.abs(small[:, 1:] - resize_area(full, width, height)[:, :-1]).mean()
+    assert difference < 0.01
+    assert difference < 0.3 * shifted
+
+
+def test_small_pictures_are_not_reduced() -> None:
+    sizes = [(800, 533, 4), (200, 150, 2), (100, 70, 1)]
+    for width, height, wanted in sizes:
+        view = View("", "", None, width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4), False)
+        assert usable_factor([view], 4) == wanted
+
+
+def test_salt_and_pepper_is_the_share_asked_for_and_the_same_for_a_seed(tmp_path: Path) -> None:
+    views = [view_of(tmp_path / "a.png", np.full((80, 100, 3), 120, np.uint8))]
+    clean = Targets(views, threads=1).get(0, 1).rgb
+    assert (clean == 120).all()
+    noisy = [Targets(views, 1, 0.2, seed).get(0, 1).rgb.numpy() for seed in (0, 0, 1)]
+    assert (noisy[0] == noisy[1]).all() and (noisy[0] != noisy[2]).any()
+    assert abs((noisy[0] == 0).all(2).mean() - 0.1) < 0.015
+    assert abs((noisy[0] == 255).all(2).mean() - 0.1) < 0.015
+
+
+def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
+    """Of every kind, at every size, read by any thread, as often as they are asked for."""
+    rng = np.random.default_rng(0)
+    views = []
+    for number, channels in enumerate((3, 4, 3)):
+        picture = rng.integers(0, 255, (140 + number, 150, channels), np.uint8)
+        mask = (rng.random(picture.shape[:2]) > 0.4).astype(np.uint8) * 255 if number else None
+        views.append(view_of(tmp_path / f"{number}.png", picture, mask))
+    in_memory = Targets(views, 3, shelf=MemoryShelf())
+    on_disk = Targets(views, 3, shelf=DiskShelf())
+    assert on_disk.have_alpha and not on_disk.hidden()
+    for factor, index in [(4, 0), (4, 2), (4, 0), (2, 1), (2, 2), (1, 2), (1, 1), (1, 0), (1, 2)]:
+        wanted, found = in_memory.get(index, factor), on_disk.get(index, factor)
+        for name in ("rgb", "alpha", "ignored"):
+            one, other = getattr(wanted, name), getattr(found, name)
+            assert (one is None) == (other is None), name
+            assert one is None or (one.dtype == other.dtype and torch.equal(one, other)), name
+
+
+def test_a_disk_shelf_holds_nothing_in_memory_and_leaves_no_file(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
+    take = DiskShelf().put((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
+    first, second = take(), take()
+    assert first[0] is not None and second[0] is not None and first[1] is None
+    assert torch.equal(first[0], second[0]) and first[0].data_ptr() != second[0].data_ptr()
+    assert not list(tmp_path.iterdir())

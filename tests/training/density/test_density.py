@@ -1,0 +1,315 @@
+"""Density control: rows, moments and budget stay in order; splits keep where things are."""
+
+from __future__ import annotations
+
+import math
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from pipeline.config.schema import Density
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density import make_strategy
+from pipeline.training.density.gradient import (
+    HALVES_OPACITY,
+    LONG_AXIS,
+    OTHER_AXES,
+    SPLIT_SHRINK,
+    GradientDensity,
+)
+from pipeline.training.density.mcmc import McmcDensity, share_out
+from pipeline.training.density.strategy import rotations
+from pipeline.training.optimisers.adam import Adam
+from tests.training.conftest import ball
+
+
+def marked(count: int) -> tuple[Gaussians, Adam]:
+    """Gaussians whose moments name the row they belong to."""
+    gaussians = ball(count, 0)
+    adam = Adam(gaussians, beta1=0.8, own_frames=True)
+    for moments in (adam.first, adam.second):
+        for tensor in moments.values():
+            tensor += torch.arange(1, count + 1).view(-1, *[1] * (tensor.ndim - 1))
+    return gaussians, adam
+
+
+def strategy(count: int, **options: object) -> GradientDensity:
+    """As 3DGS does it, where nothing else is said."""
+    paper: dict[str, object] = {"clone": True, "split_kind": "sampled"}
+    density = GradientDensity(Density(**paper | options), scale=1.0)  # type: ignore[arg-type]
+    density.start(count)
+    density.seen += 1
+    return density
+
+
+def refine(
+    density: GradientDensity, gaussians: Gaussians, adam: Adam, *, densify: bool = True
+) -> Gaussians:
+    rng = np.random.Generator(np.random.PCG64(0))
+    return density.refine(
+        gaussians, adam, rng, densify=densify, prune_huge=False, budget=density.config.max_gaussians
+    )[0]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 60), st.integers(1, 80), st.integers(0, 2**31), st.booleans())
+def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
+    gaussians, adam = marked(count)
+    rng = np.random.default_rng(seed)
+    density = strategy(count, max_gaussians=budget, split_scale=0.13)
+    density.gradient_sum = torch.from_numpy(rng.uniform(0, 4e-4, count).astype(np.float32))
+    gaussians.opacity_logits[torch.from_numpy(rng.random(count) < 0.2)] = -9.0
+    rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
+
+    rng2 = np.random.Generator(np.random.PCG64(seed))
+    result, changes = density.refine(
+        gaussians, adam, rng2, densify=densify, prune_huge=False, budget=budget
+    )
+
+    assert len(result) == count - changes.pruned + changes.cloned + changes.split
+    assert len(result) <= max(budget, count - changes.pruned)
+    assert len(density.gradient_sum) == len(density.seen) == len(result)
+    for name, tensor in result.tensors().items():
+        assert tensor.is_contiguous()
+        for moments in (adam.first, adam.second):
+            assert len(moments[name]) == len(tensor)
+            per_row = moments[name].reshape(len(tensor), math.prod(moments[name].shape[1:]))
+            assert (per_row == per_row[:, :1]).all()
+    # Whoever has moments has its own; the new have none.
+    for row, moment in zip(result.means, adam.first["opacity_logits"], strict=True):
+        if moment > 0:
+            assert rows[row.numpy().tobytes()] == moment
+    if len(result):
+        survivors = int((adam.first["opacity_logits"] > 0).sum())
+        assert survivors == count - changes.pruned - changes.split
+
+
+def test_the_budget_goes_to_the_largest_gradients() -> None:
+    gaussians, adam = marked(10)
+    density = strategy(10, max_gaussians=13, split_scale=100.0)
+    density.gradient_sum = torch.arange(10.0)
+    result = refine(density, gaussians, adam)
+    assert len(result) == 13
+    assert torch.equal(result.means[10:], gaussians.means[[7, 8, 9]])
+
+
+def test_room_is_made_by_the_faint_that_nothing_pulls_at() -> None:
+    """What is faint because it is new is pulled at, and stays: without that bonsai lost 0.6 dB."""
+    gaussians, adam = marked(40)
+    gaussians.opacity_logits[:] = 2.0
+    gaussians.opacity_logits[:2] = -3.0  # 0.05
+    density = strategy(40, max_gaussians=40, split_scale=100.0, recycle=0.1)
+    # All over the threshold; the tenth that is pulled at least are 0 and 2 to 4.
+    density.gradient_sum += torch.arange(1.0, 41.0)
+    density.gradient_sum[1] = 30.5
+    result = refine(density, gaussians, adam)
+    assert torch.equal(result.means[:39], gaussians.means[1:])
+    assert torch.equal(result.means[39:], gaussians.means[39:])
+
+
+def test_invisible_steps_do_not_thin_the_mean_gradient() -> None:
+    gaussians, adam = marked(2)
+    density = strategy(2, split_scale=100.0, grad_threshold=1.0)
+    density.gradient_sum = torch.tensor([3.0, 3.0])
+    density.seen = torch.tensor([2.0, 4.0])
+    assert len(refine(density, gaussians, adam)) == 3
+
+
+def test_a_split_keeps_the_mean_and_shrinks() -> None:
+    one = ball(1, 4)
+    count = 20_000
+    gaussians = one.select(torch.zeros(count, dtype=torch.int64))
+    adam = Adam(gaussians, beta1=0.8, own_frames=True)
+    density = strategy(count, split_scale=0.0)
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    assert len(result) == 2 * count
+    assert torch.allclose(result.log_scales, one.log_scales - math.log(SPLIT_SHRINK))
+    offset = (result.means - one.means).double()
+    sigma = one.log_scales.exp().max().item()
+    assert offset.mean(0).abs().max() < 5 * sigma / math.sqrt(2 * count)
+    # Drawn from the Gaussian itself: its covariance R S S R^T.
+    axes = rotations(one.quats)[0].double() * one.log_scales.exp().double()
+    wanted = axes @ axes.T
+    assert torch.allclose(offset.T @ offset / len(offset), wanted, atol=0.03 * sigma**2)
+
+
+def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
+    """Both as they should be, about the middle, and as far out along the axis as before."""
+    gaussians, adam = marked(5)
+    gaussians.log_scales += torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
+    density = strategy(5, clone=False, split_kind="long_axis")
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    assert len(result) == 10
+    middle = (result.means[:5] + result.means[5:]) / 2
+    assert torch.allclose(middle, gaussians.means, atol=1e-6)
+    for k in range(5):
+        longest = int(gaussians.log_scales[k].argmax())
+        scales = gaussians.log_scales[k].exp()
+        offset = rotations(gaussians.quats[k : k + 1])[0].T @ (result.means[k] - middle[k])
+        for half in (result.log_scales[k].exp(), result.log_scales[k + 5].exp()):
+            ratio = torch.full((3,), OTHER_AXES)
+            ratio[longest] = LONG_AXIS
+            assert torch.allclose(half / scales, ratio)
+            variance = half[longest] ** 2 + offset[longest] ** 2
+            assert torch.allclose(variance, scales[longest] ** 2, rtol=1e-4)
+        assert offset.abs().argmax() == longest
+        assert torch.allclose(offset.abs().sum(), offset[longest].abs(), atol=1e-5)
+    opacity = torch.sigmoid(gaussians.opacity_logits).repeat(2)
+    assert torch.allclose(torch.sigmoid(result.opacity_logits), HALVES_OPACITY * opacity)
+
+
+def test_clones_are_copies() -> None:
+    gaussians, adam = marked(5)
+    density = strategy(5, split_scale=100.0)
+    density.gradient_sum += 1.0
+    result = refine(density, gaussians, adam)
+    for tensor in result.tensors().values():
+        assert torch.equal(tensor[:5], tensor[5:])
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
+def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
+    gaussians, adam = marked(6)
+    gaussians.tensors()[name].view(6, -1)[2, 0] = math.nan
+    result = refine(strategy(6), gaussians, adam, densify=False)
+    assert len(result) == 5
+    assert all(torch.isfinite(tensor).all() for tensor in result.tensors().values())
+
+
+def test_opacity_reset_caps_and_forgets() -> None:
+    gaussians, adam = marked(4)
+    gaussians.opacity_logits[0] = -7.0
+    strategy(4).reset_opacity(gaussians, adam)
+    opacity = torch.sigmoid(gaussians.opacity_logits)
+    assert opacity[0] < 0.001
+    assert torch.allclose(opacity[1:], torch.tensor(0.01))
+    assert not adam.first["opacity_logits"].any()
+    assert adam.first["means"].all()
+
+
+def test_without_split_or_clone_the_other_is_done_to_all() -> None:
+    for options, cloned, split in (({"split": False}, 5, 0), ({"clone": False}, 0, 5)):
+        gaussians, adam = marked(5)
+        density = strategy(5, split_scale=0.13, **options)
+        density.gradient_sum += 1.0
+        rng = np.random.Generator(np.random.PCG64(0))
+        _, changes = density.refine(
+            gaussians, adam, rng, densify=True, prune_huge=False, budget=100
+        )
+        assert (changes.cloned, changes.split) == (cloned, split)
+
+
+def mcmc(**options: object) -> McmcDensity:
+    return McmcDensity(Density(strategy="mcmc", **options), scale=1.0)  # type: ignore[arg-type]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(st.integers(1, 60), st.integers(1, 80), st.integers(0, 2**31), st.booleans())
+def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
+    gaussians, adam = marked(count)
+    faint = np.random.default_rng(seed).random(count) < 0.3
+    gaussians.opacity_logits[torch.from_numpy(faint)] = -9.0
+    rng = np.random.Generator(np.random.PCG64(seed))
+    result, changes = mcmc(growth=0.2).refine(
+        gaussians, adam, rng, densify=densify, prune_huge=False, budget=budget
+    )
+    alive = count - int(faint.sum())
+    if densify and alive:
+        assert len(result) == max(count, min(budget, math.ceil(1.2 * count)))
+        assert changes.relocated == count - alive
+    else:
+        assert len(result) == alive
+        assert changes.pruned == count - alive
+    for name, tensor in result.tensors().items():
+        assert len(adam.first[name]) == len(tensor)
+        assert len(adam.second[name]) == len(tensor)
+        assert torch.isfinite(tensor).all()
+    # Whoever stayed as it was has its own moments; whoever was shared out, and the new, have none.
+    had = {row.numpy().tobytes(): i + 1 for i, row in enumerate(gaussians.means)}
+    for row, moment in zip(result.means, adam.first["opacity_logits"], strict=True):
+        assert moment in (0, had[row.numpy().tobytes()])
+
+
+@pytest.mark.parametrize("parts", [1, 2, 3, 10, 50])
+@pytest.mark.parametrize("opacity", [0.02, 0.5, 0.95])
+def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
+    """As many as ``parts`` in one place look as the one did: the same in the middle, and the same
+    light in all along a line (what equation 9 asks for)."""
+    logits = torch.logit(torch.tensor([opacity]))
+    new, shrink = share_out(logits, torch.tensor([parts]), 1e-6)
+    x = torch.linspace(-9, 9, 4001, dtype=torch.float64)
+    one = opacity * torch.exp(-0.5 * x**2)
+    part = torch.sigmoid(new.double()) * torch.exp(-0.5 * (x / shrink.double().exp()) ** 2)
+    many = 1 - (1 - part) ** parts
+    assert many.max() == pytest.approx(opacity, rel=1e-4)
+    assert many.sum() == pytest.approx(float(one.sum()), rel=1e-3)
+
+
+def test_noise_moves_the_faint_along_their_axes_alone() -> None:
+    gaussians = ball(2000, 0)
+    gaussians.opacity_logits[:1000] = -9.0
+    gaussians.opacity_logits[1000:] = 3.0
+    gaussians.quats[:] = torch.tensor([1.0, 0, 0, 0])
+    gaussians.log_scales[:] = torch.tensor([-1.0, -9.0, -9.0])
+    before = gaussians.means.clone()
+    mcmc().explore(gaussians, 1e-2, np.random.Generator(np.random.PCG64(0)))
+    moved = (gaussians.means - before).abs()
+    assert not moved[1000:].any()
+    assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
+
+
+def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
+    gaussians = ball(5, 0)
+    logits = gaussians.opacity_logits.clone().requires_grad_()
+    scales = gaussians.log_scales.clone().requires_grad_()
+    (0.1 * torch.sigmoid(logits).mean() + 0.2 * scales.exp().mean()).backward()
+    gradients = SimpleNamespace(opacity_logits=torch.zeros(5), log_scales=torch.zeros(5, 3))
+    mcmc(opacity_cost=0.1, scale_cost=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
+    assert torch.allclose(gradients.opacity_logits, logits.grad)
+    assert torch.allclose(gradients.log_scales, scales.grad)
+
+
+@pytest.mark.parametrize("scale", [2.0**-13, 2.0**13])
+@pytest.mark.parametrize("kind", ["gradient", "mcmc"])
+def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) -> None:
+    """The same scene in another unit: the same is cloned, split, moved and costs the same."""
+    found = []
+    for unit in (1.0, scale):
+        gaussians, adam = marked(200)
+        gaussians.means *= unit
+        gaussians.log_scales += math.log(unit)
+        gaussians.opacity_logits[:60] = -6.0
+        config = Density(strategy=kind, split_scale=0.13, prune_scale=0.17)  # type: ignore[arg-type]
+        density = make_strategy(config, scale=1.5 * unit)
+        density.start(200)
+        if isinstance(density, GradientDensity):
+            density.gradient_sum += torch.linspace(0, 4e-4, 200)
+            density.seen += 1
+        costs = SimpleNamespace(opacity_logits=torch.zeros(200), log_scales=torch.zeros(200, 3))
+        density.regularise(gaussians, costs)  # type: ignore[arg-type]
+        rng = np.random.Generator(np.random.PCG64(0))
+        density.explore(gaussians, 1e-2, rng)
+        result, changes = density.refine(
+            gaussians, adam, rng, densify=True, prune_huge=True, budget=300
+        )
+        log_scales = result.log_scales - math.log(unit)
+        found.append((changes, costs.log_scales, result.means / unit, log_scales))
+    assert found[0][0] == found[1][0]
+    for ours, other in zip(found[0][1:], found[1][1:], strict=True):
+        assert torch.allclose(ours, other, rtol=1e-4, atol=1e-5)
+
+
+def test_pulls_are_measured_in_normalised_device_coordinates() -> None:
+    """A pixel is 2 / width of them: by the published threshold, whatever the picture's size."""
+    density = strategy(2)
+    pulls = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
+    gradients = SimpleNamespace(means2d=pulls, means2d_abs=None)
+    forward = SimpleNamespace(radii=torch.ones(2))
+    density.observe(forward, gradients, 200, 100)  # type: ignore[arg-type]
+    assert torch.allclose(density.gradient_sum, torch.tensor([3e-4, 2e-4]))

@@ -1,0 +1,142 @@
+"""What hangs in the air before one camera is found, and goes; nothing else does."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.config.schema import Train
+from pipeline.render import RasterOptions
+from pipeline.render.views import raster_camera
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.density import floaters as floaters_module
+from pipeline.training.density.floaters import LEAST_POINTS, air_depths, floaters
+from pipeline.training.loop import trainer
+from pipeline.training.loop.trainer import TrainResult, train
+from tests.training.conftest import TinyScene, killed_in_step, tiny_config
+
+AIR = 1.0
+
+
+@pytest.fixture(autouse=True)
+def few_looks_will_do(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(trainer, "CLEAR_AIR_LOOKS", 7)
+
+
+def with_speck(scene: TinyScene, distance: float, views: tuple[int, ...] = (0,)) -> Gaussians:
+    """The scene, and last a small Gaussian right before each of these cameras."""
+    first, all_of = scene.initial, []
+    for view in (scene.views[i] for i in views):
+        speck = first.select(torch.tensor([0]))
+        ahead = view.world_to_camera[2, :3]
+        speck.means[:] = torch.from_numpy(view.centre + distance * ahead)
+        speck.log_scales.fill_(np.log(0.02))
+        speck.opacity_logits.fill_(2.0)
+        all_of.append(speck)
+    parts = [first, *all_of]
+    joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in first.tensors()}
+    return Gaussians(**joined)
+
+
+def found(scene: TinyScene, gaussians: Gaussians, air: float) -> list[int]:
+    cameras = [raster_camera(view) for view in scene.views]
+    flags = floaters(gaussians, cameras, np.full(len(cameras), air), RasterOptions(threads=1))
+    return torch.nonzero(flags)[:, 0].tolist()
+
+
+def test_a_speck_before_one_camera_is_found(scene: TinyScene) -> None:
+    last = len(scene.initial)
+    assert found(scene, with_speck(scene, 0.4), AIR) == [last]
+    assert found(scene, with_speck(scene, 0.4, (1, 4)), AIR) == [last, last + 1]
+
+
+def test_what_stands_where_points_are_or_where_none_say_so_is_no_floater(scene: TinyScene) -> None:
+    assert found(scene, with_speck(scene, 1.1), AIR) == []
+    assert found(scene, with_speck(scene, 0.4), 0.0) == []
+
+
+def test_what_two_views_see_alike_is_no_floater(scene: TinyScene) -> None:
+    """However near it is: they agree on it."""
+    twice = replace(scene, views=[*scene.views, scene.views[0]])
+    assert found(twice, with_speck(scene, 0.4), AIR) == []
+
+
+def test_what_a_hundredth_of_the_views_see_is_a_floater_all_the_same(
+    scene: TinyScene, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Neighbours with the same light agree on a fog."""
+    monkeypatch.setattr(floaters_module, "ONE_IN", len(scene.views) // 2)
+    last, other = len(scene.initial), scene.views[1:]
+    twice = replace(scene, views=[*other, *[scene.views[0]] * 2])
+    assert found(twice, with_speck(scene, 0.4), AIR) == [last]
+    assert found(twice, with_speck(scene, 1.1), AIR) == []
+    # Two of four have no more than half of it.
+    often = replace(scene, views=[*other[2:], *[scene.views[0]] * 4])
+    assert found(often, with_speck(scene, 0.4), AIR) == []
+
+
+def test_what_hides_behind_others_and_shows_nowhere_is_left_alone(scene: TinyScene) -> None:
+    faint = with_speck(scene, 0.4)
+    faint.opacity_logits[-1] = -9.0
+    assert found(scene, faint, AIR) == []
+
+
+def test_air_ends_at_half_of_the_nearest_points_but_few_may_be_wrong() -> None:
+    def known(z: list[float]) -> KnownDepths:
+        n = len(z)
+        return KnownDepths(np.zeros((n, 2)), np.array(z, np.float32), np.ones(n, np.float32))
+
+    many = known([0.1] + [4.0] * 99 + [9.0] * 100)
+    few = known([4.0] * (LEAST_POINTS - 1))
+    np.testing.assert_allclose(air_depths([many, few, known([])]), [2.0, 0.0, 0.0])
+
+
+def run(
+    scene: TinyScene, folder: Path, config: Train, first: Gaussians, threads: int = 1
+) -> TrainResult:
+    inputs = Inputs(scene.views, first, scene.extent, air=np.full(len(scene.views), AIR))
+    return train(inputs, config, seed=3, threads=threads, checkpoint_dir=folder)
+
+
+def nearest(scene: TinyScene, result: TrainResult) -> float:
+    centre = torch.from_numpy(scene.views[0].centre).to(torch.float32)
+    return float((result.gaussians.means - centre).norm(dim=1).min())
+
+
+def test_training_takes_floaters_away(scene: TinyScene, tmp_path: Path) -> None:
+    still = {"lr_boost": 1e-9, "density": {"grad_threshold": 1e9}}
+    first = with_speck(scene, 0.4)
+    result = run(scene, tmp_path / "a", tiny_config(60, **still), first)
+    assert result.counters["floaters"] == 1
+    assert nearest(scene, result) > AIR
+    kept = tiny_config(60, **{**still, "density": {"grad_threshold": 1e9, "clear_air": False}})
+    result = run(scene, tmp_path / "b", kept, first)
+    assert result.counters["floaters"] == 0
+    assert nearest(scene, result) == pytest.approx(0.4, abs=1e-3)
+    # Too few looks at each photograph to have made any, and to be worth looking at all again.
+    short = 6 * len(scene.views)
+    assert run(scene, tmp_path / "c", tiny_config(short, **still), first).counters["floaters"] == 0
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
+def test_killed_where_floaters_go_and_resumed_gives_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str
+) -> None:
+    config = tiny_config(60, density={"strategy": strategy})
+    first = with_speck(scene, 0.4)
+    whole = run(scene, tmp_path / "whole", config, first)
+    assert whole.counters["floaters"]
+    for step in (18, 19, 54):  # the first and the last time
+        folder = tmp_path / f"{step}"
+        with killed_in_step(monkeypatch, step):
+            run(scene, folder, config, first)
+        resumed = run(scene, folder, config, first, threads=2)
+        assert resumed.counters == whole.counters
+        for name, tensor in whole.gaussians.tensors().items():
+            assert torch.equal(tensor, resumed.gaussians.tensors()[name]), (step, name)

@@ -1,0 +1,105 @@
+"""One step, looked at closely: longer runs forgive a wrong rate or gradient."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.render import l1_ssim
+from pipeline.splats.morton import in_morton_order
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.density.strategy import rotations
+from pipeline.training.loop import trainer
+from pipeline.training.loop.trainer import train
+from tests.training.conftest import TinyScene, tiny_config
+
+RATES = {
+    "lr_means": 1e-3,
+    "lr_scales": 2e-3,
+    "lr_quats": 3e-3,
+    "lr_opacities": 5e-3,
+    "lr_sh0": 7e-3,
+    "lr_boost": 2.0,
+    "lr_final_share": 1.0,
+}
+
+
+@pytest.mark.parametrize("unit", ["size", "scene"])
+def test_each_parameter_steps_as_far_as_its_own_rate_says(
+    scene: TinyScene, tmp_path: Path, unit: str
+) -> None:
+    """Adam's first step is the rate itself, up or down: along and about each Gaussian's own axes,
+    the means' in its scales; or a row's root mean square where the row shares a second moment, the
+    means' in the scene's size."""
+    scale = 3.0
+    result = train(
+        Inputs(scene.views, scene.initial, scene.extent, scale),
+        tiny_config(1, **RATES, lr_means_unit=unit),
+        seed=0,
+        threads=1,
+        checkpoint_dir=tmp_path,
+    )
+    expected = {
+        "means": RATES["lr_means"],
+        "log_scales": RATES["lr_scales"],
+        "quats": RATES["lr_quats"],
+        "opacity_logits": RATES["lr_opacities"],
+        "sh": RATES["lr_sh0"],
+    }
+    for name, tensor in result.gaussians.tensors().items():
+        first = in_morton_order(scene.initial).with_sh_degree(result.gaussians.sh_degree)
+        before = first.tensors()[name]
+        steps = tensor - before
+        if name == "means" and unit == "size":
+            axes = rotations(first.quats)
+            steps = torch.einsum("nij,ni->nj", axes, steps) / first.log_scales.exp()
+        elif name == "means":
+            steps = steps.square().mean(1).sqrt() / scale
+        elif name == "quats":
+            steps = steps.square().mean(1).sqrt()
+            if unit == "size":  # three ways to turn a quaternion of length 1
+                steps *= math.sqrt(4 / 3) / before.norm(dim=1)
+        moved = float(steps.abs().max())
+        assert moved == pytest.approx(2.0 * expected[name], rel=1e-3), name
+
+
+def test_what_is_differentiated_is_the_loss_that_is_measured(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Through each photograph's exposure, against finite differences of the picture."""
+    seen: dict[str, Any] = {}
+    backward, loss = trainer.backward, trainer.l1_ssim
+
+    def watched_backward(rendered: Any, d_color: Any, *rest: Any, **options: Any) -> Any:
+        seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
+        return backward(rendered, d_color, *rest, **options)
+
+    def watched_loss(picture: Any, *rest: Any) -> Any:
+        seen["wanted_and_weights"] = rest
+        return loss(picture, *rest)
+
+    monkeypatch.setattr(trainer, "backward", watched_backward)
+    monkeypatch.setattr(trainer, "l1_ssim", watched_loss)
+    gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
+    train(
+        Inputs(scene.views, scene.initial, scene.extent, gains=gains),
+        tiny_config(1),
+        seed=0,
+        threads=1,
+        checkpoint_dir=tmp_path,
+    )
+    gain = torch.tensor(gains[0], dtype=torch.float32)
+
+    def measured(picture: torch.Tensor) -> float:
+        return l1_ssim(picture * gain, *seen["wanted_and_weights"]).loss
+
+    for channel in range(3):
+        step = torch.zeros_like(seen["color"])
+        step[..., channel] = 1e-3 * torch.sign(seen["d_color"][..., channel])
+        slope = (measured(seen["color"] + step) - measured(seen["color"] - step)) / 2
+        assert slope == pytest.approx(float((step * seen["d_color"]).sum()), rel=0.05)

@@ -1,0 +1,72 @@
+"""The line about instruction set and time a step, and checkpoints of another instruction set."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from pipeline.runtime.native import Built
+from pipeline.training.checkpoints import checkpoint
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop import trainer
+from pipeline.training.loop.step_timer import (
+    MEASURED,
+    WARM_UP,
+    StepTimer,
+    build_record,
+    other_build,
+)
+from tests.training.conftest import TinyScene, tiny_config
+
+HERE = Built(Path("lib.so"), "x86-64-v3", "g++ 12.2.0")
+ELSEWHERE = Built(Path("lib.so"), "x86-64-v4", "g++ 12.2.0")
+
+
+def lines(steps: int) -> list[str]:
+    """Said in a run whose first steps are slow and whose others take 20 ms."""
+    timer, seconds, said = StepTimer(HERE, 2, steps), 0.0, []
+    for step in range(1, steps + 1):
+        seconds += 1.0 if step <= WARM_UP // 2 else 0.02
+        said.append(timer.passes(seconds, 4))
+    return [line for line in said if line]
+
+
+@pytest.mark.parametrize("steps", [WARM_UP + MEASURED, 1000])
+def test_the_time_a_step_leaves_the_first_steps_out_and_is_said_once(steps: int) -> None:
+    (line,) = lines(steps)
+    assert line == "x86-64-v3, g++ 12.2.0, 2 threads: 20.0 ms a step, images at 1/4 of their size"
+
+
+@pytest.mark.parametrize("steps", [1, 2, 7, 20])
+def test_short_runs_are_measured_where_they_can_be(steps: int) -> None:
+    assert len(lines(steps)) == (steps > 1)
+
+
+def test_a_checkpoint_of_another_instruction_set_is_named() -> None:
+    assert other_build({}, HERE) is None
+    assert other_build({"built": build_record(HERE)}, HERE) is None
+    text = other_build({"built": build_record(ELSEWHERE)}, HERE)
+    assert text is not None and "x86-64-v3" in text and "x86-64-v4" in text
+
+
+def test_training_continues_from_a_checkpoint_of_another_instruction_set_and_says_so(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def run() -> list[str]:
+        said: list[str] = []
+        inputs = Inputs(scene.views, scene.initial, scene.extent)
+        config = tiny_config(12)
+        trainer.train(
+            inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path, on_log=said.append
+        )
+        return said
+
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    assert not any("continues with" in line for line in run())
+    kept = checkpoint.newest(tmp_path)
+    assert kept is not None
+    kept.values["built"] = build_record(ELSEWHERE)
+    checkpoint.save(tmp_path, kept)
+    (line,) = [line for line in run() if "continues with" in line]
+    assert "x86-64-v4" in line

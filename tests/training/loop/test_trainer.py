@@ -1,0 +1,400 @@
+"""Training for real on a tiny scene: it learns, resumes to the bit, and stops with clear errors."""
+
+from __future__ import annotations
+
+import itertools
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
+
+import numpy as np
+import pytest
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from pipeline.config.schema import Train
+from pipeline.render import RasterOptions
+from pipeline.render.views import render_view
+from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.checkpoints.checkpoint import PATTERN
+from pipeline.training.data import targets
+from pipeline.training.data.image_store import DiskShelf, MemoryShelf
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop import metrics_log as journal
+from pipeline.training.loop import trainer
+from pipeline.training.loop.trainer import TrainResult, train
+from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
+
+
+def run(
+    scene: TinyScene,
+    folder: Path,
+    config: Train | None = None,
+    views: list[View] | None = None,
+    threads: int = 1,
+    seed: int = 3,
+    said: list[str] | None = None,
+    journal: Path | None = None,
+    memory_mb: int | None = None,
+) -> TrainResult:
+    return train(
+        Inputs(scene.views if views is None else views, scene.initial, scene.extent),
+        config or tiny_config(),
+        seed=seed,
+        threads=threads,
+        memory_mb=memory_mb,
+        checkpoint_dir=folder,
+        journal=journal,
+        on_log=None if said is None else said.append,
+    )
+
+
+def assert_same(a: TrainResult, b: TrainResult) -> None:
+    for name, tensor in a.gaussians.tensors().items():
+        assert torch.equal(tensor, b.gaussians.tensors()[name]), name
+    assert a.curve == b.curve
+    assert a.counters == b.counters
+
+
+def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
+    """Kill the run in the middle of its ``call``-th step."""
+    calls = 0
+    original = trainer.backward
+
+    def dying(*args: object, **kwargs: object) -> object:
+        nonlocal calls
+        calls += 1
+        if calls == call:
+            raise KeyboardInterrupt
+        return original(*args, **kwargs)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(trainer, "backward", dying)
+
+
+def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) -> None:
+    """One Gaussian is above all cameras, another inside an opaque ball of others. A run too short
+    for each photograph to have been looked at knows nothing."""
+    initial = scene.initial.select(torch.arange(len(scene.initial)))
+    initial.means[0] = torch.tensor([0.0, -50.0, 0.0])
+    initial.means[1] = 0.0
+    initial.log_scales[1] = -6.0
+    around = torch.nn.functional.normalize(torch.randn(40, 3, generator=torch.manual_seed(0)))
+    initial.means[2:42] = 0.3 * around
+    initial.log_scales[2:42] = -1.0
+    initial.opacity_logits[2:42] = 12.0
+    fixed = tiny_config(40, density={"stop_share": 0.0}, lr_means=0.0, lr_opacities=0.0)
+    planted = replace(scene, initial=initial)
+    result = run(planted, tmp_path / "a", fixed)
+    assert result.counters["unseen"] == len(initial) - len(result.gaussians) >= 2
+    places = result.gaussians.means
+    assert not (places == initial.means[0]).all(1).any()
+    assert not (places == initial.means[1]).all(1).any()
+    assert (places == initial.means[2]).all(1).any()
+    short = run(
+        planted, tmp_path / "b", fixed.model_copy(update={"steps": 2 * len(scene.views) - 1})
+    )
+    assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
+
+
+def test_pictures_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
+    config = tiny_config(coarse_until=0.3)
+    assert isinstance(trainer.shelf_for(scene.views, config, None), MemoryShelf)
+    assert isinstance(trainer.shelf_for(scene.views, config, 1), DiskShelf)
+    little = run(scene, tmp_path / "b", config, memory_mb=1)
+    assert_same(run(scene, tmp_path / "a", config), little)
+
+
+def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
+    result = run(scene, tmp_path, tiny_config(500))
+    assert result.steps == 500
+    assert result.counters["changes"]["cloned"] + result.counters["changes"]["split"] > 0
+    assert result.curve[-1]["loss"] < 0.4 * result.curve[0]["loss"]
+    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 8
+    assert result.gaussians.sh_degree == 1
+    assert len(result.curve) == len(result.curve_seconds)
+    view = scene.views[0]
+    rendered = render_view(result.gaussians, view, RasterOptions(near=result.near)).rgb
+    error = np.mean((rendered - np.asarray(Image.open(view.image)) / 255.0) ** 2)
+    assert -10 * np.log10(error) > 25
+
+
+@pytest.mark.parametrize("call", [1, 2, 10, 11, 13, 23, 40])
+def test_killed_and_resumed_gives_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, call: int
+) -> None:
+    # Resolution rises after steps 12 and 24, opacity is reset after step 10.
+    monkeypatch.setattr(targets, "MIN_SHORT_SIDE", 4)
+    config = tiny_config(40, coarse_until=0.6, density={"opacity_reset_interval": 1750})
+    whole = run(scene, tmp_path / "whole", config, scene.alpha_views)
+    assert whole.counters["opacity_resets"] == 1
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, call)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path / "cut", config, scene.alpha_views)
+    assert len(list((tmp_path / "cut").glob(PATTERN))) == min(2, call - 1)
+    resumed = run(scene, tmp_path / "cut", config, scene.alpha_views)
+    assert_same(whole, resumed)
+    assert not resumed.warnings
+
+
+@pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
+def test_killed_at_twenty_random_steps_and_resumed_gives_the_same_bytes(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str
+) -> None:
+    density = {"strategy": strategy, "max_gaussians": 90, "prune_opacity": 0.1}
+    config = tiny_config(60, density=density)
+    run(scene, tmp_path / "whole", config).gaussians.save(tmp_path / "whole.npz")
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    calls = np.random.default_rng(11).permutation(np.arange(1, 61))[:20]
+    for call in calls:
+        with monkeypatch.context() as patch:
+            interrupt_at(patch, int(call))
+            with pytest.raises(KeyboardInterrupt):
+                run(scene, tmp_path / f"{call}", config)
+        run(scene, tmp_path / f"{call}", config).gaussians.save(tmp_path / "resumed.npz")
+        assert (tmp_path / "resumed.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+
+
+def test_the_journal_has_each_step_once_after_a_kill(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    file = tmp_path / "logs" / "train.metrics.jsonl"
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(journal, "SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 23)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path, journal=file)
+    with open(file, "a") as half:
+        half.write('{"time": 1, "step": 2')
+    result = run(scene, tmp_path, journal=file)
+    lines = journal.read_journal(file)
+    assert [line["step"] for line in lines] == list(range(1, 41))
+    assert lines[-1]["share"] == 1
+    assert lines[-1]["psnr"] == result.curve[-1]["psnr"]
+    assert lines[-1]["num_gaussians"] == len(result.gaussians)
+    assert lines[-1]["seconds_left"] == 0 < lines[5]["seconds_left"]
+    run(scene, tmp_path / "again", journal=file)
+    assert len(journal.read_journal(file)) == 40
+
+
+def test_minutes_pass_through_the_whole_schedule(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    # A clock of its own, a hundredth of a second a look: load has no part in it.
+    looks = itertools.count()
+    monkeypatch.setattr(trainer, "time", SimpleNamespace(monotonic=lambda: 0.01 * next(looks)))
+    config = tiny_config(budget_minutes=2 / 60, coarse_until=0.5, density={"max_gaussians": 90})
+    result = run(scene, tmp_path, config)
+    assert 2.0 <= result.seconds < 2.05
+    assert 195 <= result.steps <= 205
+    assert len(result.curve) >= 20
+    assert result.gaussians.sh_degree == 1
+    assert len(result.gaussians) > 60, "density control took place"
+    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 3
+    steps = [record["step"] for record in result.curve]
+    assert steps == sorted(steps)
+    assert steps[-1] == result.steps
+
+
+def test_isotropic_gaussians_stay_spheres(scene: TinyScene, tmp_path: Path) -> None:
+    start = scene.initial.clone()
+    start.log_scales[:] = start.log_scales[:, :1]
+    inputs = Inputs(scene.views, start, scene.extent)
+    config = tiny_config(60, isotropic=True)
+    scales = train(inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path).gaussians.log_scales
+    assert torch.equal(scales, scales[:, :1].expand(-1, 3))
+    assert (scales[:5] != start.log_scales[:5]).all()
+
+
+def test_resuming_from_an_older_step_gives_the_same_bits(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = run(scene, tmp_path / "whole")
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    with monkeypatch.context() as patch:
+        interrupt_at(patch, 20)
+        with pytest.raises(KeyboardInterrupt):
+            run(scene, tmp_path / "cut")
+    newest = max((tmp_path / "cut").glob(PATTERN))
+    data = bytearray(newest.read_bytes())
+    data[len(data) // 2] ^= 1
+    newest.write_bytes(bytes(data))
+    said: list[str] = []
+    resumed = run(scene, tmp_path / "cut", said=said)
+    assert_same(whole, resumed)
+    assert "damaged" in said[0]
+    assert len(said) == 2 and "ms a step" in said[1]
+    assert not resumed.warnings, "what happened to checkpoints is no part of the result"
+
+
+def test_a_checkpoint_of_other_settings_is_not_used(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    run(scene, tmp_path, seed=1)
+    said: list[str] = []
+    other = run(scene, tmp_path, seed=2, said=said)
+    assert_same(other, run(scene, tmp_path / "clean", seed=2))
+    assert any("other inputs" in line for line in said)
+
+
+def test_threads_do_not_change_the_bits(scene: TinyScene, tmp_path: Path) -> None:
+    before = torch.get_num_threads()
+    one = run(scene, tmp_path / "1", views=scene.alpha_views, threads=1)
+    two = run(scene, tmp_path / "2", views=scene.alpha_views, threads=2)
+    assert_same(one, two)
+    assert torch.get_num_threads() == before
+    one.gaussians.save(tmp_path / "1.npz")
+    two.gaussians.save(tmp_path / "2.npz")
+    assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
+
+
+def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) -> None:
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[8:20, 5:22] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    results = []
+    for seed in (1, 2):
+        views = []
+        for index, view in enumerate(scene.views):
+            picture = np.array(Image.open(view.image))
+            noise = np.random.default_rng(seed).integers(0, 256, picture.shape, np.uint8)
+            picture = np.where(mask[..., None] == 0, noise, picture)
+            path = tmp_path / f"{seed}_{index}.png"
+            Image.fromarray(picture).save(path)
+            views.append(replace(view, image=str(path), mask=str(tmp_path / "mask.png")))
+        results.append(run(scene, tmp_path / f"c{seed}", views=views))
+    assert_same(*results)
+
+
+def test_what_only_a_mask_sees_vanishes(scene: TinyScene, tmp_path: Path) -> None:
+    """Nobody asks for anything there, and left alone it stands in the way of other cameras."""
+    mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
+    mask[:, : WIDTH // 2] = 0
+    Image.fromarray(mask).save(tmp_path / "mask.png")
+    views = [replace(view, mask=str(tmp_path / "mask.png")) for view in scene.views[:2]]
+    seen = []
+    for weight in (0.0, 0.1):
+        config = tiny_config(200, density={"stop_share": 0.0, "prune_opacity": 0.0})
+        config = config.model_copy(update={"masked_opacity": weight})
+        result = run(scene, tmp_path / f"c{weight}", config, views=views)
+        renders = [render_view(result.gaussians, view) for view in views]
+        halves = [
+            (r.alpha[:, : WIDTH // 2].mean(), r.alpha[:, WIDTH // 2 :].mean()) for r in renders
+        ]
+        seen.append(np.mean(halves, 0))
+    (left, left_right), (thinned, right) = seen
+    assert thinned < 0.5 * left
+    assert right == pytest.approx(left_right, rel=0.2)
+
+
+def test_gains_explain_photographs_that_are_exposed_differently(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    gains = np.array([[0.5] * 3, [1.0] * 3] * (len(scene.views) // 2))
+    views = []
+    for index, (view, gain) in enumerate(zip(scene.views, gains, strict=True)):
+        picture = np.rint(np.array(Image.open(view.image)) * gain).astype(np.uint8)
+        Image.fromarray(picture).save(tmp_path / f"{index}.png")
+        views.append(replace(view, image=str(tmp_path / f"{index}.png")))
+    config = tiny_config(150)
+
+    def trained(name: str, gains: NDArray[np.float64] | None) -> TrainResult:
+        inputs = Inputs(views, scene.initial, scene.extent, gains=gains)
+        return train(inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path / name)
+
+    with_gains, without = trained("a", gains), trained("b", None)
+    assert with_gains.curve[-1]["psnr"] > without.curve[-1]["psnr"] + 3
+    # The scene itself is the brighter photographs', as if there had been no other.
+    plain = run(scene, tmp_path / "c", config)
+    assert with_gains.curve[-1]["psnr"] > plain.curve[-1]["psnr"] - 1
+
+
+def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(tmp_path / "mask.png")
+    hidden = replace(scene.views[0], name="hidden", mask=str(tmp_path / "mask.png"))
+    with_it = run(scene, tmp_path / "a", views=[*scene.views[:3], hidden, *scene.views[3:]])
+    assert any("hidden" in text for text in with_it.warnings)
+    assert_same(with_it, run(scene, tmp_path / "b"))
+    with pytest.raises(UserError, match="masks"):
+        run(scene, tmp_path / "c", views=[hidden])
+
+
+def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
+    start = scene.initial.clone()
+    start.opacity_logits.fill_(1.0)
+    start.log_scales += 0.7
+    result = train(
+        Inputs(scene.alpha_views, start, scene.extent),
+        tiny_config(500),
+        seed=0,
+        threads=1,
+        checkpoint_dir=tmp_path,
+    )
+    assert result.background == "white"
+    for view in scene.alpha_views[:2]:
+        alpha = np.asarray(Image.open(view.image))[..., 3]
+        empty = alpha == 0
+        assert empty.sum() > 50
+        before = render_view(start, view).alpha[empty].mean()
+        after = render_view(result.gaussians, view).alpha[empty].mean()
+        assert after < 0.02 < before
+
+
+def test_a_loss_that_is_no_number_is_a_clear_error(
+    scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    original = trainer.l1_ssim
+    monkeypatch.setattr(
+        trainer, "l1_ssim", lambda *args: replace(original(*args), loss=float("nan"))
+    )
+    with pytest.raises(UserError, match=r"not a number at step 1, view \d\.png"):
+        run(scene, tmp_path)
+
+
+def test_all_gaussians_dead_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="every Gaussian has died"):
+        run(scene, tmp_path, tiny_config(40, density={"prune_opacity": 1.0}))
+
+
+def test_gaussians_that_no_camera_sees_are_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    far = scene.initial.clone()
+    far.means += 1000.0
+    with pytest.raises(UserError, match="no camera sees"):
+        train(
+            Inputs(scene.views, far, scene.extent),
+            tiny_config(),
+            seed=0,
+            threads=1,
+            checkpoint_dir=tmp_path,
+        )
+
+
+def test_nothing_to_train_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+    with pytest.raises(UserError, match="0 views"):
+        run(scene, tmp_path, views=[])
+
+
+def test_more_gaussians_than_the_budget_are_thinned_with_a_warning(
+    scene: TinyScene, tmp_path: Path
+) -> None:
+    result = run(scene, tmp_path, tiny_config(10, density={"max_gaussians": 20}))
+    assert result.counters["max_gaussians"] <= 20
+    assert any("budget" in warning for warning in result.warnings)
+
+
+def test_saved_gaussians_come_back_the_same(scene: TinyScene, tmp_path: Path) -> None:
+    scene.truth.save(tmp_path / "a.npz")
+    back = Gaussians.load(tmp_path / "a.npz")
+    for name, tensor in scene.truth.tensors().items():
+        assert torch.equal(tensor, back.tensors()[name])
+    (tmp_path / "a.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:-100])
+    with pytest.raises(UserError, match="could not read"):
+        Gaussians.load(tmp_path / "a.npz")

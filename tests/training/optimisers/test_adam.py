@@ -1,0 +1,60 @@
+"""Adam against torch's own, with a learning rate for each group; and against the twin's."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import pytest
+import torch
+
+from pipeline.render import FrameAdam, RasterOptions, backward, forward
+from pipeline.render import reference as twin
+from pipeline.render.views import raster_camera
+from pipeline.training.optimisers.adam import Adam, Rates
+from tests.training.conftest import ball, camera_at
+
+RATES = Rates(means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=2e-2, shN=1e-3)
+
+
+@pytest.mark.parametrize("own_frames", [True, False])
+@pytest.mark.parametrize("degree", [0, 1])
+def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool) -> None:
+    gaussians = ball(37, 0).with_sh_degree(degree)
+    adam = Adam(gaussians, 0.8, own_frames)
+    leaves = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
+    shared = {"means": torch.zeros(37, 1), "quats": torch.zeros(37, 1)}
+    frames = FrameAdam(*torch.zeros(4, 37, 3), RATES.means, RATES.quats, 0, 0.8)
+    first = {name: torch.zeros_like(leaves[name]) for name in shared}
+    groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh" and n not in shared]
+    dc, rest = leaves["sh"][:, :1].clone(), leaves["sh"][:, 1:].clone()
+    groups += [(dc, RATES.sh0), (rest, RATES.shN)]
+    reference = torch.optim.Adam(
+        [{"params": [p], "lr": lr} for p, lr in groups], betas=(0.8, 0.999), eps=1e-15
+    )
+    camera, options = raster_camera(camera_at(0.3)), RasterOptions(sh_degree=degree)
+    wanted = torch.rand(camera.height, camera.width, 3, generator=torch.Generator().manual_seed(0))
+    for step in range(1, 8):
+        drawn = forward(*gaussians.parameters(), camera, options)
+        assert (drawn.radii > 0).all()  # what is out of view waits
+        d_color = drawn.color - wanted
+        gradients = backward(drawn, d_color)
+        scales = leaves["log_scales"].clone()
+        for name in leaves:
+            if name != "sh" and name not in shared:
+                leaves[name].grad = getattr(gradients, name)
+        dc.grad, rest.grad = gradients.sh[:, :1], gradients.sh[:, 1:]
+        reference.step()
+        if own_frames:
+            twin.frame_adam(
+                leaves["means"], leaves["quats"], scales, gradients.means, gradients.quats,
+                replace(frames, step=step),
+            )  # fmt: skip
+        else:
+            for name, second in shared.items():
+                rate, gradient = getattr(RATES, name), getattr(gradients, name)
+                twin.adam_step(leaves[name], gradient, first[name], second, rate, step, 0.8)
+        backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
+        adam.step(gaussians, gradients, RATES, step, 1)
+    leaves["sh"] = torch.cat([dc, rest], 1)
+    for name, tensor in gaussians.tensors().items():
+        assert torch.allclose(tensor, leaves[name], rtol=1e-5, atol=1e-5), name

@@ -1,0 +1,57 @@
+"""Imports go one way: a room imports itself and the rooms above it in this list."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+ROOMS = (
+    *("runtime", "config", "geometry", "scene", "splats", "io", "plan", "photos", "sfm", "render"),
+    *("training.data", "training.losses", "training.optimisers", "training.cameras"),
+    *("training.density", "training.checkpoints", "training.loop"),
+    *("metrics", "coverage", "surface", "reporting", "watching", "demo"),
+)
+PACKAGES = ("training",)  # hold rooms, and nothing else
+MODULES = ("commands", "doctor", "__main__")  # the command line: below all rooms
+
+
+def room_of(module: str) -> str:
+    """The room of a dotted name below ``pipeline``; the name's first part where it has none."""
+    inside = [room for room in ROOMS if f"{module}.".startswith(f"{room}.")]
+    return inside[0] if inside else module.split(".")[0]
+
+
+def imports(path: Path) -> set[str]:
+    """Every module below ``pipeline`` that a file imports, at its top or inside a function."""
+    found: set[str] = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.Import):
+            found |= {alias.name for alias in node.names}
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}: import by the full name"
+            found |= {f"{node.module}.{alias.name}" for alias in node.names}
+    return {name.removeprefix("pipeline.") for name in found if name.startswith("pipeline.")}
+
+
+def test_every_module_has_a_room() -> None:
+    for path in (ROOT / "pipeline").rglob("*.py"):
+        name = ".".join(path.relative_to(ROOT / "pipeline").with_suffix("").parts)
+        known = (*ROOMS, *MODULES, "__init__", *(f"{package}.__init__" for package in PACKAGES))
+        assert any(f"{name}.".startswith(f"{room}.") for room in known), f"{path} is in no room"
+
+
+@pytest.mark.parametrize("room", ROOMS)
+def test_a_room_imports_only_rooms_above_it(room: str) -> None:
+    allowed = {*ROOMS[: ROOMS.index(room) + 1], *PACKAGES}
+    for path in (ROOT / "pipeline").joinpath(*room.split(".")).rglob("*.py"):
+        climbs = {name for name in imports(path) if room_of(name) not in allowed}
+        assert not climbs, f"{path} imports {sorted(climbs)}"
+
+
+def test_the_library_knows_nothing_of_stages() -> None:
+    for path in (ROOT / "pipeline").rglob("*.py"):
+        text = path.read_text()
+        assert "import stages" not in text and "from stages" not in text, path

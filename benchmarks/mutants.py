@@ -164,11 +164,11 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/training/loop/test_trainer.py",),
     ),
     "scene_by_cameras": Mutant(
-        "stages/train.py",
+        "pipeline/training/scene.py",
         "scale=scene_scale(extent, points)",
         "scale=extent",
         "a scene as large as its cameras stand apart",
-        ("tests/stages/test_train.py",),
+        ("tests/training/test_scene.py",),
     ),
     "late_reset": Mutant(
         "pipeline/training/loop/schedule.py",
@@ -234,7 +234,7 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/scene/test_views.py",),
     ),
     "leak": Mutant(
-        "stages/train.py",
+        "pipeline/training/scene.py",
         "training = [view for view in views if not view.is_test]",
         "training = list(views)",
         "training on the held-out views",

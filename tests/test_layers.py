@@ -11,8 +11,8 @@ ROOT = Path(__file__).parents[1]
 ROOMS = (
     *("runtime", "config", "geometry", "scene", "splats", "io", "plan", "photos", "sfm", "render"),
     *("training.data", "training.losses", "training.optimisers", "training.cameras"),
-    *("training.density", "training.checkpoints", "training.loop"),
-    *("metrics", "coverage", "surface", "reporting", "watching", "demo"),
+    *("training.density", "training.checkpoints", "training.loop", "training.scene"),
+    *("metrics", "coverage", "surface", "export", "reporting", "watching", "demo"),
 )
 PACKAGES = ("training",)  # hold rooms, and nothing else
 MODULES = ("commands", "doctor", "__main__")  # the command line: below all rooms

@@ -21,7 +21,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.stats import spearmanr
 
-from pipeline.config.schema import Density, Init, Train
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Gradient, Init, Train
 from pipeline.coverage.probe_views import Draw, open_eye
 from pipeline.coverage.trust import trust_picture
 from pipeline.coverage.viewpoints import COUNT, Viewpoint, propose
@@ -39,7 +40,7 @@ from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -121,15 +122,16 @@ def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> G
         steps=steps,
         background="black",
         exposure="off",
-        lr_boost=4.0,
-        density=Density(max_gaussians=MAX_GAUSSIANS),
+        density=Gradient(max_gaussians=MAX_GAUSSIANS),
     )
+    experiments = TrainExperiments(learning_rate_factor=4.0)
     centres = np.stack([view.centre for view in views])
     first = gaussians_from_points(studio.sparse(views), centres, Init(), config.sh_degree)
     with TemporaryDirectory() as folder:
         return train(
             Inputs(views, Gaussians.from_arrays(first), extent),
             config,
+            experiments,
             seed=0,
             threads=2,
             checkpoint_dir=Path(folder),

@@ -96,7 +96,7 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
     return Protocol(
         held_out or list(views),
         [training[i] for i in picks] if held_out else [],
-        split.holdout_every if held_out else 0,
+        split.test_every if held_out else 0,
         WHITE if white else BLACK,
         near_plane(extent),
         extent,
@@ -141,7 +141,7 @@ def evaluate_views(
         pixels = load_view(view.image, view.mask, view.width, view.height)
         photo = reference(pixels, protocol.background)
         if train.refine_poses and view.is_test:
-            gain, weight = gains.get(view.name), train.ssim_weight
+            gain, weight = gains.get(view.name), train.ssim_loss_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )

@@ -36,6 +36,8 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     by_scene = width * height * len(scan.photos) / PIXELS_SEEN_PER_GAUSSIAN
     by_clock = math.inf if minutes is None else GAUSSIANS_A_MINUTE * minutes
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_clock)))
+    if density.strategy == "original" and density.pixels_per_gaussian == "auto":
+        wanted = density.max_gaussians
     limited = _by_memory(config, min(wanted, density.max_gaussians))
     if limited is not None:
         return limited

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import schema
+from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.isolate import run_isolated
@@ -45,6 +46,7 @@ def triangulate(
     threads: int,
     seed: int,
     cache: Path | None = None,
+    experiments: MatchesExperiments = DEFAULT.matches,
 ) -> TriangulationReport:
     """Write the model of ``sparse`` with points triangulated from the photographs to
     ``out/sparse/0``; poses as they were, the points it brought replaced.
@@ -56,7 +58,7 @@ def triangulate(
         sparse: folder of a COLMAP model; its images are found in the manifest by name, and those
             that are not are left out. A camera of another size than its photographs (reduced
             copies) is written in theirs.
-        matches: its ratio, inliers and neighbours; pairs are chosen by the cameras' nearness.
+        matches: its inliers and neighbours; pairs are chosen by the cameras' nearness.
         cache: of the features, where they shall outlive the call.
 
     Raises:
@@ -67,7 +69,7 @@ def triangulate(
         cache = cache or Path(folder) / "cache"
         feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
         facts: dict[str, Any] = run_isolated(
-            _triangulate, manifest, sparse, out, found, matches, seed
+            _triangulate, manifest, sparse, out, found, matches, experiments.max_ratio, seed
         )
     return TriangulationReport(
         **facts,
@@ -93,6 +95,7 @@ def _triangulate(
     out: Path,
     features: Path,
     config: schema.Matches,
+    max_ratio: float,
     seed: int,
 ) -> dict[str, Any]:
     import pycolmap
@@ -131,7 +134,7 @@ def _triangulate(
             images,
             features,
             pairs,
-            MatchingSettings(config.max_ratio, config.min_inliers, seed),
+            MatchingSettings(max_ratio, config.min_inliers, seed),
         )
         verified = verified_inliers(database)
         points = posed_model(list(cameras.values()), images, poses)

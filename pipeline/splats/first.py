@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
@@ -28,7 +29,11 @@ class FirstGaussians:
 
 
 def first_gaussians(
-    points: Points, training: Sequence[View], config: Init, seed: int
+    points: Points,
+    training: Sequence[View],
+    config: Init,
+    experiments: InitExperiments,
+    seed: int,
 ) -> FirstGaussians:
     """Gaussians at the sparse ``points``, or at random where ``config`` says so or there are fewer
     than ``MIN_POINTS``."""
@@ -37,10 +42,10 @@ def first_gaussians(
         warnings = [f"only {len(points)} sparse points: starting from random Gaussians instead"]
         method = "random"
     if method == "random":
-        first = gaussians_random(list(training), config, 0, seed)
+        first = gaussians_random(list(training), 0, seed, experiments)
     else:
         centres = np.array([view.centre for view in training])
-        first = gaussians_from_points(points, centres, config, 0)
+        first = gaussians_from_points(points, centres, config, 0, experiments)
     source = "random places" if method == "random" else "points"
     counters = {
         "num_gaussians": len(first),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.config.experiments import DEFAULT, InitExperiments
 from pipeline.config.schema import Init
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.runtime.errors import UserError
@@ -70,7 +71,11 @@ class InitGaussians:
 
 
 def gaussians_from_points(
-    points: Points, camera_centres: NDArray[np.float64], config: Init, sh_degree: int
+    points: Points,
+    camera_centres: NDArray[np.float64],
+    config: Init,
+    sh_degree: int,
+    experiments: InitExperiments = DEFAULT.init,
 ) -> InitGaussians:
     """A Gaussian at each sparse point.
 
@@ -107,7 +112,7 @@ def gaussians_from_points(
         found[:, 1 : NEIGHBOURS + 1].mean(1) if len(xyz) > 1 else np.full(1, LONE_ANGLE * usual)
     )
     colour = points.rgb[kept].astype(np.float64) / 255.0
-    result = _spheres(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
+    result = _spheres(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
     if len(xyz) > NEIGHBOURS:
         result.quats[:] = _lying(xyz, near)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
@@ -115,9 +120,9 @@ def gaussians_from_points(
 
 
 def gaussians_random(
-    views: Sequence[View], config: Init, sh_degree: int, seed: int
+    views: Sequence[View], sh_degree: int, seed: int, experiments: InitExperiments = DEFAULT.init
 ) -> InitGaussians:
-    """``config.num_random`` Gaussians of random colour in the volume the cameras look at.
+    """``experiments.num_random`` Gaussians of random colour in the volume the cameras look at.
 
     Where the cameras look at one place: half of them in a ball around it that all of them see
     whole, half in a cube around the cameras, for what stands behind. Otherwise (cameras looking
@@ -127,7 +132,7 @@ def gaussians_random(
 
     generator = np.random.Generator(np.random.PCG64(seed))
     centres = np.stack([view.centre for view in views])
-    count = config.num_random
+    count = experiments.num_random
     ball = _common_ball(views, centres)
     if ball is not None:
         centre, radius = ball
@@ -143,7 +148,7 @@ def gaussians_random(
     k = min(NEIGHBOURS, count - 1)
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
     colour = generator.random((count, 3))
-    opacity = min(config.opacity, RANDOM_OPACITY)
+    opacity = min(experiments.opacity, RANDOM_OPACITY)
     return _spheres(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
 
 

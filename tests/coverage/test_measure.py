@@ -16,7 +16,7 @@ from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
 from tests.coverage.room import UP, camera, drawer, wall
 
-TRAIN = Train(background="black", exposure="off", lr_boost=1.0, sh_degree=0)
+TRAIN = Train(background="black", exposure="off", sh_degree=0)
 
 
 def measured(folder: Path, *, threads: int = 1, held_out: bool = True) -> dict:
@@ -34,7 +34,7 @@ def measured(folder: Path, *, threads: int = 1, held_out: bool = True) -> dict:
         path = folder / view.name
         Image.fromarray(to_bytes(drawer(truth)(view).rgb)).save(path)
         views[i] = replace(view, image=str(path))
-    protocol = choose_protocol(views, Split(holdout_every=8 if held_out else 0), TRAIN)
+    protocol = choose_protocol(views, Split(test_every=8 if held_out else 0), TRAIN)
     evaluation = evaluate_views(
         scene, protocol, Evaluate(lpips_net="none"), TRAIN, folder / "renders", threads=threads
     )

@@ -45,7 +45,7 @@ def test_every_eighth_of_the_posed_photographs_by_name_is_held_out():
     views = load_views(manifest, model, Views(), Split())
     assert [view.name for view in views if view.is_test] == ["p01.jpg", "p09.jpg", "p17.jpg"]
     assert not any(
-        view.is_test for view in load_views(manifest, model, Views(), Split(holdout_every=0))
+        view.is_test for view in load_views(manifest, model, Views(), Split(test_every=0))
     )
 
 
@@ -63,7 +63,7 @@ def test_distorting_cameras_are_refused():
 
 def test_extent():
     manifest, model = make(9)
-    views = load_views(manifest, model, Views(), Split(holdout_every=8))
+    views = load_views(manifest, model, Views(), Split(test_every=8))
     # Training cameras stand at x = 1 ... 7: 3 from their mean.
     assert scene_extent(views) == pytest.approx(3.3)
     assert scene_extent(views[:1]) == 1.0

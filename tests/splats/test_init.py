@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.runtime.errors import UserError
@@ -143,7 +144,7 @@ def test_random_start_fills_what_inward_cameras_share() -> None:
     directions = np.random.default_rng(0).normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     views = [looking_at(target + 4.0 * d, target) for d in directions]
-    result = gaussians_random(views, Init(num_random=500), 2, seed=1)
+    result = gaussians_random(views, 2, 1, InitExperiments(num_random=500))
     assert_whole(result)
     assert result.sh.shape == (500, 9, 3)
     # Every second stands in the cameras' common ball, the others anywhere about them.
@@ -157,12 +158,12 @@ def test_random_start_fills_what_inward_cameras_share() -> None:
         pixel = camera[:, :2] / camera[:, 2:] * 70.0 + [40.0, 30.0]
         assert (camera[:, 2] > 0).all()
         assert ((pixel >= -0.5) & (pixel <= [80.5, 60.5])).all()
-    other = gaussians_random(views, Init(num_random=500), 2, seed=2)
+    other = gaussians_random(views, 2, 2, InitExperiments(num_random=500))
     assert not np.array_equal(result.means, other.means)
 
 
 def test_random_start_of_cameras_looking_ahead_lies_in_front_of_them() -> None:
     views = [looking_at(np.array([0.1 * i, 0.0, 0.0]), np.array([0.1 * i, 0, 9])) for i in range(5)]
-    result = gaussians_random(views, Init(num_random=300), 0, seed=1)
+    result = gaussians_random(views, 0, 1, InitExperiments(num_random=300))
     assert_whole(result)
     assert (result.means[:, 2] > 0).all()

@@ -1,4 +1,4 @@
-"""What training runs on, and the measured time of its steps: for the log, no part of a result."""
+"""The native library of a run and the measured time of its steps, for the log."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from typing import Any
 
 from pipeline.runtime.native import Built
 
-#: Steps of this process before the measurement (first pages of memory, cold caches), and in it.
+#: Steps of this process before the measurement (cold caches), and steps of the measurement.
 WARM_UP, MEASURED = 10, 40
 
 
@@ -14,22 +14,22 @@ class StepTimer:
     """Measures some early steps of one process, once.
 
     Args:
-        steps: that are left to do.
+        steps: remaining steps of the run.
     """
 
     def __init__(self, built: Built, threads: int, steps: int):
         self.built, self.threads = built, threads
         self.done, self.start = 0, 0.0
-        # A short run is measured as well as it can be.
+        # Short runs have shorter measurements.
         self.first = min(WARM_UP, steps // 2)
         self.last = min(WARM_UP + MEASURED, steps)
 
-    def passes(self, seconds: float, factor: int) -> str | None:
-        """A step is over. Returns the line for the log after the last one that is measured.
+    def after_step(self, seconds: float, factor: int) -> str | None:
+        """The line for the log after the last measured step, else None.
 
         Args:
             seconds: of training so far.
-            factor: that the pictures were reduced by.
+            factor: by which the images were reduced.
         """
         self.done += 1
         if self.done == self.first:
@@ -45,13 +45,13 @@ class StepTimer:
 
 
 def build_record(built: Built) -> dict[str, str]:
-    """What a checkpoint notes of the library that made it."""
+    """The library as checkpoints record it."""
     return {"instruction_set": built.target, "compiler": built.compiler}
 
 
 def other_build(values: dict[str, Any], built: Built) -> str | None:
-    """A line for the log where a checkpoint was made by another library. It is used all the same:
-    the bits are promised for one library alone, the quality is the same with any."""
+    """A line for the log if a checkpoint was made with another library. It is used: results are
+    equal to the last bit only with one library, but of the same quality with any."""
     before = values.get("built")
     if before is None or before == build_record(built):
         return None

@@ -13,9 +13,10 @@ from PIL import Image
 from pipeline.render import RasterOptions
 from pipeline.scene.views import View
 from pipeline.training.cameras.fit_pose import fit_pose
-from pipeline.training.cameras.poses import followed, rigid
+from pipeline.training.cameras.poses import rigid, with_common_motion
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop.trainer import TrainResult, train
+from pipeline.training.loop.result import TrainResult
+from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 
@@ -64,7 +65,7 @@ def test_cameras_that_were_not_moved_follow_the_others(scene: TinyScene) -> None
     true = {view.name: view.world_to_camera @ np.linalg.inv(drift) for view in scene.views}
     held_out = {scene.views[0].name, scene.views[4].name}
     moved = {name: pose for name, pose in true.items() if name not in held_out}
-    found = followed(scene.views, moved)
+    found = with_common_motion(scene.views, moved)
     assert list(found) == [view.name for view in scene.views]
     for name, pose in true.items():
         np.testing.assert_allclose(found[name], pose, atol=1e-12)
@@ -79,7 +80,7 @@ def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object)
             scene.truth,
             scene.extent,
         ),
-        tiny_config(300, lr_means=5e-3, **options),
+        *tiny_config(300, means_learning_rate=5e-3, **options),
         seed=3,
         threads=threads,
         checkpoint_dir=folder,
@@ -92,11 +93,12 @@ def test_training_moves_a_camera_that_disagrees_with_the_others(
     """All but one are right, and so is the scene, which stays: the one comes back."""
     views = [off(scene.views[0], 5), *scene.views[1:]]
     still = ("means", "scales", "quats", "opacities", "sh0", "shN")
-    config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, refine_poses=True)
-    config = config.model_copy(update={f"lr_{name}": 0.0 for name in still} | {"pose_reach": 0.05})
+    options: dict[str, object] = {f"{name}_learning_rate": 0.0 for name in still}
+    options |= {"refine_poses": True, "max_pose_change": 0.05}
+    config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, **options)
     result = train(
         Inputs(views, scene.truth, scene.extent),
-        config,
+        *config,
         seed=3,
         threads=1,
         checkpoint_dir=tmp_path,

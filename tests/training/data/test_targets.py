@@ -10,12 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.config.schema import Train
 from pipeline.photos.load import resize_area
 from pipeline.render import RasterOptions, forward
 from pipeline.render.views import raster_camera
 from pipeline.scene.views import View, reduced_size
-from pipeline.training.data.image_store import DiskShelf, MemoryShelf
+from pipeline.training.data.image_store import DiskStore, MemoryStore
 from pipeline.training.data.targets import Targets, usable_factor
 from tests.training.conftest import TinyScene
 
@@ -67,29 +66,27 @@ def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None
     counting = picture[:2, :2].reshape(4, 3)[1:]
     assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
     assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
-    thinning = targets.get(0, 1).thinning(0.5)
-    assert thinning is not None and targets.get(0, 1).thinning(0.0) is None
-    np.testing.assert_allclose(thinning, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+    masked = targets.get(0, 1).mask_gradient(0.5)
+    assert masked is not None and targets.get(0, 1).mask_gradient(0.0) is None
+    np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
 
 
-def test_what_is_asked_of_alpha_is_the_gradient_of_its_error_where_pixels_count(
+def test_alpha_gradient_is_the_gradient_of_its_losses(
     tmp_path: Path,
 ) -> None:
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
     mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
     target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
-    config = Train(alpha_weight=0.4, square_weight=2.5, masked_opacity=0.3)
     alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
     counts = torch.from_numpy(mask > 0)
     error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
     wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
     (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
-    asked = target.alpha_gradient(alpha.detach(), config)
-    assert asked is not None and alpha.grad is not None
-    torch.testing.assert_close(asked, alpha.grad)
-    nothing = Train(alpha_weight=0.0, masked_opacity=0.0)
-    assert target.alpha_gradient(alpha.detach(), nothing) is None
+    gradient = target.alpha_gradient(alpha.detach(), 0.3, 0.4, 2.5)
+    assert gradient is not None and alpha.grad is not None
+    torch.testing.assert_close(gradient, alpha.grad)
+    assert target.alpha_gradient(alpha.detach(), 0.0, 0.0, 2.5) is None
 
 
 def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:
@@ -132,8 +129,8 @@ def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
         picture = rng.integers(0, 255, (140 + number, 150, channels), np.uint8)
         mask = (rng.random(picture.shape[:2]) > 0.4).astype(np.uint8) * 255 if number else None
         views.append(view_of(tmp_path / f"{number}.png", picture, mask))
-    in_memory = Targets(views, 3, shelf=MemoryShelf())
-    on_disk = Targets(views, 3, shelf=DiskShelf())
+    in_memory = Targets(views, 3, store=MemoryStore())
+    on_disk = Targets(views, 3, store=DiskStore())
     assert on_disk.have_alpha and not on_disk.hidden()
     for factor, index in [(4, 0), (4, 2), (4, 0), (2, 1), (2, 2), (1, 2), (1, 1), (1, 0), (1, 2)]:
         wanted, found = in_memory.get(index, factor), on_disk.get(index, factor)
@@ -143,12 +140,12 @@ def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
             assert one is None or (one.dtype == other.dtype and torch.equal(one, other)), name
 
 
-def test_a_disk_shelf_holds_nothing_in_memory_and_leaves_no_file(
+def test_a_disk_store_holds_nothing_in_memory_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    take = DiskShelf().put((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
-    first, second = take(), take()
+    read = DiskStore().add((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
+    first, second = read(), read()
     assert first[0] is not None and second[0] is not None and first[1] is None
     assert torch.equal(first[0], second[0]) and first[0].data_ptr() != second[0].data_ptr()
     assert not list(tmp_path.iterdir())

@@ -9,7 +9,7 @@ import pytest
 from pipeline.runtime.native import Built
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop import trainer
+from pipeline.training.loop import session
 from pipeline.training.loop.step_timer import (
     MEASURED,
     WARM_UP,
@@ -17,6 +17,7 @@ from pipeline.training.loop.step_timer import (
     build_record,
     other_build,
 )
+from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, tiny_config
 
 HERE = Built(Path("lib.so"), "x86-64-v3", "g++ 12.2.0")
@@ -28,7 +29,7 @@ def lines(steps: int) -> list[str]:
     timer, seconds, said = StepTimer(HERE, 2, steps), 0.0, []
     for step in range(1, steps + 1):
         seconds += 1.0 if step <= WARM_UP // 2 else 0.02
-        said.append(timer.passes(seconds, 4))
+        said.append(timer.after_step(seconds, 4))
     return [line for line in said if line]
 
 
@@ -57,12 +58,10 @@ def test_training_continues_from_a_checkpoint_of_another_instruction_set_and_say
         said: list[str] = []
         inputs = Inputs(scene.views, scene.initial, scene.extent)
         config = tiny_config(12)
-        trainer.train(
-            inputs, config, seed=0, threads=1, checkpoint_dir=tmp_path, on_log=said.append
-        )
+        train(inputs, *config, seed=0, threads=1, checkpoint_dir=tmp_path, on_log=said.append)
         return said
 
-    monkeypatch.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+    monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0.0)
     assert not any("continues with" in line for line in run())
     kept = checkpoint.newest(tmp_path)
     assert kept is not None

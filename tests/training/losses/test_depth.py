@@ -12,7 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.config.schema import Density, Train
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Gradient, Train
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view
@@ -21,7 +22,7 @@ from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 from pipeline.training.losses.depth import TOLERANCE, depth_gradients
 from tests.training.conftest import HEIGHT, WIDTH, camera_at
 
@@ -116,13 +117,19 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
     xy = np.stack([x.ravel(), y.ravel()], 1)
     known = KnownDepths(xy, np.full(len(xy), 3.0, np.float32), np.ones(len(xy), np.float32))
     config = Train(
-        steps=200, sh_degree=0, coarse_until=0.0, depth_weight=weight, lr_means=0.02,
-        lr_means_final=0.02, lr_means_unit="scene", lr_boost=1.0,
-        density=Density(max_gaussians=120),
-    )  # fmt: skip
+        steps=200, sh_degree=0, depth_loss_weight=weight, density=Gradient(max_gaussians=120)
+    )
+    experiments = TrainExperiments(
+        coarse_share=0.0,
+        means_learning_rate=0.02,
+        means_final_learning_rate=0.02,
+        means_learning_rate_unit="scene_scale",
+        learning_rate_factor=1.0,
+    )
     result = train(
         Inputs([view], initial, extent=1.0, depths=[known]),
         config,
+        experiments,
         seed=0,
         threads=1,
         checkpoint_dir=tmp_path / "checkpoints",

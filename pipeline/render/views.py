@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.render import RasterCamera, RasterOptions, forward
+from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
 from pipeline.scene.views import View, reduced_size
 from pipeline.splats.gaussians import Gaussians
 
@@ -57,10 +57,16 @@ def within(options: RasterOptions, gaussians: Gaussians) -> RasterOptions:
     return replace(options, sh_degree=min(options.sh_degree, gaussians.sh_degree))
 
 
-def render_view(gaussians: Gaussians, view: View, options: RasterOptions | None = None) -> Render:
+def render_view(
+    gaussians: Gaussians,
+    view: View,
+    options: RasterOptions | None = None,
+    backend: Backend | None = None,
+) -> Render:
     """Render ``gaussians`` as ``view`` sees them, at the view's size."""
     options = within(options or RasterOptions(), gaussians)
-    result = forward(*gaussians.parameters(), raster_camera(view), options)
+    backend = backend or make_backend()
+    result = backend.forward(*gaussians.parameters(), raster_camera(view), options)
     return Render(
         result.color.clamp(0.0, 1.0).numpy(),
         result.alpha.numpy(),

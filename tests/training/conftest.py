@@ -13,6 +13,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Density, Train
+from pipeline.render import make_backend
 from pipeline.render.views import render_view
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -95,7 +96,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
 @contextmanager
 def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
     """What trains inside writes a checkpoint after every step, and dies in this one."""
-    original, calls = trainer.backward, 0
+    original, calls = make_backend().backward, 0
 
     def dying(*args: Any, **kwargs: Any) -> Any:
         nonlocal calls
@@ -106,5 +107,5 @@ def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
 
     with patch.context() as inside, pytest.raises(KeyboardInterrupt):
         inside.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
-        inside.setattr(trainer, "backward", dying)
+        inside.setattr(make_backend(), "backward", dying)
         yield

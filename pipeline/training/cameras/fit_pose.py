@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.render import RasterOptions, backward, forward, l1_ssim
+from pipeline.render import Backend, RasterOptions, make_backend
 from pipeline.render.views import raster_camera, within
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -29,6 +29,7 @@ def fit_pose(
     options: RasterOptions,
     extent: float,
     ssim_weight: float,
+    backend: Backend | None = None,
 ) -> View:
     """A held-out view with its pose moved to where the scene fits its photograph best; the scene
     stays as it is.
@@ -37,7 +38,9 @@ def fit_pose(
         photo: (H, W, 3), over the background of ``options``.
         mask: (H, W), false where a pixel counts for nothing.
         gain: a factor for each channel of the render.
+        backend: that draws; None: the default.
     """
+    backend = backend or make_backend()
     options = within(options, gaussians)
     poses = Poses.of([view], gaussians, extent)
     camera = raster_camera(view)
@@ -46,13 +49,14 @@ def fit_pose(
     factor = torch.tensor([1.0, 1.0, 1.0] if gain is None else list(gain), dtype=torch.float32)
     best, least = poses.poses[0].copy(), math.inf
     for number in range(FIT_STEPS):
-        rendered = forward(*gaussians.parameters(), poses.camera(camera, 0), options)
-        loss = l1_ssim(
+        rendered = backend.forward(*gaussians.parameters(), poses.camera(camera, 0), options)
+        loss = backend.l1_ssim(
             rendered.color * factor, wanted, ssim_weight, ignored, threads=options.threads
         )
         if loss.loss < least:
             best, least = poses.poses[0].copy(), loss.loss
-        found = backward(rendered, loss.grad * factor, means2d_abs=False, camera=True).camera
-        assert found is not None
-        poses.step(0, found, FIT_RATE * FIT_FALL ** (number / (FIT_STEPS - 1)))
+        d_color = loss.grad * factor
+        found = backend.backward(rendered, d_color, means2d_abs=False, camera=True)
+        assert found.camera is not None
+        poses.step(0, found.camera, FIT_RATE * FIT_FALL ** (number / (FIT_STEPS - 1)))
     return replace(view, world_to_camera=best)

@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import RasterCamera, RasterOptions, backward, forward
+from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 from pipeline.training.data.known_depths import KnownDepths
@@ -46,6 +46,7 @@ def floaters(
     air: NDArray[np.float64],
     options: RasterOptions,
     pixel: float = 1.0,
+    backend: Backend | None = None,
 ) -> Tensor:
     """(N,) bool: most of its weight is in one view, or in a hundredth of them, and there it is
     nearer than ``air``.
@@ -58,7 +59,9 @@ def floaters(
         air: (V,) camera z (``air_depths``).
         options: how training draws; harmonics and background have no part in weights.
         pixel: how many pixels of a view one of these pictures stands for.
+        backend: that draws; None: the default.
     """
+    backend = backend or make_backend()
     grey = gaussians.with_sh_degree(0)
     grey = replace(grey, sh=torch.zeros_like(grey.sh))
     options = replace(options, sh_degree=0, background=None)
@@ -67,9 +70,9 @@ def floaters(
     few = max(1, round(len(cameras) / ONE_IN))
     largest, aired = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
     for camera, depth in zip(cameras, air, strict=True):
-        drawn = forward(*grey.parameters(), camera, options)
+        drawn = backend.forward(*grey.parameters(), camera, options)
         asked = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
-        weight = backward(drawn, asked, means2d_abs=False).sh[:, 0, 0]
+        weight = backend.backward(drawn, asked, means2d_abs=False).sh[:, 0, 0]
         total += weight
         x, y, z, shift = camera.world_to_camera[2].to(torch.float32).tolist()
         # Not a product of matrices: BLAS may round by the number of threads.
@@ -96,8 +99,9 @@ def fade_floaters(
     air: NDArray[np.float64],
     options: RasterOptions,
     pixel: float,
+    backend: Backend,
 ) -> int:
     """Make floaters too faint for density control to keep, in place; how many. See ``floaters``."""
-    found = floaters(gaussians, cameras, air, options, pixel)
+    found = floaters(gaussians, cameras, air, options, pixel, backend)
     gaussians.opacity_logits[found] = FAINT
     return int(found.sum())

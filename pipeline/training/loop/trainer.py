@@ -20,8 +20,7 @@ from torch import Tensor
 
 from pipeline.config.schema import Train
 from pipeline.plan.training_memory import machine_mb, memory_mb
-from pipeline.render import Forward, RasterCamera, RasterOptions, backward, forward, l1_ssim
-from pipeline.render.cpu import build
+from pipeline.render import Backend, Forward, RasterCamera, RasterOptions, make_backend
 from pipeline.render.views import near_plane, raster_camera
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
@@ -41,7 +40,7 @@ from pipeline.training.loop.metrics_log import Journal
 from pipeline.training.loop.schedule import Schedule
 from pipeline.training.loop.state import TrainState, Window
 from pipeline.training.loop.step_time_estimator import GAUSSIANS_A_STEP, Pace
-from pipeline.training.loop.step_timer import StepTimer, build_record, other_build
+from pipeline.training.loop.step_timer import StepTimer, other_build
 from pipeline.training.losses.depth import depth_gradients
 from pipeline.training.optimisers.adam import Adam, Rates
 
@@ -101,6 +100,7 @@ def train(
     checkpoint_dir: Path,
     journal: Path | None = None,
     on_log: Callable[[str], None] | None = None,
+    backend: Backend | None = None,
 ) -> TrainResult:
     """Optimise the first Gaussians until their renders look like the views.
 
@@ -115,6 +115,7 @@ def train(
         journal: file for how it goes, second by second (``training.loop.metrics_log``).
         on_log: called with one line for each warning, and for the instruction set, the compiler
             and the time a step takes.
+        backend: of the rasterizer; None: the default.
 
     Raises:
         UserError: no views or no Gaussians, unreadable pictures, no view sees a Gaussian, the
@@ -129,7 +130,9 @@ def train(
     torch_threads = torch.get_num_threads()
     torch.set_num_threads(1)
     try:
-        return _Run(inputs, config, seed, threads, memory_mb, checkpoint_dir, on_log).train(journal)
+        backend = backend or make_backend()
+        run = _Run(inputs, config, seed, threads, memory_mb, checkpoint_dir, on_log, backend)
+        return run.train(journal)
     finally:
         torch.set_num_threads(torch_threads)
 
@@ -154,9 +157,11 @@ class _Run:
         memory_mb: int | None,
         checkpoint_dir: Path,
         on_log: Callable[[str], None] | None,
+        backend: Backend,
     ):
         self.config, self.threads = config, threads
-        self.built = build.load()
+        self.backend = backend
+        self.build = dict(backend.facts())
         self.checkpoint_dir, self.on_log = checkpoint_dir, on_log
         self.warnings: list[str] = []
         self.schedule = Schedule.of(config)
@@ -201,7 +206,7 @@ class _Run:
         density.start(len(gaussians))
         cameras = MovingCameras.of(self.views, gaussians, inputs.extent, config)
         order = rng.permutation(len(self.views))
-        adam = Adam(gaussians, config.adam_beta1, self.own_frames)
+        adam = Adam(gaussians, config.adam_beta1, self.own_frames, self.backend)
         self.state = TrainState(gaussians, adam, density, cameras, rng, order)
 
     @property
@@ -233,7 +238,7 @@ class _Run:
         # What happened to checkpoints is told, but is no part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
         if found is not None:
-            if text := other_build(found.values, self.built):
+            if text := other_build(found.values, self.build):
                 self.log(text)
             state.restore(found.step, found.arrays, found.values)
         started = saved = time.monotonic()
@@ -242,7 +247,7 @@ class _Run:
         progress.start_at(state.clock)
         journal = Journal(journal_file, state.step)
         records = max(1, steps // CURVE_RECORDS)
-        timer = StepTimer(self.built, self.threads, steps - state.clock)
+        timer = StepTimer(self.build, self.threads, steps - state.clock)
         while state.clock < steps:
             before = state.clock
             self.step()
@@ -289,17 +294,17 @@ class _Run:
             gradients_per_pixel=config.gradients_per_pixel,
             threads=self.threads,
         )
-        rendered = forward(*state.gaussians.parameters(), camera, options)
+        rendered = self.backend.forward(*state.gaussians.parameters(), camera, options)
         wanted = target.over(background)
         gain = None if self.gains is None else self.gains[index]
         seen = rendered.color if gain is None else rendered.color * gain
-        loss = l1_ssim(
+        loss = self.backend.l1_ssim(
             seen, wanted, config.ssim_weight, target.ignored, config.square_weight, self.threads
         )
         self.check(float(loss.loss), rendered.num_visible, rendered.num_dropped, index)
         d_color = loss.grad if gain is None else loss.grad * gain
         rates = self.rates()
-        gradients = backward(
+        gradients = self.backend.backward(
             rendered,
             d_color,
             *self.further_gradients(rendered, target, index),
@@ -378,7 +383,9 @@ class _Run:
         options = RasterOptions(
             antialias=self.config.antialias, near=self.near, threads=self.threads
         )
-        found = fade_floaters(state.gaussians, cameras, air, options, pixel=factor**2)
+        found = fade_floaters(
+            state.gaussians, cameras, air, options, pixel=factor**2, backend=self.backend
+        )
         state.counters.floaters += found
         return found > 0
 
@@ -486,7 +493,7 @@ class _Run:
 
     def save(self) -> None:
         state = self.state
-        values = state.values() | {"built": build_record(self.built)}
+        values = state.values() | {"built": self.build}
         checkpoint.save(
             self.checkpoint_dir,
             Checkpoint(state.step, self.identity, state.arrays(), values),

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.config.schema import Train
-from pipeline.render import RasterOptions
+from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
@@ -62,7 +62,7 @@ def assert_same(a: TrainResult, b: TrainResult) -> None:
 def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
     """Kill the run in the middle of its ``call``-th step."""
     calls = 0
-    original = trainer.backward
+    original = make_backend().backward
 
     def dying(*args: object, **kwargs: object) -> object:
         nonlocal calls
@@ -71,7 +71,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
             raise KeyboardInterrupt
         return original(*args, **kwargs)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(trainer, "backward", dying)
+    monkeypatch.setattr(make_backend(), "backward", dying)
 
 
 def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) -> None:
@@ -351,7 +351,7 @@ def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
 def test_a_loss_that_is_no_number_is_a_clear_error(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = trainer.l1_ssim
+    original = make_backend().l1_ssim
     monkeypatch.setattr(
         trainer, "l1_ssim", lambda *args: replace(original(*args), loss=float("nan"))
     )

@@ -9,7 +9,6 @@ operators; ``render`` wraps the first two in autograd. Importing this package im
 
 from __future__ import annotations
 
-import importlib
 from typing import TYPE_CHECKING, Any
 
 from pipeline.render.types import (
@@ -57,8 +56,13 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
+    # Import statements rather than names in strings: stages' keys follow them to the code.
     if name in ("Backend", "make_backend"):
-        return getattr(importlib.import_module("pipeline.render.backend"), name)
+        from pipeline.render import backend
+
+        return getattr(backend, name)
     if name in __all__:
-        return getattr(importlib.import_module("pipeline.render.operators"), name)
+        from pipeline.render import operators
+
+        return getattr(operators, name)
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -87,3 +87,9 @@ def test_the_viewer_counts_for_what_makes_pages(project):
     before = hash_of("page"), hash_of("draw")
     viewer.write_text("two")
     assert hash_of("page") != before[0] and hash_of("draw") == before[1]
+
+
+def test_the_key_of_training_covers_the_backends() -> None:
+    """They are imported at first use only, which must not hide them."""
+    reached = source._reachable("pipeline.training.loop.trainer")
+    assert {"pipeline.render.cpu.backend", "pipeline.render.cpu.build"} <= reached

@@ -30,7 +30,7 @@ def look(name: str) -> Scan:
         (
             "nerf_lego",
             100,
-            ["decode", "features", "matches", "sfm", "refine", "undistort"],
+            ["decode", "features", "matches", "refine", "sfm", "undistort"],
             None,
             None,
         ),

@@ -15,7 +15,7 @@ from pipeline.runtime import targets
 from pipeline.runtime.errors import UserError
 from tests.render.cpu.compiled import compiled
 
-REPOSITORY = Path(__file__).parents[2]
+REPOSITORY = Path(__file__).parents[3]
 
 
 def test_source_hash_needs_no_torch_and_follows_the_sources(

@@ -351,9 +351,12 @@ def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
 def test_a_loss_that_is_no_number_is_a_clear_error(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = make_backend().l1_ssim
+    backend = make_backend()
+    original = backend.l1_ssim
     monkeypatch.setattr(
-        trainer, "l1_ssim", lambda *args: replace(original(*args), loss=float("nan"))
+        type(backend),
+        "l1_ssim",
+        lambda self, *args: replace(original(*args), loss=float("nan")),
     )
     with pytest.raises(UserError, match=r"not a number at step 1, view \d\.png"):
         run(scene, tmp_path)

@@ -25,13 +25,13 @@ TINY = {
 
 
 def copy_project(target: Path) -> Path:
-    """Copy the project's sources, without results, data and builds."""
+    """Copy the project's sources and their bytecode, without results, data and builds."""
     names = ("Snakefile", "pipeline", "stages", "profiles", "config", "pyproject.toml")
     target.mkdir(parents=True)
     for name in names:
         source = ROOT / name
         if source.is_dir():
-            shutil.copytree(source, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(source, target / name)
         else:
             shutil.copy(source, target / name)
     return target
@@ -125,6 +125,14 @@ def start_and_kill(
     else:
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def unlock(project: Path) -> None:
+    """What ``snakemake --unlock`` does, in no time."""
+    locks = list((project / ".snakemake" / "locks").iterdir())
+    assert locks
+    for lock in locks:
+        lock.unlink()
 
 
 def metrics(project: Path, scene: str) -> dict:

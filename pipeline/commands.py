@@ -28,7 +28,7 @@ from pipeline.runtime.progress import track
 from pipeline.scene.cameras import camera_views, choose_views, posed_scene, read_cameras
 from pipeline.scene.views import scene_extent
 from pipeline.splats.files import check_suffix, prepare, read_gaussians, write_gaussians
-from pipeline.training.render import near_plane, render_view
+from pipeline.training.render import near_plane, render_rgb
 
 
 @dataclass(frozen=True)
@@ -116,11 +116,11 @@ def render(
     gaussians = read_gaussians(model, warnings)
     files: set[Path] = set()
     for view in track(chosen, "rendering", len(chosen), unit="views"):
-        picture = render_view(gaussians, view, options)
+        rgb = render_rgb(gaussians, view, options)
         file = _png(out, view.name, files)
         files.add(file)
         buffer = io.BytesIO()
-        Image.fromarray(to_bytes(picture.rgb)).save(buffer, "PNG")
+        Image.fromarray(to_bytes(rgb)).save(buffer, "PNG")
         write_bytes(file, buffer.getvalue())
     return [f"{out}: {len(chosen)} views rendered"]
 

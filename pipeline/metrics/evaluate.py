@@ -25,7 +25,7 @@ from pipeline.scene.model import View
 from pipeline.scene.views import scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.poses import fit_pose
-from pipeline.training.render import near_plane, render_view
+from pipeline.training.render import near_plane, render_rgb
 
 #: Training views that are rendered, too: what the model makes of pictures that it has seen.
 NUM_SEEN = 8
@@ -146,7 +146,7 @@ def evaluate_views(
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )
-        return render_view(gaussians, view, options).rgb, photo, pixels.mask
+        return render_rgb(gaussians, view, options), photo, pixels.mask
 
     def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
         return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)

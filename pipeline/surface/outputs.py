@@ -21,7 +21,7 @@ from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
 from pipeline.surface.video import write_video
-from pipeline.training.render import render_view
+from pipeline.training.render import render_rgb, render_view
 
 DRAWN = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -69,7 +69,7 @@ def write_drawn(
         path = camera_path(views, _typical_depth(gaussians, views, options), up)
         write_json(out / "path.json", describe_path(path))
         frames = [
-            to_bytes(render_view(gaussians, view, options).rgb)
+            to_bytes(render_rgb(gaussians, view, options))
             for view in track(path, "drawing the video", len(path), unit="frames")
         ]
         write_video(out, frames, FPS)

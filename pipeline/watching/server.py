@@ -15,7 +15,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.model import View
 from pipeline.scene.rotations import quat_to_rotation
 from pipeline.scene.views import up_direction
-from pipeline.training.render import render_view
+from pipeline.training.render import render_rgb, render_view
 from pipeline.watching.source import Source
 
 # Pixels of the longer side while the camera moves; then the picture is made anew in full.
@@ -167,8 +167,8 @@ class Page:
 
     def render(self, view: View) -> NDArray[np.uint8]:
         with self.lock:
-            picture = render_view(self.source.shown.gaussians, view, self.options)
-        return to_bytes(picture.rgb)
+            rgb = render_rgb(self.source.shown.gaussians, view, self.options)
+        return to_bytes(rgb)
 
     def welcome(self, client: Any) -> None:
         self.visitors[client.client_id] = _Visitor(self, client)

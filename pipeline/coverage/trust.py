@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
@@ -129,6 +130,14 @@ def trust_picture(eye: Eye, photographs: Iterable[Eye], beyond: float) -> tuple[
     evidence = gather(photographs, points)
     found = trust(evidence.information, evidence.support, points.towards)
     return found.reshape(eye.depth.shape), evidence
+
+
+def trust_pictures(
+    eyes: Sequence[Eye], photographs: Sequence[Eye], beyond: float, threads: int
+) -> Iterator[tuple[Floats, Evidence]]:
+    """``trust_picture`` of each camera in order, ``threads`` at a time."""
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        yield from pool.map(lambda eye: trust_picture(eye, photographs, beyond), eyes)
 
 
 def _cosine(a: Floats, b: Floats) -> Floats:

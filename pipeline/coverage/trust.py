@@ -6,7 +6,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.coverage.sight import Eye, Floats, Points, Sighting, look_for, points_of
 
@@ -19,8 +18,6 @@ HALF_SQUARED = 2.0
 HALF_TURN = 0.134
 #: What is trusted less is little trusted.
 LITTLE = 0.5
-
-Indices = NDArray[np.intp]
 
 
 @dataclass

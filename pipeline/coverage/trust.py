@@ -7,7 +7,6 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.coverage.probe_views import Eye, Floats, Points, Sighting, look_for, points_of
 
@@ -20,8 +19,6 @@ HALF_SQUARED = 2.0
 HALF_TURN = 0.134
 #: What is trusted less is little trusted.
 LITTLE = 0.5
-
-Indices = NDArray[np.intp]
 
 
 @dataclass

@@ -51,11 +51,6 @@ class Built:
     compiler: str
 
 
-def used_libraries() -> dict[str, Built]:
-    """The libraries that this process has looked up so far, by name."""
-    return dict(_used)
-
-
 def native_facts() -> dict[str, str | None]:
     """The instruction set and the compiler of the libraries that this process used; where it used
     none, the instruction set that one would be looked for, and no compiler."""

@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from tests.e2e.harness import TINY, copy_project, copy_run, rules_run, snakemake
+from tests.tools import unsupported
 
 pytestmark = pytest.mark.slow
 
@@ -166,7 +167,7 @@ def test_results_that_cannot_be_written(finished, tmp_path):
         ["mount", "-t", "tmpfs", "-o", "size=300k", "tmpfs", str(disk)], check=False
     )
     if mounted.returncode != 0:
-        pytest.skip("needs the right to mount a small file system")
+        unsupported("needs the right to mount a small file system")
     try:
         small = copy_project(tmp_path / "small")
         shutil.copytree(finished / "data", small / "data")

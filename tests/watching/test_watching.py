@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.__main__ import main
+from pipeline.command.main import main
 from pipeline.runtime.errors import UserError
 from pipeline.scene.colmap import write_model
 from pipeline.scene.model import Camera, Posed, Reconstruction

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.__main__ import main
+from pipeline.command.main import main
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.io.colmap import write_model

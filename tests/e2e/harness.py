@@ -103,12 +103,18 @@ def rules_run(done: subprocess.CompletedProcess[str]) -> set[str]:
 
 
 def start_and_kill(
-    project: Path, target: str, ready: str, *, config: dict, only_snakemake: bool = False
+    project: Path,
+    target: str,
+    ready: str,
+    *,
+    config: dict,
+    cores: int = 2,
+    only_snakemake: bool = False,
 ) -> None:
     """Start Snakemake and SIGKILL it, with its jobs or alone, once a file matching ``ready``
     (a glob below the project) exists."""
     process = subprocess.Popen(
-        command(target, config=config),
+        command(target, config=config, cores=cores),
         cwd=project,
         env=environment(project),
         stdout=subprocess.DEVNULL,

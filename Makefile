@@ -6,12 +6,15 @@ CORES ?= all
 VENV := .venv
 BIN := $(VENV)/bin
 
-.PHONY: demo test test-native lint format docs viewer setup extension clean
+READERS := tests/io/independent
+
+.PHONY: demo test test-native test-packages lint format docs viewer setup extension clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
 	@echo "make test   run the tests;  make test-native  those of the C++ code alone"
+	@echo "make test-packages  other projects' packages that some tests compare with (needs Node)"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
 	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
@@ -23,7 +26,7 @@ help:
 export PYTHONDONTWRITEBYTECODE :=
 PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r
 
-# Three stamp files: the program's own packages, those of its extras, those of the developers.
+# A stamp file each: the program's own packages, those of its extras, of the developers, of tests.
 $(VENV)/product: pyproject.toml
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
@@ -38,7 +41,7 @@ $(VENV)/product: pyproject.toml
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
 
-$(VENV)/watch $(VENV)/dev: $(VENV)/product
+$(VENV)/watch $(VENV)/dev $(VENV)/test: $(VENV)/product
 	@echo "installing the packages of '$(@F)' into $(VENV)"
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
@@ -65,12 +68,21 @@ NATIVE_TESTS := tests/render tests/sfm/test_matching.py tests/training
 test-native: setup $(VENV)/dev
 	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
 
+# Other projects' readers and decoders: without them, the tests that compare with them are skipped.
+test-packages: $(VENV)/test $(READERS)/node_modules/.package-lock.json
+
+$(READERS)/node_modules/.package-lock.json: $(READERS)/package-lock.json
+	@echo "installing Node's packages into $(READERS)"
+	@cd $(READERS) && npm ci --no-audit --no-fund --loglevel=error
+	@touch $@
+
 lint: $(VENV)/dev
 	@$(BIN)/ruff check .
 	@$(BIN)/ruff format --check .
 	@$(BIN)/mypy
 	@$(BIN)/snakefmt --check Snakefile
 	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
+	@$(BIN)/python -m tests.style.words
 
 format: $(VENV)/dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile

@@ -42,7 +42,7 @@ localrules:
     plan,
 
 
-report: "pipeline/reporting/captions/workflow.rst"
+report: project.packaged("pipeline/reporting/captions/workflow.rst")
 
 
 rule all:
@@ -58,13 +58,13 @@ rule benchmark:
     output:
         table=report(
             "results/benchmark.csv",
-            caption="pipeline/reporting/captions/benchmark.rst",
+            caption=project.packaged("pipeline/reporting/captions/benchmark.rst"),
             category="Batch",
         ),
         data="results/benchmark.json",
         page=report(
             "results/index.html",
-            caption="pipeline/reporting/captions/index.rst",
+            caption=project.packaged("pipeline/reporting/captions/index.rst"),
             category="Batch",
         ),
     params:
@@ -78,7 +78,7 @@ rule plan:
         plan="results/{scene}/plan.json",
         picture=report(
             "results/{scene}/plan.svg",
-            caption="pipeline/reporting/captions/plan.rst",
+            caption=project.packaged("pipeline/reporting/captions/plan.rst"),
             category="{scene}",
         ),
     params:
@@ -99,7 +99,9 @@ for spec in project.stages:
         output:
             **{
                 f"published_{number}": report(
-                    f"results/{{scene}}/{file}", caption=caption, category="{scene}"
+                    f"results/{{scene}}/{file}",
+                    caption=project.packaged(caption),
+                    category="{scene}",
                 )
                 for number, (file, caption) in enumerate(spec.publishes.items())
             },

@@ -40,12 +40,18 @@ MILLISECONDS = 600_000  # the processor draws every pixel
 CAMERAS = 3
 
 
+def chromium() -> str | None:
+    """An installed Chromium."""
+    names = ("chromium", "chromium-browser", "chromium-headless-shell", "chrome", "google-chrome")
+    return next(filter(None, map(shutil.which, names)), None)
+
+
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
     parser.add_argument("results", type=Path, help="a finished scene, for example results/demo")
     results = parser.parse_args().results
-    chromium = next(filter(None, map(shutil.which, ("chromium", "chromium-browser"))), None)
-    if chromium is None:
+    browser = chromium()
+    if browser is None:
         print("error: no Chromium on PATH", file=sys.stderr)
         return 2
     scene = posed_scene(results, None, None)
@@ -65,18 +71,18 @@ def main() -> int:
         text = page.read_text("utf-8")
         swapped.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, text), "utf-8")
         for what, file in (("the page's SPZ", page.resolve()), ("the PLY", swapped)):
-            for view, own, theirs in zip(views, ours, drawn(chromium, file, views), strict=True):
+            for view, own, theirs in zip(views, ours, drawn(browser, file, views), strict=True):
                 print(f"{what} {view.name}: {psnr(theirs / 255, own / 255):.2f} dB")
     return 0
 
 
-def drawn(chromium: str, page: Path, views: list[View]) -> Iterator[Any]:
+def drawn(browser: str, page: Path, views: list[View]) -> Iterator[Any]:
     """(H, W, 3) uint8 of each view, as the page's viewer draws it."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:
-        browser = driver.chromium.launch(executable_path=chromium, args=FLAGS, timeout=MILLISECONDS)
-        opened = browser.new_page(viewport={"width": 480, "height": 400})
+        launched = driver.chromium.launch(executable_path=browser, args=FLAGS, timeout=MILLISECONDS)
+        opened = launched.new_page(viewport={"width": 480, "height": 400})
         opened.set_default_timeout(MILLISECONDS)
         opened.goto(page.as_uri())
         opened.evaluate("viewer.ready")
@@ -84,7 +90,7 @@ def drawn(chromium: str, page: Path, views: list[View]) -> Iterator[Any]:
             url = opened.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
             png = base64.b64decode(url.partition(",")[2])
             yield np.asarray(Image.open(io.BytesIO(png)).convert("RGB"))
-        browser.close()
+        launched.close()
 
 
 if __name__ == "__main__":

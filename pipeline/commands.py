@@ -18,7 +18,7 @@ from pipeline.io.splat_files import check_suffix, read_gaussians, write_gaussian
 from pipeline.metrics.evaluate import BLACK, NO_GAINS, WHITE, choose_protocol, evaluate_views
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render import RasterOptions
-from pipeline.render.views import near_plane, render_view, to_bytes
+from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
@@ -111,11 +111,11 @@ def render(
     gaussians = read_gaussians(model, warnings)
     files: set[Path] = set()
     for view in track(chosen, "rendering", len(chosen), unit="views"):
-        picture = render_view(gaussians, view, options)
+        rgb = render_rgb(gaussians, view, options)
         file = _png(out, view.name, files)
         files.add(file)
         buffer = io.BytesIO()
-        Image.fromarray(to_bytes(picture.rgb)).save(buffer, "PNG")
+        Image.fromarray(to_bytes(rgb)).save(buffer, "PNG")
         write_bytes(file, buffer.getvalue())
     return [f"{out}: {len(chosen)} views rendered"]
 

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.__main__ import main
+from pipeline.command.main import main
 from pipeline.config.schema import Config
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
@@ -268,12 +268,12 @@ def test_wrong_arguments_exit_with_2(arguments, capsys):
     with pytest.raises(SystemExit) as caught:
         main(arguments)
     assert caught.value.code == 2
-    assert "usage: python -m pipeline" in capsys.readouterr().err
+    assert "usage: splatmake" in capsys.readouterr().err
 
 
 def test_help_is_there_at_once():
     code = (
-        "import sys\nfrom pipeline.__main__ import main\n"
+        "import sys\nfrom pipeline.command.main import main\n"
         "try:\n    main(['evaluate', '--help'])\nfinally:\n    assert 'torch' not in sys.modules"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)

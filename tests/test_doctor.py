@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from pipeline import doctor
-from pipeline.__main__ import main
+from pipeline.command.main import main
 from pipeline.runtime import processor
 
 REPOSITORY = Path(__file__).parents[1]
@@ -128,7 +128,7 @@ def test_it_needs_none_of_the_packages(tmp_path):
     code = (
         "import sys\n"
         "for name in ('torch', 'numpy', 'pydantic', 'scipy'): sys.modules[name] = None\n"
-        "from pipeline.__main__ import main\n"
+        "from pipeline.command.main import main\n"
         "sys.exit(main(['doctor']))\n"
     )
     run = [sys.executable, "-c", code]

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Config, ExportFormat
+from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.splat_files import read_gaussians
@@ -21,7 +22,7 @@ from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, Posed, Reconstruction
 from pipeline.surface.outputs import DRAWN
-from stages.export import WRITERS, run
+from stages.export import work
 from tests.splats.samples import sample
 
 FORMATS = get_args(ExportFormat)
@@ -72,9 +73,10 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
         scratch=out.parent,
         shared_cache=out.parent,
         threads=1,
+        memory_mb=None,
         logs=out.parent,
     )
-    run(job)
+    work(job)
     final = scene / "export"
     out.rename(final)
     return final, job

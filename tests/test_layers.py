@@ -15,7 +15,7 @@ ROOMS = (
     *("metrics", "coverage", "surface", "export", "reporting", "watching", "demo"),
 )
 PACKAGES = ("training",)  # hold rooms, and nothing else
-MODULES = ("commands", "doctor", "__main__")  # the command line: below all rooms
+MODULES = ("api", "commands", "command", "doctor", "__main__")  # the command line and the API
 
 
 def room_of(module: str) -> str:

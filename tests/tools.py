@@ -1,29 +1,79 @@
-"""Compilers and other programs that tests use where they are installed."""
+"""What tests need beside the product's own packages, and what happens where it is missing.
+
+A test is skipped where a program, a package or a file is missing. With SPLATMAKE_REQUIRE_ALL set,
+as in CI, tests/conftest.py fails it instead, unless no package can help (``unsupported``).
+"""
 
 from __future__ import annotations
 
 import os
 import shutil
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import NoReturn
 
 import pytest
+
+#: Real photographs, which lie beside the repository on some machines.
+SHARED_DATA = Path(__file__).resolve().parents[2] / "shared" / "data"
 
 PACKAGES = {
     "g++": "g++",
     "clang++": "clang",
     "aarch64-linux-gnu-g++": "g++-aarch64-linux-gnu",
     "aarch64-linux-gnu-objdump": "binutils-aarch64-linux-gnu",
+    "node": "nodejs",
     "objdump": "binutils",
     "qemu-aarch64": "qemu-user",
 }
+UNSUPPORTED = "not on this machine: "
 
 
 def need(*programs: str) -> None:
-    """Skips the test where one is missing; with SPLATMAKE_REQUIRE_COMPILERS, as in CI, fails it."""
+    """Skips the test where one is missing."""
     lacking = [program for program in programs if shutil.which(program) is None]
-    if not lacking:
-        return
-    packages = " ".join(PACKAGES.get(program, program) for program in lacking)
-    text = f"not run: {', '.join(lacking)} missing (apt-get install {packages})"
-    if os.environ.get("SPLATMAKE_REQUIRE_COMPILERS"):
-        pytest.fail(text)
-    pytest.skip(text)
+    if lacking:
+        packages = " ".join(PACKAGES.get(program, program) for program in lacking)
+        pytest.skip(f"not run: {', '.join(lacking)} missing (apt-get install {packages})")
+
+
+def need_package(name: str, exactly: str | None = None) -> None:
+    """Skips the test where a Python package, or this version of it, is not installed."""
+    try:
+        found = version(name)
+    except PackageNotFoundError:
+        found = "missing"
+    if found == "missing" or exactly not in (None, found):
+        wanted = name if exactly is None else f"{name}=={exactly}"
+        pytest.skip(f"not run: {name} {found} (pip install {wanted})")
+
+
+def need_data(name: str) -> Path:
+    """A file or folder of the shared data; skips the test where it is missing."""
+    path = SHARED_DATA / name
+    if not path.exists():
+        unsupported(f"{path} is missing")
+    return path
+
+
+def unsupported(reason: str) -> NoReturn:
+    """Skips a test that this processor, this system or this machine's data does not allow."""
+    pytest.skip(UNSUPPORTED + reason)
+
+
+def fail_skipped(
+    report: pytest.TestReport | pytest.CollectReport,
+) -> pytest.TestReport | pytest.CollectReport:
+    """The report, failed if SPLATMAKE_REQUIRE_ALL is set and the test was skipped for want of
+    something that can be installed."""
+    if (
+        os.environ.get("SPLATMAKE_REQUIRE_ALL")
+        and report.skipped
+        and not hasattr(report, "wasxfail")
+    ):
+        # pytest's form of a skip: file, line, "Skipped: reason".
+        reason = report.longrepr[2] if isinstance(report.longrepr, tuple) else str(report.longrepr)
+        if not reason.removeprefix("Skipped: ").startswith(UNSUPPORTED):
+            report.outcome = "failed"
+            report.longrepr = f"SPLATMAKE_REQUIRE_ALL is set, and this test did not run: {reason}"
+    return report

@@ -27,7 +27,6 @@ PICTURES: dict[str, Look] = {
     "pictures_blurred": "blurred",
 }
 VIEWS, WIDTH, HEIGHT = 14, 320, 240
-STEP_DEGREES = 12.0
 # Heavy blur: sigma in pixels of 320.
 BLUR = 5.0
 

@@ -15,9 +15,9 @@ from PIL import Image
 
 from pipeline.config.schema import Train
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.probe_views import Bools, Doubles, Draw, Eye, Floats, open_eye, points_of
+from pipeline.coverage.probe_views import Bools, Doubles, Draw, Eye, Floats, open_eyes, points_of
 from pipeline.coverage.summary import describe
-from pipeline.coverage.trust import LITTLE, gather, trust_picture
+from pipeline.coverage.trust import LITTLE, gather, trust_pictures
 from pipeline.coverage.viewpoints import Outlook, propose
 from pipeline.metrics.evaluate import Protocol, reference
 from pipeline.photos.load import load_view, resize_area
@@ -102,21 +102,20 @@ def measure_coverage(
         views: all with a pose.
         evaluation: what ``evaluate_views`` returned.
         renders: folder of the renders that it names.
+        threads: views rendered or judged at a time.
 
     Returns:
         The content of ``coverage.json``.
     """
 
-    options = protocol.options(train, threads)
+    options = protocol.options(train, threads=1)
 
     def draw(view: View) -> Render:
         return render_view(gaussians, view, options)
 
     training = _evenly([view for view in views if not view.is_test], MAX_PHOTOGRAPHS)
-    eyes = [
-        open_eye(view, draw)
-        for view in track(training, "looking at what was seen", len(training), unit="views")
-    ]
+    opened = open_eyes(training, draw, threads)
+    eyes = list(track(opened, "looking at what was seen", len(training), unit="views"))
     depths = np.concatenate([eye.depth[~eye.open] for eye in eyes])
     result: dict[str, Any] = {
         "photographs": sum(not view.is_test for view in views),
@@ -127,11 +126,11 @@ def measure_coverage(
         return _written(out, result | {"reason": "the scene shows no surface"})
     beyond = float(np.percentile(depths, 95))
     surface, nearest = _surface(_evenly(eyes, MAX_SAMPLED), eyes, beyond)
-    asked = _held_out(evaluation, renders, protocol, eyes, draw, beyond, nearest)
+    asked = _held_out(evaluation, renders, protocol, eyes, draw, beyond, nearest, threads)
     # All photographs that there are: nobody need take a held-out one again.
     known = [*eyes, *(item.eye for item in asked)]
     cameras = [*training, *(_named(views, item.eye.view.name) for item in asked)]
-    outlook = propose(cameras, known, draw, world.up, beyond)
+    outlook = propose(cameras, known, draw, world.up, beyond, threads)
     floaters = near_floaters(gaussians, eyes, known[len(eyes) :], nearest)
     result |= {
         "surface": surface,
@@ -153,9 +152,9 @@ def measure_coverage(
     shown = sorted(shown, key=lambda item: item.record["trust"])[:SHOWN]
     for i, item in enumerate(shown):
         item.record.update(_pictures(out, f"view_{i + 1}", item.eye, item.trust))
-    for i, proposal in enumerate(outlook.proposals):
-        picture, _ = trust_picture(proposal.eye, known, beyond)
-        result["viewpoints"][i] |= _pictures(out, f"next_{i + 1}", proposal.eye, picture)
+    proposed = [proposal.eye for proposal in outlook.proposals]
+    for i, (picture, _) in enumerate(trust_pictures(proposed, known, beyond, threads)):
+        result["viewpoints"][i] |= _pictures(out, f"next_{i + 1}", proposed[i], picture)
     return _written(out, result)
 
 
@@ -209,15 +208,17 @@ def _held_out(
     draw: Draw,
     beyond: float,
     nearest: float,
+    threads: int,
 ) -> list[Asked]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
     measured = [item for item in evaluation["per_view"] if item["name"] in by_name]
     measured = _evenly(measured, MAX_HELD_OUT)
+    views = [by_name[item["name"]] for item in measured]
+    asking = list(open_eyes(views, draw, threads))
+    mapped = trust_pictures(asking, eyes, beyond, threads)
+    mapped = track(mapped, "mapping trust", len(measured), unit="views")
     result = []
-    for item in track(measured, "mapping trust", len(measured), unit="views"):
-        view = by_name[item["name"]]
-        eye = open_eye(view, draw)
-        picture, evidence = trust_picture(eye, eyes, beyond)
+    for item, view, eye, (picture, evidence) in zip(measured, views, asking, mapped, strict=True):
         pixels = load_view(view.image, view.mask, view.width, view.height)
         photo = reference(pixels, protocol.background)
         with Image.open(renders / item["render"]) as render:

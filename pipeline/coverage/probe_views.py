@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -119,6 +120,13 @@ def open_eye(view: View, draw: Draw) -> Eye:
     near, far = _windows(depth)
     focal = float(np.sqrt(view.fx * view.fy))
     return Eye(small, focal, drawn.rgb, depth, near, far, counts)
+
+
+def open_eyes(views: Sequence[View], draw: Draw, threads: int) -> Iterator[Eye]:
+    """``open_eye`` of each view in order, ``threads`` at a time: renders so small leave the
+    rasterizer's own threads little to share."""
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        yield from pool.map(lambda view: open_eye(view, draw), views)
 
 
 def _windows(depth: Floats) -> tuple[Floats, Floats]:

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.coverage.probe_views import Eye, Floats, Points, Sighting, look_for, points_of
 
@@ -19,8 +19,6 @@ HALF_SQUARED = 2.0
 HALF_TURN = 0.134
 #: What is trusted less is little trusted.
 LITTLE = 0.5
-
-Indices = NDArray[np.intp]
 
 
 @dataclass
@@ -129,6 +127,14 @@ def trust_picture(eye: Eye, photographs: Iterable[Eye], beyond: float) -> tuple[
     evidence = gather(photographs, points)
     found = trust(evidence.information, evidence.support, points.towards)
     return found.reshape(eye.depth.shape), evidence
+
+
+def trust_pictures(
+    eyes: Sequence[Eye], photographs: Sequence[Eye], beyond: float, threads: int
+) -> Iterator[tuple[Floats, Evidence]]:
+    """``trust_picture`` of each camera in order, ``threads`` at a time."""
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        yield from pool.map(lambda eye: trust_picture(eye, photographs, beyond), eyes)
 
 
 def _cosine(a: Floats, b: Floats) -> Floats:

@@ -15,7 +15,7 @@ from pipeline.coverage.probe_views import (
     Eye,
     Points,
     look_for,
-    open_eye,
+    open_eyes,
     points_of,
 )
 from pipeline.coverage.trust import gather, trust
@@ -96,7 +96,12 @@ class Outlook:
 
 
 def propose(
-    views: Sequence[View], eyes: Sequence[Eye], draw: Draw, up: Doubles, beyond: float
+    views: Sequence[View],
+    eyes: Sequence[Eye],
+    draw: Draw,
+    up: Doubles,
+    beyond: float,
+    threads: int = 1,
 ) -> Outlook:
     """Viewpoints that together raise the trust most, each after those before it.
 
@@ -110,8 +115,9 @@ def propose(
         views: the photographs' cameras, at their own size. eyes: the same, in the same order.
         up: (3,) the world's.
         beyond: depth to take where a ray meets no surface, world unit.
+        threads: viewpoints rendered at a time.
     """
-    viewpoints, opened = _with_sight(_around(views, eyes, up), draw)
+    viewpoints, opened = _with_sight(_around(views, eyes, up), draw, threads)
     if not viewpoints:
         return Outlook([], [], 0.0, 0.0)
     points, owner = _surfaces(opened, beyond)
@@ -245,12 +251,15 @@ def _room(viewpoints: Sequence[Viewpoint], eyes: Sequence[Eye], up: Doubles) -> 
     return np.asarray(free | (near & ~hidden & (xyz @ up >= lowest)))
 
 
-def _with_sight(viewpoints: list[Viewpoint], draw: Draw) -> tuple[list[Viewpoint], list[Eye]]:
+def _with_sight(
+    viewpoints: list[Viewpoint], draw: Draw, threads: int
+) -> tuple[list[Viewpoint], list[Eye]]:
     """Those that have sight of something, and what they see."""
     kept: list[Viewpoint] = []
     eyes: list[Eye] = []
-    for viewpoint in track(viewpoints, "looking around", len(viewpoints), unit="viewpoints"):
-        eye = open_eye(viewpoint.view, draw)
+    opened = open_eyes([viewpoint.view for viewpoint in viewpoints], draw, threads)
+    opened = track(opened, "looking around", len(viewpoints), unit="viewpoints")
+    for viewpoint, eye in zip(viewpoints, opened, strict=True):
         nearest = np.percentile(np.where(eye.open, 1e30, eye.depth), 10)
         if eye.open.mean() <= MAX_OPEN and nearest >= MIN_ROOM * viewpoint.distance:
             kept.append(viewpoint)

@@ -19,7 +19,7 @@ from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
 from pipeline.render import RasterOptions
-from pipeline.render.views import near_plane, render_view, to_bytes
+from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.views import View, scene_extent
@@ -145,7 +145,7 @@ def evaluate_views(
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )
-        return render_view(gaussians, view, options).rgb, photo, pixels.mask
+        return render_rgb(gaussians, view, options), photo, pixels.mask
 
     def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
         return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)

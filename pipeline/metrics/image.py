@@ -23,7 +23,6 @@ PSNR_CAP = 100.0
 """dB, reported for identical pictures: JSON has no infinity."""
 
 SSIM_VARIANT = "3DGS: 11x11 Gaussian, sigma 1.5, zero padding, mean over channels"
-SSIM_VALID_VARIANT = "11x11 Gaussian, sigma 1.5, valid region only, mean over channels"
 
 _RADIUS = 5
 _SIGMA = 1.5

@@ -206,6 +206,8 @@ def _split(picture: Picture) -> tuple[Picture, Picture | None]:
     alpha = np.ascontiguousarray(picture[..., -1]) if channels in (2, 4) else None
     if channels <= 2:
         return np.repeat(picture[..., :1], 3, axis=2), alpha
+    if channels == 3:  # By cv2, which is several times as fast as a copy of a reversed view.
+        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), alpha
     return np.ascontiguousarray(picture[..., 2::-1]), alpha
 
 

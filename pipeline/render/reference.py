@@ -266,17 +266,18 @@ def blend(
 
     in order of depth, equal depths by index. A pixel stops before the Gaussian that would take its
     transmittance below 1e-4. Gradients go to the first ``gradients_per_pixel`` that a pixel draws.
+    ``projection.means2d`` may be (H W, V, 2), a centre for each pixel.
     """
     dtype, height, width = colors.dtype, camera.height, camera.width
     order = torch.sort(projection.depths.detach().float(), stable=True).indices
-    center, conic = projection.means2d[order], projection.conics[order]
+    center, conic = projection.means2d[..., order, :], projection.conics[order]
     depth, color = projection.depths[order], colors[order]
     grid_y, grid_x = torch.meshgrid(
         torch.arange(height, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5,
         indexing="ij",
     )  # fmt: skip
-    dx = grid_x.reshape(-1, 1) - center[:, 0]
-    dy = grid_y.reshape(-1, 1) - center[:, 1]
+    dx = grid_x.reshape(-1, 1) - center[..., 0]
+    dy = grid_y.reshape(-1, 1) - center[..., 1]
     power = -0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) - conic[:, 1] * dx * dy
     raw = projection.opacities[order] * power.exp()
     alpha = torch.where(raw >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     import torch
@@ -56,6 +58,48 @@ class RasterOptions:
     black_stays: bool = False
     gradients_per_pixel: int = 0
     threads: int = 0
+
+
+@dataclass(frozen=True)
+class Forward:
+    """A drawn view and what ``backward`` needs of it. Do not write to its tensors.
+
+    Attributes:
+        color: (H, W, 3) float32, the background included.
+        alpha: (H, W) float32, 1 - transmittance.
+        radii: (N,) float32 pixels along the long axis out to where alpha falls to 1/255;
+            0: not visible.
+        num_visible: Gaussians that touch the image.
+        num_dropped: Gaussians left out because a value is not finite or degenerate.
+        num_intersections: (Gaussian, tile) pairs, what memory and time go with.
+        draw_depths: draws ``depth`` and ``median_depth``.
+        state: the backend's own.
+    """
+
+    color: torch.Tensor
+    alpha: torch.Tensor
+    radii: torch.Tensor
+    num_visible: int
+    num_dropped: int
+    num_intersections: int
+    draw_depths: Callable[[], tuple[torch.Tensor, torch.Tensor]]
+    state: Any
+
+    @cached_property
+    def _depths(self) -> tuple[torch.Tensor, torch.Tensor]:
+        # At first use: a training step that needs neither does not pay for them.
+        return self.draw_depths()
+
+    @property
+    def depth(self) -> torch.Tensor:
+        """(H, W) float32, sum of weight * camera z, not divided by alpha."""
+        return self._depths[0]
+
+    @property
+    def median_depth(self) -> torch.Tensor:
+        """(H, W) float32, camera z of the Gaussian that takes the transmittance below 0.5; 0 where
+        none does."""
+        return self._depths[1]
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""Pictures for pages: error maps, display orientation, JPEG inside HTML, a montage."""
+"""Pictures for pages: error maps, display orientation, JPEG inside HTML."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import base64
 import io
 from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -14,7 +13,6 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.reporting.data import Comparison
-from pipeline.runtime.atomic import write_bytes
 
 Picture = NDArray[np.uint8]
 
@@ -151,32 +149,3 @@ def _jpeg(picture: Picture) -> bytes:
 
 def _data_uri(jpeg: bytes) -> str:
     return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
-
-
-def montage(views: Sequence[Comparison], *, max_side: int = 480, gap: int = 8) -> Picture:
-    """Photograph | render | error map, a row a view, on white.
-
-    Args:
-        max_side: longest side of a single picture, in pixels.
-        gap: white pixels between pictures.
-    """
-    rows = [[shrunk(picture, max_side) for picture in triple(view)] for view in views]
-    widths = [3 * row[0].shape[1] + 2 * gap for row in rows]
-    height = sum(row[0].shape[0] for row in rows) + gap * (len(rows) - 1)
-    canvas = np.full((height, max(widths), 3), 255, np.uint8)
-    y = 0
-    for row, width in zip(rows, widths, strict=True):
-        x = (canvas.shape[1] - width) // 2
-        for picture in row:
-            h, w = picture.shape[:2]
-            canvas[y : y + h, x : x + w] = picture
-            x += w + gap
-        y += row[0].shape[0] + gap
-    return canvas
-
-
-def write_montage(views: Sequence[Comparison], path: Path, *, max_side: int = 480) -> None:
-    """Write ``montage`` as PNG, whole or not at all."""
-    buffer = io.BytesIO()
-    Image.fromarray(montage(views, max_side=max_side)).save(buffer, "PNG", optimize=True)
-    write_bytes(path, buffer.getvalue())

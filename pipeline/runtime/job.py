@@ -43,6 +43,7 @@ from pydantic import BaseModel
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.layout import IS_CHECKOUT, PACKAGES
 from pipeline.runtime.machine import machine_facts
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.runtime.native import native_facts
@@ -393,6 +394,8 @@ def versions() -> dict[str, str]:
         "scipy",
         "rawpy",
         "snakemake",
+        # A checkout has a commit instead.
+        *(() if IS_CHECKOUT else ("splatmake",)),
     ):
         try:
             found[name] = version(name)
@@ -402,7 +405,10 @@ def versions() -> dict[str, str]:
 
 
 def _commit() -> str | None:
-    git = ["git", "-C", str(Path(__file__).parent), "rev-parse", "HEAD"]
+    """The checkout's commit. An installed package may lie in someone else's repository."""
+    if not IS_CHECKOUT:
+        return None
+    git = ["git", "-C", str(PACKAGES), "rev-parse", "HEAD"]
     try:
         done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
     except (OSError, subprocess.TimeoutExpired):

@@ -4,7 +4,8 @@ A library lies in ``<root>/<file>-<variant>-<digest>/`` beside ``library.json``,
 sources' hash, the variant (``pipeline.runtime.targets``), flags, compiler and versions. Variants
 lie side by side, so that the nodes of a mixed cluster can share a folder, and a library is found by
 its record without a compiler. The roots are ``pipeline/prebuilt`` (for packages that bring their
-libraries) and $SPLATMAKE_CACHE, by default ``build/native`` of the repository.
+libraries) and $SPLATMAKE_CACHE, by default ``build/native`` of the repository, or a folder in the
+user's cache where the program is installed.
 """
 
 from __future__ import annotations
@@ -25,12 +26,12 @@ from typing import Any
 
 from pipeline.runtime import targets
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
+from pipeline.runtime.layout import IS_CHECKOUT, PACKAGES, PREBUILT, user_cache
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.processor import processor
 from pipeline.runtime.targets import Extensions, Target, Variant
 
 RECORD = "library.json"
-PREBUILT = Path(__file__).parents[1] / "prebuilt"
 # In order of preference where $CXX is not set. macOS's g++ is clang under another name.
 COMPILERS = ("c++", "clang++") if sys.platform == "darwin" else ("g++", "clang++")
 
@@ -49,11 +50,6 @@ class Built:
     path: Path
     target: str
     compiler: str
-
-
-def used_libraries() -> dict[str, Built]:
-    """The libraries that this process has looked up so far, by name."""
-    return dict(_used)
 
 
 def native_facts() -> dict[str, str | None]:
@@ -224,7 +220,9 @@ class NativeLibrary:
 def cache_folder() -> Path:
     """Where libraries are built."""
     chosen = os.environ.get("SPLATMAKE_CACHE")
-    return Path(chosen) if chosen else Path(__file__).parents[2] / "build" / "native"
+    if chosen:
+        return Path(chosen)
+    return PACKAGES / "build" / "native" if IS_CHECKOUT else user_cache() / "native"
 
 
 def _roots() -> list[Path]:

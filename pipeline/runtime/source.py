@@ -3,11 +3,18 @@
 from __future__ import annotations
 
 import ast
+import contextlib
 import hashlib
+import json
 import re
+import sys
 from collections.abc import Iterator
 from functools import cache
 from pathlib import Path
+from typing import Any
+
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.native import cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -27,6 +34,11 @@ NATIVE = {
     "pipeline.sfm.nearest": "pipeline/sfm/csrc",
 }
 
+# Module -> the digest of its file, the names that it imports, the hash of its syntax tree. Parsing
+# all modules takes longer than the rest of Snakemake's start.
+RECORD = "sources.json"
+_unsaved: set[str] = set()
+
 _COMMENT = re.compile(r'//[^\n]*|/\*.*?\*/|("(?:\\.|[^"\\])*")', re.S)
 
 
@@ -35,11 +47,12 @@ def stage_source_hash(module: str) -> str:
 
     Python counts by its syntax tree without docstrings, C++ by its text without comments and
     spacing, so that neither comments nor formatting change the hash; the pages' viewer by its
-    bytes.
+    bytes. What is parsed is kept beside the compiled libraries, for the next process.
     """
     digest = hashlib.sha256()
     for name in sorted(_reachable(module)):
         digest.update(f"{name}={_module_hash(name)}\n".encode())
+    _keep_parsed()
     return digest.hexdigest()[:16]
 
 
@@ -64,44 +77,17 @@ def _file_of(module: str) -> Path | None:
 
 
 @cache
-def _tree(module: str) -> ast.Module | None:
-    file = _file_of(module)
-    return None if file is None else ast.parse(file.read_text(), filename=str(file))
-
-
-@cache
 def _imports(module: str) -> tuple[str, ...]:
-    found: list[str] = []
-    tree = _tree(module)
-    if tree is None:
-        return ()
-    for node in _runtime_nodes(tree):
-        if isinstance(node, ast.Import):
-            found += [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
-            found.append(node.module)
-            found += [f"{node.module}.{alias.name}" for alias in node.names]
-    ours = [n for n in found if n.split(".")[0] in ("pipeline", "stages") and _file_of(n)]
+    ours = [n for n in _parsed(module)[0] if n.split(".")[0] in ("pipeline", "stages")]
+    ours = [n for n in ours if _file_of(n)]
     # A package's __init__ runs before its modules do.
     parents = [n.rpartition(".")[0] for n in ours if "." in n]
     return tuple(sorted({*ours, *(p for p in parents if _file_of(p))}))
 
 
-def _runtime_nodes(tree: ast.AST) -> Iterator[ast.AST]:
-    """All nodes but those below ``if TYPE_CHECKING:``."""
-    for node in ast.iter_child_nodes(tree):
-        if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
-            continue
-        yield node
-        yield from _runtime_nodes(node)
-
-
 @cache
 def _module_hash(module: str) -> str:
-    tree = _tree(module)
-    digest = hashlib.sha256()
-    if tree is not None:
-        digest.update(ast.dump(_without_docstrings(tree)).encode())
+    digest = hashlib.sha256(_parsed(module)[1].encode())
     if module in NATIVE:
         for file in sorted((ROOT / NATIVE[module]).glob("*")):
             if file.suffix in (".cpp", ".h"):
@@ -112,11 +98,54 @@ def _module_hash(module: str) -> str:
     return digest.hexdigest()
 
 
+# --- parsing ----------------------------------------------------------------------------------
+
+
+@cache
+def _parsed(module: str) -> tuple[list[str], str]:
+    """The names that a module imports, and the hash of its syntax tree."""
+    file = _file_of(module)
+    if file is None:
+        return [], ""
+    text = file.read_bytes()
+    digest = hashlib.sha256(text).hexdigest()
+    known = _record().get(module)
+    if known is None or known[0] != digest:
+        tree = ast.parse(text, filename=str(file))
+        code = ast.dump(_without_docstrings(tree))
+        known = [digest, _imported(tree), hashlib.sha256(code.encode()).hexdigest()]
+        _record()[module] = known
+        _unsaved.add(module)
+    return known[1], known[2]
+
+
+def _imported(tree: ast.Module) -> list[str]:
+    found: list[str] = []
+    for node in _statements(tree):
+        if isinstance(node, ast.Import):
+            found += [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom) and node.module and node.level == 0:
+            found.append(node.module)
+            found += [f"{node.module}.{alias.name}" for alias in node.names]
+    return found
+
+
 def _without_docstrings(tree: ast.Module) -> ast.Module:
-    for node in ast.walk(tree):
+    for node in _statements(tree):
         if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef | ast.AsyncFunctionDef):
             node.body = [n for n in node.body if not _is_string(n)] or [ast.Pass()]
     return tree
+
+
+def _statements(node: ast.AST) -> Iterator[ast.AST]:
+    """A module or statement and all statements inside it, at any depth, but what is imported for
+    type checkers alone."""
+    yield node
+    only_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+    for name in ("body", "handlers", "orelse", "finalbody", "cases"):
+        inside = () if name == "body" and only_types else getattr(node, name, ())
+        for statement in inside if isinstance(inside, list) else ():
+            yield from _statements(statement)
 
 
 def _is_string(node: ast.stmt) -> bool:
@@ -125,3 +154,26 @@ def _is_string(node: ast.stmt) -> bool:
         and isinstance(node.value, ast.Constant)
         and isinstance(node.value.value, str)
     )
+
+
+@cache
+def _record() -> dict[str, list[Any]]:
+    """What earlier processes have parsed in the same way; ``_parsed`` adds to it."""
+    try:
+        stored = json.loads((cache_folder() / RECORD).read_text())
+        return dict(stored["modules"]) if stored["parser"] == _parser() else {}
+    except (OSError, ValueError, LookupError, TypeError):
+        return {}
+
+
+def _keep_parsed() -> None:
+    if _unsaved:
+        with contextlib.suppress(OSError):  # it only saves time
+            write_json(cache_folder() / RECORD, {"parser": _parser(), "modules": _record()})
+        _unsaved.clear()
+
+
+def _parser() -> str:
+    """What decides the hash of a syntax tree: Python's version and this file."""
+    own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
+    return f"{sys.version_info[:3]} {own}"

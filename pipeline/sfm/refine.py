@@ -129,8 +129,14 @@ def adjust(
     return _solve(options, config, model)
 
 
-def adjust_points(model: pycolmap.Reconstruction, *, loss_px: float) -> float:
-    """The same for the points alone, between cameras that stay."""
+def adjust_points(
+    model: pycolmap.Reconstruction, *, loss_px: float, done: Set[int] = frozenset()
+) -> None:
+    """The same for the points alone, between cameras that stay.
+
+    ``done``: ids of points that ``adjust`` has moved with these cameras and this loss: they are
+    at their minimum.
+    """
     options = _options(loss_px, FUNCTION_TOLERANCE)
     options.refine_focal_length = False
     options.refine_extra_params = False
@@ -142,9 +148,12 @@ def adjust_points(model: pycolmap.Reconstruction, *, loss_px: float) -> float:
     options.ceres.solver_options.initial_trust_region_radius = 1e8
     config = pycolmap.BundleAdjustmentConfig()
     # Without its images: pycolmap then takes no derivatives by their poses.
-    for point_id in sorted(model.point3D_ids()):
+    for point_id in sorted(model.point3D_ids() - done):
         config.add_variable_point(point_id)
-    return _solve(options, config, model)
+    if config.num_points():
+        _solve(options, config, model)
+    else:
+        model.update_point_3d_errors()
 
 
 def _options(loss_px: float, tolerance: float) -> pycolmap.BundleAdjustmentOptions:

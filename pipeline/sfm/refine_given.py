@@ -38,6 +38,8 @@ TOLERANCE = 1e-6
 # Points that the adjusted world is laid over the given one by.
 ANCHORS = 5000
 
+Tracks = list[tuple[int, list[int]]]
+
 
 @dataclass(frozen=True)
 class GivenReport:
@@ -63,22 +65,24 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
     model = pycolmap.Reconstruction(sparse)
     model.update_point_3d_errors()
     before = float(model.compute_mean_reprojection_error())
-    given = _anchors(model)
+    tracks = _tracks(model)
+    anchors = [number for number, _ in tracks[:ANCHORS]]
+    given = _positions(model, anchors)
     found = refine(
-        _longest_tracks(model, TRACKS_TO_DECIDE),
+        _longest_tracks(model, tracks, TRACKS_TO_DECIDE),
         radial=config.refine_radial == "auto",
         principal_point=config.refine_principal_point,
         inner_iterations=True,
     )
-    adjusted = _adjust_again(model, found) if found.freed else found.model
+    adjusted = _adjust_again(model, tracks, found) if found.freed else found.model
     if not found.freed or not _is_finite(adjusted):
         out.mkdir(parents=True, exist_ok=True)
         for file in pose_files(sparse):
             shutil.copy(file, out)
         return GivenReport(False, before, before, [*found.decisions, "poses stay as given"])
     _take_over(model, adjusted)
-    adjust_points(model, loss_px=LOSS_PX)
-    _lay_over(model, given)
+    adjust_points(model, loss_px=LOSS_PX, done=adjusted.point3D_ids())
+    _lay_over(model, anchors, given)
     write_model(model, out)
     after = float(model.compute_mean_reprojection_error())
     told = (
@@ -88,23 +92,34 @@ def refine_given(sparse: Path, config: schema.Sfm, out: Path) -> GivenReport:
     return GivenReport(True, before, after, [*found.decisions, told])
 
 
-def _adjust_again(model: pycolmap.Reconstruction, found: Refined) -> pycolmap.Reconstruction:
+def _adjust_again(
+    model: pycolmap.Reconstruction, tracks: Tracks, found: Refined
+) -> pycolmap.Reconstruction:
     """The longest tracks of ``model`` and its cameras, adjusted from what was found with fewer."""
-    thinned = _longest_tracks(model, TRACKS_PER_IMAGE)
+    thinned = _longest_tracks(model, tracks, TRACKS_PER_IMAGE)
     _take_over(thinned, found.model)
     # The cameras have moved: points must follow before a loss that gives up distant ones.
-    adjust_points(thinned, loss_px=WIDE_LOSS_PX)
+    adjust_points(thinned, loss_px=WIDE_LOSS_PX, done=found.model.point3D_ids())
     adjust(thinned, found.centres, loss_px=LOSS_PX, tolerance=TOLERANCE, inner_iterations=True)
     return thinned
 
 
-def _longest_tracks(model: pycolmap.Reconstruction, per_image: int) -> pycolmap.Reconstruction:
+def _tracks(model: pycolmap.Reconstruction) -> Tracks:
+    """Point ids, each with the ids of the images of its track, longest tracks first."""
+    tracks = [
+        (number, [element.image_id for element in point.track.elements])
+        for number, point in model.points3D.items()
+    ]
+    return sorted(tracks, key=lambda item: (-len(item[1]), item[0]))
+
+
+def _longest_tracks(
+    model: pycolmap.Reconstruction, tracks: Tracks, per_image: int
+) -> pycolmap.Reconstruction:
     """A copy with the points alone that fill the images' shares, those seen by most first."""
     thinned = pycolmap.Reconstruction(model)
     missing = dict.fromkeys(thinned.reg_image_ids(), per_image)
-    lengths = {number: point.track.length() for number, point in thinned.points3D.items()}
-    for number in sorted(lengths, key=lambda number: (-lengths[number], number)):
-        images = [element.image_id for element in thinned.point3D(number).track.elements]
+    for number, images in tracks:
         if all(missing[image] <= 0 for image in images):
             thinned.delete_point3D(number)
         else:
@@ -125,17 +140,16 @@ def _take_over(model: pycolmap.Reconstruction, adjusted: pycolmap.Reconstruction
             model.point3D(number).xyz = point.xyz
 
 
-def _anchors(model: pycolmap.Reconstruction) -> dict[int, NDArray[np.float64]]:
-    """Places of the points seen by most."""
-    length = {number: point.track.length() for number, point in model.points3D.items()}
-    chosen = sorted(length, key=lambda number: (-length[number], number))[:ANCHORS]
-    return {number: model.point3D(number).xyz.copy() for number in chosen}
+def _positions(model: pycolmap.Reconstruction, points: list[int]) -> NDArray[np.float64]:
+    """(N, 3) positions of these points."""
+    return np.stack([model.point3D(number).xyz for number in points])
 
 
-def _lay_over(model: pycolmap.Reconstruction, given: dict[int, NDArray[np.float64]]) -> None:
-    """Turn, shift and scale ``model`` to where its points were given."""
-    now = np.stack([model.point3D(number).xyz for number in given])
-    before = np.stack(list(given.values()))
+def _lay_over(
+    model: pycolmap.Reconstruction, anchors: list[int], before: NDArray[np.float64]
+) -> None:
+    """Turn, shift and scale ``model`` to where its points ``anchors`` were given."""
+    now = _positions(model, anchors)
     # Smaller than any misfit that matters, so that no point is left out for less.
     floor = 1e-6 * float(np.median(np.linalg.norm(before - np.median(before, axis=0), axis=1)))
     fitted = robust_similarity(now, before, np.ones(3), floor)

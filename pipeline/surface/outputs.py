@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render import RasterOptions
-from pipeline.render.views import render_view, to_bytes
+from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
@@ -68,7 +68,7 @@ def write_drawn(
         path = camera_path(views, _typical_depth(gaussians, views, options), up)
         write_json(out / "path.json", describe_path(path))
         frames = [
-            to_bytes(render_view(gaussians, view, options).rgb)
+            to_bytes(render_rgb(gaussians, view, options))
             for view in track(path, "drawing the video", len(path), unit="frames")
         ]
         write_video(out, frames, FPS)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.geometry.up_direction import up_direction
 from pipeline.render import RasterOptions
-from pipeline.render.views import render_view, to_bytes
+from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 from pipeline.watching.source import Source
@@ -166,8 +166,8 @@ class Page:
 
     def render(self, view: View) -> NDArray[np.uint8]:
         with self.lock:
-            picture = render_view(self.source.shown.gaussians, view, self.options)
-        return to_bytes(picture.rgb)
+            rgb = render_rgb(self.source.shown.gaussians, view, self.options)
+        return to_bytes(rgb)
 
     def welcome(self, client: Any) -> None:
         self.visitors[client.client_id] = _Visitor(self, client)

@@ -21,6 +21,7 @@ from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import canonical, file_digest, is_current
+from pipeline.runtime.layout import PACKAGES
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.registry import STAGES
 
@@ -74,6 +75,11 @@ class SnakemakeProject:
     def stages(self) -> Iterable[StageSpec]:
         """The declarations of all stages, in the order of the DAG."""
         return STAGES.values()
+
+    def packaged(self, file: str) -> str:
+        """The absolute path of a file that is named from the folder of the packages, which is not
+        the Snakefile's where the program is installed."""
+        return str(PACKAGES / file)
 
     def inputs(self, spec: StageSpec) -> Callable[[Any], dict[str, str]]:
         """Input function: role -> the ``stage.json`` that fills it, and ``plan.json`` for a stage

@@ -25,13 +25,13 @@ TINY = {
 
 
 def copy_project(target: Path) -> Path:
-    """Copy the project's sources, without results, data and builds."""
+    """Copy the project's sources and their bytecode, without results, data and builds."""
     names = ("Snakefile", "pipeline", "stages", "profiles", "config", "pyproject.toml")
     target.mkdir(parents=True)
     for name in names:
         source = ROOT / name
         if source.is_dir():
-            shutil.copytree(source, target / name, ignore=shutil.ignore_patterns("__pycache__"))
+            shutil.copytree(source, target / name)
         else:
             shutil.copy(source, target / name)
     return target
@@ -103,12 +103,18 @@ def rules_run(done: subprocess.CompletedProcess[str]) -> set[str]:
 
 
 def start_and_kill(
-    project: Path, target: str, ready: str, *, config: dict, only_snakemake: bool = False
+    project: Path,
+    target: str,
+    ready: str,
+    *,
+    config: dict,
+    cores: int = 2,
+    only_snakemake: bool = False,
 ) -> None:
     """Start Snakemake and SIGKILL it, with its jobs or alone, once a file matching ``ready``
     (a glob below the project) exists."""
     process = subprocess.Popen(
-        command(target, config=config),
+        command(target, config=config, cores=cores),
         cwd=project,
         env=environment(project),
         stdout=subprocess.DEVNULL,
@@ -125,6 +131,14 @@ def start_and_kill(
     else:
         os.killpg(process.pid, signal.SIGKILL)
     process.wait()
+
+
+def unlock(project: Path) -> None:
+    """What ``snakemake --unlock`` does, in no time."""
+    locks = list((project / ".snakemake" / "locks").iterdir())
+    assert locks
+    for lock in locks:
+        lock.unlink()
 
 
 def metrics(project: Path, scene: str) -> dict:

@@ -3,22 +3,36 @@
 from __future__ import annotations
 
 import json
+import shutil
 
 import pytest
 
 from pipeline.io.colmap import read_model
 from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
+from tests.once import made_once
 
 pytestmark = pytest.mark.slow
 
 ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "coverage", "export", "report"}
 PINHOLE = ("--distortion", "none")
 SFM = {"features", "matches", "sfm"}
+MASKED = ("--poses", "colmap", "--masks", *PINHOLE)
 
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
     return copy_project(tmp_path_factory.mktemp("branches") / "project")
+
+
+@pytest.fixture(scope="session")
+def masked(tmp_path_factory):
+    """The folder of a scene with poses and masks."""
+
+    def make(project):
+        copy_project(project)
+        make_scene(project, "masked", *MASKED)
+
+    return made_once(tmp_path_factory, "e2e-masked", make) / "data/masked"
 
 
 @pytest.mark.parametrize(
@@ -32,12 +46,15 @@ def project(tmp_path_factory):
         ),
         ("bare", ("--poses", "transforms", "--no-points", *PINHOLE), ALWAYS),
         ("lens", ("--poses", "colmap", "--distortion", "opencv"), ALWAYS | {"refine", "undistort"}),
-        ("masked", ("--poses", "colmap", "--masks", *PINHOLE), ALWAYS | {"refine"}),
+        ("masked", MASKED, ALWAYS | {"refine"}),
         ("alpha", ("--poses", "transforms", "--format", "png", "--alpha", *PINHOLE), ALWAYS),
     ],
 )
-def test_the_plan_runs_what_the_scene_needs(project, scene, options, expected):
-    make_scene(project, scene, *options)
+def test_the_plan_runs_what_the_scene_needs(project, masked, scene, options, expected):
+    if options == MASKED:
+        shutil.copytree(masked, project / "data" / scene)
+    else:
+        make_scene(project, scene, *options)
     done = snakemake(project, f"results/{scene}/metrics.json", config=TINY)
     assert rules_run(done) == expected
     found = json.loads((project / f"results/{scene}/metrics.json").read_text())
@@ -48,15 +65,15 @@ def test_the_plan_runs_what_the_scene_needs(project, scene, options, expected):
     assert found["pose_error"]["rotation_median_deg"] < 0.3
 
 
-def test_given_poses_can_be_ignored(project):
-    make_scene(project, "ignored", "--poses", "colmap")
+def test_given_poses_can_be_ignored(project, masked):
+    shutil.copytree(masked, project / "data/ignored")
     done = snakemake(project, "-n", "results/ignored/metrics.json", config={"poses": "ignore"})
     assert rules_run(done) >= SFM
 
 
-def test_cameras_that_training_moves_are_what_comes_out(project):
+def test_cameras_that_training_moves_are_what_comes_out(project, masked):
     """On the masked scene: its poses are exact, so that what moves them must do no harm."""
-    make_scene(project, "moving", "--poses", "colmap", "--masks", *PINHOLE)
+    shutil.copytree(masked, project / "data/moving")
     moves = {"refine_poses": True, "refine_intrinsics": True}
     limits = {"max_pose_change": 0.003, "max_intrinsics_change": 0.003}
     config = {**TINY, "train": {**TINY["train"], **moves}, "experiments": {"train": limits}}

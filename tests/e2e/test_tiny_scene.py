@@ -22,6 +22,7 @@ from tests.e2e.harness import (
     rules_run,
     snakemake,
     start_and_kill,
+    unlock,
 )
 
 pytestmark = pytest.mark.slow
@@ -107,8 +108,10 @@ def test_a_changed_mask_is_noticed_and_new_truth_measures_only(project):
     """What stands beside the photographs counts as they do; ground truth is never an input."""
     truth = project / "data/tiny/sparse_gt"
     aside = truth.rename(truth.with_name("aside"))
-    done = snakemake(project, TARGET, config=TINY)
-    assert json.loads((project / TARGET).read_text())["pose_error"] is None
+    measured = "results/tiny/evaluate"
+    snakemake(project, f"{measured}/stage.json", config=TINY)
+    found = json.loads((project / measured / "evaluation.json").read_text())
+    assert found["pose_error"] is None
     model = (project / "results/tiny/train/gaussians.npz").stat().st_mtime_ns
     aside.rename(truth)
     done = snakemake(project, TARGET, config=TINY)
@@ -144,44 +147,35 @@ def test_the_commands_of_the_readme_are_commands(project):
         assert done.returncode == 0, line + done.stdout + done.stderr
 
 
-@pytest.mark.parametrize(
-    ("stage", "ready"),
-    [
-        ("sfm", "results/tiny/.scratch/sfm/*/out"),
-        ("train", "results/tiny/.scratch/train/*/out"),
-        ("evaluate", "results/tiny/.scratch/evaluate/*/out/renders/*.png"),
-    ],
-)
-def test_kill_9_and_again_gives_the_same_result(project, finished, stage, ready):
-    folder = project / "results/tiny"
-    order = ["sfm", "undistort", "init", "train", "evaluate", "coverage", "export", "report"]
-    for name in order[order.index(stage) :]:
-        shutil.rmtree(folder / name, ignore_errors=True)
-    (folder / "metrics.json").unlink()
-    start_and_kill(project, TARGET, ready, config=TINY)
-    assert not (folder / stage / "stage.json").exists()
-    snakemake(project, "--unlock", config=TINY)
-    snakemake(project, TARGET, config=TINY)
-    assert metrics(project, "tiny") == metrics(finished, "tiny")
-    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
-
-
-def test_training_goes_on_from_its_last_checkpoint(project, finished):
+def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
+    """From the photographs on, killed in mapping, before training's first checkpoint and after
+    one, and in evaluation."""
     trainer = project / "pipeline/training/loop/trainer.py"
     text = trainer.read_text()
     often = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.2")
     assert often != text
     trainer.write_text(often)
     folder = project / "results/tiny"
-    checkpoints = "results/tiny/.scratch/train/*/checkpoints"
-    # Whole ones alone: the temporary file of the first may be all that a kill leaves.
-    whole = f"{checkpoints}/checkpoint_*.sha256"
-    start_and_kill(project, TARGET, whole, config=TINY)
-    assert list(project.glob(whole))
-    snakemake(project, "--unlock", config=TINY)
-    done = snakemake(project, TARGET, config=TINY)
-    assert "going on from" in done.stdout
-    assert not (folder / ".scratch/train").exists()
+    shutil.rmtree(project / "results")
+    shutil.rmtree(project / ".snakemake")
+    scratch = "results/tiny/.scratch"
+    # Whole checkpoints alone: the temporary file of the first may be all that a kill leaves.
+    for stage, ready in (
+        ("sfm", "*/out"),
+        ("train", "*/out"),
+        ("train", "*/checkpoints/checkpoint_*.sha256"),
+        ("evaluate", "*/out/renders/*.png"),
+    ):
+        ready = f"{scratch}/{stage}/{ready}"
+        assert not list(project.glob(ready)) or ready.endswith("out")
+        start_and_kill(project, TARGET, ready, config=TINY, cores=1)
+        assert list(project.glob(ready))
+        assert not (folder / stage / "stage.json").exists()
+        unlock(project)
+    snakemake(project, TARGET, config=TINY, cores=1)
+    assert "going on from" in (folder / "logs/train.log").read_text()
+    assert not (project / scratch / "train").exists()
+    assert metrics(project, "tiny") == metrics(finished, "tiny")
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
 
 
@@ -201,7 +195,7 @@ def test_an_orphaned_job_and_a_new_run_do_not_meet(project, finished):
 
 def test_two_runs_at_once_on_one_scene(project, finished):
     """Snakemake's own lock turns the second away; the first one's result is whole."""
-    shutil.rmtree(project / "results/tiny/train")
+    shutil.rmtree(project / "results/tiny/export")
     (project / TARGET).unlink()
     first, second = (
         subprocess.Popen(
@@ -216,14 +210,6 @@ def test_two_runs_at_once_on_one_scene(project, finished):
     codes = sorted([first.wait(), second.wait()])
     assert codes[0] == 0
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
-
-
-def test_one_thread_gives_the_same_bytes_as_two(project, finished):
-    shutil.rmtree(project / "results")
-    shutil.rmtree(project / ".snakemake")
-    snakemake(project, TARGET, config=TINY, cores=1)
-    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
-    assert metrics(project, "tiny") == metrics(finished, "tiny")
 
 
 def test_progress_is_written_for_people_and_programs(finished):

@@ -15,9 +15,10 @@ from pipeline.photos.verify import verify_photos
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
 from pipeline.sfm.sift import Picture
+from tests.tools import need_data
 
 pytestmark = pytest.mark.skipif(
-    not heif.installed(), reason="pillow-heif is not installed: pip install pillow-heif"
+    not heif.installed(), reason="not run: pillow-heif missing (make test-packages)"
 )
 
 
@@ -52,6 +53,14 @@ def test_size_and_pixels_agree_where_the_phone_was_held_upright(tmp_path: Path) 
     photo = scan(tmp_path, "s", Config(), cache=None).photos[0]
     assert load_rgba(photo.path)[0].shape == (photo.height, photo.width, 3)
     assert Picture(photo, 1000).rgb.shape == (photo.height, photo.width, 3)
+
+
+def test_a_file_of_a_phone_is_read() -> None:
+    path = need_data("raw/heic/iphone_7.heic")
+    one = Config.model_validate({"inspect": {"min_images": 1}})
+    photo = scan(path.parent, "s", one, cache=None).photos[0]
+    assert "iPhone 7" in photo.camera_group and photo.gps is not None
+    assert load_rgba(photo.path)[0].shape == (photo.height, photo.width, 3)
 
 
 def test_a_broken_one_is_told(tmp_path: Path) -> None:

@@ -1,14 +1,12 @@
 """What is written is what other programs read: Niantic's and Adobe's SPZ library, PlayCanvas's
-splat-transform, gsply, Khronos's glTF validator, glTF Transform. Each is skipped where it is not
-installed."""
+splat-transform, gsply, Khronos's glTF validator, glTF Transform. `make test-packages` installs
+them; each is skipped where it is missing."""
 
 from __future__ import annotations
 
 import csv
 import json
-import shutil
 import subprocess
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
@@ -21,6 +19,7 @@ from pipeline.io.spz import write_spz
 from pipeline.splats.gaussians import Gaussians
 from tests.io.test_spz import OURS as SPZ
 from tests.splats.samples import Within, sample
+from tests.tools import need, need_package
 
 HERE = Path(__file__).parent / "independent"
 PACKAGES = json.loads((HERE / "package.json").read_text())["dependencies"]
@@ -31,21 +30,11 @@ SPLAT = Within(0, 2e-6, 0.5001 / 255, 1.8, 0.5001 / 255 / 0.28209, 0)
 
 
 def needs_node(package: str) -> None:
-    if shutil.which("node") is None:
-        pytest.skip("Node.js is not installed")
+    need("node")
     found = HERE / "node_modules" / package / "package.json"
     wanted = PACKAGES[package]
     if not found.is_file() or json.loads(found.read_text())["version"] != wanted:
-        pytest.skip(f"{package} {wanted} is not there: npm install --prefix {HERE}")
-
-
-def needs_gsply() -> None:
-    try:
-        found = version("gsply")
-    except PackageNotFoundError:
-        pytest.skip(f"gsply is not installed: pip install gsply=={GSPLY}")
-    if found != GSPLY:
-        pytest.skip(f"gsply is {found}, {GSPLY} is compared with")
+        pytest.skip(f"not run: {package} {wanted} missing (make test-packages)")
 
 
 def node(*arguments: str | Path) -> str:
@@ -162,7 +151,7 @@ def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
 
 @pytest.mark.parametrize(("suffix", "within"), [(".ply", EXACT), (".spz", SPZ)])
 def test_gsply_reads_our_files(tmp_path, suffix, within) -> None:
-    needs_gsply()
+    need_package("gsply", GSPLY)
     import gsply
     from gsply.spz import read_spz
 

@@ -18,8 +18,8 @@ from pipeline.photos.load import load_rgb
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
+from tests.tools import need_data
 
-DATA = Path(__file__).resolve().parents[3] / "shared" / "data" / "raw"
 TAKEN = "2026:01:01 12:00:00"
 
 
@@ -125,14 +125,13 @@ def test_same_stems_keep_apart(tmp_path: Path, light: np.ndarray) -> None:
     assert [photo.name for photo in report.manifest.photos] == ["a.dng.png", "a.nef.png"]
 
 
-@pytest.mark.skipif(not DATA.is_dir(), reason="real RAW files are not on this machine")
 def test_real_raw_files_of_three_bodies(tmp_path: Path) -> None:
     sizes = {
         "canon_eos_6d_linear_lossy.dng": (1224, 816),
         "canon_eos_kissx4_magiclantern_colorchart.dng": (1734, 1156),
         "kodak_dc50.KDC": (768, 512),
     }
-    photos = [manifest([DATA / name], *size).photos[0] for name, size in sizes.items()]
+    photos = [manifest([need_data("raw") / name], *size).photos[0] for name, size in sizes.items()]
     source = Manifest(scene="raw", photos=tuple(photos))
     report = develop(source, Decode(demosaic="linear"), tmp_path, threads=2)
     assert not report.warnings

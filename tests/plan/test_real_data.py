@@ -1,7 +1,5 @@
 """Real photographs: what the scan says of them, against what is known of the sets."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 
@@ -9,14 +7,11 @@ from pipeline.config.schema import Config
 from pipeline.plan.given_poses import load_given
 from pipeline.plan.scan import Scan, scan
 from tests.plans import make_plan
-
-DATA = Path(__file__).parents[3] / "shared" / "data"
+from tests.tools import need_data
 
 
 def look(name: str) -> Scan:
-    if not (DATA / name).is_dir():
-        pytest.skip(f"{DATA / name} is not there")
-    return scan(DATA / name, name, Config(), cache=None)
+    return scan(need_data(name), name, Config(), cache=None)
 
 
 @pytest.mark.parametrize(
@@ -30,7 +25,7 @@ def look(name: str) -> Scan:
         (
             "nerf_lego",
             100,
-            ["decode", "features", "matches", "sfm", "refine", "undistort"],
+            ["decode", "features", "matches", "refine", "sfm", "undistort"],
             None,
             None,
         ),

@@ -1,7 +1,6 @@
 """Pictures on the page show what they claim."""
 
 import io
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -12,11 +11,9 @@ from pipeline.reporting.pictures import (
     ERROR_SCALE,
     MASKED_GREY,
     error_map,
-    montage,
     page_pictures,
     shrunk,
     upright,
-    write_montage,
 )
 
 
@@ -77,13 +74,3 @@ def test_pictures_of_a_page_stay_within_its_budget() -> None:
     pictures = page_pictures(views)
     assert sum(len(uri) for row in pictures for uri, _, _ in row) < 4_700_000
     assert all(width / height == pytest.approx(9 / 7, rel=0.02) for _, width, height in pictures[0])
-
-
-def test_montage_has_a_row_a_view(tmp_path: Path) -> None:
-    views = [view(), view(40, 30, seed=1)]
-    picture = montage(views, max_side=480, gap=8)
-    assert picture.shape == (30 + 8 + 40, 3 * 40 + 2 * 8, 3)
-    np.testing.assert_array_equal(picture[:30, :40], views[0].photograph)
-    np.testing.assert_array_equal(picture[:30, 48:88], views[0].render)
-    write_montage(views, tmp_path / "m.png")
-    np.testing.assert_array_equal(np.asarray(Image.open(tmp_path / "m.png")), picture)

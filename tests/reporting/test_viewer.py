@@ -6,7 +6,6 @@ from __future__ import annotations
 import base64
 import io
 import re
-import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -17,15 +16,16 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.page import FLAGS
+from benchmarks.page import FLAGS, chromium
 from pipeline.io.ply import write_splat_ply
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
 from tests.reporting.made import gaussians, report, trained
+from tests.tools import need_package
 
-CHROMIUM = next(filter(None, map(shutil.which, ("chromium", "chromium-browser", "chrome"))), None)
+CHROMIUM = chromium()
 SECONDS = 180.0  # a browser on a busy machine; a page is there within one or two on an idle one
 
 Pixels = NDArray[np.uint8]
@@ -33,10 +33,12 @@ Pixels = NDArray[np.uint8]
 
 @pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    need_package("playwright")
     if CHROMIUM is None:
-        pytest.skip("no Chromium is installed")
-    with playwright.sync_playwright() as driver:
+        pytest.skip("not run: no Chromium (apt-get install chromium)")
+    from playwright.sync_api import sync_playwright
+
+    with sync_playwright() as driver:
         browser = driver.chromium.launch(
             executable_path=CHROMIUM, args=FLAGS, timeout=1000 * SECONDS
         )

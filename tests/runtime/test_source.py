@@ -22,14 +22,19 @@ def project(tmp_path, monkeypatch):
     for name, text in files.items():
         (tmp_path / name).write_text(text)
     monkeypatch.setattr(source, "ROOT", tmp_path)
+    monkeypatch.setenv("SPLATMAKE_CACHE", str(tmp_path / "cache"))
 
     def hash_of(stage):
-        for cached in (source._tree, source._imports, source._module_hash):
-            cached.cache_clear()
+        forget()
         return source.stage_source_hash(f"stages.{stage}")
 
     yield tmp_path, hash_of
-    for cached in (source._tree, source._imports, source._module_hash):
+    forget()
+
+
+def forget():
+    """What a new process does not have."""
+    for cached in (source._imports, source._module_hash, source._parsed, source._record):
         cached.cache_clear()
 
 
@@ -87,3 +92,48 @@ def test_the_viewer_counts_for_what_makes_pages(project):
     before = hash_of("page"), hash_of("draw")
     viewer.write_text("two")
     assert hash_of("page") != before[0] and hash_of("draw") == before[1]
+
+
+def test_the_key_of_training_covers_the_backends() -> None:
+    """They are imported at first use only, which must not hide them."""
+    reached = source._reachable("pipeline.training.loop.trainer")
+    assert {"pipeline.render.cpu.backend", "pipeline.render.cpu.build"} <= reached
+
+
+def test_a_file_is_parsed_once_and_again_when_it_changes(project, monkeypatch):
+    """And what was kept is not needed: neither a damaged record nor another parser's counts."""
+    root, hash_of = project
+    parsed = []
+    parse = source.ast.parse
+    monkeypatch.setattr(
+        source.ast, "parse", lambda text, filename: parsed.append(filename) or parse(text)
+    )
+    first = hash_of("work")
+    assert len(parsed) == len(set(parsed)) >= 3
+    parsed.clear()
+    assert hash_of("work") == first and not parsed
+    (root / "pipeline/a.py").write_text("import pipeline.b\nX = 1\n")
+    assert hash_of("work") != first
+    assert parsed == [str(root / "pipeline/a.py"), str(root / "pipeline/b.py")]
+    (root / "pipeline/a.py").write_text("X = 1\n")
+    assert hash_of("work") == first
+
+    record = root / "cache" / source.RECORD
+    kept = record.read_text()
+    for damaged in ("{", "[]", kept.replace('"parser": "', '"parser": "other ')):
+        assert damaged != kept
+        record.write_text(damaged)
+        parsed.clear()
+        assert hash_of("work") == first and len(parsed) >= 3
+
+
+def test_imports_inside_functions_and_branches_count(project):
+    root, hash_of = project
+    before = hash_of("work")
+    inside = "def f():\n    try:\n        pass\n    except OSError:\n        {}\n"
+    (root / "pipeline/a.py").write_text("X = 1\n" + inside.format("pass"))
+    plain = hash_of("work")
+    (root / "pipeline/a.py").write_text("X = 1\n" + inside.format("import pipeline.b"))
+    with_b = hash_of("work")
+    (root / "pipeline/b.py").write_text("Y = 2\n")
+    assert len({before, plain, with_b, hash_of("work")}) == 4

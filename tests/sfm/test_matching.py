@@ -29,7 +29,7 @@ from pipeline.sfm.isolate import run_isolated
 from stages.workflow.registry import STAGES
 from tests.plans import make_plan
 from tests.sfm import corner, jobs
-from tests.tools import need
+from tests.tools import need, unsupported
 
 FEATURES = schema.Features(max_features=500)
 
@@ -104,7 +104,7 @@ VARIANTS = [
 def test_every_target_finds_the_same(tmp_path, monkeypatch, variant):
     wanted = {extension.feature for extension in variant.extensions}
     if variant.target.missing or not wanted <= processor.features():
-        pytest.skip(f"this processor cannot run {variant.name}")
+        unsupported(f"this processor cannot run {variant.name}")
     check_library(tmp_path, monkeypatch, near.LIBRARY.flags_for(variant))
 
 
@@ -112,7 +112,7 @@ def test_the_form_for_avx_vnni_finds_the_same(tmp_path, monkeypatch):
     """Few processors have it: its one instruction is replaced by some of AVX2's."""
     target = targets.named("x86-64-v3")
     if target.missing:
-        pytest.skip(f"this processor cannot run {target.name}")
+        unsupported(f"this processor cannot run {target.name}")
     header = ["-include", str(Path(__file__).with_name("avx_vnni.h"))]
     check_library(tmp_path, monkeypatch, near.LIBRARY.flags_for(Variant(target)) + header)
 

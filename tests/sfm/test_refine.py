@@ -144,7 +144,7 @@ def test_points_beyond_what_poses_need_are_adjusted_too(bent, tmp_path):
 
 
 def _refine_with(tracks: int, sparse: Path, out: Path) -> Any:
-    from pipeline.sfm import given
+    from pipeline.sfm import refine_given as given
 
     given.TRACKS_PER_IMAGE = tracks
     return given.refine_given(sparse, Sfm(), out)

@@ -12,7 +12,7 @@ from pipeline.scene.views import View
 from pipeline.surface.depth import DepthMap
 
 
-def view_at(centre, target, size=96, focal=110.0, up_sign=1.0, name="view"):
+def view_at(centre, target, size=96, focal=110.0, name="view"):
     """A square view that looks at a point; the world's z is up."""
     rotation = look_at(np.asarray(centre, float), np.asarray(target, float))
     pose = np.eye(4)

@@ -15,10 +15,11 @@ from PIL import Image
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.options import option_paths
 from pipeline.config.schema import Train
+from pipeline.render import make_backend
 from pipeline.render.views import render_view
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.loop import session, trainer
+from pipeline.training.loop import session
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
 NUM_VIEWS = 6
@@ -123,7 +124,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
 @contextmanager
 def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
     """What trains inside writes a checkpoint after every step, and dies in this one."""
-    original, calls = trainer.backward, 0
+    original, calls = make_backend().backward, 0
 
     def dying(*args: Any, **kwargs: Any) -> Any:
         nonlocal calls
@@ -134,5 +135,5 @@ def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
 
     with patch.context() as inside, pytest.raises(KeyboardInterrupt):
         inside.setattr(session, "CHECKPOINT_SECONDS", 0.0)
-        inside.setattr(trainer, "backward", dying)
+        inside.setattr(make_backend(), "backward", dying)
         yield

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.__main__ import main
+from pipeline.command.main import main
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.io.colmap import write_model
@@ -22,6 +22,7 @@ from pipeline.training.checkpoints.checkpoint import Checkpoint
 from pipeline.training.loop.metrics_log import NAME
 from pipeline.watching.server import Page, Room, picture_size
 from pipeline.watching.source import Source
+from tests.tools import need_package
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, ball, camera_at
 
 
@@ -108,7 +109,7 @@ def test_a_picture_has_the_windows_shape(aspect: float, size: tuple[int, int]) -
 
 
 def test_the_page_is_served_and_renders(scene: Path) -> None:
-    pytest.importorskip("viser", reason="viser is not installed")
+    need_package("viser")
     add_checkpoint(scene, 10, 30, 1000)
     page = Page(Source(scene, None), host="127.0.0.1", port=18080, side=64, threads=1)
     try:
@@ -126,7 +127,7 @@ def test_the_page_is_served_and_renders(scene: Path) -> None:
 def test_curves_arrive_in_tensorboard(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    pytest.importorskip("tensorboard", reason="tensorboard is not installed")
+    need_package("tensorboard")
     from tensorboard.backend.event_processing.event_accumulator import EventAccumulator
 
     out = tmp_path / "events"

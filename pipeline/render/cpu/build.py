@@ -41,7 +41,8 @@ def _library(
         flags=FLAGS,
         compile_only=compile_only,
         link_only=link_only,
-        facts={"torch": importlib.metadata.version("torch")},
+        # Without a local version (+cpu, +cu128): those builds share libtorch_cpu's interface.
+        facts={"torch": importlib.metadata.version("torch").partition("+")[0]},
     )
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.render import RasterOptions, backward, forward, l1_ssim
+from pipeline.render import Backend, RasterOptions, make_backend
 from pipeline.render.views import raster_camera, within
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -29,6 +29,7 @@ def fit_pose(
     options: RasterOptions,
     extent: float,
     ssim_weight: float,
+    backend: Backend | None = None,
 ) -> View:
     """The view with the pose at which the render of the fixed scene is closest to its photograph.
 
@@ -38,7 +39,9 @@ def fit_pose(
         gain: factor of each channel of the render.
         extent: unit of translations (``scene.views.scene_extent``), world units.
         ssim_weight: as in training.
+        backend: None: the default.
     """
+    backend = backend or make_backend()
     options = within(options, gaussians)
     poses = PoseRefinement.of([view], gaussians, extent, limit=math.inf)
     camera = raster_camera(view)
@@ -47,13 +50,14 @@ def fit_pose(
     factor = torch.tensor([1.0, 1.0, 1.0] if gain is None else list(gain), dtype=torch.float32)
     best, least = poses.poses[0].copy(), math.inf
     for number in range(FIT_STEPS):
-        rendered = forward(*gaussians.parameters(), poses.camera(camera, 0), options)
-        loss = l1_ssim(
+        rendered = backend.forward(*gaussians.parameters(), poses.camera(camera, 0), options)
+        loss = backend.l1_ssim(
             rendered.color * factor, target, ssim_weight, ignored, threads=options.threads
         )
         if loss.loss < least:
             best, least = poses.poses[0].copy(), loss.loss
-        found = backward(rendered, loss.grad * factor, means2d_abs=False, camera=True).camera
-        assert found is not None
-        poses.step(0, found, FIT_RATE * FIT_DECAY ** (number / (FIT_STEPS - 1)))
+        d_color = loss.grad * factor
+        gradients = backend.backward(rendered, d_color, means2d_abs=False, camera=True).camera
+        assert gradients is not None
+        poses.step(0, gradients, FIT_RATE * FIT_DECAY ** (number / (FIT_STEPS - 1)))
     return replace(view, world_to_camera=best)

@@ -14,7 +14,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import RasterCamera, RasterOptions, backward, forward
+from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 from pipeline.training.data.known_depths import KnownDepths
@@ -70,6 +70,7 @@ class FloaterRemoval:
         cameras: Sequence[RasterCamera],
         options: RasterOptions,
         pixel: float,
+        backend: Backend,
     ) -> int:
         """Make floaters transparent, in place, so that density control prunes them.
 
@@ -78,7 +79,7 @@ class FloaterRemoval:
         Returns:
             the number of floaters.
         """
-        found = floaters(gaussians, cameras, self.depths, options, pixel)
+        found = floaters(gaussians, cameras, self.depths, options, pixel, backend)
         gaussians.opacity_logits[found] = FADED_LOGIT
         return int(found.sum())
 
@@ -89,6 +90,7 @@ def floaters(
     depths: NDArray[np.float64],
     options: RasterOptions,
     pixel: float = 1.0,
+    backend: Backend | None = None,
 ) -> Tensor:
     """(N,) bool: Gaussians with most of their weight in one view, or in a hundredth of the views,
     and there closer than ``depths``.
@@ -101,7 +103,9 @@ def floaters(
         depths: (V,) camera z (``empty_depths``).
         options: as in training; SH degree and background do not matter.
         pixel: number of pixels of the view in one pixel of the reduced size.
+        backend: None: the default.
     """
+    backend = backend or make_backend()
     grey = gaussians.with_sh_degree(0)
     grey = replace(grey, sh=torch.zeros_like(grey.sh))
     options = replace(options, sh_degree=0, background=None)
@@ -110,9 +114,9 @@ def floaters(
     few = max(1, round(len(cameras) / VIEWS_PER_FLOATER_VIEW))
     largest, largest_empty = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
     for camera, depth in zip(cameras, depths, strict=True):
-        rendered = forward(*grey.parameters(), camera, options)
+        rendered = backend.forward(*grey.parameters(), camera, options)
         d_color = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
-        weight = backward(rendered, d_color, means2d_abs=False).sh[:, 0, 0]
+        weight = backend.backward(rendered, d_color, means2d_abs=False).sh[:, 0, 0]
         total += weight
         x, y, z, shift = camera.world_to_camera[2].to(torch.float32).tolist()
         # Not a matrix product: BLAS may round differently with the number of threads.

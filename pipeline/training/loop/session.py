@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
-from pipeline.render.cpu import build
 from pipeline.runtime.progress import Progress
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
 from pipeline.training.loop.metrics_log import MetricsLog
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
-from pipeline.training.loop.step_timer import StepTimer, build_record, other_build
+from pipeline.training.loop.step_timer import StepTimer, other_build
 
 CHECKPOINT_SECONDS = 30.0
 
@@ -22,6 +21,7 @@ class Session:
 
     Args:
         steps: length of the schedule.
+        build: ``Backend.facts``.
         identity: of the run (``checkpoints.identity``).
         metrics_log: path of the metrics log, or None.
         log: called with each line for the log.
@@ -33,6 +33,7 @@ class Session:
         state: TrainState,
         steps: int,
         *,
+        build: Mapping[str, str],
         identity: str,
         checkpoint_dir: Path,
         metrics_log: Path | None,
@@ -42,14 +43,14 @@ class Session:
     ):
         self.state, self.steps, self.log = state, steps, log
         self.identity, self.checkpoint_dir = identity, checkpoint_dir
-        self.built = build.load()
+        self.build = dict(build)
         self._resume()
         self.started = self.saved = time.monotonic()
         self.seconds_before = state.seconds
         self.progress = Progress("training", steps, unit=unit)
         self.progress.start_at(state.clock)
         self.metrics_log = MetricsLog(metrics_log, state.step)
-        self.timer = StepTimer(self.built, threads, steps - state.clock)
+        self.timer = StepTimer(self.build, threads, steps - state.clock)
 
     def after_step(self, before: int, factor: int) -> None:
         """Log, record and save what is due after a step.
@@ -76,13 +77,13 @@ class Session:
         # Messages on checkpoints are logged only: they are not part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
         if found is not None:
-            if text := other_build(found.values, self.built):
+            if text := other_build(found.values, self.build):
                 self.log(text)
             self.state.restore(found.step, found.arrays, found.values)
 
     def _save(self) -> None:
         state = self.state
-        values = state.values() | {"built": build_record(self.built)}
+        values = state.values() | {"built": self.build}
         saved = Checkpoint(state.step, self.identity, state.arrays(), values)
         checkpoint.save(self.checkpoint_dir, saved)
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.plan.training_memory import machine_mb, memory_mb
-from pipeline.render import RasterCamera
+from pipeline.render import Backend, RasterCamera
 from pipeline.render.views import near_plane, raster_camera
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
@@ -104,6 +104,7 @@ def initial_state(
     scene: TrainingScene,
     config: Train,
     experiments: TrainExperiments,
+    backend: Backend,
     *,
     steps: int,
     seed: int,
@@ -121,7 +122,7 @@ def initial_state(
     cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, config, experiments)
     order = rng.permutation(len(scene.views))
     own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
-    adam = Adam(gaussians, experiments.adam_beta1, own_frames)
+    adam = Adam(gaussians, experiments.adam_beta1, own_frames, backend)
     return TrainState(gaussians, adam, density, cameras, rng, order)
 
 

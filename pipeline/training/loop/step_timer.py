@@ -1,10 +1,12 @@
-"""The native library of a run and the measured time of its steps, for the log."""
+"""The build of the rasterizer in a run and the measured time of its steps, for the log.
+
+A build is what ``Backend.facts`` returns: the instruction set and the compiler, by name.
+"""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import Any
-
-from pipeline.runtime.native import Built
 
 #: Steps of this process before the measurement (cold caches), and steps of the measurement.
 WARM_UP, MEASURED = 10, 40
@@ -17,8 +19,8 @@ class StepTimer:
         steps: remaining steps of the run.
     """
 
-    def __init__(self, built: Built, threads: int, steps: int):
-        self.built, self.threads = built, threads
+    def __init__(self, build: Mapping[str, str], threads: int, steps: int):
+        self.build, self.threads = build, threads
         self.done, self.start = 0, 0.0
         # Short runs have shorter measurements.
         self.first = min(WARM_UP, steps // 2)
@@ -39,24 +41,19 @@ class StepTimer:
         each = 1e3 * (seconds - self.start) / (self.last - self.first)
         size = "full size" if factor == 1 else f"1/{factor} of their size"
         return (
-            f"{self.built.target}, {self.built.compiler}, {self.threads} threads: "
+            f"{', '.join(self.build.values())}, {self.threads} threads: "
             f"{each:.1f} ms a step, images at {size}"
         )
 
 
-def build_record(built: Built) -> dict[str, str]:
-    """The library as checkpoints record it."""
-    return {"instruction_set": built.target, "compiler": built.compiler}
-
-
-def other_build(values: dict[str, Any], built: Built) -> str | None:
-    """A line for the log if a checkpoint was made with another library. It is used: results are
-    equal to the last bit only with one library, but of the same quality with any."""
+def other_build(values: dict[str, Any], build: Mapping[str, str]) -> str | None:
+    """A line for the log if a checkpoint was made with another build. It is used: results are
+    equal to the last bit only with one build, but of the same quality with any."""
     before = values.get("built")
-    if before is None or before == build_record(built):
+    facts = "{instruction_set} ({compiler})"
+    if before is None or before == build:
         return None
     return (
-        f"training continues with {built.target} ({built.compiler}) from a checkpoint made with "
-        f"{before['instruction_set']} ({before['compiler']}): the last bits of the result are "
-        "those of neither alone"
+        f"training continues with {facts.format(**build)} from a checkpoint made with "
+        f"{facts.format(**before)}: the last bits of the result are those of neither alone"
     )

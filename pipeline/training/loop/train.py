@@ -14,6 +14,7 @@ import torch
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
+from pipeline.render import Backend, make_backend
 from pipeline.runtime.errors import UserError
 from pipeline.training.checkpoints.identity import identity_of
 from pipeline.training.data.inputs import Inputs
@@ -35,6 +36,7 @@ def train(
     checkpoint_dir: Path,
     metrics_log: Path | None = None,
     on_log: Callable[[str], None] | None = None,
+    backend: Backend | None = None,
 ) -> TrainResult:
     """Optimise the initial Gaussians so that their renders match the views.
 
@@ -48,6 +50,7 @@ def train(
             the machine or container, which is the limit in any case.
         metrics_log: file for the progress (``training.loop.metrics_log``).
         on_log: called with each warning, and with the instruction set and the time per step.
+        backend: of the rasterizer; None: the default.
 
     Raises:
         UserError: no views or no Gaussians, unreadable images, no view sees a Gaussian, the loss is
@@ -59,6 +62,7 @@ def train(
             f"{len(inputs.initial)} Gaussians",
             fix="check the split and the initialisation",
         )
+    backend = backend or make_backend()
     log = on_log or (lambda text: None)
     warnings: list[str] = []
 
@@ -76,10 +80,13 @@ def train(
             inputs, config, experiments, seed=seed, threads=threads, memory_mb=memory_mb, warn=warn
         )
         steps = Schedule.of(config, experiments).steps
-        state = initial_state(scene, config, experiments, steps=steps, seed=seed, warn=warn)
+        state = initial_state(
+            scene, config, experiments, backend, steps=steps, seed=seed, warn=warn
+        )
         session = Session(
             state,
             steps,
+            build=backend.facts(),
             identity=identity,
             checkpoint_dir=checkpoint_dir,
             metrics_log=metrics_log,
@@ -87,7 +94,7 @@ def train(
             threads=threads,
             unit="steps" if config.budget_minutes is None else "parts",
         )
-        trainer = Trainer(scene, state, config, experiments, threads)
+        trainer = Trainer(scene, state, config, experiments, backend, threads)
         while state.clock < steps:
             before = state.clock
             trainer.step()

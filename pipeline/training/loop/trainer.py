@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.render import Forward, RasterCamera, RasterOptions, backward, forward, l1_ssim
+from pipeline.render import Backend, Forward, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.training.data.targets import Target, usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
@@ -38,9 +38,10 @@ class Trainer:
         state: TrainState,
         config: Train,
         experiments: TrainExperiments,
+        backend: Backend,
         threads: int,
     ):
-        self.scene, self.state, self.threads = scene, state, threads
+        self.scene, self.state, self.backend, self.threads = scene, state, backend, threads
         self.config, self.experiments = config, experiments
         self.schedule = Schedule.of(config, experiments)
         self.clock = Clock(self.schedule.steps, config.budget_minutes)
@@ -61,12 +62,12 @@ class Trainer:
         index, factor = state.next_view(), self.factor()
         target, camera = self.scene.target(index, factor), self.camera(index, factor)
         background = self.draw_background()
-        rendered = forward(*state.gaussians.parameters(), camera, self.options(background))
+        rendered = self.backend.forward(*state.gaussians.parameters(), camera, self.options(background))
         d_color = self.color_loss(rendered, target, index, background)
         d_alpha, d_depth = self.other_losses(rendered, target, index)
         run_length = self.clock.run_length(state)
         rates = self.schedule.learning_rates(state.clock, run_length, self.rate_unit)
-        gradients = backward(
+        gradients = self.backend.backward(
             rendered,
             d_color,
             d_alpha,
@@ -91,7 +92,7 @@ class Trainer:
         image = target.over(background)
         gain = None if self.scene.gains is None else self.scene.gains[index]
         color = rendered.color if gain is None else rendered.color * gain
-        loss = l1_ssim(
+        loss = self.backend.l1_ssim(
             color,
             image,
             self.config.ssim_loss_weight,
@@ -160,7 +161,9 @@ class Trainer:
         options = RasterOptions(
             antialias=self.config.antialias, near=self.scene.near, threads=self.threads
         )
-        found = self.floaters.fade(self.state.gaussians, cameras, options, pixel=factor**2)
+        found = self.floaters.fade(
+            self.state.gaussians, cameras, options, pixel=factor**2, backend=self.backend
+        )
         self.state.counters.floaters += found
         return found
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipeline.render import FrameAdam, Gradients, ShAdam, adam_step, frame_adam
+from pipeline.render import Backend, FrameAdam, Gradients, ShAdam, make_backend
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
@@ -38,6 +38,7 @@ class Adam:
 
     Attributes:
         beta1: decay rate of the first moment.
+        backend: performs the updates.
         own_frames: update means along, and rotations about, each Gaussian's own axes.
         first, second: moments by the name of the array, of its shape, float32. With ``own_frames``,
             those of quaternions are (N, 3), about the axes. Without, the second moments of means
@@ -46,7 +47,10 @@ class Adam:
         last: (N,) int32, the last step in which each row had a gradient.
     """
 
-    def __init__(self, gaussians: Gaussians, beta1: float, own_frames: bool):
+    def __init__(
+        self, gaussians: Gaussians, beta1: float, own_frames: bool, backend: Backend | None = None
+    ):
+        self.backend = backend or make_backend()
         self.beta1, self.own_frames = beta1, own_frames
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
@@ -74,14 +78,14 @@ class Adam:
         updated = {"sh"}
         if self.own_frames:
             updated |= {"means", "quats"}
-            frame_adam(
+            self.backend.frame_adam(
                 gaussians.means, gaussians.quats, gaussians.log_scales, gradients.means,
                 gradients.quats, self.frames(rates, step), threads,
             )  # fmt: skip
         for name, parameter in gaussians.tensors().items():
             if name in updated:
                 continue
-            adam_step(
+            self.backend.adam_step(
                 parameter, getattr(gradients, name), self.first[name], self.second[name],
                 getattr(rates, name), step, self.beta1, BETA2, EPSILON, threads,
             )  # fmt: skip

@@ -2,7 +2,7 @@
 
 A target that this processor lacks is emulated (aarch64) or compiled only (x86-64-v4), which the
 skip's reason says. Compilers and the emulator may be missing on a user's machine; with
-SPLATMAKE_REQUIRE_COMPILERS set, as in CI, a missing one fails.
+SPLATMAKE_REQUIRE_ALL set, as in CI, a missing one fails.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from pipeline.render.cpu import build
 from pipeline.runtime import processor, targets
 from tests.render.cpu.compiled import compiled
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
-from tests.tools import need
+from tests.tools import need, unsupported
 
 COMPILER = os.environ.get("CXX") or "g++"
 
@@ -43,7 +43,7 @@ def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[st
     if target.architecture == here:
         return [compiler], []
     if (here, target.name) != ("x86-64", "aarch64"):
-        pytest.skip(f"not run: {target.name} on {here}")
+        unsupported(f"{target.name} does not run on {here}")
     # Linked statically, so that the emulator needs no libraries. clang++ takes g++'s.
     cross = "aarch64-linux-gnu-g++"
     need(cross, "qemu-aarch64")
@@ -159,7 +159,7 @@ def test_every_target_matches_the_reference(
     command, emulator = toolchain(COMPILER, chosen)
     driver = compiled(tmp_path_factory, command, build.flags(target)) / "driver"
     if not emulator and chosen.missing:
-        pytest.skip(f"compiled, but not run: this processor lacks {', '.join(chosen.missing)}")
+        unsupported(f"compiled, but the processor lacks {', '.join(chosen.missing)}")
     for case in cases:
         case.write(tmp_path / "in")
         subprocess.run([*emulator, driver, tmp_path / "in", tmp_path / "out"], check=True)

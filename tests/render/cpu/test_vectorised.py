@@ -18,7 +18,7 @@ from pipeline.render.cpu import build
 from pipeline.runtime.targets import TARGETS
 from tests.render.cpu.compiled import compiled
 from tests.render.cpu.disassembly import Loop, innermost_loops
-from tests.tools import need
+from tests.tools import need, unsupported
 
 KERNELS = ("blend", "blend_backward", "loss", "project", "project_backward", "adam")
 X86 = platform.machine().lower() in ("x86_64", "amd64")
@@ -32,7 +32,7 @@ def _tools(target: str) -> tuple[list[str], str]:
     """Compiler and objdump for a target; skips where this machine has none."""
     if (target == "aarch64") == X86:
         if not X86:
-            pytest.skip("no cross compiler for x86-64 is looked for")
+            unsupported("no cross compiler for x86-64 is looked for")
         compiler, objdump = ["aarch64-linux-gnu-g++", "-static"], "aarch64-linux-gnu-objdump"
     else:
         compiler, objdump = build.compiler(), "objdump"

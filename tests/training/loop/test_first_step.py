@@ -10,11 +10,10 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.render import l1_ssim
+from pipeline.render import l1_ssim, make_backend
 from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.strategy import rotations
-from pipeline.training.loop import trainer
 from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, tiny_config
 
@@ -74,7 +73,7 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
 ) -> None:
     """Through each photograph's exposure, against finite differences of the picture."""
     seen: dict[str, Any] = {}
-    backward, loss = trainer.backward, trainer.l1_ssim
+    backward, loss = make_backend().backward, make_backend().l1_ssim
 
     def watched_backward(rendered: Any, d_color: Any, *rest: Any, **options: Any) -> Any:
         seen["color"], seen["d_color"] = rendered.color.clone(), d_color.clone()
@@ -84,8 +83,8 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
         seen["wanted_and_weights"] = rest
         return loss(picture, *rest)
 
-    monkeypatch.setattr(trainer, "backward", watched_backward)
-    monkeypatch.setattr(trainer, "l1_ssim", watched_loss)
+    monkeypatch.setattr(make_backend(), "backward", watched_backward)
+    monkeypatch.setattr(make_backend(), "l1_ssim", watched_loss)
     gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
     train(
         Inputs(scene.views, scene.initial, scene.extent, gains=gains),

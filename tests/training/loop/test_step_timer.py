@@ -6,7 +6,6 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runtime.native import Built
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
@@ -14,14 +13,13 @@ from pipeline.training.loop.step_timer import (
     MEASURED,
     WARM_UP,
     StepTimer,
-    build_record,
     other_build,
 )
 from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, tiny_config
 
-HERE = Built(Path("lib.so"), "x86-64-v3", "g++ 12.2.0")
-ELSEWHERE = Built(Path("lib.so"), "x86-64-v4", "g++ 12.2.0")
+HERE = {"instruction_set": "x86-64-v3", "compiler": "g++ 12.2.0"}
+ELSEWHERE = {"instruction_set": "x86-64-v4", "compiler": "g++ 12.2.0"}
 
 
 def lines(steps: int) -> list[str]:
@@ -46,8 +44,8 @@ def test_short_runs_are_measured_where_they_can_be(steps: int) -> None:
 
 def test_a_checkpoint_of_another_instruction_set_is_named() -> None:
     assert other_build({}, HERE) is None
-    assert other_build({"built": build_record(HERE)}, HERE) is None
-    text = other_build({"built": build_record(ELSEWHERE)}, HERE)
+    assert other_build({"built": HERE}, HERE) is None
+    text = other_build({"built": ELSEWHERE}, HERE)
     assert text is not None and "x86-64-v3" in text and "x86-64-v4" in text
 
 
@@ -65,7 +63,7 @@ def test_training_continues_from_a_checkpoint_of_another_instruction_set_and_say
     assert not any("continues with" in line for line in run())
     kept = checkpoint.newest(tmp_path)
     assert kept is not None
-    kept.values["built"] = build_record(ELSEWHERE)
+    kept.values["built"] = ELSEWHERE
     checkpoint.save(tmp_path, kept)
     (line,) = [line for line in run() if "continues with" in line]
     assert "x86-64-v4" in line

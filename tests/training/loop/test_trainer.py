@@ -13,7 +13,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.render import RasterOptions
+from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
@@ -22,7 +22,7 @@ from pipeline.training.checkpoints.checkpoint import PATTERN
 from pipeline.training.data import targets
 from pipeline.training.data.image_store import DiskStore, MemoryStore
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop import metrics_log, session, setup, trainer
+from pipeline.training.loop import metrics_log, session, setup
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
 from tests.training.conftest import HEIGHT, WIDTH, Options, TinyScene, tiny_config
@@ -61,7 +61,7 @@ def assert_same(a: TrainResult, b: TrainResult) -> None:
 def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
     """Kill the run in the middle of its ``call``-th step."""
     calls = 0
-    original = trainer.backward
+    original = make_backend().backward
 
     def dying(*args: object, **kwargs: object) -> object:
         nonlocal calls
@@ -70,7 +70,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
             raise KeyboardInterrupt
         return original(*args, **kwargs)  # type: ignore[arg-type]
 
-    monkeypatch.setattr(trainer, "backward", dying)
+    monkeypatch.setattr(make_backend(), "backward", dying)
 
 
 def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) -> None:
@@ -353,9 +353,12 @@ def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
 def test_a_loss_that_is_no_number_is_a_clear_error(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    original = trainer.l1_ssim
+    backend = make_backend()
+    original = backend.l1_ssim
     monkeypatch.setattr(
-        trainer, "l1_ssim", lambda *args: replace(original(*args), loss=float("nan"))
+        type(backend),
+        "l1_ssim",
+        lambda self, *args: replace(original(*args), loss=float("nan")),
     )
     with pytest.raises(UserError, match=r"not finite at step 1, view \d\.png"):
         run(scene, tmp_path)

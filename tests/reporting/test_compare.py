@@ -8,7 +8,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks import compare
+from pipeline.reporting import compare
 
 
 def row(scene: str, config: str, psnr: float, **changes: Any) -> dict[str, Any]:
@@ -71,7 +71,7 @@ def test_each_run_of_a_batch_is_a_row() -> None:
         "refine_wall_s": None,
     }
     more = {"total_images": 12, "registered_images": 11, "peak_rss_mb": 512.4, "warnings": 2}
-    lines = compare.each(
+    lines = compare.each_run(
         [
             row("a", "fast", 30.0, **times, **more, rotation_error_deg=0.0123),
             row("b", "fast", 20.0, **times, **more, rotation_error_deg=None, train_psnr=None),

@@ -1,0 +1,162 @@
+"""Checks of what comes into a backend: types, shapes, and cameras that can be drawn with."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import torch
+
+from pipeline.render.types import FrameAdam, RasterCamera, ShAdam
+
+MAX_IMAGE_SIDE = 1 << 16
+
+Parameters = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+"""means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,), sh (N, K, 3)."""
+
+
+def plain(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> torch.Tensor:
+    """The tensor detached and contiguous.
+
+    Raises:
+        ValueError: not float32 on the CPU, or of another shape (None: any size).
+    """
+    fits = value.dim() == len(shape) and all(
+        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+    )
+    if value.dtype != torch.float32 or value.device.type != "cpu" or not fits:
+        raise ValueError(
+            f"{name}: expected float32 {tuple('any' if s is None else s for s in shape)} on the "
+            f"CPU, found {value.dtype} {tuple(value.shape)} on {value.device}"
+        )
+    return value.detach().contiguous()
+
+
+def parameters(
+    means: torch.Tensor,
+    log_scales: torch.Tensor,
+    quats: torch.Tensor,
+    opacity_logits: torch.Tensor,
+    sh: torch.Tensor,
+    degree: int,
+) -> Parameters:
+    """The five arrays of Gaussians, checked by ``plain``, with harmonics up to ``degree``."""
+    n = means.shape[0]
+    if not 0 <= degree <= 3 or sh.dim() != 3 or sh.shape[1] < (degree + 1) ** 2:
+        raise ValueError(f"sh_degree {degree} does not fit sh of shape {tuple(sh.shape)}")
+    return (
+        plain("means", means, (n, 3)),
+        plain("log_scales", log_scales, (n, 3)),
+        plain("quats", quats, (n, 4)),
+        plain("opacity_logits", opacity_logits, (n,)),
+        plain("sh", sh, (n, None, 3)),
+    )
+
+
+def check_camera(camera: RasterCamera, near: float) -> None:
+    """ValueError where nothing can be drawn with the camera."""
+    pose = camera.world_to_camera.detach()
+    if pose.shape != (4, 4):
+        raise ValueError(f"world_to_camera: expected (4, 4), found {tuple(pose.shape)}")
+    values = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy, near], dtype=torch.float64)
+    if not bool(values.isfinite().all() and pose[:3].isfinite().all()):
+        raise ValueError("camera: every value must be finite")
+    if not (camera.fx > 0 and camera.fy > 0):
+        raise ValueError(f"camera: focal lengths must be positive, found {camera.fx}, {camera.fy}")
+    if not (1 <= camera.width <= MAX_IMAGE_SIDE and 1 <= camera.height <= MAX_IMAGE_SIDE):
+        raise ValueError(
+            f"camera: {camera.width} x {camera.height} px, sides must be 1 to {MAX_IMAGE_SIDE}"
+        )
+    if not near > 0:
+        raise ValueError(f"near must be positive, found {near}")
+
+
+def image_gradients(
+    d_color: torch.Tensor,
+    d_alpha: torch.Tensor | None,
+    d_depth: torch.Tensor | None,
+    size: tuple[int, int],
+) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+    """Gradients on the images of a view of ``size`` (width, height), checked by ``plain``."""
+    width, height = size
+    return (
+        plain("d_color", d_color, (height, width, 3)),
+        None if d_alpha is None else plain("d_alpha", d_alpha, (height, width)),
+        None if d_depth is None else plain("d_depth", d_depth, (height, width)),
+    )
+
+
+def images(
+    rendered: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
+) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    """A loss's images: rendered (H, W, 3), the target float32 or uint8, the mask uint8."""
+    rendered = plain("rendered", rendered, (None, None, 3))
+    size = tuple(rendered.shape)
+    if target.dtype == torch.uint8 and tuple(target.shape) == size:
+        target = target.contiguous()
+    else:
+        target = plain("target", target, size)
+    if mask is not None:
+        if mask.dtype not in (torch.bool, torch.uint8) or tuple(mask.shape) != size[:2]:
+            raise ValueError(
+                f"mask: expected bool or uint8 {size[:2]}, found {mask.dtype} {tuple(mask.shape)}"
+            )
+        mask = mask.contiguous().view(torch.uint8)
+    return rendered, target, mask
+
+
+def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
+    """ValueError where the moments do not fit ``sh``, or the rates are none."""
+    for tensor in (adam.exp_avg, adam.exp_avg_sq):
+        if tensor.dtype != torch.float32 or tensor.shape != sh.shape or not tensor.is_contiguous():
+            raise ValueError("sh_adam: moments must be float32, contiguous and shaped as sh")
+    if adam.last.dtype != torch.int32 or adam.last.shape != sh.shape[:1]:
+        raise ValueError(f"sh_adam: last must be int32 of shape ({len(sh)},)")
+    values = [adam.rate0, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
+    if adam.step < 1 or not torch.tensor(values, dtype=torch.float64).isfinite().all():
+        raise ValueError(f"sh_adam: step {adam.step} must be at least 1 and the rates finite")
+
+
+def check_adam(
+    param: torch.Tensor,
+    grad: torch.Tensor,
+    exp_avg: torch.Tensor,
+    exp_avg_sq: torch.Tensor,
+    lr: float | Sequence[float],
+    step: int,
+) -> None:
+    """ValueError where ``adam_step`` cannot be taken."""
+    shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
+    for tensor in (param, grad, exp_avg, exp_avg_sq):
+        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise ValueError("adam_step: tensors must be float32 and contiguous")
+        if tensor.shape != param.shape and not (shared and tensor is exp_avg_sq):
+            raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
+    if shared and not isinstance(lr, int | float):
+        raise ValueError(f"adam_step: rows that share a moment have one lr, found {lr}")
+    rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
+    if step < 1 or not len(rates) or not rates.isfinite().all():
+        raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
+
+
+def check_frame_adam(
+    means: torch.Tensor,
+    quats: torch.Tensor,
+    log_scales: torch.Tensor,
+    d_means: torch.Tensor,
+    d_quats: torch.Tensor,
+    adam: FrameAdam,
+) -> None:
+    """ValueError where ``frame_adam`` cannot be taken."""
+    moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
+    fours = (quats, d_quats)
+    for tensor in (means, log_scales, d_means, *moments, *fours):
+        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+            raise ValueError("frame_adam: tensors must be float32 and contiguous")
+        width = 4 if any(tensor is four for four in fours) else 3
+        if tensor.shape != (len(means), width):
+            raise ValueError(
+                f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
+            )
+    rates = torch.tensor([adam.mean_rate, adam.turn_rate], dtype=torch.float64)
+    if adam.step < 1 or not rates.isfinite().all():
+        raise ValueError(f"frame_adam: step {adam.step} must be at least 1 and rates finite")

@@ -1,0 +1,201 @@
+"""The float64 reference as a backend: what a new one is held to. Small scenes only."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+
+import torch
+
+from pipeline.render import checks, reference
+from pipeline.render.backend import Backend
+from pipeline.render.checks import Parameters
+from pipeline.render.types import (
+    CameraGradients,
+    Forward,
+    FrameAdam,
+    Gradients,
+    LossResult,
+    RasterCamera,
+    RasterOptions,
+    ShAdam,
+)
+
+
+@dataclass(frozen=True)
+class Projected:
+    """Float64 copies that carry gradients, and the visible Gaussians on the image plane.
+
+    Attributes:
+        parameters: as they came in.
+        leaves: the five arrays.
+        change: (10,) zeros, of which ``camera`` is the function that ``reference.moved`` is.
+    """
+
+    parameters: Parameters
+    leaves: list[torch.Tensor]
+    change: torch.Tensor
+    camera: RasterCamera
+    options: RasterOptions
+    projection: reference.Projection
+
+
+@dataclass(frozen=True)
+class State:
+    """A drawn view; ``centres`` (pixels, V, 2) are the ellipses' centres as each pixel uses them,
+    so that absolute gradients can be summed by pixel."""
+
+    projected: Projected
+    centres: torch.Tensor
+    image: reference.Blend
+
+
+class ReferenceBackend(Backend[Projected, Projected]):
+    """``reference``'s functions, differentiated by autograd; pixels times Gaussians of memory."""
+
+    def facts(self) -> Mapping[str, str]:
+        return {"instruction_set": "float64 reference", "compiler": f"torch {torch.__version__}"}
+
+    def project(
+        self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
+    ) -> Projected:
+        leaves = [tensor.double().requires_grad_() for tensor in parameters]
+        change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
+        moved = reference.moved(camera, change)
+        means, log_scales, quats, opacity_logits, sh = leaves
+        projection = reference.project(means, log_scales, quats, opacity_logits, sh, moved, options)
+        return Projected(parameters, leaves, change, moved, options, projection)
+
+    def bin(self, projected: Projected) -> Projected:
+        return projected
+
+    def blend(self, binned: Projected) -> Forward:
+        leaves, camera, options = binned.leaves, binned.camera, binned.options
+        projection = binned.projection
+        visible = projection.index
+        colors = reference.sh_colors(
+            leaves[0][visible], leaves[4][visible], camera, options.sh_degree, options.black_stays
+        )
+        centres = projection.means2d.expand(camera.height * camera.width, -1, -1)
+        image = reference.blend(replace(projection, means2d=centres), colors, camera, options)
+        return Forward(
+            image.color.detach().float(), image.alpha.detach().float(), projection.radii.float(),
+            len(visible), projection.num_dropped, image.pairs,
+            lambda: (image.depth.detach().float(), image.median_depth.float()),
+            State(binned, centres, image),
+        )  # fmt: skip
+
+    def backward(
+        self,
+        fwd: Forward,
+        d_color: torch.Tensor,
+        d_alpha: torch.Tensor | None = None,
+        d_depth: torch.Tensor | None = None,
+        *,
+        means2d_abs: bool = True,
+        camera: bool = False,
+        sh_adam: ShAdam | None = None,
+    ) -> Gradients:
+        state: State = fwd.state
+        projected, image = state.projected, state.image
+        size = projected.camera.width, projected.camera.height
+        d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, size)
+        total = (image.color * d_color).sum()
+        for plane, gradient in ((image.alpha, d_alpha), (image.depth, d_depth)):
+            if gradient is not None:
+                total = total + (plane * gradient).sum()
+        found = torch.autograd.grad(
+            total,
+            [*projected.leaves, projected.change, state.centres],
+            retain_graph=True,
+            allow_unused=True,
+            materialize_grads=True,
+        )
+        arrays, d_change, d_centres = found[:5], found[5], found[6]
+        index, count = projected.projection.index, len(arrays[0])
+        d_means2d, d_abs = torch.zeros(count, 2), torch.zeros(count, 2)
+        d_means2d[index] = d_centres.sum(0).float()
+        d_abs[index] = d_centres.abs().sum(0).float()
+        d_sh = arrays[4]
+        if sh_adam is not None:
+            asked = torch.cat([g.reshape(count, -1) for g in arrays], 1).any(1)
+            _step_sh(projected.parameters[4], d_sh, asked, sh_adam)
+            d_sh = d_sh[:0]
+        return Gradients(
+            arrays[0].float(), arrays[1].float(), arrays[2].float(), arrays[3].float(),
+            d_sh.float(), d_means2d, d_abs if means2d_abs else None,
+            CameraGradients(*d_change.split([3, 3, 2, 2])) if camera else None,
+        )  # fmt: skip
+
+    def l1_ssim(
+        self,
+        rendered: torch.Tensor,
+        target: torch.Tensor,
+        ssim_weight: float,
+        mask: torch.Tensor | None = None,
+        square_weight: float = 0.0,
+        threads: int = 0,
+    ) -> LossResult:
+        rendered, target, mask = checks.images(rendered, target, mask)
+        leaf = rendered.double().requires_grad_()
+        left_out = None if mask is None else mask.bool()
+        loss, error, ssim = reference.l1_ssim(leaf, target, ssim_weight, left_out, square_weight)
+        (grad,) = torch.autograd.grad(loss, leaf)
+        return LossResult(
+            float(loss.detach()), float(error.detach()), float(ssim.detach()), grad.float()
+        )
+
+    def adam_step(
+        self,
+        param: torch.Tensor,
+        grad: torch.Tensor,
+        exp_avg: torch.Tensor,
+        exp_avg_sq: torch.Tensor,
+        lr: float | Sequence[float],
+        step: int,
+        beta1: float = 0.9,
+        beta2: float = 0.999,
+        eps: float = 1e-15,
+        threads: int = 0,
+    ) -> None:
+        checks.check_adam(param, grad, exp_avg, exp_avg_sq, lr, step)
+        with _in_double(param, exp_avg, exp_avg_sq) as (p, first, second):
+            reference.adam_step(p, grad.double(), first, second, lr, step, beta1, beta2, eps)
+
+    def frame_adam(
+        self,
+        means: torch.Tensor,
+        quats: torch.Tensor,
+        log_scales: torch.Tensor,
+        d_means: torch.Tensor,
+        d_quats: torch.Tensor,
+        adam: FrameAdam,
+        threads: int = 0,
+    ) -> None:
+        checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
+        moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
+        with _in_double(means, quats, *moments) as (m, q, *doubles):
+            mean, mean_sq, turn, turn_sq = doubles
+            precise = replace(
+                adam, mean_avg=mean, mean_avg_sq=mean_sq, turn_avg=turn, turn_avg_sq=turn_sq
+            )
+            gradients = d_means.double(), d_quats.double()
+            reference.frame_adam(m, q, log_scales.double(), *gradients, precise)
+
+
+def _step_sh(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:
+    checks.check_sh_adam(adam, sh)
+    with _in_double(sh, adam.exp_avg, adam.exp_avg_sq) as (p, first, second):
+        precise = replace(adam, exp_avg=first, exp_avg_sq=second)
+        reference.sh_adam(p, grad, asked, precise)
+
+
+@contextmanager
+def _in_double(*tensors: torch.Tensor) -> Iterator[list[torch.Tensor]]:
+    """Float64 copies; what they hold in the end goes back into the tensors."""
+    with torch.no_grad():
+        doubles = [tensor.double() for tensor in tensors]
+        yield doubles
+        for tensor, double in zip(tensors, doubles, strict=True):
+            tensor.copy_(double)

@@ -1,0 +1,221 @@
+"""The runs of a batch, what its configurations are worth, or how well a second batch repeats it.
+
+    splatmake compare results/benchmark.json --each
+    splatmake compare results/benchmark.json --base balanced
+    splatmake compare first/benchmark.json results/benchmark.json
+
+prints the table as Markdown. ``config/ablations.yaml`` and ``config/skipping.yaml`` make batches
+that are worth comparing.
+"""
+
+from __future__ import annotations
+
+import json
+import statistics
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.runs import Run
+from pipeline.config.schema import Config
+from pipeline.runtime.errors import UserError
+
+# The same run on the same machine gives these to the bit.
+QUALITY = (
+    "psnr",
+    "ssim",
+    "train_psnr",
+    "num_gaussians",
+    "registered_images",
+    "reprojection_error_px",
+    "rotation_error_deg",
+    "centre_error_share",
+)
+# Stages in which a choice of the plan shows; the others' time goes with them.
+POSES = ("decode", "features", "matches", "sfm", "refine", "undistort")
+WORK = (*POSES, "train")
+
+Row = dict[str, Any]
+
+
+def each_run(rows: Sequence[Row]) -> list[str]:
+    """Each run for itself: quality, and wall seconds by stage."""
+    lines = [
+        "| run | PSNR | on training views | SSIM | Gaussians | posed | rotation, centres | poses s "
+        "| training s | in all s | most MB | |",
+        "|---" * 12 + "|",
+    ]
+    seeded = len({row["seed"] for row in rows}) > 1
+    for row in rows:
+        name = Run(row["scene"], row["config"], row["seed"] if seeded else None).name
+        if row["status"] != "ok":
+            lines.append(f"| {name} | {row['status']}: {row['message']} {'| ' * 10}|")
+            continue
+        turned, moved = row["rotation_error_deg"], row["centre_error_share"]
+        known = turned is not None and moved is not None
+        cells = [
+            name,
+            f"{row['psnr']:.2f} dB",
+            "" if row["train_psnr"] is None else f"{row['train_psnr']:.2f}",
+            _short(row["ssim"]),
+            f"{row['num_gaussians'] / 1e3:.0f}k",
+            f"{row['registered_images']}/{row['total_images']}",
+            f"{turned:.3f} degrees, {moved:.2%}" if known else "",
+            f"{_wall(row, POSES):.0f}",
+            f"{_wall(row, ('train',)):.0f}",
+            f"{row['wall_s']:.0f}",
+            f"{row['peak_rss_mb']:.0f}",
+            "warned" if row["warnings"] else "",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return lines
+
+
+def against(rows: Sequence[Row], base: str) -> list[str]:
+    """Each configuration beside ``base``, scene by scene and in the mean: the difference of PSNR
+    (dB), of SSIM and of CPU seconds for poses and training together; then these seconds apart, and
+    Gaussians. Of several seeds, compared seed by seed: the median, and half the range.
+    """
+    by_run = {(row["scene"], row["config"], row["seed"]): row for row in rows}
+    configs, scenes, seeds = (
+        list(dict.fromkeys(row[key] for row in rows)) for key in ("config", "scene", "seed")
+    )
+    head = "| | " + " | ".join(scenes) + " | mean | CPU s: poses, training | Gaussians |"
+    lines = [head, "|---" * (len(scenes) + 4) + "|"]
+    for config in configs:
+        cells: list[str] = []
+        gains: list[float] = []
+        kept: list[list[Row]] = []
+        for scene in scenes:
+            found = [by_run[key] for seed in seeds if (key := (scene, config, seed)) in by_run]
+            done = [row for row in found if row["status"] == "ok"]
+            if not done:
+                states = [f"{row['status']}: {row['message']}" for row in found]
+                cells.append(states[0] if states else "no run")
+                continue
+            kept.append(done)
+            pairs = [
+                (row, other)
+                for row in done
+                if (other := by_run.get((scene, base, row["seed"]))) and other["status"] == "ok"
+            ]
+            if config == base or not pairs:
+                psnr = _spread([row["psnr"] for row in done], "{:.2f}")
+                ssim = _short(statistics.median(row["ssim"] for row in done))
+                seconds = _spread([_cpu(row, WORK) for row in done], "{:.0f}")
+                cells.append(f"{psnr} dB, {ssim}, {seconds} s")
+                continue
+            more = [row["psnr"] - other["psnr"] for row, other in pairs]
+            gains.append(statistics.median(more))
+            ssim = _short(statistics.median(r["ssim"] - o["ssim"] for r, o in pairs), "+")
+            seconds = _spread(
+                [_cpu(row, WORK) - _cpu(other, WORK) for row, other in pairs], "{:+.0f}"
+            )
+            cells.append(f"{_spread(more, '{:+.2f}')}, {ssim}, {seconds} s")
+        mean = f"{statistics.fmean(gains):+.2f} dB" if gains else ""
+        cost = gaussians = ""
+        if kept:
+            poses, training, number = (
+                statistics.fmean(statistics.median(of(row) for row in done) for done in kept)
+                for of in (
+                    lambda row: _cpu(row, POSES),
+                    lambda row: _cpu(row, ("train",)),
+                    lambda row: row["num_gaussians"],
+                )
+            )
+            cost = f"{poses:.0f}, {training:.0f}"
+            gaussians = f"{number / 1e3:.0f}k"
+        name = f"**{config}**" if config == base else config
+        lines.append(f"| {name} | {' | '.join(cells)} | {mean} | {cost} | {gaussians} |")
+    return lines
+
+
+def _spread(values: Sequence[float], form: str) -> str:
+    """The median, and of several values half their range."""
+    middle = form.format(statistics.median(values))
+    if len(values) == 1:
+        return middle
+    half = form.replace("+", "").format((max(values) - min(values)) / 2)
+    return f"{middle} ±{half}"
+
+
+def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
+    """What two batches of the same runs agree in: quality to the bit, and the ratio of times."""
+    again = {(row["scene"], row["config"], row["seed"]): row for row in second}
+    lines = ["| run | quality | wall s | CPU s |", "|---|---|---|---|"]
+    ratios: dict[str, list[float]] = {"wall_s": [], "cpu_s": []}
+    for row in first:
+        name = "@".join(str(row[key]) for key in ("scene", "config") if row[key])
+        other = again.get((row["scene"], row["config"], row["seed"]))
+        if other is None or row["status"] != "ok" or other["status"] != "ok":
+            states = row["status"], "no run" if other is None else other["status"]
+            lines.append(f"| {name} | {states[0]}, then {states[1]} | | |")
+            continue
+        differ = [f"{key} {row[key]} and {other[key]}" for key in QUALITY if row[key] != other[key]]
+        cells = [", ".join(differ) or "the same"]
+        for key, found in ratios.items():
+            # What was taken over from another run has that run's time.
+            found.append(other[key] / row[key])
+            cells.append(f"{row[key]:.0f}, {other[key]:.0f}")
+        lines.append(f"| {name} | {' | '.join(cells)} |")
+    for key, found in ratios.items():
+        if found:
+            spread = f"{min(found):.2f} to {max(found):.2f}"
+            lines.append(
+                f"\n{key}, second to first: median {statistics.median(found):.2f}, {spread}"
+            )
+    return lines
+
+
+def _wall(row: Row, stages: Sequence[str]) -> float:
+    return sum(row[f"{stage}_wall_s"] or 0.0 for stage in stages)
+
+
+def _cpu(row: Row, stages: Sequence[str]) -> float:
+    return sum(row[f"{stage}_cpu_s"] or 0.0 for stage in stages)
+
+
+def _short(value: float, sign: str = "") -> str:
+    return f"{value:{sign}.3f}".replace("0.", ".", 1)
+
+
+def compare(batches: Sequence[Path], base: str | None = None, each: bool = False) -> list[str]:
+    """A table of one batch, or of how well a second repeats the first, as lines of Markdown.
+
+    Args:
+        batches: one or two ``benchmark.json``.
+        base: the configuration that others are compared with; None: the default preset.
+        each: each run of one batch, without comparing.
+
+    Raises:
+        UserError: more than two files, one that is no batch's, or no such configuration.
+    """
+    if len(batches) > 2:
+        raise UserError(
+            f"expected one or two batches, found {len(batches)}", fix="compare them in pairs"
+        )
+    runs = [_read(path) for path in batches]
+    if len(runs) == 2:
+        return repeated(*runs)
+    if each:
+        return each_run(runs[0])
+    base = base or Config().preset
+    configs = sorted({row["config"] for row in runs[0]})
+    if base not in configs:
+        raise UserError(
+            f"expected a configuration {base!r}, found {', '.join(configs)}",
+            file=batches[0],
+            fix="name one of them with --base",
+        )
+    return against(runs[0], base)
+
+
+def _read(path: Path) -> list[Row]:
+    try:
+        return list(json.loads(path.read_text())["runs"])
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise UserError(
+            f"expected a batch's benchmark.json: {error}",
+            file=path,
+            fix="make one: snakemake results/benchmark.csv",
+        ) from None

@@ -17,7 +17,7 @@ help:
 	@echo "make test-packages  other projects' packages that some tests compare with (needs Node)"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
-	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
+	@echo "make docs   regenerate the reference of options and config/config.yaml"
 	@echo "make viewer rebuild the pages' viewer (needs Node 20 or newer)"
 	@echo "make clean  remove results/ and data/demo"
 

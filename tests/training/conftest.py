@@ -1,4 +1,4 @@
-"""A tiny scene of known Gaussians, photographed by the rasterizer itself."""
+"""A tiny scene: renders of known Gaussians as photographs."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ NUM_VIEWS = 6
 
 @dataclass
 class TinyScene:
-    """``views`` have files without alpha, ``alpha_views`` the same with it."""
+    """``views`` have images without alpha, ``alpha_views`` the same with alpha."""
 
     truth: Gaussians
     initial: Gaussians
@@ -123,7 +123,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
 
 @contextmanager
 def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
-    """What trains inside writes a checkpoint after every step, and dies in this one."""
+    """Training inside writes a checkpoint after every step and is interrupted in this step."""
     original, calls = make_backend().backward, 0
 
     def dying(*args: Any, **kwargs: Any) -> Any:

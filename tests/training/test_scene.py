@@ -1,4 +1,4 @@
-"""What is prepared of a scene for its training, and what is said of the training."""
+"""Inputs of the training of a scene, and the description of its result."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ from tests.training.conftest import ball, camera_at
 
 
 class Started(Exception):
-    """Training would begin."""
+    """Raised where training would begin."""
 
 
-def test_the_scene_is_as_large_as_what_is_seen(
+def test_the_scale_follows_the_depths_of_training_views(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Not as its cameras stand apart, along a street say; and held-out views are kept from it."""
+    """Not the extent of the cameras, along a street for example; test views have no influence."""
     views = [replace(camera_at(k), name=str(k), is_test=k == 0) for k in range(3)]
     known = KnownDepths(np.zeros((1, 2)), np.full(1, 4.0, np.float32), np.ones(1, np.float32))
     given: list[Inputs] = []
@@ -62,7 +62,7 @@ def test_the_scene_is_as_large_as_what_is_seen(
     assert given[0].size == pytest.approx(SCALE_SHARE * 4.0)
 
 
-def test_a_training_too_short_for_its_views_says_so() -> None:
+def test_too_few_epochs_give_a_warning() -> None:
     assert stage.too_few_epochs(600, 200, 60.0, None) is None
     by_steps = stage.too_few_epochs(150, 200, 60.0, None)
     assert by_steps is not None and "150 steps are 0.8 epochs over 200 training views" in by_steps

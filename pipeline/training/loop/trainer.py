@@ -62,7 +62,9 @@ class Trainer:
         index, factor = state.next_view(), self.factor()
         target, camera = self.scene.target(index, factor), self.camera(index, factor)
         background = self.draw_background()
-        rendered = self.backend.forward(*state.gaussians.parameters(), camera, self.options(background))
+        rendered = self.backend.forward(
+            *state.gaussians.parameters(), camera, self.options(background)
+        )
         d_color = self.color_loss(rendered, target, index, background)
         d_alpha, d_depth = self.other_losses(rendered, target, index)
         run_length = self.clock.run_length(state)

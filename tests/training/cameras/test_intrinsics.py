@@ -1,4 +1,4 @@
-"""Focal lengths and principal points that are off by a little are brought back."""
+"""Refinement of intrinsics recovers inaccurate focal lengths and principal points."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ WRONG = np.array([0.03, -0.02, 0.015])
 
 
 def wrong(view: View) -> View:
-    """Another camera than the others', and off."""
+    """The view with a camera of its own, whose intrinsics are wrong."""
     factor = float(np.exp(WRONG[0]))
     return replace(
         view,
@@ -42,7 +42,7 @@ def wrong(view: View) -> View:
 
 
 def trained(scene: TinyScene, folder: Path, steps: int, **options: object) -> TrainResult:
-    """The scene is right, and stays; every third view's camera is wrong."""
+    """Train with fixed, correct Gaussians; every third view has wrong intrinsics."""
     views = [wrong(v) if i % 3 == 0 else v for i, v in enumerate(scene.views)]
     options |= {f"{name}_learning_rate": 0.0 for name in STILL}
     options |= {"refine_intrinsics": True, "max_intrinsics_change": 0.08}
@@ -56,9 +56,7 @@ def trained(scene: TinyScene, folder: Path, steps: int, **options: object) -> Tr
     )
 
 
-def test_training_adjusts_a_lens_that_disagrees_with_the_others(
-    scene: TinyScene, tmp_path: Path
-) -> None:
+def test_training_recovers_wrong_intrinsics(scene: TinyScene, tmp_path: Path) -> None:
     result = trained(scene, tmp_path, 600)
     assert result.poses is None
     assert result.intrinsics is not None and list(result.intrinsics) == [0, 7]
@@ -66,7 +64,7 @@ def test_training_adjusts_a_lens_that_disagrees_with_the_others(
     np.testing.assert_allclose(result.intrinsics[7], -WRONG, atol=0.1 * np.abs(WRONG).max())
 
 
-def test_adjusted_lenses_survive_a_kill_to_the_bit(
+def test_refined_intrinsics_are_the_same_bits_after_a_kill(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = trained(scene, tmp_path / "whole", 100, refine_poses=True)
@@ -84,8 +82,8 @@ def test_adjusted_lenses_survive_a_kill_to_the_bit(
         assert torch.equal(tensor, resumed.gaussians.tensors()[name]), name
 
 
-def test_a_picture_of_another_size_has_the_same_change(scene: TinyScene) -> None:
-    """Training sees pictures at a half of their size, too; the model stands for the whole."""
+def test_a_change_of_intrinsics_is_independent_of_the_image_size(scene: TinyScene) -> None:
+    """Training also uses reduced images; the model holds cameras of the full size."""
     lenses = IntrinsicsRefinement.of([wrong(scene.views[0])], 0.02)
     lenses.change[0] = -WRONG
     view = wrong(scene.views[0])

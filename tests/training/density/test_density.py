@@ -1,4 +1,4 @@
-"""Density control: rows, moments and budget stay in order; splits keep where things are."""
+"""Density control: rows, moments and budget are consistent; splits keep positions and extents."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ from tests.training.conftest import ball
 
 
 def marked(count: int) -> tuple[Gaussians, Adam]:
-    """Gaussians whose moments name the row they belong to."""
+    """Gaussians with moments that are equal to their row's number, from 1."""
     gaussians = ball(count, 0)
     adam = Adam(gaussians, beta1=0.8, own_frames=True)
     for moments in (adam.first, adam.second):
@@ -118,7 +118,7 @@ def test_transparent_gaussians_with_small_gradients_are_recycled() -> None:
     assert torch.equal(result.means[39:], gaussians.means[39:])
 
 
-def test_invisible_steps_do_not_thin_the_mean_gradient() -> None:
+def test_steps_without_the_gaussian_do_not_change_its_mean_gradient() -> None:
     gaussians, adam = marked(2)
     density = strategy(2, split_scale=100.0, grad_threshold=1.0)
     density.gradient_sum = torch.tensor([3.0, 3.0])
@@ -146,7 +146,7 @@ def test_a_split_keeps_the_mean_and_shrinks() -> None:
 
 
 def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
-    """Both as they should be, about the middle, and as far out along the axis as before."""
+    """About the old centre, with the old variance along the axis."""
     gaussians, adam = marked(5)
     gaussians.log_scales += torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     density = strategy(5, clone=False, split_kind="long_axis")
@@ -181,7 +181,7 @@ def test_clones_are_copies() -> None:
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
-def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
+def test_values_that_are_not_finite_are_removed(name: str) -> None:
     gaussians, adam = marked(6)
     gaussians.tensors()[name].view(6, -1)[2, 0] = math.nan
     result = refine(strategy(6), gaussians, adam, densify=False)
@@ -189,7 +189,7 @@ def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
     assert all(torch.isfinite(tensor).all() for tensor in result.tensors().values())
 
 
-def test_opacity_reset_caps_and_forgets() -> None:
+def test_an_opacity_reset_limits_opacities_and_clears_moments() -> None:
     gaussians, adam = marked(4)
     gaussians.opacity_logits[0] = -7.0
     strategy(4).reset_opacity(gaussians, adam)
@@ -200,7 +200,7 @@ def test_opacity_reset_caps_and_forgets() -> None:
     assert adam.first["means"].all()
 
 
-def test_without_split_or_clone_the_other_is_done_to_all() -> None:
+def test_without_splits_all_are_cloned_and_without_clones_all_are_split() -> None:
     for options, cloned, split in (({"split": False}, 5, 0), ({"clone": False}, 0, 5)):
         gaussians, adam = marked(5)
         density = strategy(5, split_scale=0.13, **options)
@@ -245,9 +245,9 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 10, 50])
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.95])
-def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
-    """As many as ``parts`` in one place look as the one did: the same in the middle, and the same
-    light in all along a line (what equation 9 asks for)."""
+def test_relocation_keeps_the_rendered_image(parts: int, opacity: float) -> None:
+    """``parts`` Gaussians in one place render like the single one: the same maximum and the same
+    integral along a line (equation 9)."""
     logits = torch.logit(torch.tensor([opacity]))
     new, shrink = share_out(logits, torch.tensor([parts]), 1e-6)
     x = torch.linspace(-9, 9, 4001, dtype=torch.float64)
@@ -258,7 +258,7 @@ def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
     assert many.sum() == pytest.approx(float(one.sum()), rel=1e-3)
 
 
-def test_noise_moves_the_faint_along_their_axes_alone() -> None:
+def test_noise_moves_transparent_gaussians_along_their_axes() -> None:
     gaussians = ball(2000, 0)
     gaussians.opacity_logits[:1000] = -9.0
     gaussians.opacity_logits[1000:] = 3.0
@@ -271,7 +271,7 @@ def test_noise_moves_the_faint_along_their_axes_alone() -> None:
     assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
 
 
-def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
+def test_mcmc_regularisers_are_gradients_of_the_mean_opacity_and_scale() -> None:
     gaussians = ball(5, 0)
     logits = gaussians.opacity_logits.clone().requires_grad_()
     scales = gaussians.log_scales.clone().requires_grad_()
@@ -287,7 +287,7 @@ def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
 def test_density_control_does_not_depend_on_the_unit(
     config: Gradient | Mcmc | Original, scale: float
 ) -> None:
-    """The same scene in another unit: the same is cloned, split, moved and costs the same."""
+    """The same Gaussians are cloned, split and moved, with the same losses, in another unit."""
     found = []
     for unit in (1.0, scale):
         gaussians, adam = marked(200)
@@ -321,7 +321,7 @@ def test_density_control_does_not_depend_on_the_unit(
 
 
 def test_gradients_are_measured_in_normalised_device_coordinates() -> None:
-    """A pixel is 2 / width of them: by the published threshold, whatever the picture's size."""
+    """A pixel is 2 / width: thresholds are independent of the size of the image."""
     density = strategy(2)
     means2d = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
     gradients = SimpleNamespace(means2d=means2d, means2d_abs=None)

@@ -1,4 +1,4 @@
-"""Training knows no more of a backend than its interface: the float64 reference trains as well."""
+"""Training uses only the interface of a backend: the float64 reference trains as well."""
 
 from __future__ import annotations
 

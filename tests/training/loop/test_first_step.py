@@ -1,4 +1,4 @@
-"""One step, looked at closely: longer runs forgive a wrong rate or gradient."""
+"""The first step in detail: longer runs hide wrong learning rates and gradients."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ RATES = {
 
 
 @pytest.mark.parametrize("unit", ["gaussian_scale", "scene_scale", "camera_extent"])
-def test_each_parameter_steps_as_far_as_its_own_rate_says(
+def test_each_parameter_has_its_own_learning_rate(
     scene: TinyScene, tmp_path: Path, unit: str
 ) -> None:
     """Adam's first step is the rate itself, up or down: along and about each Gaussian's own axes,
@@ -68,10 +68,10 @@ def test_each_parameter_steps_as_far_as_its_own_rate_says(
         assert moved == pytest.approx(2.0 * expected[name], rel=1e-3), name
 
 
-def test_what_is_differentiated_is_the_loss_that_is_measured(
+def test_the_gradient_is_that_of_the_loss(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Through each photograph's exposure, against finite differences of the picture."""
+    """With exposure gains, against finite differences of the image."""
     seen: dict[str, Any] = {}
     backward, loss = make_backend().backward, make_backend().l1_ssim
 

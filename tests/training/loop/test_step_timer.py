@@ -1,4 +1,4 @@
-"""The line about instruction set and time a step, and checkpoints of another instruction set."""
+"""The log line on instruction set and time per step; checkpoints of another instruction set."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ ELSEWHERE = {"instruction_set": "x86-64-v4", "compiler": "g++ 12.2.0"}
 
 
 def lines(steps: int) -> list[str]:
-    """Said in a run whose first steps are slow and whose others take 20 ms."""
+    """Log lines of a run whose first steps are slow and whose others take 20 ms."""
     timer, seconds, said = StepTimer(HERE, 2, steps), 0.0, []
     for step in range(1, steps + 1):
         seconds += 1.0 if step <= WARM_UP // 2 else 0.02
@@ -32,24 +32,24 @@ def lines(steps: int) -> list[str]:
 
 
 @pytest.mark.parametrize("steps", [WARM_UP + MEASURED, 1000])
-def test_the_time_a_step_leaves_the_first_steps_out_and_is_said_once(steps: int) -> None:
+def test_the_time_per_step_excludes_the_first_steps_and_is_logged_once(steps: int) -> None:
     (line,) = lines(steps)
     assert line == "x86-64-v3, g++ 12.2.0, 2 threads: 20.0 ms a step, images at 1/4 of their size"
 
 
 @pytest.mark.parametrize("steps", [1, 2, 7, 20])
-def test_short_runs_are_measured_where_they_can_be(steps: int) -> None:
+def test_short_runs_are_measured_unless_they_have_one_step(steps: int) -> None:
     assert len(lines(steps)) == (steps > 1)
 
 
-def test_a_checkpoint_of_another_instruction_set_is_named() -> None:
+def test_a_checkpoint_of_another_instruction_set_is_logged() -> None:
     assert other_build({}, HERE) is None
     assert other_build({"built": HERE}, HERE) is None
     text = other_build({"built": ELSEWHERE}, HERE)
     assert text is not None and "x86-64-v3" in text and "x86-64-v4" in text
 
 
-def test_training_continues_from_a_checkpoint_of_another_instruction_set_and_says_so(
+def test_training_resumes_from_a_checkpoint_of_another_instruction_set(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def run() -> list[str]:

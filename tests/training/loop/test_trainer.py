@@ -1,4 +1,4 @@
-"""Training for real on a tiny scene: it learns, resumes to the bit, and stops with clear errors."""
+"""Training a tiny scene: it converges, resumes to the same bits, and stops with clear errors."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ def interrupt_at(monkeypatch: pytest.MonkeyPatch, call: int) -> None:
     monkeypatch.setattr(make_backend(), "backward", dying)
 
 
-def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) -> None:
+def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Path) -> None:
     """One Gaussian is above all cameras, another inside an opaque ball of others. A run too short
     for each photograph to have been looked at knows nothing."""
     initial = scene.initial.select(torch.arange(len(scene.initial)))
@@ -101,7 +101,7 @@ def test_what_no_photograph_saw_is_left_out(scene: TinyScene, tmp_path: Path) ->
     assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
 
 
-def test_pictures_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
+def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
     config = tiny_config(coarse_share=0.3)
     assert isinstance(setup.choose_image_store(scene.views, config.train, None), MemoryStore)
     assert isinstance(setup.choose_image_store(scene.views, config.train, 1), DiskStore)
@@ -184,7 +184,7 @@ def test_the_metrics_log_has_each_step_once_after_a_kill(
     assert len(metrics_log.read_metrics_log(file)) == 40
 
 
-def test_minutes_pass_through_the_whole_schedule(
+def test_a_time_budget_passes_through_the_whole_schedule(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     # A clock of its own, a hundredth of a second a look: load has no part in it.
@@ -256,7 +256,7 @@ def test_threads_do_not_change_the_bits(scene: TinyScene, tmp_path: Path) -> Non
     assert (tmp_path / "1.npz").read_bytes() == (tmp_path / "2.npz").read_bytes()
 
 
-def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) -> None:
+def test_ignored_pixels_have_no_influence(scene: TinyScene, tmp_path: Path) -> None:
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[8:20, 5:22] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -274,8 +274,8 @@ def test_what_a_mask_hides_has_no_influence(scene: TinyScene, tmp_path: Path) ->
     assert_same(*results)
 
 
-def test_what_only_a_mask_sees_vanishes(scene: TinyScene, tmp_path: Path) -> None:
-    """Nobody asks for anything there, and left alone it stands in the way of other cameras."""
+def test_gaussians_behind_masks_vanish(scene: TinyScene, tmp_path: Path) -> None:
+    """No colour loss constrains them, and other cameras would see them."""
     mask = np.full((HEIGHT, WIDTH), 255, np.uint8)
     mask[:, : WIDTH // 2] = 0
     Image.fromarray(mask).save(tmp_path / "mask.png")
@@ -295,9 +295,7 @@ def test_what_only_a_mask_sees_vanishes(scene: TinyScene, tmp_path: Path) -> Non
     assert right == pytest.approx(left_right, rel=0.2)
 
 
-def test_gains_explain_photographs_that_are_exposed_differently(
-    scene: TinyScene, tmp_path: Path
-) -> None:
+def test_gains_compensate_for_different_exposures(scene: TinyScene, tmp_path: Path) -> None:
     gains = np.array([[0.5] * 3, [1.0] * 3] * (len(scene.views) // 2))
     views = []
     for index, (view, gain) in enumerate(zip(scene.views, gains, strict=True)):
@@ -317,9 +315,7 @@ def test_gains_explain_photographs_that_are_exposed_differently(
     assert with_gains.curve[-1]["psnr"] > plain.curve[-1]["psnr"] - 1
 
 
-def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
-    scene: TinyScene, tmp_path: Path
-) -> None:
+def test_a_completely_masked_view_has_no_influence(scene: TinyScene, tmp_path: Path) -> None:
     Image.fromarray(np.zeros((HEIGHT, WIDTH), np.uint8)).save(tmp_path / "mask.png")
     hidden = replace(scene.views[0], name="hidden", mask=str(tmp_path / "mask.png"))
     with_it = run(scene, tmp_path / "a", views=[*scene.views[:3], hidden, *scene.views[3:]])
@@ -329,7 +325,7 @@ def test_a_view_that_its_mask_hides_is_as_if_it_were_not_there(
         run(scene, tmp_path / "c", views=[hidden])
 
 
-def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
+def test_transparent_pixels_stay_empty(scene: TinyScene, tmp_path: Path) -> None:
     start = scene.initial.clone()
     start.opacity_logits.fill_(1.0)
     start.log_scales += 0.7
@@ -350,7 +346,7 @@ def test_alpha_leaves_the_empty_empty(scene: TinyScene, tmp_path: Path) -> None:
         assert after < 0.02 < before
 
 
-def test_a_loss_that_is_no_number_is_a_clear_error(
+def test_a_loss_that_is_not_finite_is_a_clear_error(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     backend = make_backend()
@@ -364,7 +360,7 @@ def test_a_loss_that_is_no_number_is_a_clear_error(
         run(scene, tmp_path)
 
 
-def test_all_gaussians_dead_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
+def test_no_gaussian_left_is_a_clear_error(scene: TinyScene, tmp_path: Path) -> None:
     with pytest.raises(UserError, match="no Gaussian is left"):
         run(scene, tmp_path, tiny_config(40, density={"prune_opacity": 1.0}))
 
@@ -395,7 +391,7 @@ def test_more_gaussians_than_the_budget_are_thinned_with_a_warning(
     assert any("budget" in warning for warning in result.warnings)
 
 
-def test_saved_gaussians_come_back_the_same(scene: TinyScene, tmp_path: Path) -> None:
+def test_gaussians_are_saved_and_loaded_exactly(scene: TinyScene, tmp_path: Path) -> None:
     scene.truth.save(tmp_path / "a.npz")
     back = Gaussians.load(tmp_path / "a.npz")
     for name, tensor in scene.truth.tensors().items():

@@ -47,8 +47,9 @@ def snakemake_command(
         )
     # Not resolved: a link to a folder names the scene.
     folder = Path(os.path.abspath(scene))
-    # JSON is YAML, and Snakemake reads values as YAML: a quoted path stays one string.
-    entries = [f"data_root={json.dumps(str(folder.parent), ensure_ascii=False)}"]
+    # Snakemake reads values as YAML: a quoted path stays one string. The spaces keep the quotes,
+    # which it would strip.
+    entries = [f"data_root= {json.dumps(str(folder.parent), ensure_ascii=False)} "]
     if preset is not None:
         entries.append(f"preset={preset}")
     if profile is not None and not Path(profile).exists():

@@ -64,7 +64,7 @@ def snakemake_command(
     ]
 
 
-def become(command: Sequence[str]) -> NoReturn:
+def become(command: list[str]) -> NoReturn:
     """Replace this process by Snakemake's, so that signals reach it and its exit code is ours."""
     # Without it, Python looks for packages in the current folder first, which is the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}

@@ -218,7 +218,7 @@ def _held_out(
         view = by_name[item["name"]]
         eye = open_eye(view, draw)
         picture, evidence = trust_picture(eye, eyes, beyond)
-        pixels = load_view(view.image, view.mask, view.width, view.height)
+        pixels = load_view(view)
         photo = reference(pixels, protocol.background)
         with Image.open(renders / item["render"]) as render:
             error = ((np.asarray(render) / 255.0 - photo / 255.0) ** 2).mean(axis=2)

@@ -114,7 +114,7 @@ class Targets:
         self._store = MemoryStore() if store is None else store
 
         def load(view: View) -> _StoredTarget:
-            pixels = load_view(view.image, view.mask, view.width, view.height)
+            pixels = load_view(view)
             if noise:
                 _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
             return _StoredTarget(_target(pixels), self._store)

@@ -102,7 +102,7 @@ class Scene:
         Raises:
             UserError: its file is missing or cannot be read.
         """
-        pixels = load_view(view.image, view.mask, view.width, view.height)
+        pixels = load_view(view)
         return reference(pixels, self._protocol.background).astype(np.float32) / np.float32(255)
 
     def measure(self, views: Sequence[View] = ()) -> Quality:

@@ -37,6 +37,7 @@ def work(job: Job) -> None:
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])
     found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
+    found.check_unchanged(job.key["fingerprint"], folder)
     manifest, warnings = verify_photos(
         found.manifest, threads=job.threads, min_photos=config.inspect.min_images
     )

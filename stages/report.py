@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Report, Split, Train
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_json
-from pipeline.runtime.job import Job, run_facts
+from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -24,19 +24,23 @@ def work(job: Job) -> None:
     from pipeline.metrics.evaluate import choose_protocol
     from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.headline import headline
+    from pipeline.reporting.metrics import NAME, read_runs, with_times
     from pipeline.reporting.page import write_report
     from pipeline.reporting.scene import SceneResults, report_data
 
     start = time.perf_counter()
     plan, views, train = job.key["plan"], inputs.trained_views(job), job.section(Train)
     evaluation = inputs.read_json(job.inputs["evaluate"] / "evaluation.json")
-    own = run_facts(job, time.perf_counter() - start)
     results = job.inputs["inspect"].parent
-    metrics = collect_metrics(job.scene, plan, results, evaluation, own)
-    write_json(job.out / "metrics.json", metrics)
+    own = job.run_record(time.perf_counter() - start)
+    metrics = collect_metrics(
+        job.scene, plan, results, evaluation, seed=job.seed, versions=own.versions
+    )
+    write_json(job.out / NAME, metrics.model_dump(mode="json"))
+    runs = read_runs(metrics, results, without=job.stage) | {job.stage: own}
     scene = SceneResults(
         scene=job.scene,
-        metrics=metrics,
+        metrics=with_times(metrics, runs),
         plan=plan,
         folders=job.inputs,
         manifest=inputs.read_manifest(job, "views"),

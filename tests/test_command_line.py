@@ -17,6 +17,7 @@ from pipeline.config.schema import Config
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.io.ply import write_splat_ply
+from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import write_transforms
 from pipeline.render import RasterOptions
@@ -141,7 +142,13 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
     (project / "data").mkdir(parents=True)
     (folder / "scene" / "images").rename(project / "data" / "images")
     photos = [
-        Photo(name=f"p{i}.png", path=f"data/images/p{i}.png", width=SIZE, height=SIZE, digest="")
+        Photo(
+            name=f"p{i}.png",
+            path=f"data/images/p{i}.png",
+            width=SIZE,
+            height=SIZE,
+            digest=digest_of(project / "data" / "images" / f"p{i}.png"),
+        )
         for i in range(3)
     ]
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "inspect" / "images.json")

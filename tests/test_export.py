@@ -15,6 +15,7 @@ from pipeline.config.schema import Config, ExportFormat
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
+from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
 from pipeline.runtime.errors import UserError
@@ -49,7 +50,9 @@ def scene(tmp_path: Path) -> Path:
     for i in range(9):
         path = scene / "undistort" / "images" / f"p{i}.png"
         Image.new("RGB", (90, 60), (90, 80, 70)).save(path)
-        photos.append(Photo(name=path.name, path=str(path), width=90, height=60, digest=""))
+        photos.append(
+            Photo(name=path.name, path=str(path), width=90, height=60, digest=digest_of(path))
+        )
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
     (scene / "train").mkdir()
     sample(50).save(scene / "train" / "gaussians.npz")

@@ -14,7 +14,7 @@ from pipeline.io.posefiles import truth_folder
 from pipeline.plan.scan import scan
 from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import read_stage
+from pipeline.runtime.record import read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
@@ -101,7 +101,7 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
 
 
 def _finished(folder: Path, work: Path) -> Matched:
-    config = read_stage(folder / "sfm")["key"]["config"]["sfm"]
+    config = read_stage(folder / "sfm").key["config"]["sfm"]
     database = work / "database.db"
     shutil.copyfile(folder / "matches" / "database.db", database)
     truth = folder / "inspect" / "truth"

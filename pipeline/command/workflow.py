@@ -47,8 +47,9 @@ def snakemake_command(
         )
     # Not resolved: a link to a folder names the scene.
     folder = Path(os.path.abspath(scene))
-    # JSON is YAML, and Snakemake reads values as YAML: a quoted path stays one string.
-    entries = [f"data_root={json.dumps(str(folder.parent), ensure_ascii=False)}"]
+    # Snakemake reads values as YAML: a quoted path stays one string. The spaces keep the quotes,
+    # which it would strip.
+    entries = [f"data_root= {json.dumps(str(folder.parent), ensure_ascii=False)} "]
     if preset is not None:
         entries.append(f"preset={preset}")
     if profile is not None and not Path(profile).exists():
@@ -63,7 +64,7 @@ def snakemake_command(
     ]
 
 
-def become(command: Sequence[str]) -> NoReturn:
+def become(command: list[str]) -> NoReturn:
     """Replace this process by Snakemake's, so that signals reach it and its exit code is ours."""
     # Without it, Python looks for packages in the current folder first, which is the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}

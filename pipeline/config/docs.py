@@ -1,12 +1,15 @@
-"""``python -m pipeline.config.docs [--check]``: the option page and the commented default YAML.
+"""``python -m pipeline.config.docs [--check]``: the option page, the commented default YAML, and
+the JSON schemas of the files that stages write.
 
-Both are made from the schemas, so that they can't disagree with the program.
+All are made from the models, so that they can't disagree with the program.
 """
 
 from __future__ import annotations
 
+import json
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
@@ -22,6 +25,15 @@ from pipeline.runtime.atomic import write_text
 ROOT = Path(__file__).resolve().parents[2]
 PAGE = ROOT / "docs" / "configuration.md"
 DEFAULTS = ROOT / "config" / "config.yaml"
+SCHEMAS = ROOT / "docs" / "schemas"
+
+# File that a stage writes -> its model. By name: no module of the library imports one above it.
+_RECORDS = {
+    "stage.json": "pipeline.runtime.record:StageRecord",
+    "run.json": "pipeline.runtime.record:RunRecord",
+    "images.json": "pipeline.scene.manifest:Manifest",
+    "metrics.json": "pipeline.reporting.metrics:Metrics",
+}
 
 _INTRO = """# Configuration
 
@@ -138,10 +150,22 @@ def _words(kind: Any, metadata: Sequence[Any] = ()) -> str:
     return " ".join([words.get(kind, "`null`" if kind is NoneType else "mapping"), *bounds])
 
 
+def json_schemas() -> dict[Path, str]:
+    """The JSON schemas (draft 2020-12) of the files that stages write, by path."""
+    found = {}
+    for name, model in _RECORDS.items():
+        module, _, attribute = model.partition(":")
+        schema = getattr(import_module(module), attribute).model_json_schema(mode="serialization")
+        schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+        path = SCHEMAS / name.replace(".json", ".schema.json")
+        found[path] = json.dumps(schema, indent=2) + "\n"
+    return found
+
+
 def main() -> int:
-    """Write both files, or with ``--check`` only say whether they are current."""
+    """Write the files, or with ``--check`` only say whether they are current."""
     stale = []
-    for path, text in ((PAGE, page()), (DEFAULTS, defaults())):
+    for path, text in {PAGE: page(), DEFAULTS: defaults(), **json_schemas()}.items():
         if not path.exists() or path.read_text() != text:
             stale.append(path.relative_to(ROOT))
             if "--check" not in sys.argv[1:]:

@@ -219,7 +219,7 @@ def _held_out(
     mapped = track(mapped, "mapping trust", len(measured), unit="views")
     result = []
     for item, view, eye, (picture, evidence) in zip(measured, views, asking, mapped, strict=True):
-        pixels = load_view(view.image, view.mask, view.width, view.height)
+        pixels = load_view(view)
         photo = reference(pixels, protocol.background)
         with Image.open(renders / item["render"]) as render:
             error = ((np.asarray(render) / 255.0 - photo / 255.0) ** 2).mean(axis=2)

@@ -116,7 +116,7 @@ def open_eye(view: View, draw: Draw) -> Eye:
     depth = np.where(met, drawn.median_depth, np.float32(np.inf))
     counts = np.ones(depth.shape, bool)
     if view.mask is not None:
-        counts = resize_mask(load_mask(view.mask), small.width, small.height)
+        counts = resize_mask(load_mask(view.mask, view.mask_digest), small.width, small.height)
     near, far = _windows(depth)
     focal = float(np.sqrt(view.fx * view.fy))
     return Eye(small, focal, drawn.rgb, depth, near, far, counts)

@@ -1,4 +1,4 @@
-"""Facts about files, remembered as long as a file's size and time stay the same."""
+"""Facts about files, remembered as long as a file's size and times stay the same."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 from pipeline.runtime.atomic import write_text
 
 # Raise it when what is remembered about a file changes.
-_VERSION = 3
+_VERSION = 4
 
 
 class FactCache:
@@ -37,7 +37,9 @@ class FactCache:
     def get(self, path: Path, question: str, answer: Callable[[], Any]) -> Any:
         """``answer()``, or what it gave when the file was last as it is now."""
         status = os.stat(path)
-        return self.remember(f"{question}:{path}", [status.st_size, status.st_mtime_ns], answer)
+        # cp -p and rsync set the time of modification, but nobody can set the time of change.
+        state = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
+        return self.remember(f"{question}:{path}", state, answer)
 
     def remember(self, key: str, state: Any, answer: Callable[[], Any]) -> Any:
         """``answer()``, or what it gave when ``state`` was last the same under ``key``."""

@@ -7,7 +7,7 @@ for everything here; the EXIF orientation it reports is 1.
 from __future__ import annotations
 
 from importlib.util import find_spec
-from pathlib import Path
+from typing import IO
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,14 +28,14 @@ def register() -> None:
     pillow_heif.register_heif_opener()
 
 
-def read_pixels(path: str | Path) -> NDArray[np.uint8]:
+def read_pixels(file: IO[bytes]) -> NDArray[np.uint8]:
     """(H, W, 3) BGR or (H, W, 4) BGRA, as OpenCV reads other pictures.
 
     Raises:
         OSError, ValueError: no picture that can be decoded.
     """
     register()
-    with Image.open(path) as image:
+    with Image.open(file) as image:
         mode = "RGBA" if "A" in image.mode else "RGB"
         pixels = np.asarray(image.convert(mode))
     order = [2, 1, 0, 3] if mode == "RGBA" else [2, 1, 0]

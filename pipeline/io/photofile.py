@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import datetime
-import hashlib
 import math
 import warnings
 from collections.abc import Iterator, Mapping
@@ -17,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import heif
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
+from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 
 Image.MAX_IMAGE_PIXELS = None  # The user's own photographs: 200 megapixels are no attack.
@@ -59,12 +59,6 @@ class FileFacts(BaseModel):
             return size
         focal = f"{self.focal_mm:g} mm" if self.focal_mm else "?"
         return " | ".join([self.body or "?", self.lens or "?", focal, size])
-
-
-def digest_of(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
 
 
 def read_facts(path: Path) -> FileFacts:

@@ -17,7 +17,7 @@ from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
 from pipeline.io.llff import read_rows
 from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, suffix_of
-from pipeline.io.photofile import digest_of
+from pipeline.io.recorded import digest_of
 from pipeline.io.transforms import find_transforms, frame_camera_model, read_frames
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Reconstruction

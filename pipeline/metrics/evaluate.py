@@ -138,7 +138,7 @@ def evaluate_views(
     options = protocol.options(train, threads)
 
     def compare(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
-        pixels = load_view(view.image, view.mask, view.width, view.height)
+        pixels = load_view(view)
         photo = reference(pixels, protocol.background)
         if train.refine_poses and view.is_test:
             gain, weight = gains.get(view.name), train.ssim_weight

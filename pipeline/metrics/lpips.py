@@ -118,35 +118,42 @@ def weights_found(net: Net) -> dict[str, int]:
     return {file.name: file.stat().st_size for file in files if file.is_file()}
 
 
+def _reason(file: Path, what: str, error: Exception) -> str:
+    return f"{file.name} {what}: {error}".replace(str(file.parent), "...")
+
+
 def lpips_available(net: Net) -> tuple[Lpips | None, str]:
     """The metric, or None and why there is none.
 
     Returns:
         ``(measure, "")``, or ``(None, reason)`` where a file is missing or not what it should
-        be; the reason names the file and where to put it. ``measure(image, reference, mask)``
-        takes (H, W, 3) in [0, 1] and a mask (H, W) or None, and returns the distance (0 for
-        identical pictures). Masked (zero) pixels of the image are replaced by the reference's
-        and each layer is averaged by how much of it is unmasked. It raises UserError for
-        pictures under ``MIN_SIDE`` pixels.
+        be; the reason names the file and the folder it belongs into.
+        ``measure(image, reference, mask)`` takes (H, W, 3) in [0, 1] and a mask (H, W) or None,
+        and returns the distance (0 for identical pictures). Masked (zero) pixels of the image are
+        replaced by the reference's and each layer is averaged by how much of it is unmasked. It
+        raises UserError for pictures under ``MIN_SIDE`` pixels.
     """
     if net == "none":
         return None, "switched off"
     network = _NETWORKS[net]
     backbone_file, heads_file = _weight_files(network)
-    missing = [str(file) for file in (backbone_file, heads_file) if not file.is_file()]
+    # The reason becomes part of the result: it holds no path of this machine.
+    missing = [file.name for file in (backbone_file, heads_file) if not file.is_file()]
     if missing:
         return None, (
-            f"weights not found: put {' and '.join(missing)} there (torchvision's ImageNet "
-            f"backbone {network.backbone}; the linear heads of LPIPS v0.1 as {network.heads[0]})"
+            f"weights not found: put {' and '.join(missing)} into hub/checkpoints of torch's "
+            "folder ($TORCH_HOME, by default ~/.cache/torch): torchvision's ImageNet backbone "
+            f"{network.backbone}, and the linear heads of LPIPS v0.1 as {network.heads[0]}"
         )
     try:
         weights = _backbone(_load(backbone_file), network)
     except Exception as error:
-        return None, f"{backbone_file} is not torchvision's {network.backbone}: {error}"
+        what = f"is not torchvision's {network.backbone}"
+        return None, _reason(backbone_file, what, error)
     try:
         heads = _heads(_load(heads_file), network)
     except Exception as error:
-        return None, f"{heads_file} does not hold the linear heads of LPIPS v0.1: {error}"
+        return None, _reason(heads_file, "does not hold the linear heads of LPIPS v0.1", error)
 
     def measure(
         image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None = None

@@ -85,7 +85,7 @@ def sample_views(views: Sequence[View]) -> list[View]:
 def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
     """(M,) True for the usable ones of the pixels ``xy`` (M, 2), and (K, 3) log2 of their display
     values."""
-    pixels = load_view(view.image, view.mask, view.width, view.height)
+    pixels = load_view(view)
     usable = np.isfinite(xy).all(axis=1)
     column, row = np.nan_to_num(xy).astype(int).T
     column, row = column.clip(0, view.width - 1), row.clip(0, view.height - 1)

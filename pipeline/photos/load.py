@@ -1,5 +1,8 @@
 """Pictures from files, on the stored pixel grid: EXIF orientation is never applied.
 
+A file is read once: the bytes that are decoded are those whose digest was compared with the
+recorded one. Without a recorded digest (None) nothing is compared.
+
 cv2's decoders fill what is missing from a cut-off file with grey and say nothing; the files'
 own framing is checked here instead.
 """
@@ -7,6 +10,7 @@ own framing is checked here instead.
 from __future__ import annotations
 
 import contextlib
+import io
 import struct
 import zipfile
 import zlib
@@ -20,7 +24,9 @@ from numpy.typing import NDArray
 
 from pipeline.io import heif
 from pipeline.io.names import suffix_of
+from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
 
 Picture = NDArray[Any]
 FIX = "Replace the file by a whole one, or remove it from the folder."
@@ -43,51 +49,55 @@ class ViewPixels:
     mask: NDArray[np.bool_] | None
 
 
-def load_rgb(path: str | Path) -> Picture:
+def load_rgb(path: str | Path, digest: str | None = None) -> Picture:
     """Read a picture as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.
 
+    Args:
+        digest: the file's recorded digest (``recorded.digest_of``).
+
     Raises:
-        UserError: the file is missing, cut off, or no picture that can be read.
+        UserError: the file is missing, cut off, no picture that can be read, or not the one that
+            was recorded.
     """
-    return _split(_read(Path(path)))[0]
+    return _split(read_picture(path, digest))[0]
 
 
-def load_rgba(path: str | Path) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
+def load_rgba(
+    path: str | Path, digest: str | None = None
+) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
     """Read a picture as (H, W, 3) uint8 RGB and (H, W) uint8 alpha, None where it has none.
 
     Raises:
         UserError: as ``load_rgb``.
     """
-    rgb, alpha = _split(_read(Path(path)))
+    rgb, alpha = _split(read_picture(path, digest))
     return to_8bit(rgb), None if alpha is None else to_8bit(alpha)
 
 
-def load_mask(path: str | Path) -> NDArray[np.bool_]:
+def load_mask(path: str | Path, digest: str | None = None) -> NDArray[np.bool_]:
     """Read a mask as (H, W) bool: True where any colour channel is not zero.
 
     Raises:
         UserError: as ``load_rgb``.
     """
-    return np.asarray(load_rgb(path).any(axis=2))
+    return np.asarray(load_rgb(path, digest).any(axis=2))
 
 
-def load_depth(path: str | Path, aspect: float) -> NDArray[np.float64]:
-    """Read a depth map (one-channel PNG, TIFF or .npy) as (H, W) float64, values as stored.
-
-    Args:
-        aspect: width over height that it must have.
+def read_depth(path: str | Path, digest: str | None = None) -> Picture:
+    """Read a depth map (PNG, TIFF, .npy or the first array of an .npz) as it is stored.
 
     Raises:
-        UserError: it cannot be read, has several channels, or another shape.
+        UserError: it cannot be read, or is not the file that was recorded.
     """
     path = Path(path)
+    data = read_recorded(path, digest)
     try:
         if path.suffix in (".npy", ".npz"):
-            stored = np.load(path, allow_pickle=False)
+            stored = np.load(io.BytesIO(data), allow_pickle=False)
             depth: Picture | None = stored if path.suffix == ".npy" else stored[stored.files[0]]
         else:
-            depth = cv2.imread(str(path), cv2.IMREAD_UNCHANGED)
-    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile, cv2.error):
+            depth = _decode(data)
+    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
         depth = None
     if depth is None:
         raise UserError(
@@ -95,6 +105,20 @@ def load_depth(path: str | Path, aspect: float) -> NDArray[np.float64]:
             file=path,
             fix="Save it as 16-bit grey PNG, float TIFF or .npy.",
         )
+    return depth
+
+
+def load_depth(path: str | Path, aspect: float, digest: str | None = None) -> NDArray[np.float64]:
+    """Read a depth map of one channel as (H, W) float64, values as stored.
+
+    Args:
+        aspect: width over height that it must have.
+
+    Raises:
+        UserError: as ``read_depth``; or it has several channels, or another shape.
+    """
+    path = Path(path)
+    depth = read_depth(path, digest)
     if depth.ndim == 3 and depth.shape[2] == 1:
         depth = depth[..., 0]
     if depth.ndim != 2 or depth.dtype.kind not in "uif" or not depth.size:
@@ -112,23 +136,22 @@ def load_depth(path: str | Path, aspect: float) -> NDArray[np.float64]:
     return depth.astype(np.float64)
 
 
-def load_view(
-    path: str | Path, mask_path: str | Path | None, width: int, height: int
-) -> ViewPixels:
-    """Read a view and its mask, resized by area to exactly ``width`` x ``height`` pixels.
+def load_view(view: View) -> ViewPixels:
+    """Read a view's picture and mask, resized by area to exactly the view's size.
 
     Colours are averaged weighted by alpha, so that hidden colours never bleed in. A mask's pixel
     counts only if all pixels under it do.
 
     Raises:
-        UserError: as ``load_rgb``; or picture or mask is not of the asked shape.
+        UserError: as ``load_rgb``; or picture or mask is not of the view's shape.
     """
-    rgb, alpha = load_rgba(path)
-    _check_shape(rgb, width, height, Path(path))
+    width, height = view.width, view.height
+    rgb, alpha = load_rgba(view.image, view.image_digest)
+    _check_shape(rgb, width, height, Path(view.image))
     mask = None
-    if mask_path is not None:
-        mask = load_mask(mask_path)
-        _check_shape(mask, width, height, Path(mask_path))
+    if view.mask is not None:
+        mask = load_mask(view.mask, view.mask_digest)
+        _check_shape(mask, width, height, Path(view.mask))
         mask = resize_mask(mask, width, height)
     return ViewPixels(*resize_rgba(rgb, alpha, width, height), mask)
 
@@ -169,22 +192,23 @@ def to_8bit(values: Picture) -> NDArray[np.uint8]:
     return ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
-def _read(path: Path) -> Picture:
-    try:
-        data = path.read_bytes()
-    except OSError as error:
-        raise UserError(f"cannot be read: {error.strerror}", file=path, fix=FIX) from None
+def read_picture(path: str | Path, digest: str | None = None) -> Picture:
+    """Read a picture as OpenCV gives it: (H, W) grey, (H, W, 2) grey and alpha, (H, W, 3) BGR or
+    (H, W, 4) BGRA; uint8 or uint16.
+
+    Raises:
+        UserError: as ``load_rgb``.
+    """
+    path = Path(path)
+    data = read_recorded(path, digest)
     if _is_cut_off(data):
         raise UserError("the picture is cut off or damaged", file=path, fix=FIX)
     picture: Picture | None = None
     if suffix_of(path.name) in heif.HEIF_SUFFIXES:
         with contextlib.suppress(OSError, ValueError):
-            picture = heif.read_pixels(path)
-    elif data:
-        try:
-            picture = cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-        except cv2.error:
-            picture = None
+            picture = heif.read_pixels(io.BytesIO(data))
+    else:
+        picture = _decode(data)
     if picture is None:
         raise UserError(
             "not a picture that can be read (expected JPEG, PNG, TIFF or WebP)", file=path, fix=FIX
@@ -196,6 +220,17 @@ def _read(path: Path) -> Picture:
             fix="Convert the picture to 8-bit or 16-bit PNG.",
         )
     return picture
+
+
+def _decode(data: bytes) -> Picture | None:
+    """OpenCV's picture of a file's bytes; None where it is none that OpenCV reads."""
+    if not data:
+        return None
+    try:
+        # None where no decoder knows the file, unlike what OpenCV's type annotations say.
+        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
+    except cv2.error:
+        return None
 
 
 def _split(picture: Picture) -> tuple[Picture, Picture | None]:

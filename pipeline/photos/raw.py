@@ -7,6 +7,7 @@ share the white balance.
 
 from __future__ import annotations
 
+import io
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,7 +18,7 @@ import rawpy
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Decode
-from pipeline.io.photofile import digest_of
+from pipeline.io.recorded import digest_of, read_recorded
 from pipeline.photos.naming import rename
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
@@ -106,7 +107,7 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
 def _balance(photo: Photo) -> _Balance | str:
     """White balances of a RAW file, or a warning if it cannot be read."""
     try:
-        with rawpy.imread(photo.path) as raw:
+        with rawpy.imread(_bytes_of(photo)) as raw:
             body = np.asarray(raw.rgb_xyz_matrix).tobytes()
             as_shot = np.array(raw.camera_whitebalance, np.float64)
             daylight = np.array(raw.daylight_whitebalance, np.float64)
@@ -136,7 +137,7 @@ def _develop_one(
 ) -> Photo | str:
     """The developed photograph, or a warning if it cannot be read."""
     try:
-        with rawpy.imread(photo.path) as raw:
+        with rawpy.imread(_bytes_of(photo)) as raw:
             rgb = raw.postprocess(
                 demosaic_algorithm=DEMOSAIC[config.demosaic],
                 half_size=config.half_size,
@@ -170,6 +171,10 @@ def _develop_one(
             "focal_px": focal,
         }
     )
+
+
+def _bytes_of(photo: Photo) -> io.BytesIO:
+    return io.BytesIO(read_recorded(photo.path, photo.digest))
 
 
 def _left_out(photo: Photo, error: Exception) -> str:

@@ -14,12 +14,13 @@ from pipeline.config import schema
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import fold_radius, normalised, pixels
 from pipeline.io.colmap import write_model
-from pipeline.io.photofile import digest_of
+from pipeline.io.recorded import digest_of
 from pipeline.photos.load import (
     Picture,
     load_mask,
     load_rgb,
     load_rgba,
+    read_depth,
     resize_area,
     resize_mask,
     resize_rgba,
@@ -235,7 +236,8 @@ def _write(
         _encode(mask_path, mask.astype(np.uint8) * 255)
     depth_path = None
     if photo.depth is not None:
-        depth_path = out / "depths" / f"{name}{Path(photo.depth).suffix}"
+        suffix = Path(photo.depth).suffix.replace(".npz", ".npy")
+        depth_path = out / "depths" / f"{name}{suffix}"
         _write_depth(photo, lens, depth_path)
     return photo.model_copy(
         update={
@@ -247,7 +249,9 @@ def _write(
             "alpha": alpha is not None,
             "bits": 8 if path.suffix == ".jpg" or picture.dtype == np.uint8 else 16,
             "mask": None if mask_path is None else str(mask_path),
+            "mask_digest": None if mask_path is None else digest_of(mask_path),
             "depth": None if depth_path is None else str(depth_path),
+            "depth_digest": None if depth_path is None else digest_of(depth_path),
             "focal_px": float(lens.target.params[0]),
         }
     )
@@ -258,9 +262,9 @@ def _picture(photo: Photo, lens: _Lens) -> tuple[Picture, NDArray[np.uint8] | No
     size = (lens.target.width, lens.target.height)
     alpha: NDArray[np.uint8] | None = None
     if photo.alpha:
-        picture, alpha = load_rgba(photo.path)
+        picture, alpha = load_rgba(photo.path, photo.digest)
     else:
-        picture = load_rgb(photo.path)
+        picture = load_rgb(photo.path, photo.digest)
     _check_size(picture, photo, photo.path)
     if lens.x is None or alpha is None:
         new = lens.remap(picture, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
@@ -286,7 +290,7 @@ def _mask(photo: Photo, lens: _Lens, views: schema.Views) -> NDArray[np.bool_] |
     size = (lens.target.width, lens.target.height)
     mask = None
     if photo.mask is not None and views.masks == "auto":
-        full = load_mask(photo.mask).astype(np.uint8)
+        full = load_mask(photo.mask, photo.mask_digest).astype(np.uint8)
         full = _nearest(full, photo.width, photo.height)
         new = lens.remap(full, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
         mask = resize_mask(new > 0, *size)
@@ -301,14 +305,11 @@ def _write_depth(photo: Photo, lens: _Lens, path: Path) -> None:
     """Write the undistorted depth map, by nearest neighbour. Undistortion does not change depth
     along z."""
     assert photo.depth is not None
-    is_array = path.suffix == ".npy"
-    depth = np.load(photo.depth) if is_array else cv2.imread(photo.depth, cv2.IMREAD_UNCHANGED)
-    if depth is None:
-        raise UserError("the depth map cannot be read", file=photo.depth, fix="Replace the file.")
+    depth = read_depth(photo.depth, photo.depth_digest)
     depth = _nearest(depth, photo.width, photo.height)
     depth = lens.remap(depth, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
     depth = _nearest(depth, lens.target.width, lens.target.height)
-    if not is_array:
+    if path.suffix != ".npy":
         return _encode(path, depth)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, depth)

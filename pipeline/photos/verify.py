@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -10,6 +11,7 @@ from PIL import Image
 
 from pipeline.io import heif
 from pipeline.io.names import suffix_of
+from pipeline.io.recorded import ChangedFileError, read_recorded
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
@@ -30,7 +32,8 @@ def verify_photos(
         one for each damaged photograph, and one if photographs are copies of others.
 
     Raises:
-        UserError: fewer than ``min_photos`` can be decoded; the message names the damaged ones.
+        UserError: fewer than ``min_photos`` can be decoded (the message names the damaged ones), or
+            a photograph has changed since it was scanned.
     """
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         results = pool.map(_fault_of, manifest.photos)
@@ -74,10 +77,10 @@ def _copies(photos: Sequence[Photo]) -> list[str]:
 
 def _fault_of(photo: Photo) -> str | None:
     """Why the photograph cannot be decoded; None if it can."""
-    decode: Callable[[str], None] = _decode_raw if photo.raw else _decode
+    decode: Callable[[Photo], None] = _decode_raw if photo.raw else _decode
     try:
-        decode(photo.path)
-    except MemoryError:
+        decode(photo)
+    except (MemoryError, ChangedFileError):
         raise
     # PIL's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and others;
     # LibRaw has its own exceptions.
@@ -87,15 +90,15 @@ def _fault_of(photo: Photo) -> str | None:
     return None
 
 
-def _decode(path: str) -> None:
-    if suffix_of(path) in heif.HEIF_SUFFIXES:
+def _decode(photo: Photo) -> None:
+    if suffix_of(photo.path) in heif.HEIF_SUFFIXES:
         heif.register()
-    with Image.open(path) as image:
+    with Image.open(io.BytesIO(read_recorded(photo.path, photo.digest))) as image:
         image.load()
 
 
-def _decode_raw(path: str) -> None:
+def _decode_raw(photo: Photo) -> None:
     import rawpy  # Imported only if the scene has RAW files.
 
-    with rawpy.imread(path) as raw:
+    with rawpy.imread(io.BytesIO(read_recorded(photo.path, photo.digest))) as raw:
         raw.unpack()

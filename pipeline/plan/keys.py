@@ -9,7 +9,7 @@ from typing import Any
 from pipeline.config.options import select
 from pipeline.plan.plan import Plan, public_plan
 from pipeline.plan.stage import StageSpec
-from pipeline.runtime.job import canonical
+from pipeline.runtime.record import canonical
 from pipeline.runtime.source import stage_source_hash
 
 # Asked again for every run of a batch.

@@ -75,7 +75,7 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
         views = Views.model_validate(sections["views"])
         split = Split.model_validate(sections["split"])
         train = Train.model_validate(sections["train"])
-    except (OSError, ValueError, KeyError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"expected a finished scene, could not read its settings: {error}",
             file=record,

@@ -21,7 +21,7 @@ from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, companions, pictures_in, relative_folders
 from pipeline.io.gcp import GCP_FILE
 from pipeline.io.names import RAW_SUFFIXES, NameIndex, stem_key, suffix_of
-from pipeline.io.photofile import FileFacts, digest_of, read_facts
+from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
     GivenPoses,
     find_poses,
@@ -30,6 +30,7 @@ from pipeline.io.posefiles import (
     transforms_photos,
     truth_folder,
 )
+from pipeline.io.recorded import digest_of
 from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
 from pipeline.plan.sequence import why_ordered
 from pipeline.runtime.errors import UserError
@@ -75,6 +76,20 @@ class Scan(BaseModel):
     @property
     def warnings(self) -> tuple[str, ...]:
         return self.manifest.warnings
+
+    def check_unchanged(self, fingerprint: str, folder: Path) -> None:
+        """Compare with the fingerprint of an earlier scan of ``folder``.
+
+        Raises:
+            UserError: they differ.
+        """
+        if self.fingerprint != fingerprint:
+            raise UserError(
+                "the scene has changed since snakemake was started",
+                file=folder,
+                fix="run the same snakemake command again, and leave the scene's files unchanged "
+                "while it runs",
+            )
 
     @property
     def num_raw(self) -> int:
@@ -440,7 +455,6 @@ def _photo(
     depth: Path | None,
     cache: FactCache,
 ) -> Photo:
-    beside = [path for path in (mask, depth) if path is not None]
     return Photo(
         name=name,
         path=str(folder / image_folder / name),
@@ -452,8 +466,9 @@ def _photo(
         bits=facts.bits,
         orientation=facts.orientation,
         mask=str(mask) if mask else None,
+        mask_digest=_digest(mask, cache) if mask else None,
         depth=str(depth) if depth else None,
-        companions=_digest_files(folder, beside, cache) if beside else "",
+        depth_digest=_digest(depth, cache) if depth else None,
         focal_px=facts.focal_px,
         camera_group=facts.camera_group,
         gps=facts.gps,
@@ -467,9 +482,12 @@ def _photo(
 def _digest_files(folder: Path, files: Sequence[Path], cache: FactCache) -> str:
     lines = []
     for path in files:
-        digest = cache.get(path, "digest", partial(digest_of, path))
-        lines.append(f"{path.relative_to(folder).as_posix()}\0{digest}")
+        lines.append(f"{path.relative_to(folder).as_posix()}\0{_digest(path, cache)}")
     return hashlib.blake2b("\n".join(sorted(lines)).encode(), digest_size=16).hexdigest()
+
+
+def _digest(path: Path, cache: FactCache) -> str:
+    return str(cache.get(path, "digest", partial(digest_of, path)))
 
 
 def _fingerprint(

@@ -2,20 +2,23 @@
 
 from __future__ import annotations
 
-import json
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-from pipeline.runtime.job import read_stage
+from pipeline.reporting.metrics import Metrics
+from pipeline.runtime.record import read_stage
 
 
 def collect_metrics(
     scene: str,
-    plan: dict[str, Any],
+    plan: Mapping[str, Any],
     folder: Path,
-    evaluation: dict[str, Any],
-    own_run: dict[str, Any],
-) -> dict[str, Any]:
+    evaluation: Mapping[str, Any],
+    *,
+    seed: int,
+    versions: dict[str, str],
+) -> Metrics:
     """Gather a scene's metrics.
 
     Args:
@@ -23,61 +26,37 @@ def collect_metrics(
         plan: ``plan.json``.
         folder: ``results/<scene>``, with the stages' folders.
         evaluation: ``evaluate/evaluation.json``.
-        own_run: how the calling stage's run has gone so far (it has no ``run.json`` yet).
+        seed: the run's.
+        versions: of the packages whose results count.
 
-    Returns:
-        The content of ``metrics.json``; times and memory are this machine's, the rest is the
-        same for the same input.
+    Raises:
+        UserError: a stage's record is missing or damaged.
     """
-    stages: dict[str, Any] = {}
     warnings: list[str] = list(plan["warnings"])
     counters: dict[str, dict[str, Any]] = {}
     for name, step in plan["stages"].items():
-        if not step["run"]:
-            stages[name] = _timing(None) | {"skipped": True, "reason": step["reason"]}
+        if not step["run"] or name == "report":
             continue
-        if name == "report":
-            run = own_run
-        else:
-            record = read_stage(folder / name)
-            counters[name] = record["counters"]
-            known = plan["warnings"]
-            warnings += [f"{name}: {text}" for text in record["warnings"] if text not in known]
-            run = read_json(folder / name / "run.json")
-        stages[name] = _timing(run) | {"skipped": False, "reason": step["reason"]}
-    sfm, refined = counters.get("sfm", {}), counters.get("refine", {})
-    photos = counters["inspect"]["photos"]
-    return {
-        "scene": scene,
-        "psnr": evaluation["psnr"],
-        "ssim": evaluation["ssim"],
-        "lpips": evaluation["lpips"],
-        "lpips_reason": evaluation["lpips_reason"],
-        "train_psnr": evaluation["train_psnr"],
-        "psnr_without_gains": evaluation["psnr_without_gains"],
-        "per_view": evaluation["per_view"],
-        "protocol": evaluation["protocol"],
-        "num_gaussians": counters["train"]["num_gaussians"],
-        "registered_images": sfm.get("registered", counters["inspect"].get("given_poses")),
-        "total_images": photos + counters["inspect"]["left_out"],
-        "reprojection_error_px": sfm.get("mean_reprojection_error_px", refined.get("error_px")),
-        "sfm_verdict": sfm.get("verdict"),
-        "georeference": sfm.get("georeference"),
-        "pose_error": evaluation["pose_error"],
-        "stages": stages,
-        "versions": own_run["versions"],
-        "seed": own_run["seed"],
-        "warnings": warnings,
-    }
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text())
-
-
-def _timing(run: dict[str, Any] | None) -> dict[str, Any]:
-    if run is None:
-        return {"wall_s": 0.0, "cpu_s": 0.0, "peak_rss_mb": 0.0}
-    # Work that was killed and resumed counts its earlier processes, too.
-    wall = round(run["wall_s"] + run.get("earlier_s", 0.0), 3)
-    return {"wall_s": wall, "cpu_s": run["cpu_s"], "peak_rss_mb": run["peak_rss_mb"]}
+        record = read_stage(folder / name)
+        counters[name] = record.counters
+        warnings += [f"{name}: {text}" for text in record.warnings if text not in plan["warnings"]]
+    inspect, sfm, refined = (counters.get(name, {}) for name in ("inspect", "sfm", "refine"))
+    return Metrics.model_validate(
+        {
+            "scene": scene,
+            **{name: evaluation[name] for name in Metrics.model_fields if name in evaluation},
+            "num_gaussians": counters["train"]["num_gaussians"],
+            "registered_images": sfm.get("registered", inspect.get("given_poses")),
+            "total_images": inspect["photos"] + inspect["left_out"],
+            "reprojection_error_px": sfm.get("mean_reprojection_error_px", refined.get("error_px")),
+            "sfm_verdict": sfm.get("verdict"),
+            "georeference": sfm.get("georeference"),
+            "stages": {
+                name: {"skipped": not step["run"], "reason": step["reason"]}
+                for name, step in plan["stages"].items()
+            },
+            "versions": versions,
+            "seed": seed,
+            "warnings": warnings,
+        }
+    )

@@ -1,28 +1,42 @@
-"""``python -m pipeline.reporting.headline results/<scene>/metrics.json``: the result in a line."""
+"""``python -m pipeline.reporting.headline results/<scene>``: the result in a line."""
 
 from __future__ import annotations
 
-import json
 import sys
 from pathlib import Path
-from typing import Any
+
+from pipeline.reporting.metrics import Metrics, read_metrics, read_runs
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 
-def headline(metrics: dict[str, Any]) -> str:
-    """One line for people: quality, size, poses, time."""
-    lpips = "n/a" if metrics["lpips"] is None else f"{metrics['lpips']:.3f}"
-    wall = sum(stage["wall_s"] for stage in metrics["stages"].values())
-    pose = metrics["pose_error"]
-    error = f", rotation error {pose['rotation_median_deg']:.3f} degrees" if pose else ""
+def headline(metrics: Metrics) -> str:
+    """One line for people: quality, size, poses."""
+    lpips = "n/a" if metrics.lpips is None else f"{metrics.lpips:.3f}"
+    pose = metrics.pose_error
+    known = pose is not None and pose.rotation_median_deg is not None
+    error = f", rotation error {pose.rotation_median_deg:.3f} degrees" if pose and known else ""
     return (
-        f"{metrics['scene']}: PSNR {metrics['psnr']:.2f} dB, SSIM {metrics['ssim']:.4f}, "
-        f"LPIPS {lpips}, {metrics['num_gaussians']} Gaussians, "
-        f"{metrics['registered_images']}/{metrics['total_images']} images{error}, "
-        f"{wall:.0f} s, {len(metrics['warnings'])} warnings"
+        f"{metrics.scene}: PSNR {metrics.psnr:.2f} dB, SSIM {metrics.ssim:.4f}, "
+        f"LPIPS {lpips}, {metrics.num_gaussians} Gaussians, "
+        f"{metrics.registered_images}/{metrics.total_images} images{error}, "
+        f"{len(metrics.warnings)} warnings"
     )
 
 
+def main(folders: list[str]) -> int:
+    for name in folders:
+        # results/<scene>, or a file in it.
+        folder = Path(name) if Path(name).is_dir() else Path(name).parent
+        try:
+            metrics = read_metrics(folder)
+            runs = read_runs(metrics, folder).values()
+        except UserError as error:
+            print(f"error: {error}", file=sys.stderr)
+            return EXIT_USER_ERROR
+        wall = sum(run.wall_s + run.earlier_s for run in runs)
+        print(f"{headline(metrics)}, {wall:.0f} s\n  page: {folder / 'report.html'}")
+    return 0
+
+
 if __name__ == "__main__":
-    for name in sys.argv[1:]:
-        print(headline(json.loads(Path(name).read_text())))
-        print(f"  page: {Path(name).with_name('report.html')}")
+    sys.exit(main(sys.argv[1:]))

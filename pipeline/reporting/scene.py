@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,9 +13,8 @@ from PIL import Image
 
 from pipeline.metrics.evaluate import Protocol, reference
 from pipeline.photos.load import load_view
-from pipeline.reporting.collect import read_json
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
-from pipeline.runtime.job import read_stage
+from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
@@ -26,7 +26,8 @@ class SceneResults:
     """What the stages of a scene made.
 
     Attributes:
-        metrics, plan: the contents of ``metrics.json`` and ``plan.json``.
+        metrics: the content of ``metrics.json`` with the times of the stages.
+        plan: the content of ``plan.json``.
         folders: role -> the stage's folder: inspect, train, evaluate and coverage.
         manifest: photographs of the views.
         model: cameras as training refined them, and sparse points.
@@ -85,7 +86,7 @@ def _comparisons(
     comparisons = []
     for label, measured in ranked(evaluation["per_view"], shown):
         view = by_name[measured["name"]]
-        pixels = load_view(view.image, view.mask, view.width, view.height)
+        pixels = load_view(view)
         with Image.open(results.folders["evaluate"] / "renders" / measured["render"]) as render:
             comparisons.append(
                 Comparison(
@@ -114,7 +115,7 @@ def _coverage(folder: Path) -> Coverage:
 
 def _curve(train: Path) -> list[dict[str, Any]]:
     """The training curve with the seconds of the run that made it."""
-    seconds = read_json(train / "run.json")["curve_seconds"]
+    seconds = read_run(train).curve_seconds or []
     records = read_json(train / "curve.json")
     return [r | {"seconds": s} for r, s in zip(records, seconds, strict=True)]
 
@@ -123,7 +124,11 @@ def _decisions(plan: Mapping[str, Any], results: Path) -> dict[str, list[str]]:
     """The decisions of each stage that has run, after those that the plan made for it."""
     return {
         name: step["decisions"]
-        + (read_stage(results / name)["decisions"] if name != "report" else [])
+        + (list(read_stage(results / name).decisions) if name != "report" else [])
         for name, step in plan["stages"].items()
         if step["run"]
     }
+
+
+def read_json(path: Path) -> Any:
+    return json.loads(path.read_text())

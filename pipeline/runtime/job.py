@@ -1,40 +1,29 @@
-"""What every stage needs around its work: identity, lock, atomic outputs, sidecars, errors.
+"""What every stage needs around its work: identity, lock, atomic outputs, records, errors.
 
-A stage owns one folder. Its work is written to a scratch folder and put in place by a rename
-when all is done, so that what exists is whole. Two sidecars stand beside the outputs:
+A stage owns one folder. Its work is written to a scratch folder and put in place by a rename when
+all is done, so that what exists is whole. Its records (``pipeline.runtime.record``) stand beside
+its outputs.
 
-- ``stage.json``: the same for the same work. Key, digests of inputs and outputs, counters,
-  decisions, warnings.
-- ``run.json``: how this run went. Versions, commit, machine, instruction set, wall and CPU time,
-  peak memory.
-
-A stage whose key and inputs are those of its finished folder is not worked again: Snakemake
-deletes a job's declared outputs before it runs it, so a hidden copy of ``stage.json`` lets the
-stage see that the work is there, check the digests, and put the declared file back. Finished work
-of the same identity in a neighbouring folder (another configuration of the scene) is taken over by
-hard links in the same way.
+A stage whose key and inputs are those of its finished folder is not run again: Snakemake deletes a
+job's declared outputs before it runs the job, so a hidden copy of ``stage.json`` lets the stage see
+that the work is there, check the digests, and put the declared file back. Finished work of the same
+identity in a neighbouring folder (another configuration of the scene) is taken over by hard links
+in the same way. Before a stage works, the files of its inputs are compared with their records.
 """
 
 from __future__ import annotations
 
 import contextlib
-import fcntl
-import hashlib
 import json
 import os
-import platform
-import resource
 import shutil
 import sqlite3
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, field
-from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -43,14 +32,23 @@ from pydantic import BaseModel
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
-from pipeline.runtime.layout import IS_CHECKOUT, PACKAGES
-from pipeline.runtime.machine import machine_facts
-from pipeline.runtime.memory import peak_memory_mb
-from pipeline.runtime.native import native_facts
-from pipeline.runtime.progress import Console, write_progress_to
+from pipeline.runtime.facts import run_record
+from pipeline.runtime.lock import locked, logging_to
+from pipeline.runtime.progress import write_progress_to
+from pipeline.runtime.record import (
+    HIDDEN_STAGE,
+    RUN,
+    STAGE,
+    RunRecord,
+    StageRecord,
+    canonical,
+    check_outputs,
+    content_digest,
+    identity,
+    output_digests,
+    read_record,
+)
 from pipeline.runtime.section import read_section
-
-SIDE_CARS = ("stage.json", "run.json", ".stage.json")
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -106,6 +104,11 @@ class Job:
         self.tell(facts.pop("decisions", []), facts.pop("warnings", []))
         self.counters |= facts
 
+    def run_record(self, wall: float) -> RunRecord:
+        """How the run has gone for ``wall`` seconds."""
+        seed = self.key["seed"]
+        return run_record(wall, threads=self.threads, seed=seed, timings=self.timings)
+
     def tell(self, decisions: Sequence[str], warnings: Sequence[str]) -> None:
         for text in decisions:
             self.decide(text)
@@ -141,7 +144,7 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
     0: done, or there already. 2: the user must mend something (one clear message). Any other
     exception is a bug of the program: exit code 1, with a traceback.
     """
-    with _logging_to(request.log, request.out.parent.name):
+    with logging_to(request.log, request.out.parent.name):
         try:
             targets.usable()  # a wrong $SPLATMAKE_TARGET ends the run before any work
             return _run_locked(request, work)
@@ -176,16 +179,16 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
     scene_folder = request.out.parent
     scratch_root = scene_folder / ".scratch"
     scratch_root.mkdir(parents=True, exist_ok=True)
-    with _locked(scratch_root / f"{request.stage}.lock", request):
+    with locked(scratch_root / f"{request.stage}.lock", request.stage, request.out):
         digests = {role: content_digest(folder) for role, folder in request.inputs.items()}
         _recover(request.out)
         if _is_done(request, digests):
-            write_bytes(request.out / "stage.json", (request.out / ".stage.json").read_bytes())
+            write_bytes(request.out / STAGE, (request.out / HIDDEN_STAGE).read_bytes())
             _publish(request)
             print(f"{request.stage}: up to date, nothing to do", file=sys.stderr)
             return 0
         stage_scratch = scratch_root / request.stage
-        scratch = stage_scratch / _identity(request.key, digests)[:16]
+        scratch = stage_scratch / identity(request.key, digests)[:16]
         out = scratch / "out"
         if out.exists():
             shutil.rmtree(out)
@@ -193,6 +196,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
         if _taken_over(request, digests, out):
             shutil.rmtree(stage_scratch, ignore_errors=True)
             return 0
+        check_outputs(request.inputs.values(), request.threads)
         job = Job(
             stage=request.stage,
             scene=scene_folder.name,
@@ -218,69 +222,27 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
             raise
         finally:
             write_progress_to(None)
-        _write_sidecars(job, digests, time.perf_counter() - start)
+        _write_records(job, digests, time.perf_counter() - start)
         replace_folder(out, request.out)
         _publish(request)
         shutil.rmtree(stage_scratch, ignore_errors=True)
     return 0
 
 
-# --- identity ---------------------------------------------------------------------------------
-
-
-def canonical(value: Any) -> str:
-    """Canonical JSON: sorted keys, no spaces, no NaN."""
-    return json.dumps(value, sort_keys=True, separators=(",", ":"), allow_nan=False)
-
-
-def content_digest(folder: Path) -> str:
-    """Digest of what a finished stage made: its outputs, not how or from what it made them.
-
-    Ground truth (below ``truth/``) is left out: no stage's result may depend on it, and those
-    that measure against it have it in their keys.
-    """
-    record = read_stage(folder)
-    content = {name: record[name] for name in ("outputs", "counters", "warnings")}
-    content["outputs"] = {k: v for k, v in content["outputs"].items() if not k.startswith("truth/")}
-    return hashlib.sha256(canonical(content).encode()).hexdigest()
-
-
-def read_stage(folder: Path) -> dict[str, Any]:
-    """The parsed ``stage.json`` of a finished stage's folder."""
-    path = folder / "stage.json"
-    try:
-        return json.loads(path.read_text())
-    except FileNotFoundError:
-        raise UserError(
-            "this stage's output is missing", file=path, fix="run snakemake again"
-        ) from None
-
-
-def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
-    """Whether the stage that owns ``folder`` has finished with this key and with what its inputs
-    (folder by role) now contain."""
-    try:
-        record = read_stage(folder)
-        digests = {role: content_digest(path) for role, path in inputs.items()}
-    except (UserError, OSError, ValueError):
-        return False
-    return canonical(record["key"]) == key and record["inputs"] == digests
-
-
-def _identity(key: Mapping[str, Any], inputs: Mapping[str, str]) -> str:
-    return hashlib.sha256(canonical({"key": key, "inputs": inputs}).encode()).hexdigest()
-
-
 def _is_done(request: Request, inputs: dict[str, str]) -> bool:
-    hidden = request.out / ".stage.json"
-    if not hidden.is_file():
+    record = _finished(request.out)
+    if record is None or record.identity != identity(request.key, inputs):
         return False
+    return output_digests(request.out, request.threads) == record.outputs
+
+
+def _finished(folder: Path) -> StageRecord | None:
+    """The hidden record of a finished stage. A damaged one is as good as none: the work is done
+    again."""
     try:
-        record = json.loads(hidden.read_text())
-        same = _identity(record["key"], record["inputs"]) == _identity(request.key, inputs)
-    except (ValueError, KeyError):
-        return False
-    return same and _digests(request.out) == record["outputs"]
+        return read_record(folder / HIDDEN_STAGE, StageRecord)
+    except (UserError, OSError):
+        return None
 
 
 def _taken_over(request: Request, inputs: dict[str, str], out: Path) -> bool:
@@ -289,23 +251,21 @@ def _taken_over(request: Request, inputs: dict[str, str], out: Path) -> bool:
     Its files are hard links where the file system has them. Stages replace files and never write
     into them, so that neither folder can change the other; the digests are those of the links.
     """
-    wanted = _identity(request.key, inputs)
-    for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/.stage.json")):
+    wanted = identity(request.key, inputs)
+    for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/{HIDDEN_STAGE}")):
         source = hidden.parent
+        record = _finished(source)
+        if source == request.out or record is None or record.identity != wanted:
+            continue
         try:
-            record = json.loads(hidden.read_text())
-            run = json.loads((source / "run.json").read_text())
-            if source == request.out or _identity(record["key"], record["inputs"]) != wanted:
-                continue
-        except (OSError, ValueError, KeyError):
+            run = read_record(source / RUN, RunRecord)
+        except (UserError, OSError):
             continue
         with contextlib.suppress(OSError):  # It may be replaced at this moment.
             shutil.copytree(source, out, copy_function=_link, dirs_exist_ok=True)
-        if _digests(out) == record["outputs"]:
-            record["scene"] = request.out.parent.name
-            write_json(out / "run.json", run | {"taken_from": source.parent.name})
-            write_json(out / ".stage.json", record)
-            write_json(out / "stage.json", record)
+        if output_digests(out, request.threads) == record.outputs:
+            taken = run.model_copy(update={"taken_from": source.parent.name})
+            _write(out, record.model_copy(update={"scene": request.out.parent.name}), taken)
             replace_folder(out, request.out)
             _publish(request)
             print(f"{request.stage}: taken over from {source.parent.name}", file=sys.stderr)
@@ -326,139 +286,33 @@ def _recover(out: Path) -> None:
     """A kill between the two renames of ``replace_folder`` leaves the former folder aside."""
     old = out.with_name(f".{out.name}.old")
     if old.exists():
-        if (out / ".stage.json").exists():
+        if (out / HIDDEN_STAGE).exists():
             shutil.rmtree(old)
         else:
             shutil.rmtree(out, ignore_errors=True)
             old.rename(out)
 
 
-def _digests(folder: Path) -> dict[str, str]:
-    files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in SIDE_CARS)
-    return {p.relative_to(folder).as_posix(): file_digest(p) for p in files}
+def _write_records(job: Job, inputs: dict[str, str], wall: float) -> None:
+    record = StageRecord(
+        stage=job.stage,
+        scene=job.scene,
+        key=job.key,
+        inputs=inputs,
+        outputs=output_digests(job.out, job.threads),
+        counters=json.loads(canonical(job.counters)),  # tuples become lists
+        decisions=tuple(job.decisions),
+        warnings=tuple(job.warnings),
+    )
+    _write(job.out, record, job.run_record(wall))
 
 
-def file_digest(path: Path) -> str:
-    """SHA-256 of a file's bytes, hexadecimal."""
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
-
-
-# --- sidecars ---------------------------------------------------------------------------------
-
-
-def _write_sidecars(job: Job, inputs: dict[str, str], wall: float) -> None:
-    record = {
-        "stage": job.stage,
-        "scene": job.scene,
-        "key": job.key,
-        "inputs": inputs,
-        "outputs": _digests(job.out),
-        "counters": job.counters,
-        "decisions": job.decisions,
-        "warnings": job.warnings,
-    }
-    write_json(job.out / "run.json", run_facts(job, wall))
-    write_json(job.out / ".stage.json", record)
-    write_json(job.out / "stage.json", record)
-
-
-def run_facts(job: Job, wall: float) -> dict[str, Any]:
-    """How a run went: times in seconds, memory in MiB, versions, commit, machine,
-    instruction set."""
-    own = resource.getrusage(resource.RUSAGE_SELF)
-    children = resource.getrusage(resource.RUSAGE_CHILDREN)
-    return {
-        "wall_s": round(wall, 3),
-        "cpu_s": round(sum(u.ru_utime + u.ru_stime for u in (own, children)), 3),
-        "peak_rss_mb": round(peak_memory_mb(), 1),
-        "threads": job.threads,
-        "seed": job.key["seed"],
-        **machine_facts(),
-        **native_facts(),
-        "versions": versions(),
-        "commit": _commit(),
-        "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
-        **job.timings,
-    }
-
-
-def versions() -> dict[str, str]:
-    """Versions of Python and of the packages whose results we depend on."""
-    found = {"python": platform.python_version()}
-    for name in (
-        "torch",
-        "pycolmap",
-        "opencv-contrib-python-headless",
-        "numpy",
-        "scipy",
-        "rawpy",
-        "snakemake",
-        # A checkout has a commit instead.
-        *(() if IS_CHECKOUT else ("splatmake",)),
-    ):
-        try:
-            found[name] = version(name)
-        except PackageNotFoundError:
-            found[name] = "missing"
-    return found
-
-
-def _commit() -> str | None:
-    """The checkout's commit. An installed package may lie in someone else's repository."""
-    if not IS_CHECKOUT:
-        return None
-    git = ["git", "-C", str(PACKAGES), "rev-parse", "HEAD"]
-    try:
-        done = subprocess.run(git, capture_output=True, text=True, timeout=5, check=False)
-    except (OSError, subprocess.TimeoutExpired):
-        return None
-    return done.stdout.strip() or None
+def _write(out: Path, record: StageRecord, run: RunRecord) -> None:
+    write_json(out / RUN, run.model_dump(mode="json"))
+    for name in (HIDDEN_STAGE, STAGE):
+        write_json(out / name, record.model_dump(mode="json"))
 
 
 def _publish(request: Request) -> None:
     for name, target in request.publish.items():
         write_bytes(target, (request.out / name).read_bytes())
-
-
-# --- lock and log -----------------------------------------------------------------------------
-
-
-@contextmanager
-def _locked(path: Path, request: Request) -> Iterator[None]:
-    """Hold the stage's lock: a job orphaned by a killed Snakemake may still be writing."""
-    with open(path, "w") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
-            print(
-                f"{request.stage}: another run is at work on {request.out}; waiting for it",
-                file=sys.stderr,
-                flush=True,
-            )
-            fcntl.flock(file, fcntl.LOCK_EX)
-        yield
-
-
-@contextmanager
-def _logging_to(path: Path | None, name: str) -> Iterator[None]:
-    if path is None:
-        yield
-        return
-    terminal = sys.stderr
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        log = open(path, "w")  # noqa: SIM115  (closed below)
-    except OSError:
-        # The work itself will meet the same trouble and say so in full.
-        yield
-        return
-    with log:
-        console = Console(terminal, log, f"{name}: ")
-        sys.stderr = console  # type: ignore[assignment]
-        try:
-            yield
-        finally:
-            console.clear()
-            console.flush()
-            sys.stderr = terminal

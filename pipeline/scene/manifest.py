@@ -5,9 +5,10 @@ from __future__ import annotations
 from collections.abc import Callable
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, model_validator
 
 from pipeline.runtime.atomic import write_text
+from pipeline.runtime.record import read_record
 
 
 class Photo(BaseModel):
@@ -26,7 +27,7 @@ class Photo(BaseModel):
     width: int
     height: int
     digest: str
-    """Hex digest of the file's bytes."""
+    """Hex digest of the file's bytes (``recorded.digest_of``), which every reader compares."""
     raw: bool = False
     alpha: bool = False
     bits: int = 8
@@ -34,9 +35,10 @@ class Photo(BaseModel):
     """EXIF orientation, 1 to 8."""
     mask: str | None = None
     """Mask file; non-zero pixels count, zero ones are ignored."""
+    mask_digest: str | None = None
     depth: str | None = None
-    companions: str = ""
-    """Hex digest of the mask's and depth map's bytes that the user brought."""
+    """Depth map file."""
+    depth_digest: str | None = None
     focal_px: float | None = None
     """Focal length prior from EXIF in pixels of this size."""
     camera_group: str = ""
@@ -45,6 +47,12 @@ class Photo(BaseModel):
     """Latitude and longitude in degrees, altitude in metres."""
     taken: str | None = None
     """EXIF time, ISO 8601."""
+
+    @model_validator(mode="after")
+    def _files_have_digests(self) -> Photo:
+        if bool(self.mask) != bool(self.mask_digest) or bool(self.depth) != bool(self.depth_digest):
+            raise ValueError("a mask or depth map and its digest belong together")
+        return self
 
 
 class Manifest(BaseModel):
@@ -70,10 +78,12 @@ class Manifest(BaseModel):
 
     @staticmethod
     def read(path: Path) -> Manifest:
+        """Raises: UserError: the file is missing or damaged."""
+
         def resolved(file: str) -> str:
             return str(path.parent / file) if file.startswith("./") else file
 
-        return Manifest.model_validate_json(path.read_text())._with_files(resolved)
+        return read_record(path, Manifest)._with_files(resolved)
 
     def _with_files(self, change: Callable[[str], str]) -> Manifest:
         photos = [

@@ -27,6 +27,7 @@ class View:
         world_to_camera: (4, 4) float64.
         is_test: held out.
         camera_id: key into ``Reconstruction.cameras``; views of one camera share its lens.
+        image_digest, mask_digest: of the files (``recorded.digest_of``); readers compare them.
     """
 
     name: str
@@ -41,6 +42,8 @@ class View:
     world_to_camera: NDArray[np.float64]
     is_test: bool
     camera_id: int = 0
+    image_digest: str | None = None
+    mask_digest: str | None = None
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -102,6 +105,8 @@ def load_views(
                 world_to_camera=image.world_to_camera,
                 is_test=is_held_out(index, every),
                 camera_id=image.camera_id,
+                image_digest=photo.digest,
+                mask_digest=photo.mask_digest if views.masks == "auto" else None,
             )
         )
     return result

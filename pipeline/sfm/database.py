@@ -22,8 +22,8 @@ import pycolmap
 from numpy.typing import NDArray
 
 from pipeline.config import schema
-from pipeline.runtime.job import file_digest
 from pipeline.runtime.progress import Progress
+from pipeline.runtime.record import file_digest
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.nearest import match_descriptors

@@ -19,7 +19,7 @@ from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
 # Part of the cache key: raise it whenever the same photograph would give other keypoints.
-ALGORITHM_VERSION = 1
+ALGORITHM_VERSION = 2
 
 # Fewer keypoints than this seldom carry a verified pair (15 inliers after a ratio test).
 FEW_FEATURES = 100
@@ -95,9 +95,10 @@ def extract_features(
 
 
 def _cache_key(photo: Photo, config: schema.Features) -> str:
+    """Extraction compares the bytes it decodes with the digests that are in the key."""
     facts = {
         "photo": photo.digest,
-        "mask": _digest(Path(photo.mask)) if photo.mask else None,
+        "mask": photo.mask_digest,
         "config": config.model_dump(mode="json"),
         "version": ALGORITHM_VERSION,
     }
@@ -109,14 +110,6 @@ def _prune(cache: Path, used: set[str]) -> None:
     if len(others) > len(used):
         for file in others:
             file.unlink()
-
-
-def _digest(path: Path) -> str | None:
-    """Hex digest of a file; None where there is none (reading it then gives the error)."""
-    if not path.is_file():
-        return None
-    with open(path, "rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def _extract_opencv(

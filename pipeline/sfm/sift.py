@@ -2,14 +2,11 @@
 
 from __future__ import annotations
 
-from typing import Any
-
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io import heif
-from pipeline.io.names import suffix_of
+from pipeline.photos.load import read_picture
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.sfm.keypoints import Keypoints, root_sift
@@ -30,21 +27,8 @@ class Picture:
     """
 
     def __init__(self, photo: Photo, max_long_side_px: int):
-        pixels: NDArray[Any] | None
-        if suffix_of(photo.path) in heif.HEIF_SUFFIXES:
-            pixels = heif.read_pixels(photo.path)
-        else:
-            pixels = cv2.imread(photo.path, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-        if pixels is None:
-            raise UserError("cannot be read as a picture", file=photo.path, fix="remove it")
+        pixels = read_picture(photo.path, photo.digest)
         height, width = pixels.shape[:2]
-        if (width, height) != (photo.width, photo.height):
-            raise UserError(
-                f"is {width}x{height} pixels, but was {photo.width}x{photo.height} when the scene "
-                "was inspected",
-                file=photo.path,
-                fix="do not change photographs while the program runs; start it again",
-            )
         reduction = min(1.0, max_long_side_px / max(width, height))
         size = (max(1, round(width * reduction)), max(1, round(height * reduction)))
         bgr, alpha = _split(pixels)
@@ -128,13 +112,8 @@ def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
     """8-bit BGR over black, and the alpha channel where there is one."""
     if pixels.dtype == np.uint16:
         alpha_scale, pixels8 = 65535.0, (pixels // 257).astype(np.uint8)
-    elif pixels.dtype == np.uint8:
-        alpha_scale, pixels8 = 255.0, pixels
     else:
-        # Float and other pictures: stretched to what they hold.
-        low, high = float(np.nanmin(pixels)), float(np.nanmax(pixels))
-        values = (np.nan_to_num(pixels, nan=low) - low) / max(high - low, 1e-12)
-        alpha_scale, pixels8 = 1.0, (values * 255).astype(np.uint8)
+        alpha_scale, pixels8 = 255.0, pixels
     if pixels8.ndim == 2:
         return np.repeat(pixels8[..., None], 3, axis=2), None
     if pixels8.shape[2] in (2, 4):
@@ -150,12 +129,10 @@ def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
 def _read_mask(photo: Photo, size: tuple[int, int]) -> NDArray[np.uint8]:
     """(h, w) uint8: 1 where the photograph's mask is not zero."""
     assert photo.mask is not None
-    mask = cv2.imread(photo.mask, cv2.IMREAD_UNCHANGED | cv2.IMREAD_IGNORE_ORIENTATION)
-    if mask is None:
-        raise UserError("cannot be read as a mask", file=photo.mask, fix="replace or remove it")
+    mask = read_picture(photo.mask, photo.mask_digest)
     if mask.ndim == 3:
         mask = mask[..., :3].max(axis=2)
     usable = (mask > 0).astype(np.uint8)
     if (mask.shape[1], mask.shape[0]) != size:
-        usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST)
+        usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
     return usable

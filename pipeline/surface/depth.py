@@ -103,7 +103,7 @@ class DepthMaps:
             view = picture.view
             if view.is_test:
                 continue
-            photo = load_view(view.image, view.mask, view.width, view.height)
+            photo = load_view(view)
             depth = np.array(picture.median)
             if photo.alpha is not None:
                 depth[photo.alpha == 0] = np.inf

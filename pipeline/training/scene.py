@@ -162,7 +162,7 @@ def _known_depths(
     views: list[View], manifest: Manifest, points: list[KnownDepths], notes: _Notes
 ) -> list[KnownDepths]:
     """Depths of the sparse points and of the user's depth maps, by view."""
-    maps = {photo.name: photo.depth for photo in manifest.photos}
+    maps = {p.name: (p.depth, p.depth_digest) if p.depth else None for p in manifest.photos}
     known, kinds, refused = add_maps(views, points, [maps[view.name] for view in views])
     if kinds:
         fits = ", ".join(f"{count} as {FITS[kind]}" for kind, count in kinds.items())

@@ -11,11 +11,14 @@ from PIL import Image
 
 from pipeline.config.runs import Run
 from pipeline.metrics.evaluate import reference
-from pipeline.photos.load import load_view
+from pipeline.photos.load import ViewPixels, load_rgba, resize_rgba
 from pipeline.reporting.batch import MACHINE, Result, as_csv, as_json
 from pipeline.reporting.data import ranked
 from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
+from pipeline.reporting.metrics import read_metrics, read_runs, with_times
 from pipeline.runtime.atomic import write_json, write_text
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
+from pipeline.runtime.record import read_run
 from pipeline.scene.manifest import Manifest
 from stages.workflow.registry import STAGES
 
@@ -41,11 +44,12 @@ def result_of(outcome: dict[str, Any], results: Path) -> Result:
         return Result(run, outcome["status"], outcome["stage"], outcome["message"])
     folder = results / run.name
     ply = folder / "export" / "point_cloud.ply"
-    facts = read_json(folder / "train" / "run.json")
+    metrics = read_metrics(folder)
+    facts = read_run(folder / "train").model_dump(mode="json")
     return Result(
         run,
         "ok",
-        metrics=read_json(folder / "metrics.json"),
+        metrics=with_times(metrics, read_runs(metrics, folder)),
         size_mb=round(ply.stat().st_size / 1e6, 3) if ply.is_file() else None,
         machine={name: facts.get(name) for name in MACHINE},
     )
@@ -72,7 +76,8 @@ def batch_of(found: list[Result], results: Path) -> Batch:
         renders[result.run.name] = thumbnail(render, photo.orientation, name)
         if scene not in photos:
             height, width = render.shape[:2]
-            pixels = load_view(photo.path, None, width, height)
+            rgb, alpha = load_rgba(photo.path, photo.digest)
+            pixels = ViewPixels(*resize_rgba(rgb, alpha, width, height), None)
             background = tuple(result.metrics["protocol"]["background"])
             photos[scene] = thumbnail(reference(pixels, background), photo.orientation, name)
     return Batch(found, renders, photos, plans, list(STAGES))
@@ -88,4 +93,8 @@ if __name__ == "__main__":
     parser.add_argument("--outcomes", required=True, help="how each run ended (JSON), or - (stdin)")
     args = parser.parse_args()
     text = sys.stdin.read() if args.outcomes == "-" else args.outcomes
-    write_batch(json.loads(text)["outcomes"], args.results)
+    try:
+        write_batch(json.loads(text)["outcomes"], args.results)
+    except UserError as error:
+        print(f"error in the batch's tables: {error}", file=sys.stderr)
+        sys.exit(EXIT_USER_ERROR)

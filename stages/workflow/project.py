@@ -20,8 +20,8 @@ from pipeline.plan.stage import StageSpec
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import canonical, file_digest, is_current
 from pipeline.runtime.layout import PACKAGES
+from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.registry import STAGES
 

@@ -88,6 +88,10 @@ def test_merge_leaves_its_arguments_alone():
 def test_generated_page_and_defaults_are_current():
     assert docs.PAGE.read_text() == docs.page(), "run make docs"
     assert docs.DEFAULTS.read_text() == docs.defaults(), "run make docs"
+    schemas = docs.json_schemas()
+    assert set(docs.SCHEMAS.iterdir()) == set(schemas), "a schema of no file, or none of one"
+    for path, text in schemas.items():
+        assert path.read_text() == text, "run make docs"
 
 
 def test_uncommented_defaults_are_the_defaults():

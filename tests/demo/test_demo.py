@@ -22,6 +22,7 @@ from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import normalised, pixels
 from pipeline.io.colmap import read_model
+from pipeline.io.recorded import digest_of
 from pipeline.photos.load import load_mask, load_rgb, load_rgba
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
@@ -143,7 +144,8 @@ def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> N
     write_demo(tmp_path / "dng", replace(SPEC, format="dng"))
     paths = sorted((tmp_path / "dng" / "images").iterdir())
     photos = [
-        Photo(name=p.name, path=str(p), width=160, height=120, digest="", raw=True) for p in paths
+        Photo(name=p.name, path=str(p), width=160, height=120, digest=digest_of(p), raw=True)
+        for p in paths
     ]
     manifest = Manifest(scene="demo", photos=tuple(photos))
     report = develop(manifest, Decode(), tmp_path / "out", threads=2)

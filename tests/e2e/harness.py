@@ -142,12 +142,8 @@ def unlock(project: Path) -> None:
 
 
 def metrics(project: Path, scene: str) -> dict:
-    """``metrics.json`` without what may differ between two runs: times and memory."""
-    found = json.loads((project / "results" / scene / "metrics.json").read_text())
-    for stage in found["stages"].values():
-        for name in ("wall_s", "cpu_s", "peak_rss_mb"):
-            stage.pop(name)
-    return found
+    """``metrics.json``: the same for the same work."""
+    return json.loads((project / "results" / scene / "metrics.json").read_text())
 
 
 def model_digests(project: Path, scene: str) -> dict[str, str]:

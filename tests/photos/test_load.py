@@ -9,8 +9,16 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.photos.load import load_mask, load_rgb, load_rgba, load_view
+from pipeline.io.recorded import digest_of
+from pipeline.photos.load import load_depth, load_mask, load_rgb, load_rgba, load_view
 from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
+
+
+def view_of(path: Path, mask: Path | None, width: int, height: int, **more: str) -> View:
+    file = None if mask is None else str(mask)
+    size = (width, height, 1.0, 1.0, 0.0, 0.0)
+    return View("v", str(path), file, *size, np.eye(4), is_test=False, **more)  # type: ignore[arg-type]
 
 
 def gradient(height: int = 24, width: int = 36) -> np.ndarray:
@@ -61,7 +69,7 @@ def test_hidden_colours_do_not_bleed_when_resized(tmp_path: Path) -> None:
     rgba[..., 1] = 255  # green where transparent
     rgba[:, ::2] = (200, 10, 30, 255)
     Image.fromarray(rgba).save(tmp_path / "a.png")
-    view = load_view(tmp_path / "a.png", None, 4, 4)
+    view = load_view(view_of(tmp_path / "a.png", None, 4, 4))
     assert view.alpha is not None
     assert np.all(view.rgb == (200, 10, 30)) and np.all(view.alpha == 128)
 
@@ -72,7 +80,7 @@ def test_resizing_averages_areas_and_masks_count_where_they_are_whole(tmp_path: 
     mask[:, :19] = 1  # non-zero counts, however dark
     Image.fromarray(rgb).save(tmp_path / "a.png")
     Image.fromarray(mask).save(tmp_path / "m.png")
-    view = load_view(tmp_path / "a.png", tmp_path / "m.png", 18, 12)
+    view = load_view(view_of(tmp_path / "a.png", tmp_path / "m.png", 18, 12))
     expected = rgb.reshape(12, 2, 18, 2, 3).mean(axis=(1, 3))
     assert np.abs(view.rgb - expected).max() <= 0.5
     assert view.mask is not None
@@ -123,4 +131,30 @@ def test_text_called_jpg_missing_file_and_turned_picture(tmp_path: Path) -> None
         load_rgb(tmp_path / "gone.png")
     Image.fromarray(gradient()).save(tmp_path / "a.png")
     with pytest.raises(UserError, match="36x24"):
-        load_view(tmp_path / "a.png", None, 24, 36)
+        load_view(view_of(tmp_path / "a.png", None, 24, 36))
+
+
+def test_a_file_that_is_not_the_recorded_one_is_refused_by_name(tmp_path: Path) -> None:
+    Image.fromarray(gradient()).save(tmp_path / "a.png")
+    Image.new("L", (36, 24), 255).save(tmp_path / "m.png")
+    np.save(tmp_path / "d.npy", np.ones((24, 36)))
+    digest = {name: digest_of(tmp_path / name) for name in ("a.png", "m.png", "d.npy")}
+    view = view_of(
+        tmp_path / "a.png",
+        tmp_path / "m.png",
+        36,
+        24,
+        image_digest=digest["a.png"],
+        mask_digest=digest["m.png"],
+    )
+    assert np.array_equal(load_view(view).rgb, gradient())
+    assert load_depth(tmp_path / "d.npy", 1.5, digest["d.npy"]).shape == (24, 36)
+    Image.new("L", (36, 24), 0).save(tmp_path / "m.png")
+    with pytest.raises(UserError, match=r"m\.png: has changed since the scene was inspected"):
+        load_view(view)
+    Image.fromarray(gradient()[::-1]).save(tmp_path / "a.png")
+    with pytest.raises(UserError, match=r"a\.png: has changed .*\n.*run the same snakemake"):
+        load_view(view)
+    np.save(tmp_path / "d.npy", np.zeros((24, 36)))
+    with pytest.raises(UserError, match=r"d\.npy: has changed"):
+        load_depth(tmp_path / "d.npy", 1.5, digest["d.npy"])

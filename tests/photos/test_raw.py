@@ -14,6 +14,7 @@ from pipeline.demo.render import rays, render
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng
 from pipeline.geometry.cameras import Camera
+from pipeline.io.recorded import digest_of
 from pipeline.photos.load import load_rgb
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
@@ -30,7 +31,7 @@ def manifest(paths: list[Path], width: int, height: int) -> Manifest:
             path=str(path),
             width=width,
             height=height,
-            digest="",
+            digest=digest_of(path),
             raw=True,
             bits=16,
             focal_px=100.0,

@@ -16,6 +16,7 @@ from pipeline.demo.sensor import srgb, to_bytes
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import pixels
 from pipeline.io.colmap import read_model
+from pipeline.io.recorded import digest_of
 from pipeline.photos.load import load_mask, load_rgb, load_rgba, resize_area
 from pipeline.photos.undistort import pinhole_camera, undistort
 from pipeline.runtime.errors import UserError
@@ -45,7 +46,11 @@ def rendered(camera: Camera, *, transparent: bool = False) -> tuple[np.ndarray, 
 
 
 def photo(path: Path, width: int, height: int, **more: object) -> Photo:
-    return Photo(name=path.name, path=str(path), width=width, height=height, digest="", **more)  # type: ignore[arg-type]
+    for kind in ("mask", "depth"):
+        if kind in more:
+            more[f"{kind}_digest"] = digest_of(Path(str(more[kind])))
+    size = {"width": width, "height": height}
+    return Photo(name=path.name, path=str(path), digest=digest_of(path), **size, **more)  # type: ignore[arg-type]
 
 
 def scene(camera: Camera, *photos: Photo) -> tuple[Manifest, Reconstruction]:

@@ -53,3 +53,12 @@ def test_copies_are_a_warning(tmp_path):
     manifest = scan(tmp_path, "s", Config(), cache=None).manifest
     (warning,) = verify_photos(manifest, threads=1)[1]
     assert "q.jpg = p01.jpg" in warning and warning.startswith("copies of other photographs: 1 (")
+
+
+def test_a_photograph_replaced_after_the_scan_is_an_error(tmp_path):
+    """Its facts, read by the scan, are another picture's."""
+    files = photos(tmp_path, 3)
+    manifest = scan(tmp_path, "s", Config(), cache=None).manifest
+    files[1].write_bytes(files[2].read_bytes())
+    with pytest.raises(UserError, match=r"p01\.jpg: has changed since the scene was inspected"):
+        verify_photos(manifest, threads=1)

@@ -354,7 +354,12 @@ def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count
 
 
 def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
-    some = many(tmp_path, 50, depth=lambda i: f"depths/{i}.png" if i < 30 else None)
+    some = many(
+        tmp_path,
+        50,
+        depth=lambda i: f"depths/{i}.png" if i < 30 else None,
+        depth_digest=lambda i: f"{i}" if i < 30 else None,
+    )
     plan = make_plan(some, Config())
     assert plan.config.train.depth_weight == 0.3
     assert any("30 depth maps" in text for text in plan.stages["train"].decisions)

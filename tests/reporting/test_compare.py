@@ -8,6 +8,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.command.main import main
 from pipeline.reporting import compare
 
 
@@ -87,28 +88,24 @@ def test_each_run_of_a_batch_is_a_row() -> None:
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
 
 
-def test_a_second_batch_is_the_same_or_says_in_what_it_differs(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_second_batch_is_the_same_or_says_in_what_it_differs(tmp_path: Path) -> None:
     first = [row("a", "fast", 30.0), row("b", "fast", 20.0)]
     second = [row("a", "fast", 30.0, wall_s=33.0), row("b", "fast", 20.5, ssim=0.5)]
     files = []
     for name, rows in (("first", first), ("second", second)):
-        files.append(str(tmp_path / f"{name}.json"))
-        Path(files[-1]).write_text(json.dumps({"runs": rows}))
-    monkeypatch.setattr("sys.argv", ["compare", *files])
-    assert compare.main() == 0
-    told = capsys.readouterr().out
+        files.append(tmp_path / f"{name}.json")
+        files[-1].write_text(json.dumps({"runs": rows}))
+    told = "\n".join(compare.compare(files))
     assert "| a@fast | the same | 30, 33 | 60, 60 |" in told
     assert "| b@fast | psnr 20.0 and 20.5 | 30, 30 | 60, 60 |" in told
     assert "wall_s, second to first: median 1.05, 1.00 to 1.10" in told
 
 
-def test_what_is_no_batch_is_said(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_is_no_batch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     file = tmp_path / "benchmark.json"
     file.write_text("{}")
-    monkeypatch.setattr("sys.argv", ["compare", str(file)])
-    assert compare.main() == 2
+    assert main(["compare", str(file)]) == 2
     assert f"error: {file}" in capsys.readouterr().err
+    file.write_text(json.dumps({"runs": [row("a", "fast", 30.0)]}))
+    assert main(["compare", str(file), "--base", "slow"]) == 2
+    assert "expected a configuration 'slow', found fast" in capsys.readouterr().err

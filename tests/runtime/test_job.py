@@ -9,7 +9,8 @@ from dataclasses import replace
 import pytest
 
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.job import Job, Request, content_digest, run_stage
+from pipeline.runtime.job import Job, Request, run_stage
+from pipeline.runtime.record import content_digest
 
 KEY = {"stage": "work", "seed": 0, "config": {}}
 

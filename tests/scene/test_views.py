@@ -15,7 +15,9 @@ def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruc
     camera = camera or Camera("PINHOLE", 301, 200, np.array([250.0, 260.0, 150.0, 99.0]))
     names = [f"p{i:02d}.jpg" for i in range(count)]
     photos = [
-        Photo(name=n, path=f"/x/{n}", width=301, height=200, digest=n, mask=f"/m/{n}")
+        Photo(
+            name=n, path=f"/x/{n}", width=301, height=200, digest=n, mask=f"/m/{n}", mask_digest="m"
+        )
         for n in names
     ]
     images = {

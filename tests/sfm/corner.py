@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from functools import lru_cache
 from pathlib import Path
 
@@ -10,6 +9,7 @@ import cv2
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
+from pipeline.io.recorded import digest_of
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Posed, Reconstruction
 
@@ -81,7 +81,7 @@ def photo(path: Path, name: str | None = None, **facts) -> Photo:
         path=str(path),
         width=pixels.shape[1],
         height=pixels.shape[0],
-        digest=hashlib.sha256(path.read_bytes()).hexdigest(),
+        digest=digest_of(path),
         **facts,
     )
 

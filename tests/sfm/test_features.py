@@ -10,6 +10,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config import schema
+from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
@@ -35,6 +36,11 @@ def saved(folder: Path, file: str, pixels: np.ndarray, **facts):
     folder.mkdir(parents=True, exist_ok=True)
     assert cv2.imwrite(str(folder / file), pixels)
     return corner.photo(folder / file, **facts)
+
+
+def masked(mask: Path) -> dict[str, str]:
+    """A photograph's facts about its mask."""
+    return {"mask": str(mask), "mask_digest": digest_of(mask)}
 
 
 def test_the_strongest_are_kept_largest_first(tmp_path, pixels):
@@ -85,7 +91,7 @@ def test_masked_pixels_have_no_features_and_lose_none_elsewhere(tmp_path, pixels
     mask = np.zeros(pixels.shape[:2], np.uint8)
     mask[:, :150] = 1  # non-zero is enough
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
-    photo = saved(tmp_path, "a.png", pixels, mask=str(tmp_path / "mask.png"))
+    photo = saved(tmp_path, "a.png", pixels, **masked(tmp_path / "mask.png"))
     keypoints = extract(tmp_path, [photo])[0]["a.png"]
     assert (keypoints.xy[:, 0] <= 151).all()
     # The strongest are chosen among the allowed ones: there are still as many as were asked for.
@@ -141,12 +147,26 @@ def test_copies_of_a_photograph_are_extracted_once(tmp_path, pixels):
 def test_what_changes_the_keypoints_misses_the_cache(tmp_path, pixels):
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.ones(pixels.shape[:2], np.uint8))
-    photo = saved(tmp_path, "a.png", pixels, mask=str(mask))
+    photo = saved(tmp_path, "a.png", pixels, **masked(mask))
     assert extract(tmp_path, [photo])[1].num_cached == 0
     assert extract(tmp_path, [photo])[1].num_cached == 1
     assert extract(tmp_path, [photo], schema.Features(max_features=400))[1].num_cached == 0
     cv2.imwrite(str(mask), np.eye(*pixels.shape[:2], dtype=np.uint8))
+    photo = photo.model_copy(update=masked(mask))
     assert extract(tmp_path, [photo])[1].num_cached == 0
+
+
+@pytest.mark.parametrize("backend", ["opencv", "colmap"])
+@pytest.mark.parametrize("changed", ["a.png", "mask.png"])
+def test_a_file_changed_since_inspect_is_named_and_nothing_is_cached(
+    tmp_path, pixels, changed, backend
+):
+    cv2.imwrite(str(tmp_path / "mask.png"), np.ones(pixels.shape[:2], np.uint8))
+    photo = saved(tmp_path, "a.png", pixels, **masked(tmp_path / "mask.png"))
+    cv2.imwrite(str(tmp_path / changed), np.roll(pixels, 40, axis=1))  # of the same size
+    with pytest.raises(UserError, match=f"{changed}: has changed since the scene was inspected"):
+        extract(tmp_path, [photo], schema.Features(backend=backend))
+    assert not list((tmp_path / "cache").iterdir())
 
 
 def test_the_cache_keeps_two_settings_and_does_not_grow_for_ever(tmp_path, pixels):
@@ -182,11 +202,12 @@ def test_an_empty_wall_is_a_warning_with_its_name(tmp_path):
     assert report.warnings == ["wall.png: only 0 features"]
 
 
-def test_unreadable_and_changed_photographs_are_named(tmp_path, pixels):
+def test_unreadable_photographs_are_named(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
     (tmp_path / "a.png").write_text("not a picture")
-    with pytest.raises(UserError, match=r"a\.png: cannot be read"):
+    photo = photo.model_copy(update={"digest": digest_of(tmp_path / "a.png")})
+    with pytest.raises(UserError, match=r"a\.png: not a picture that can be read"):
         extract(tmp_path, [photo])
-    saved(tmp_path, "a.png", pixels[:100])
-    with pytest.raises(UserError, match=r"a\.png: is 400x100 pixels, but was 400x300"):
+    (tmp_path / "a.png").unlink()
+    with pytest.raises(UserError, match=r"a\.png: cannot be read"):
         extract(tmp_path, [photo])

@@ -75,9 +75,12 @@ def fit_map(values: Array, z: Array) -> Fit | None:
 
 
 def map_depths(
-    view: View, path: str, points: KnownDepths
+    view: View, path: str, points: KnownDepths, digest: str | None = None
 ) -> tuple[KnownDepths, Fit] | tuple[None, None]:
     """Samples of the depth map ``path`` of ``view``, fitted to the depths of its ``points``.
+
+    Args:
+        digest: the file's recorded digest.
 
     Returns:
         the samples, each of weight 1, and the fit; None where points and map do not agree.
@@ -85,7 +88,7 @@ def map_depths(
     Raises:
         UserError: the file is no depth map that can be read, or not of the view's shape.
     """
-    full = load_depth(path, view.width / view.height)
+    full = load_depth(path, view.width / view.height, digest)
     height, width = full.shape
 
     def at(xy: Array) -> Array:
@@ -121,19 +124,25 @@ def merged(points: KnownDepths, samples: KnownDepths) -> KnownDepths:
 
 
 def add_maps(
-    views: Sequence[View], points: Sequence[KnownDepths], paths: Sequence[str | None]
+    views: Sequence[View],
+    points: Sequence[KnownDepths],
+    maps: Sequence[tuple[str, str | None] | None],
 ) -> tuple[list[KnownDepths], dict[str, int], list[str]]:
     """``points`` with the samples of the views' depth maps.
+
+    Args:
+        maps: each view's file and its recorded digest; None for a view without a depth map.
 
     Returns:
         known depths by view; how many maps each kind of fit took; names of views whose maps
         the points contradict.
     """
     known, kinds, refused = list(points), dict.fromkeys(("factor", "depth", "inverse"), 0), []
-    for index, (view, path) in enumerate(zip(views, paths, strict=True)):
-        if path is None:
+    for index, (view, file) in enumerate(zip(views, maps, strict=True)):
+        if file is None:
             continue
-        samples, fit = map_depths(view, path, points[index])
+        path, digest = file
+        samples, fit = map_depths(view, path, points[index], digest)
         if samples is None or fit is None:
             refused.append(view.name)
             continue

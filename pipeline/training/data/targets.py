@@ -109,7 +109,7 @@ class Targets:
         self._shelf = MemoryShelf() if shelf is None else shelf
 
         def load(view: View) -> _Kept:
-            pixels = load_view(view.image, view.mask, view.width, view.height)
+            pixels = load_view(view)
             if noise:
                 _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
             return _Kept(_target(pixels), self._shelf)

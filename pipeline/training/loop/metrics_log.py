@@ -10,7 +10,7 @@ import json
 import time
 from pathlib import Path
 
-from pipeline.runtime.job import peak_memory_mb
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.training.loop.state import TrainState
 
 NAME = "train.metrics.jsonl"

@@ -69,8 +69,8 @@ def test_a_map_of_something_else_and_one_without_points_are_refused(tmp_path):
     few = KnownDepths(np.zeros((3, 2)), np.ones(3, np.float32), np.ones(3, np.float32))
     np.save(tmp_path / "map.npy", z)
     views = [VIEW, replace(VIEW, name="b.png"), replace(VIEW, name="c.png")]
-    paths = [str(tmp_path / "noise.npy"), str(tmp_path / "map.npy"), None]
-    known, kinds, refused = add_maps(views, [sparse(z), few, few], paths)
+    maps = [(str(tmp_path / "noise.npy"), None), (str(tmp_path / "map.npy"), None), None]
+    known, kinds, refused = add_maps(views, [sparse(z), few, few], maps)
     assert refused == ["a.png", "b.png"] and kinds == {}
     assert [len(k) for k in known] == [60, 3, 3]
 

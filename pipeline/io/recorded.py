@@ -1,0 +1,60 @@
+"""The bytes of photographs, masks and depth maps, compared with the digests in ``images.json``."""
+
+from __future__ import annotations
+
+import hashlib
+from pathlib import Path
+
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.record import changed, owner_of, rerun
+
+_DIGEST_BYTES = 16
+
+
+class ChangedFileError(UserError):
+    """A file is not the one whose digest was recorded."""
+
+
+def digest_of(path: Path) -> str:
+    """Hex digest of a file's bytes."""
+    with open(path, "rb") as file:
+        return hashlib.file_digest(file, _hash).hexdigest()
+
+
+def read_recorded(path: str | Path, digest: str | None) -> bytes:
+    """The bytes of a file.
+
+    The bytes that are returned are the ones that were compared: decode them, do not read the file
+    again.
+
+    Args:
+        digest: what ``digest_of`` gave when the file was recorded; None compares nothing.
+
+    Raises:
+        ChangedFileError: the file has another digest.
+        UserError: the file cannot be read.
+    """
+    path = Path(path)
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        raise UserError(
+            f"cannot be read: {error.strerror}",
+            file=path,
+            fix="replace the file by a whole one, or remove it from the folder",
+        ) from None
+    if digest is None or _hash(data).hexdigest() == digest:
+        return data
+    folder = owner_of(path)
+    if folder is not None:
+        raise ChangedFileError(changed(folder), file=path, fix=rerun(folder))
+    raise ChangedFileError(
+        "has changed since the scene was inspected",
+        file=path,
+        fix="run the same snakemake command again: the stages that use this file are run again; "
+        "leave the scene's files unchanged while snakemake runs",
+    )
+
+
+def _hash(data: bytes = b"") -> hashlib.blake2b:
+    return hashlib.blake2b(data, digest_size=_DIGEST_BYTES)

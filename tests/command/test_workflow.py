@@ -1,0 +1,84 @@
+"""``splatmake run`` and ``plan``: what is handed to Snakemake."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+from snakemake.cli import parse_config
+
+from pipeline.command import workflow
+from pipeline.command.main import main
+
+
+@pytest.fixture
+def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
+    """The commands that would have replaced the process."""
+    commands: list[list[str]] = []
+    monkeypatch.setattr(workflow, "become", commands.append)
+    return commands
+
+
+def config_of(command: list[str]) -> dict[str, Any]:
+    """The configuration as Snakemake understands the command."""
+    return dict(parse_config(command[command.index("--config") + 1 :]))
+
+
+def test_the_folder_is_the_scene_and_its_parent_data_root(
+    tmp_path: Path, started: list[list[str]]
+) -> None:
+    """Whatever characters the path has: YAML would take some for its own."""
+    photos = tmp_path / "my photos: #1 é" / "garden"
+    photos.mkdir(parents=True)
+    link = tmp_path / "patio"
+    link.symlink_to(photos)
+    for folder, name, root in ((photos, "garden", photos.parent), (link, "patio", tmp_path)):
+        assert main(["run", str(folder)]) == 0
+        command = started.pop()
+        assert f"results/{name}/metrics.json" in command
+        assert config_of(command) == {"data_root": str(root)}
+
+
+@pytest.mark.parametrize("mark", [[], ["--"]])
+def test_options_are_ours_or_snakemakes(
+    tmp_path: Path, started: list[list[str]], mark: list[str]
+) -> None:
+    theirs = ["--forcerun", "train", "-p", "--jobs", "3"]
+    ours = ["--preset", "fast", "--cores", "2", "--config", "seed=3", "train={steps: 5}"]
+    assert main(["plan", str(tmp_path), *ours, *mark, *theirs]) == 0
+    command = started.pop()
+    first = command.index("--dry-run")
+    assert command[first + 1 : first + 1 + len(theirs)] == theirs
+    assert command[command.index("--cores") + 1] == "2"
+    found = config_of(command)
+    assert (found["preset"], found["seed"], found["train"]) == ("fast", 3, {"steps": "5"})
+
+
+def test_profiles_of_the_program_have_names(
+    tmp_path: Path, started: list[list[str]], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    main(["run", str(tmp_path), "--workflow-profile", "slurm"])
+    command = started.pop()
+    chosen = Path(command[command.index("--workflow-profile") + 1])
+    assert "slurm" in (chosen / "config.yaml").read_text()
+    (tmp_path / "slurm").mkdir()
+    main(["run", str(tmp_path), "--workflow-profile", "slurm"])
+    assert "slurm" in started.pop()  # the user's own
+
+
+def test_no_folder_is_a_clear_error(
+    tmp_path: Path, started: list[list[str]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    assert main(["run", str(tmp_path / "gardn")]) == 2
+    assert "expected a folder of photographs, found nothing" in capsys.readouterr().err
+    assert not started
+
+
+def test_a_mistyped_option_of_another_command_is_refused(
+    capsys: pytest.CaptureFixture[str],
+) -> None:
+    with pytest.raises(SystemExit):
+        main(["doctor", "--jsn"])
+    assert "--jsn" in capsys.readouterr().err

@@ -1,0 +1,172 @@
+"""The installed program: an environment of its own, another folder, and none of the checkout.
+
+Covered: the build, package data, entry point, Snakefile, profiles and API. Not covered: the
+resolution and download of dependencies, which are those of the environment that runs the tests.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tests.e2e.harness import ROOT, TINY, copy_run
+from tests.install.package import (
+    copy_sources,
+    install,
+    make_environment,
+    programs_without_compilers,
+    variables,
+)
+from tests.once import made_once
+
+EXAMPLE = re.search(r"```python\n(.+?)```", (ROOT / "docs" / "api.md").read_text(), re.S)
+CACHE = ROOT / "build" / "native"
+CONFIG = [f"{name}={json.dumps(value)}" for name, value in TINY.items()]
+
+
+def run(
+    environment: Path, *command: str, cwd: Path, **more: str
+) -> subprocess.CompletedProcess[str]:
+    """Run one of the environment's programs; stdout and stderr together in ``stdout``."""
+    name, *arguments = command
+    done = subprocess.run(
+        [str(environment / "bin" / name), *arguments],
+        cwd=cwd,
+        env=variables(environment, CACHE) | more,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=900,
+    )
+    assert done.returncode == 0, f"{' '.join(command)} ended with {done.returncode}:\n{done.stdout}"
+    return done
+
+
+def _install(folder: Path) -> None:
+    sources = copy_sources(folder / "sources")
+    install(make_environment(folder / "environment"), sources)
+
+
+@pytest.fixture(scope="session")
+def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment in which the program is installed from its sources."""
+    return made_once(tmp_path_factory, "installed", _install) / "environment"
+
+
+def site_packages(environment: Path) -> Path:
+    return next(environment.glob("lib/python*/site-packages"))
+
+
+def test_every_file_of_the_packages_is_installed(installed: Path) -> None:
+    """Package data is chosen by patterns: a new kind of file would be left out silently."""
+    sources = installed.parent / "sources"
+    expected = {
+        str(path.relative_to(sources))
+        for package in ("pipeline", "stages", "splatmake")
+        for path in (sources / package).rglob("*")
+        if path.is_file() and path.suffix not in (".md", ".pyc")
+    }
+    packages = site_packages(installed)
+    found = {str(path.relative_to(packages)) for path in packages.rglob("*") if path.is_file()}
+    assert expected - found == set()
+    for name in ("Snakefile", "profiles/default/config.yaml", "profiles/slurm/config.yaml"):
+        assert (packages / "pipeline" / "workflow" / name).read_text() == (ROOT / name).read_text()
+
+
+def test_the_command_runs_outside_of_the_checkout(installed: Path, tmp_path: Path) -> None:
+    """Also in a folder with packages of the program's names, which are the user's."""
+    for name in ("pipeline", "stages"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "__init__.py").write_text("raise SystemExit('not this one')\n")
+    assert "splatmake 0" in run(installed, "splatmake", "--version", cwd=tmp_path).stdout
+    report = json.loads(run(installed, "splatmake", "doctor", "--json", cwd=tmp_path).stdout)
+    assert report["ready"]
+    code = "import pipeline, stages, splatmake; print(pipeline.__file__, splatmake.__file__)"
+    places = run(installed, "python", "-P", "-c", code, cwd=tmp_path).stdout.split()
+    assert all(place.startswith(str(site_packages(installed))) for place in places), places
+
+
+def test_libraries_are_not_compiled_into_the_installation(installed: Path, tmp_path: Path) -> None:
+    code = "from pipeline.runtime import native; print(native.cache_folder())"
+    cache = {"SPLATMAKE_CACHE": "", "XDG_CACHE_HOME": str(tmp_path)}
+    found = run(installed, "python", "-c", code, cwd=tmp_path, **cache).stdout.strip()
+    assert found == str(tmp_path / "splatmake" / "native")
+
+
+@pytest.mark.slow
+def test_photographs_to_measurements(installed: Path, finished: Path, tmp_path: Path) -> None:
+    """``splatmake run`` on photographs elsewhere gives what a checkout gives, and the example of
+    docs/api.md loads it."""
+    photos = copy_run(finished / "data", tmp_path / "my photos") / "tiny"
+    work = tmp_path / "work"
+    work.mkdir()
+    for name in ("pipeline", "stages"):  # the user's own, not ours
+        (work / name).mkdir()
+        (work / name / "__init__.py").write_text("raise SystemExit('not this one')\n")
+    planned = run(installed, "splatmake", "plan", str(photos), "--config", *CONFIG, cwd=work)
+    assert "dry-run" in planned.stdout and not (work / "results" / "tiny" / "train").exists()
+    run(installed, "splatmake", "run", str(photos), "--cores", "2", "--config", *CONFIG, cwd=work)
+    ours, theirs = (
+        json.loads((place / "results/tiny/metrics.json").read_text()) for place in (work, finished)
+    )
+    for name in ("psnr", "ssim", "num_gaussians"):
+        assert ours[name] == theirs[name]
+    run(
+        *(installed, "splatmake", "run", str(photos), "--report", "report.zip"),
+        *("--config", *CONFIG),
+        cwd=work,
+    )
+
+    assert EXAMPLE is not None
+    example = EXAMPLE[1].replace("results/garden", "results/tiny")
+    assert len(example.splitlines()) <= 10
+    (tmp_path / "example.py").write_text(example)
+    printed = run(installed, "python", "../example.py", cwd=work).stdout
+    assert f"{ours['psnr']:.2f} dB" in printed
+
+
+@pytest.mark.slow
+def test_the_example_passes_a_type_checker(installed: Path, tmp_path: Path) -> None:
+    """As a user's code: the installed packages say that they are typed, and no part of the API is
+    Any."""
+    assert EXAMPLE is not None
+    text = EXAMPLE[1] + "\nreveal_type(scene.measure().psnr)\nreveal_type(splatmake.load)\n"
+    (tmp_path / "example.py").write_text(text)
+    found = run(
+        *(installed, "python", "-m", "mypy", "--strict", "--follow-imports=silent", "example.py"),
+        cwd=tmp_path,
+    ).stdout
+    assert 'Revealed type is "float"' in found or 'Revealed type is "builtins.float"' in found
+    assert "Scene" in found
+
+
+@pytest.mark.slow
+def test_a_wheel_with_kernels_needs_no_compiler(finished: Path, tmp_path: Path) -> None:
+    """The first steps of a reconstruction, with every native library from the wheel."""
+    pytest.importorskip("build")
+    sources = copy_sources(tmp_path / "sources")
+    subprocess.run(
+        ["python", "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), "."],
+        cwd=sources,
+        env=variables(Path(sys.prefix), CACHE) | {"SPLATMAKE_PREBUILT": "1"},
+        check=True,
+    )
+    (wheel,) = tmp_path.glob("*.whl")
+    environment = tmp_path / "environment"
+    install(make_environment(environment), wheel)
+    cache = tmp_path / "cache"
+    path = f"{environment / 'bin'}:{programs_without_compilers(tmp_path / 'programs')}"
+    bare = {"PATH": path, "SPLATMAKE_CACHE": str(cache)}
+    report = run(environment, "splatmake", "doctor", cwd=tmp_path, **bare).stdout
+    assert "compiler g++" in report and "ready to run" in report
+    config = [f"views={json.dumps(TINY['views'])}", 'train={"steps": 20}']
+    photos = finished / "data" / "tiny"
+    run(environment, "splatmake", "run", str(photos), "--config", *config, cwd=tmp_path, **bare)
+    used = json.loads((tmp_path / "results/tiny/train/run.json").read_text())
+    assert used["versions"]["splatmake"] == "0.1.0" and used["commit"] is None
+    assert not cache.exists() or not list(cache.rglob("*.so"))

@@ -1,0 +1,113 @@
+"""metrics.json: gathered from records, the same on any machine; times come from run.json."""
+
+import json
+
+import pytest
+
+from pipeline.reporting.collect import collect_metrics
+from pipeline.reporting.headline import headline, main
+from pipeline.reporting.metrics import Metrics, read_metrics, read_runs, with_times
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.record import RunRecord, StageRecord
+
+COUNTERS = {
+    "inspect": {"photos": 7, "left_out": 1},
+    "sfm": {"registered": 6, "mean_reprojection_error_px": 0.5, "verdict": "good"},
+    "train": {"num_gaussians": 1000},
+    "report": {},
+}
+PLAN = {
+    "warnings": ["it is dark"],
+    "stages": {name: {"run": True, "reason": "needed"} for name in COUNTERS}
+    | {"decode": {"run": False, "reason": "no RAW files"}},
+}
+EVALUATION = {
+    "psnr": 27.5,
+    "ssim": 0.9,
+    "lpips": None,
+    "lpips_reason": "switched off",
+    "train_psnr": 30.0,
+    "psnr_without_gains": None,
+    "per_view": [{"name": "a.jpg", "psnr": 27.5, "ssim": 0.9, "lpips": None, "render": "0.png"}],
+    "protocol": {
+        "resolution": ["80x60"],
+        "split": "every 8th",
+        "poses_and_points": "all",
+        "num_views": 1,
+        "psnr": "mean",
+        "ssim": "mean",
+        "lpips": "switched off",
+        "masks": None,
+        "background": [0.0, 0.0, 0.0],
+        "exposure": None,
+        "poses": None,
+    },
+    "pose_error": None,
+}
+
+
+def run(wall: float, **more) -> RunRecord:
+    facts = {"wall_s": wall, "cpu_s": 2 * wall, "peak_rss_mb": 100.0, "threads": 2, "seed": 0}
+    return RunRecord(**facts, versions={}, commit=None, finished="2026-01-01T00:00:00", **more)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """A finished scene's records."""
+    scene = tmp_path / "barn"
+    for name, counters in COUNTERS.items():
+        record = StageRecord(
+            stage=name,
+            scene="barn",
+            key={},
+            inputs={},
+            outputs={},
+            counters=counters,
+            decisions=(),
+            warnings=("it is dark", f"{name} is unsure") if name == "sfm" else (),
+        )
+        write_json(scene / name / "stage.json", record.model_dump(mode="json"))
+        more = {"earlier_s": 2.0} if name == "train" else {}
+        write_json(scene / name / "run.json", run(3.0, **more).model_dump(mode="json"))
+    found = collect_metrics("barn", PLAN, scene, EVALUATION, seed=3, versions={"torch": "2"})
+    write_json(scene / "report" / "metrics.json", found.model_dump(mode="json"))
+    return scene
+
+
+def test_metrics_come_from_the_records_and_hold_no_times(folder):
+    found = read_metrics(folder)
+    assert (found.psnr, found.num_gaussians, found.sfm_verdict) == (27.5, 1000, "good")
+    assert (found.registered_images, found.total_images, found.seed) == (6, 8, 3)
+    assert found.warnings == ["it is dark", "sfm: sfm is unsure"], "each once"
+    assert found.stages["decode"].skipped and not found.stages["train"].skipped
+    assert "_s" not in "".join(found.stages["train"].model_dump())
+    assert json.loads((folder / "report" / "metrics.json").read_text())["schema_version"] == 1
+
+
+def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
+    found = read_metrics(folder)
+    stages = with_times(found, read_runs(found, folder))["stages"]
+    assert stages["train"]["wall_s"] == 5.0 and stages["sfm"]["wall_s"] == 3.0
+    assert stages["decode"]["wall_s"] == 0.0 and stages["sfm"]["cpu_s"] == 6.0
+
+
+def test_the_headline_says_quality_size_poses_and_time(folder, capsys):
+    line = "barn: PSNR 27.50 dB, SSIM 0.9000, LPIPS n/a, 1000 Gaussians, 6/8 images, 2 warnings"
+    assert headline(read_metrics(folder)) == line
+    assert main([str(folder / "metrics.json")]) == 0
+    assert capsys.readouterr().out.startswith(f"{line}, 14 s\n")
+
+
+@pytest.mark.parametrize("name", ["report/metrics.json", "sfm/run.json"])
+def test_a_damaged_file_is_one_clear_error(folder, name, capsys):
+    (folder / name).write_text('{"psnr": ')
+    with pytest.raises(UserError, match=f"{name}: cannot be read"):
+        read_runs(read_metrics(folder), folder)
+    assert main([str(folder)]) == 2
+    assert "--forcerun" in capsys.readouterr().err
+
+
+def test_a_number_that_is_none_is_refused():
+    with pytest.raises(ValueError, match="psnr"):
+        Metrics.model_validate({"psnr": "good"})

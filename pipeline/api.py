@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Evaluate, Train
 from pipeline.io import splat_files
 from pipeline.io.camera_files import choose_views
-from pipeline.metrics.evaluate import NO_GAINS, Protocol, choose_protocol, evaluate_views, reference
+from pipeline.metrics.evaluate import (
+    NO_GAINS,
+    Protocol,
+    choose_protocol,
+    evaluate_views,
+    photo_over_background,
+)
 from pipeline.metrics.image import psnr, ssim
 from pipeline.photos.load import load_view
 from pipeline.plan.posed_scene import PosedScene, posed_scene
@@ -103,7 +109,9 @@ class Scene:
             UserError: its file is missing or cannot be read.
         """
         pixels = load_view(view)
-        return reference(pixels, self._protocol.background).astype(np.float32) / np.float32(255)
+        return photo_over_background(pixels, self._protocol.background).astype(
+            np.float32
+        ) / np.float32(255)
 
     def measure(self, views: Sequence[View] = ()) -> Quality:
         """Render views and compare them with their photographs, by the protocol of metrics.json.
@@ -114,7 +122,9 @@ class Scene:
         Raises:
             UserError: a photograph that cannot be read, or masks that leave no pixel.
         """
-        protocol = replace(self._protocol, views=list(views) or self._protocol.views, seen=[])
+        protocol = replace(
+            self._protocol, views=list(views) or self._protocol.views, training_views=[]
+        )
         with tempfile.TemporaryDirectory() as renders:
             found = evaluate_views(
                 self.gaussians,

@@ -86,7 +86,7 @@ class Scene:
 
     @property
     def test_views(self) -> list[View]:
-        """The views that were held out of training; empty where none was."""
+        """The test views, which are not used for training; may be empty."""
         return [view for view in self.views if view.is_test]
 
     def view(self, name: str) -> View:
@@ -117,7 +117,7 @@ class Scene:
         """Render views and compare them with their photographs, by the protocol of metrics.json.
 
         Args:
-            views: those to measure; empty: the test views, or all views where none was held out.
+            views: those to measure; empty: the test views, or all views if there are no test views.
 
         Raises:
             UserError: a photograph that cannot be read, or masks that leave no pixel.

@@ -159,5 +159,5 @@ def test_default_formats(scene):
 
 
 def test_pruning_everything_is_an_error(scene):
-    with pytest.raises(UserError, match="fainter"):
+    with pytest.raises(UserError, match="have an opacity below"):
         export(scene, min_opacity=1.0)

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.metrics.evaluate import Protocol, reference
+from pipeline.metrics.evaluate import Protocol, photo_over_background
 from pipeline.photos.load import load_view
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
 from pipeline.runtime.record import read_run, read_stage
@@ -92,7 +92,7 @@ def _comparisons(
                 Comparison(
                     label=label,
                     name=view.name,
-                    photograph=reference(pixels, results.protocol.background),
+                    photograph=photo_over_background(pixels, results.protocol.background),
                     render=np.asarray(render),
                     mask=pixels.mask,
                     psnr=measured["psnr"],

@@ -46,16 +46,21 @@ class Target:
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
     def alpha_gradient(
-        self, alpha: Tensor, mask_weight: float, alpha_weight: float, squared_error_weight: float
+        self,
+        alpha: Tensor,
+        mask_loss_weight: float,
+        alpha_loss_weight: float,
+        squared_error_weight: float,
     ) -> Tensor | None:
         """(H, W) float32 gradient of the losses on the rendered ``alpha`` (H, W); None without any.
 
         Args:
-            mask_weight: of alpha on ignored pixels (``mask_gradient``).
-            alpha_weight, squared_error_weight: of the error on other pixels (``error_gradient``).
+            mask_loss_weight: of alpha on ignored pixels (``mask_gradient``).
+            alpha_loss_weight, squared_error_weight: of the error on other pixels
+                (``error_gradient``).
         """
-        masked = self.mask_gradient(mask_weight)
-        error = self.error_gradient(alpha, alpha_weight, squared_error_weight)
+        masked = self.mask_gradient(mask_loss_weight)
+        error = self.error_gradient(alpha, alpha_loss_weight, squared_error_weight)
         if masked is None or error is None:
             return error if masked is None else masked
         return masked + error

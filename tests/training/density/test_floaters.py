@@ -122,7 +122,7 @@ def test_training_removes_floaters(scene: TinyScene, tmp_path: Path) -> None:
     result = run(scene, tmp_path / "b", kept, first)
     assert result.counters["floaters"] == 0
     assert nearest(scene, result) == pytest.approx(0.4, abs=1e-3)
-    # Too few looks at each photograph to have made any, and to be worth looking at all again.
+    # Runs of few epochs do not remove floaters.
     short = 6 * len(scene.views)
     assert run(scene, tmp_path / "c", tiny_config(short, **still), first).counters["floaters"] == 0
 

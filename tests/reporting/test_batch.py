@@ -138,7 +138,7 @@ def test_the_page_warns_about_different_image_sizes():
             results.append(result)
         return index_html(Batch(results))
 
-    said = "pictures of different sizes"
+    said = "images of different sizes"
     assert said in page(("fox", "fast", "64x48"), ("fox", "high", "80x60"))
     alike = [("fox", "fast", "64x48"), ("cat", "fast", "80x60")]
     assert said not in page(*alike, *((scene, "high", size) for scene, _, size in alike))

@@ -63,10 +63,10 @@ def test_every_number_is_on_the_page() -> None:
         *("17.89 dB", "23.45 dB", "0.1234", "7,003", "640x480", "every 8th", "a window"),
         *("because of decode", "skipped", "incremental mapper: 49 images", "300 sparse points"),
         *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
-        *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 squares"),
-        *("0.222 (11.1% of squares)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
-        *("63 % of this picture is unknown", "fill 17 % of what is missing"),
-        *("1 held-out", "4 training", "1: 0.9", "one photograph was left out"),
+        *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 blocks"),
+        *("0.222 (11.1% of blocks)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
+        *("63 % of this view is unknown", "add 17 % of the trust that is missing"),
+        *("1 test cameras", "4 training", "1: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
 

@@ -91,7 +91,7 @@ format: $(VENV)/dev
 
 docs: $(VENV)/product
 	@$(BIN)/python -m pipeline.config.docs
-	@$(BIN)/python -m pipeline.command.reference_page
+	@$(BIN)/python -m pipeline.command.reference_pages
 	@$(BIN)/python -m benchmarks.tables
 
 site: $(VENV)/docs

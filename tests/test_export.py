@@ -31,8 +31,8 @@ FORMATS = get_args(ExportFormat)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """results/NAME with what the export reads: pictures of 90x60 whose camera stands for 180x120,
-    as poses of larger photographs are given."""
+    """results/NAME with the inputs of the export: images of 90x60 with a camera of 180x120, as if
+    the poses were given for larger photographs."""
     scene = tmp_path / "results" / "NAME"
     camera = Camera("PINHOLE", 180, 120, np.array([100.0, 100, 90, 60]))
     images = {i + 1: Posed(f"p{i}.png", 1, np.eye(3), np.array([float(i), 0, 4])) for i in range(9)}
@@ -114,7 +114,7 @@ def test_rendered_formats_are_written_on_demand(scene):
 
 
 def test_formats_without_an_antialias_flag_are_named_in_a_warning(scene):
-    """Drawn without the compensation that they were trained with, lego lost 10 dB."""
+    """A viewer without opacity compensation renders such files much worse."""
     out, job = export(scene, antialias=True, formats=["ply", "spz"])
     assert [text.split()[0] for text in job.warnings] == ["point_cloud.ply"]
     assert json.loads((out / "frame.json").read_text())["render"]["antialias"]

@@ -124,8 +124,11 @@ def write_renders(folder: Path, renders: RenderCache) -> None:
 
 
 def write_depths(folder: Path, renders: RenderCache) -> None:
-    """Write ``median/`` and ``expected/``, a TIFF of each view, named as its photograph: one channel
-    of 32-bit floats, camera z (not distance along the ray) in world units, 0 if there is no surface."""
+    """Write a TIFF of each view, named as its photograph, into ``median/`` and ``expected/``.
+
+    One channel of 32-bit floats: camera z (not distance along the ray), world units; 0 if there is
+    no surface.
+    """
     names = rename({view.name: ".tiff" for view in renders.views})
     for rendered in renders:
         for kind in ("median", "expected"):

@@ -123,8 +123,8 @@ def _fit(terms: list[Any], at: Array, values: Array, query: Array) -> Array:
 
 
 def _horizontal_axes(up: Array, offsets: Array) -> tuple[Array, Array]:
-    """Two unit vectors orthogonal to ``up``; the first towards the mean of the cameras, if it is not
-    at the origin."""
+    """Two unit vectors orthogonal to ``up``; the first towards the mean of the cameras, unless that
+    is the origin."""
     for guess in (offsets.mean(axis=0), *np.eye(3)):
         side = guess - (guess @ up) * up
         if np.linalg.norm(side) > 1e-3 * (1e-12 + np.linalg.norm(guess)):
@@ -134,7 +134,7 @@ def _horizontal_axes(up: Array, offsets: Array) -> tuple[Array, Array]:
 
 
 def _smooth(values: Array) -> Array:
-    """(FRAMES, 3) positions along the polygon ``values``, back and forth, smoothed by a Gaussian."""
+    """(FRAMES, 3) positions along the polygon ``values``, back and forth, smoothed by Gaussian."""
     there_and_back = np.concatenate([values, values[-2:0:-1]]) if len(values) > 2 else values
     count = len(there_and_back)
     place = np.arange(FRAMES) * count / FRAMES

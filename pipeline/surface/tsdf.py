@@ -245,8 +245,8 @@ def _integrate(
 
 
 def chunks(grid: Grid, side: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.intp]]]:
-    """Non-empty chunks of ``side``^3 blocks: the coordinates (3,) of the first block, and the rows of
-    the blocks in the chunk and of the adjacent ones that complete its last cells."""
+    """Non-empty chunks of ``side``^3 blocks: coordinates (3,) of the first block, and rows of the
+    blocks in the chunk and of the adjacent ones that complete its last cells."""
     packed = np.unique(_pack(grid.blocks // side))
     for first in _unpack(packed) * side:
         inside = np.all((grid.blocks >= first) & (grid.blocks <= first + side), axis=1)

@@ -286,7 +286,7 @@ def test_decisions_say_the_resolution_and_the_split(tmp_path):
     assert plan.facts["view_size"] == [54, 96]
     assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
     assert "one view in 5" in plan.stages["evaluate"].reason
-    assert "no view" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
+    assert "no test views" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
 
 
 def test_facts_and_warnings_go_with_the_plan(tmp_path):
@@ -339,6 +339,12 @@ def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, bu
     # What was settled settles to the same.
     again = make_plan(many(tmp_path, count, **size), plan.config)
     assert again.config == plan.config
+
+
+def test_the_published_strategy_is_limited_by_its_maximum_alone(tmp_path):
+    config = Config.model_validate({"train": {"density": {"strategy": "original"}}})
+    plan = make_plan(many(tmp_path, 30), config)
+    assert plan.config.train.density.max_gaussians == 3_000_000
 
 
 @pytest.mark.parametrize(

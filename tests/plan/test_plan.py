@@ -286,7 +286,7 @@ def test_decisions_say_the_resolution_and_the_split(tmp_path):
     assert plan.facts["view_size"] == [54, 96]
     assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
     assert "one view in 5" in plan.stages["evaluate"].reason
-    assert "no view" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
+    assert "no test views" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
 
 
 def test_facts_and_warnings_go_with_the_plan(tmp_path):

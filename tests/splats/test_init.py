@@ -87,7 +87,7 @@ def test_scale_is_the_mean_distance_of_three_neighbours() -> None:
     result = gaussians_from_points(points_at(grid), CENTRES, Init(), 0)
     assert np.allclose(np.exp(result.log_scales), 0.1, rtol=1e-5)
     assert np.allclose(0.5 + SH_C0 * result.sh[:, 0], 200 / 255, atol=1e-6)
-    assert np.allclose(1 / (1 + np.exp(-result.opacity_logits)), Init().opacity, atol=1e-6)
+    assert np.allclose(1 / (1 + np.exp(-result.opacity_logits)), InitExperiments().opacity, atol=1e-6)
 
 
 def test_points_next_to_a_camera_and_far_outliers_are_dropped() -> None:

@@ -45,9 +45,10 @@ def scenes(records: Sequence[Record]) -> str:
             centre = statistics.median(run["pose_error"]["centre_relative_median"] for run in runs)
             poses = f"{rotation:.3f}°, {centre:.2%}"
         minutes = [
-            _middle([sum(_cpu(run, names) for names in stages) / 60 for run in runs], "{:.1f}")
-            for stages in (POSES, ("train",), tuple(runs[0]["cpu_s"]))
+            _minutes(runs, stages) for stages in (POSES, ("train",), tuple(runs[0]["cpu_s"]))
         ]
+        if "report" not in runs[0]["cpu_s"]:  # of training alone
+            minutes[2] = "-"
         rows.append(
             [
                 record["scene"],
@@ -127,8 +128,12 @@ def _memory(runs: Sequence[Record]) -> str:
     return f"{max(known) / 1e3:.1f} GB" if known else ""
 
 
-def _cpu(run: Record, stage: str) -> float:
-    return float(run["cpu_s"].get(stage, 0.0))
+def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
+    """CPU minutes of some stages; a dash where none was recorded."""
+    if not runs[0]["cpu_s"].keys() & set(stages):
+        return "-"
+    sums = [sum(run["cpu_s"].get(stage, 0.0) for stage in stages) / 60 for run in runs]
+    return _middle(sums, "{:.1f}")
 
 
 def _middle(values: Sequence[float], form: str) -> str:
@@ -154,7 +159,7 @@ KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "stages": stages,
     "formats": formats,
 }
-MARKER = re.compile(rf"<!-- ({'|'.join(KINDS)}): ([^>]+) -->\n\n?(?:\|[^\n]*\n)*")
+MARKER = re.compile(rf"<!-- ({'|'.join(KINDS)}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?")
 FIGURE = re.compile(r"<!-- figure: (\S+) (\S+) -->.*?<!-- end -->", re.DOTALL)
 
 

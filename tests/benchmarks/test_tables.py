@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ PAGES = [str(page.relative_to(ROOT)) for page in pages()]
 def test_pages_state_what_their_records_hold(page: str) -> None:
     text = (ROOT / page).read_text()
     assert rewritten(text) == text, "run python -m benchmarks.tables"
+    assert not re.search(r"^\|[^\n]*\n[^|\n]", text, re.M), "a table without a line after it"
 
 
 @pytest.mark.parametrize("page", PAGES)

@@ -1,4 +1,4 @@
-"""Every backend keeps the interface's promises, held to the float64 reference."""
+"""Every backend fulfils the interface and agrees with the float64 reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.render.backend import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 
 REFERENCE = make_backend("reference")
-CAMERA = camera(31, 22, turned=True)
+CAMERA = camera(31, 22, rotated=True)
 OPTIONS = RasterOptions(background=(0.2, 0.5, 0.9))
 
 
@@ -31,7 +31,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_images_and_gradients_are_the_references(backend: Backend, scene: Scene) -> None:
+def test_images_and_gradients_equal_the_reference(backend: Backend, scene: Scene) -> None:
     gradients = []
     images = []
     for each in (backend, REFERENCE):
@@ -51,13 +51,13 @@ def test_images_and_gradients_are_the_references(backend: Backend, scene: Scene)
         assert relative(getattr(found.camera, name), getattr(wanted.camera, name)) < 1e-5, name
 
 
-def test_project_bin_and_blend_make_up_forward(backend: Backend, scene: Scene) -> None:
+def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> None:
     parts = backend.blend(backend.bin(backend.project(scene, CAMERA, OPTIONS)))
     assert torch.equal(parts.color, backend.forward(*scene, CAMERA, OPTIONS).color)
 
 
 @pytest.mark.parametrize("target", [torch.rand(22, 31, 3), torch.full((22, 31, 3), 90).byte()])
-def test_the_loss_is_the_references(backend: Backend, target: torch.Tensor) -> None:
+def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -> None:
     rendered, mask = noise(22, 31, 3).sigmoid(), noise(22, 31) > 1
     found, wanted = (
         each.l1_ssim(rendered, target, 0.2, mask, 0.5) for each in (backend, REFERENCE)
@@ -76,7 +76,7 @@ def stepped(step: Callable[..., object], tensors: list[torch.Tensor]) -> list[to
     return tensors
 
 
-def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> None:
+def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> None:
     n = len(scene[0])
     means, log_scales, quats, _, sh = scene
     moments = [0.1 * noise(n, 3, seed=3), noise(n, 3, seed=4).square()]
@@ -90,7 +90,7 @@ def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> N
             each.adam_step(m, d_means, a, b, 0.01, 3)
 
         def frame(m: torch.Tensor, q: torch.Tensor, *state: torch.Tensor, each=each) -> None:
-            adam = FrameAdam(*state, mean_rate=0.02, turn_rate=0.01, step=3)
+            adam = FrameAdam(*state, mean_rate=0.02, rotation_rate=0.01, step=3)
             each.frame_adam(m, q, log_scales, d_means, d_quats, adam)
 
         def harmonics(s: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
@@ -109,7 +109,7 @@ def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> N
         assert torch.allclose(found, wanted, rtol=1e-4, atol=2e-6)
 
 
-def test_bad_input_is_refused(backend: Backend, scene: Scene) -> None:
+def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:
     with pytest.raises(ValueError, match="means: expected float32"):
         backend.forward(scene[0].double(), *scene[1:], CAMERA, OPTIONS)
     with pytest.raises(ValueError, match="focal lengths must be positive"):
@@ -123,6 +123,6 @@ def test_bad_input_is_refused(backend: Backend, scene: Scene) -> None:
     assert set(backend.facts()) == {"instruction_set", "compiler"}
 
 
-def test_an_unknown_backend_is_named() -> None:
+def test_an_unknown_backend_is_an_error() -> None:
     with pytest.raises(ValueError, match="no backend 'x'; there are cpu, reference"):
         make_backend("x")

@@ -290,7 +290,7 @@ class _Run:
             background=background,
             antialias=config.antialias,
             near=self.near,
-            black_stays=config.black_stays,
+            clamp_color_gradient=config.black_stays,
             gradients_per_pixel=config.gradients_per_pixel,
             threads=self.threads,
         )

@@ -2,7 +2,7 @@
 
 One gzip stream: a header of 16 bytes, then one section an attribute, all Gaussians in each.
 Coordinates are written unconverted, in the PLY's frame, as programs that turn PLY into SPZ do.
-Source of the layout: github.com/nianticlabs/spz, README.md. docs/formats.md states what
+Source of the layout: github.com/nianticlabs/spz, README.md. docs/reference/formats.md states what
 quantisation leaves.
 """
 

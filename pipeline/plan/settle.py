@@ -125,7 +125,7 @@ def _mapper(config: Config) -> Choice:
     wanted = config.sfm.mapper
     if wanted != "auto":
         return wanted, f"{wanted} mapper, as configured"
-    # Its time grows with the photographs as such, the global one's with their square (docs/sfm.md).
+    # Its time grows in proportion to the photographs, the global one's with their square.
     return "incremental", "incremental mapper; the global one where its model is not good"
 
 

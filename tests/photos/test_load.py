@@ -89,14 +89,14 @@ def test_images_are_resized_by_area_and_partly_masked_pixels_are_masked(tmp_path
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.95])
-def test_a_truncated_file_is_an_error(tmp_path: Path, suffix: str, kept: float) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
+def test_a_truncated_file_is_an_error(tmp_path: Path, suffix: str, share: float) -> None:
     rng = np.random.default_rng(0)
     picture = Image.fromarray(rng.integers(0, 255, (64, 64, 3), np.uint8))
     path = tmp_path / f"photo.{suffix}"
     picture.save(path)
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * kept)])
+    path.write_bytes(data[: int(len(data) * share)])
     with pytest.raises(UserError, match=f"photo.{suffix}"):
         load_rgb(path)
 

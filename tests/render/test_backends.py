@@ -40,15 +40,15 @@ def test_images_and_gradients_equal_the_reference(backend: Backend, scene: Scene
         d = noise(22, 31, 3), noise(22, 31, seed=1), noise(22, 31, seed=2)
         gradients.append(each.backward(drawn, *d, camera=True))
         assert drawn.num_visible > 0 == drawn.num_dropped
-    for found, wanted in zip(*images, strict=True):
+    for found, expected in zip(*images, strict=True):
         assert found.dtype == torch.float32
-        assert torch.allclose(found, wanted, atol=2e-5)
-    found, wanted = gradients
+        assert torch.allclose(found, expected, atol=2e-5)
+    found, expected = gradients
     for name in (*NAMES, "means2d", "means2d_abs"):
         assert getattr(found, name).dtype == torch.float32
-        assert relative(getattr(found, name), getattr(wanted, name)) < 1e-5, name
+        assert relative(getattr(found, name), getattr(expected, name)) < 1e-5, name
     for name in ("rotation", "translation", "focal", "principal"):
-        assert relative(getattr(found.camera, name), getattr(wanted.camera, name)) < 1e-5, name
+        assert relative(getattr(found.camera, name), getattr(expected.camera, name)) < 1e-5, name
 
 
 def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> None:
@@ -59,12 +59,12 @@ def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> Non
 @pytest.mark.parametrize("target", [torch.rand(22, 31, 3), torch.full((22, 31, 3), 90).byte()])
 def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -> None:
     rendered, mask = noise(22, 31, 3).sigmoid(), noise(22, 31) > 1
-    found, wanted = (
+    found, expected = (
         each.l1_ssim(rendered, target, 0.2, mask, 0.5) for each in (backend, REFERENCE)
     )
-    assert found.loss == pytest.approx(wanted.loss, rel=1e-5)
+    assert found.loss == pytest.approx(expected.loss, rel=1e-5)
     assert found.grad.dtype == torch.float32
-    assert relative(found.grad, wanted.grad) < 1e-5
+    assert relative(found.grad, expected.grad) < 1e-5
 
 
 def copies(*tensors: torch.Tensor) -> list[torch.Tensor]:
@@ -105,8 +105,8 @@ def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> 
             + stepped(frame, copies(means, quats, *moments))
             + stepped(harmonics, copies(sh, 0.01 * noise(*sh.shape), 0.01 * noise(*sh.shape) ** 2))
         )
-    for found, wanted in zip(*results, strict=True):
-        assert torch.allclose(found, wanted, rtol=1e-4, atol=2e-6)
+    for found, expected in zip(*results, strict=True):
+        assert torch.allclose(found, expected, rtol=1e-4, atol=2e-6)
 
 
 def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:

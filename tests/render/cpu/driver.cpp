@@ -263,14 +263,14 @@ int main(int argc, char** argv) {
         return 0;
     }
     constexpr float infinity = std::numeric_limits<float>::infinity();
-    const float wild[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
+    const float extreme[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
                           1e-12f,        1e12f,    88,        -88, 27.6f,  -27.6f, 12,     100};
     const int64_t sizes[][2] = {{1, 1}, {2, 3}, {17, 31}, {16, 16}, {53, 7}, {5, 90}};
     for (int round = 0; round < 300; round++) {
         Scene scene = ordinary(random, random() % 40, int(random() % 4));
         for (int hit = int(random() % 16); hit > 0; hit--) {
             Array<float>& field = *scene.fields[random() % 5];
-            const float value = wild[random() % 16];
+            const float value = extreme[random() % 16];
             if (field.size) field[random() % field.size] = value;
         }
         const int64_t* size = sizes[random() % 6];

@@ -61,10 +61,10 @@ def test_kernels_equal_the_reference(
         total = (image.color * d_color).sum()
         for part, weight in zip((image.alpha, image.depth), extra, strict=True):
             total = total + (0 if weight is None else (part * weight).sum())
-        wanted = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
-        for name, want in zip(NAMES, wanted, strict=False):
-            assert relative(getattr(found, name), want) <= 1e-5, name
-        assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
+        expected = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
+        for name, value in zip(NAMES, expected, strict=False):
+            assert relative(getattr(found, name), value) <= 1e-5, name
+        assert relative(found.means2d[projection.index], expected[5]) <= 1e-5
 
 
 @pytest.mark.parametrize("seed", range(6))
@@ -86,10 +86,10 @@ def test_culling_of_groups_of_sixteen(seed: int) -> None:
     scene[2][:: 16 * 37] = 0.0  # invalid rotations are dropped and counted anywhere
     cam, options = camera(40, 30, rotated=seed % 2 == 1), RasterOptions()
     fwd = render.forward(*scene, cam, options)
-    wanted = reference.project(*(t.double() for t in scene), cam, options)
+    expected = reference.project(*(t.double() for t in scene), cam, options)
     seen = torch.nonzero(fwd.radii)[:, 0]
-    assert torch.equal(seen, wanted.index)
-    assert fwd.num_dropped == wanted.num_dropped >= 10
+    assert torch.equal(seen, expected.index)
+    assert fwd.num_dropped == expected.num_dropped >= 10
     whole = (fwd.radii.view(clusters, 16) > 0).sum(1)
     assert (whole == 0).sum() > 100 and ((whole > 0) & (whole < 16)).sum() > 20
 
@@ -107,7 +107,7 @@ def test_camera_gradients_equal_the_reference(
     d_color = torch.randn(*image.color.shape, generator=gen) * sure[..., None]
     d_depth = torch.randn(*image.depth.shape, generator=gen) * sure
     total = (image.color * d_color).sum() + (image.depth * d_depth).sum()
-    (wanted,) = torch.autograd.grad(total, change)
+    (expected,) = torch.autograd.grad(total, change)
     fwd = render.forward(*scene, cam, options)
     found = [
         render.backward(
@@ -122,7 +122,7 @@ def test_camera_gradients_equal_the_reference(
     parts = [torch.cat([f.rotation, f.translation, f.focal, f.principal]) for f in found]
     assert torch.equal(*parts)
     for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
-        assert relative(parts[0][part], wanted[part]) <= 1e-5, part
+        assert relative(parts[0][part], expected[part]) <= 1e-5, part
     assert render.backward(fwd, d_color).camera is None
 
 
@@ -134,11 +134,11 @@ def test_absolute_gradients_are_summed_over_pixels() -> None:
     found = render.backward(render.forward(*scene, cam, options), d_color)
     _, projection, image = reference_image(scene, cam, options)
     per_pixel = (image.color * d_color).sum(-1).reshape(-1)
-    wanted = torch.zeros(len(projection.index), 2, dtype=torch.float64)
+    expected = torch.zeros(len(projection.index), 2, dtype=torch.float64)
     for value in per_pixel:
-        wanted += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
+        expected += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
     assert found.means2d_abs is not None
-    assert relative(found.means2d_abs[projection.index], wanted) <= 1e-5
+    assert relative(found.means2d_abs[projection.index], expected) <= 1e-5
     assert (
         render.backward(
             render.forward(*scene, cam, options), d_color, means2d_abs=False

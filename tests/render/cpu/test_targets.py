@@ -115,9 +115,9 @@ def make_case(seed: int, count: int, size: tuple[int, int], options: RasterOptio
     target = torch.rand(image.color.shape, generator=gen)
     total = (image.color * d_color).sum() + (image.alpha * d_alpha).sum()
     total = total + (image.depth * d_depth).sum()
-    *wanted, d_camera = torch.autograd.grad(total, [*inputs, projection.means2d, change])
+    *expected, d_camera = torch.autograd.grad(total, [*inputs, projection.means2d, change])
     incoming = [d_color, d_alpha, d_depth, target]
-    return Case(scene, cam, options, incoming, sure, projection, image, wanted, d_camera)
+    return Case(scene, cam, options, incoming, sure, projection, image, expected, d_camera)
 
 
 @pytest.fixture(scope="module")
@@ -134,8 +134,8 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
     assert (found["alpha"] - image.alpha).abs()[sure].max() <= COLOR
     assert (found["depth"] - image.depth).abs()[sure].max() <= DEPTH
     assert (found["median"] - image.median_depth).abs()[sure].max() <= MEDIAN
-    for name, want in zip(NAMES, case.gradients, strict=False):
-        assert relative(found[name], want) <= GRADIENT, name
+    for name, value in zip(NAMES, case.gradients, strict=False):
+        assert relative(found[name], value) <= GRADIENT, name
     assert relative(found["means2d"][index], case.gradients[5]) <= GRADIENT
     for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
         assert relative(found_camera[part], case.camera_gradient[part]) <= GRADIENT, part

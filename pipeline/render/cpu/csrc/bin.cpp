@@ -123,8 +123,8 @@ class TileSorter {
         // Two passes of radix sort by the leading bits of the depth, twice as many bits as number
         // the list, so that few entries agree in them. Least significant digit first: stable.
         const int depth_bits = 32 - __builtin_clz(high - low);
-        const int wanted = 32 - __builtin_clz(uint32_t(count));
-        const int bits = std::min({wanted, kMostBits, (depth_bits + 1) / 2});
+        const int needed = 32 - __builtin_clz(uint32_t(count));
+        const int bits = std::min({needed, kMostBits, (depth_bits + 1) / 2});
         const int shift = kPlaceBits + std::max(depth_bits - 2 * bits, 0);
         const uint32_t buckets = 1u << bits;
         uint32_t place[2][1 << kMostBits];

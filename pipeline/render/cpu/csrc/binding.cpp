@@ -193,14 +193,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
 // loss, error, ssim, (H, W, 3) gradient
 std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
                                                    OptionalTensor mask, double ssim_weight,
-                                                   double square_weight, int64_t threads) {
+                                                   double l2_weight, int64_t threads) {
     const bool bytes = target.scalar_type() == ScalarType::Byte;
     Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
     const splat::LossValues values = splat::l1_ssim(
         {rendered.size(1), rendered.size(0), floats(rendered), bytes ? nullptr : floats(target),
          bytes ? target.const_data_ptr<uint8_t>() : nullptr,
          mask ? mask->const_data_ptr<uint8_t>() : nullptr},
-        {ssim_weight, square_weight}, int(threads), mutable_floats(grad));
+        {ssim_weight, l2_weight}, int(threads), mutable_floats(grad));
     return {values.loss, values.error, values.ssim, grad};
 }
 
@@ -263,7 +263,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, float "
-        "square_weight, int threads) -> (float, float, float, Tensor)");
+        "l2_weight, int threads) -> (float, float, float, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");

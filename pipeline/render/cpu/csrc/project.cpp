@@ -195,10 +195,10 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                 ShBlock sh;
                 sh.read(view.sh_degree, in.sh + sh_width * group.first, sh_width, drawn);
                 f32x16 rgb[3], rows[16];
-                const uint32_t sane =
+                const uint32_t in_range =
                     sh_colors(directions(toward), view.sh_degree, sh, kShMax, rgb);
-                dropped += __builtin_popcount(drawn & ~sane);
-                drawn &= sane;
+                dropped += __builtin_popcount(drawn & ~in_range);
+                drawn &= in_range;
                 visible += __builtin_popcount(drawn);
                 make_records(seen, rgb, rows);
                 for (int lane = 0; lane < kGroup; lane++)

@@ -158,8 +158,8 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
             write_zeros(out, first, group.count, sh_width);
             return;
         }
-        const GroupMoments asked(records + first, slots + first, slot_gradients, drawn);
-        drawn &= asked.any();
+        const GroupMoments moments(records + first, slots + first, slot_gradients, drawn);
+        drawn &= moments.any();
         if (!drawn) {
             write_zeros(out, first, group.count, sh_width);
             return;
@@ -169,7 +169,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         CameraCenter::Toward toward[kGroupParts];
         for (int part = 0; part < kGroupParts; part++) {
             const Inputs inputs = group.part(part);
-            image[part] = asked.part(part);
+            image[part] = moments.part(part);
             gradients[part] = project_backward(project(inputs, view), image[part], view);
             toward[part] = center.toward(inputs.mean);
         }
@@ -182,9 +182,9 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         const auto check = [&](f32x16& v) { sound = sound & (most >= abs(v)); };
         f32x16 d_rgb[3], d_mean[3];
         for (int c = 0; c < 3; c++) {
-            const f32x16 d = asked.moment[kRed + c];
+            const f32x16 d = moments.moment[kRed + c];
             const f32x16 rising = view.clamp_color_gradient ? zero : min(d, zero);
-            d_rgb[c] = select(asked.rgb[c] > zero, d, rising);
+            d_rgb[c] = select(moments.rgb[c] > zero, d, rising);
             check(d_rgb[c]);
         }
         ShBlock sh;
@@ -193,7 +193,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (int k = 0; k < 3; k++) g.mean[k] += d_mean[k];
 
         f32x16 absolute[2];
-        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * asked.moment[kAbsX + k];
+        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * moments.moment[kAbsX + k];
         g.each(check);
         for (f32x16& v : absolute) check(v);
         const auto clear = [&](f32x16& v) { v = keep(sound, v); };

@@ -100,15 +100,15 @@ SPLAT_INLINE uint32_t sh_colors(const Directions& d, int degree, const ShBlock& 
     sh_basis<false>(degree, d.x, d.y, d.z, basis, nullptr, nullptr, nullptr);
     for (f32x16& c : rgb) c = splat16(0.5f);
     const f32x16 bound = splat16(limit), zero = {};
-    Mask16 sane = bound >= zero;
+    Mask16 in_range = bound >= zero;
     for (int k = 0; k < sh_count(degree); k++)
         for (int c = 0; c < 3; c++) {
             const f32x16 value = sh.value[3 * k + c];
-            sane = sane & (bound >= abs(value));
+            in_range = in_range & (bound >= abs(value));
             rgb[c] += basis[k] * value;
         }
     for (f32x16& c : rgb) c = max(c, zero);
-    return bits(sane);
+    return bits(in_range);
 }
 
 // Given dL/d(rgb) after the clamp: replaces the coefficients by their gradients, and returns
@@ -120,10 +120,10 @@ SPLAT_INLINE void sh_backward(const Directions& d, int degree, const f32x16 (&d_
     f32x16 gx = {}, gy = {}, gz = {};
     for (int k = 0; k < sh_count(degree); k++) {
         f32x16* const value = sh.value + 3 * k;
-        const f32x16 pull = value[0] * d_rgb[0] + value[1] * d_rgb[1] + value[2] * d_rgb[2];
-        gx += pull * dx[k];
-        gy += pull * dy[k];
-        gz += pull * dz[k];
+        const f32x16 d_basis = value[0] * d_rgb[0] + value[1] * d_rgb[1] + value[2] * d_rgb[2];
+        gx += d_basis * dx[k];
+        gy += d_basis * dy[k];
+        gz += d_basis * dz[k];
         for (int c = 0; c < 3; c++) value[c] = basis[k] * d_rgb[c];
     }
     // d(v / |v|) = (I - d d^T) dv / |v|

@@ -81,7 +81,7 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "black_for_good": Mutant(
         f"{_CSRC}/project_backward.cpp",
-        "view.black_stays ? zero : min(d, zero)",
+        "view.clamp_color_gradient ? zero : min(d, zero)",
         "zero",
         "a colour that fell to zero never comes back",
         _KERNELS,

@@ -1,10 +1,10 @@
-"""Pictures from files, on the stored pixel grid: EXIF orientation is never applied.
+"""Load images, masks and depth maps, as stored: EXIF orientation is never applied.
 
-A file is read once: the bytes that are decoded are those whose digest was compared with the
-recorded one. Without a recorded digest (None) nothing is compared.
+If a recorded digest is given, the bytes that are decoded are the ones whose digest is compared: the
+file is read once.
 
-cv2's decoders fill what is missing from a cut-off file with grey and say nothing; the files'
-own framing is checked here instead.
+cv2's decoders silently fill the missing part of a truncated file with grey. Truncation is therefore
+detected from the file formats' own structure.
 """
 
 from __future__ import annotations
@@ -29,8 +29,8 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 
 Picture = NDArray[Any]
-FIX = "Replace the file by a whole one, or remove it from the folder."
-# Sizes reached by rounding (images_4/ and the like) still have nearly the same shape.
+FIX = "Replace the file by an undamaged one, or remove it from the folder."
+# Largest relative difference of aspect ratios: sizes of downscaled images are rounded.
 ASPECT_TOLERANCE = 0.02
 
 
@@ -40,8 +40,8 @@ class ViewPixels:
 
     Attributes:
         rgb: (H, W, 3) uint8, straight (not multiplied by alpha); 0 where alpha is 0.
-        alpha: (H, W) uint8, or None where the file has none.
-        mask: (H, W) bool, True where pixels count, or None without a mask.
+        alpha: (H, W) uint8, or None if the file has none.
+        mask: (H, W) bool, True for valid pixels, or None without a mask.
     """
 
     rgb: NDArray[np.uint8]
@@ -50,14 +50,13 @@ class ViewPixels:
 
 
 def load_rgb(path: str | Path, digest: str | None = None) -> Picture:
-    """Read a picture as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.
+    """Read an image as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.
 
     Args:
         digest: the file's recorded digest (``recorded.digest_of``).
 
     Raises:
-        UserError: the file is missing, cut off, no picture that can be read, or not the one that
-            was recorded.
+        UserError: the file is missing, truncated, not a readable image, or its digest differs.
     """
     return _split(read_picture(path, digest))[0]
 
@@ -65,7 +64,7 @@ def load_rgb(path: str | Path, digest: str | None = None) -> Picture:
 def load_rgba(
     path: str | Path, digest: str | None = None
 ) -> tuple[NDArray[np.uint8], NDArray[np.uint8] | None]:
-    """Read a picture as (H, W, 3) uint8 RGB and (H, W) uint8 alpha, None where it has none.
+    """Read an image as (H, W, 3) uint8 RGB and (H, W) uint8 alpha, None without alpha.
 
     Raises:
         UserError: as ``load_rgb``.
@@ -75,7 +74,7 @@ def load_rgba(
 
 
 def load_mask(path: str | Path, digest: str | None = None) -> NDArray[np.bool_]:
-    """Read a mask as (H, W) bool: True where any colour channel is not zero.
+    """Read a mask as (H, W) bool: True if any colour channel is not zero.
 
     Raises:
         UserError: as ``load_rgb``.
@@ -84,10 +83,10 @@ def load_mask(path: str | Path, digest: str | None = None) -> NDArray[np.bool_]:
 
 
 def read_depth(path: str | Path, digest: str | None = None) -> Picture:
-    """Read a depth map (PNG, TIFF, .npy or the first array of an .npz) as it is stored.
+    """Read a depth map (PNG, TIFF, .npy, or the first array of an .npz) as stored.
 
     Raises:
-        UserError: it cannot be read, or is not the file that was recorded.
+        UserError: the file cannot be read, or its digest differs.
     """
     path = Path(path)
     data = read_recorded(path, digest)
@@ -109,13 +108,13 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
 
 
 def load_depth(path: str | Path, aspect: float, digest: str | None = None) -> NDArray[np.float64]:
-    """Read a depth map of one channel as (H, W) float64, values as stored.
+    """Read a depth map with one channel as (H, W) float64, values as stored.
 
     Args:
-        aspect: width over height that it must have.
+        aspect: expected ratio of width to height.
 
     Raises:
-        UserError: as ``read_depth``; or it has several channels, or another shape.
+        UserError: as ``read_depth``, or it has several channels or another aspect ratio.
     """
     path = Path(path)
     depth = read_depth(path, digest)
@@ -129,21 +128,22 @@ def load_depth(path: str | Path, aspect: float, digest: str | None = None) -> ND
         )
     if abs(depth.shape[1] / depth.shape[0] / aspect - 1.0) > ASPECT_TOLERANCE:
         raise UserError(
-            f"is {depth.shape[1]}x{depth.shape[0]} pixels, not of the photograph's shape",
+            f"is {depth.shape[1]}x{depth.shape[0]} pixels, another aspect ratio than the "
+            "photograph's",
             file=path,
-            fix="Depth maps must cover the same picture as the photographs.",
+            fix="Depth maps must cover the whole photograph.",
         )
     return depth.astype(np.float64)
 
 
 def load_view(view: View) -> ViewPixels:
-    """Read a view's picture and mask, resized by area to exactly the view's size.
+    """Read a view's image and mask, resized by area averaging to the view's size.
 
-    Colours are averaged weighted by alpha, so that hidden colours never bleed in. A mask's pixel
-    counts only if all pixels under it do.
+    Colours are weighted by alpha, so that colours of transparent pixels have no influence. A mask
+    pixel is valid only if all source pixels that it covers are valid.
 
     Raises:
-        UserError: as ``load_rgb``; or picture or mask is not of the view's shape.
+        UserError: as ``load_rgb``, or the image or mask has another aspect ratio than the view.
     """
     width, height = view.width, view.height
     rgb, alpha = load_rgba(view.image, view.image_digest)
@@ -173,27 +173,27 @@ def resize_rgba(
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize an (H, W) mask; a pixel counts only if all pixels under it do: its colour is a mean
-    of theirs."""
+    """Resize an (H, W) mask; a pixel is valid only if all source pixels that it covers are: its
+    colour is their mean."""
     return np.asarray(resize_area(mask.astype(np.float32), width, height) > 0.999)
 
 
 def resize_area(picture: Picture, width: int, height: int) -> Picture:
-    """Resize (H, W[, C]) by area averaging; the dtype is kept."""
+    """Resize (H, W[, C]) by area averaging; the dtype is unchanged."""
     if picture.shape[:2] == (height, width):
         return picture
     return np.asarray(cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA))
 
 
 def to_8bit(values: Picture) -> NDArray[np.uint8]:
-    """uint8 as it is; uint16 rounded, 65535 to 255."""
+    """uint8 unchanged; uint16 scaled from 65535 to 255 and rounded."""
     if values.dtype == np.uint8:
         return values
     return ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
 
 
 def read_picture(path: str | Path, digest: str | None = None) -> Picture:
-    """Read a picture as OpenCV gives it: (H, W) grey, (H, W, 2) grey and alpha, (H, W, 3) BGR or
+    """Read an image in OpenCV's layout: (H, W) grey, (H, W, 2) grey and alpha, (H, W, 3) BGR or
     (H, W, 4) BGRA; uint8 or uint16.
 
     Raises:
@@ -201,8 +201,8 @@ def read_picture(path: str | Path, digest: str | None = None) -> Picture:
     """
     path = Path(path)
     data = read_recorded(path, digest)
-    if _is_cut_off(data):
-        raise UserError("the picture is cut off or damaged", file=path, fix=FIX)
+    if _is_truncated(data):
+        raise UserError("the image is truncated or damaged", file=path, fix=FIX)
     picture: Picture | None = None
     if suffix_of(path.name) in heif.HEIF_SUFFIXES:
         with contextlib.suppress(OSError, ValueError):
@@ -211,37 +211,37 @@ def read_picture(path: str | Path, digest: str | None = None) -> Picture:
         picture = _decode(data)
     if picture is None:
         raise UserError(
-            "not a picture that can be read (expected JPEG, PNG, TIFF or WebP)", file=path, fix=FIX
+            "not a readable image (expected JPEG, PNG, TIFF or WebP)", file=path, fix=FIX
         )
     if picture.dtype not in (np.uint8, np.uint16):
         raise UserError(
             f"pixels of type {picture.dtype} (expected 8 or 16 bits)",
             file=path,
-            fix="Convert the picture to 8-bit or 16-bit PNG.",
+            fix="Convert the image to 8-bit or 16-bit PNG.",
         )
     return picture
 
 
 def _decode(data: bytes) -> Picture | None:
-    """OpenCV's picture of a file's bytes; None where it is none that OpenCV reads."""
+    """Decode an image file's bytes with OpenCV; None if OpenCV cannot read them."""
     if not data:
         return None
     try:
-        # None where no decoder knows the file, unlike what OpenCV's type annotations say.
+        # None for an unknown format, contrary to OpenCV's type annotations.
         return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
     except cv2.error:
         return None
 
 
 def _split(picture: Picture) -> tuple[Picture, Picture | None]:
-    """OpenCV's grey, grey + alpha, BGR or BGRA as RGB and alpha."""
+    """Convert OpenCV's grey, grey + alpha, BGR or BGRA to RGB and alpha."""
     if picture.ndim == 2:
         picture = picture[..., None]
     channels = picture.shape[2]
     alpha = np.ascontiguousarray(picture[..., -1]) if channels in (2, 4) else None
     if channels <= 2:
         return np.repeat(picture[..., :1], 3, axis=2), alpha
-    if channels == 3:  # By cv2, which is several times as fast as a copy of a reversed view.
+    if channels == 3:  # cv2 is several times faster than a copy of a reversed view.
         return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGR2RGB)), alpha
     return np.ascontiguousarray(picture[..., 2::-1]), alpha
 
@@ -250,27 +250,28 @@ def _check_shape(picture: Picture, width: int, height: int, path: Path) -> None:
     found_height, found_width = picture.shape[:2]
     if abs(found_width * height / (found_height * width) - 1) > ASPECT_TOLERANCE:
         raise UserError(
-            f"is {found_width}x{found_height} pixels (expected the shape of {width}x{height})",
+            f"is {found_width}x{found_height} pixels (expected the aspect ratio of "
+            f"{width}x{height})",
             file=path,
-            fix="Use the picture its camera was made for, neither turned nor cropped.",
+            fix="Use the image that the camera belongs to, neither rotated nor cropped.",
         )
 
 
-def _is_cut_off(data: bytes) -> bool:
-    """True where a JPEG, PNG or WebP file ends before its format says it does."""
+def _is_truncated(data: bytes) -> bool:
+    """Whether a JPEG, PNG or WebP file is incomplete according to its format."""
     if data[:2] == b"\xff\xd8":
-        return not _jpeg_ends(data)
+        return not _jpeg_is_complete(data)
     if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return not _png_is_whole(data)
+        return not _png_is_complete(data)
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return len(data) < 8 + int(struct.unpack("<I", data[4:8])[0])
     return False
 
 
-def _jpeg_ends(data: bytes) -> bool:
-    """True if an end-of-image marker follows the first scan (ITU T.81, annex B).
+def _jpeg_is_complete(data: bytes) -> bool:
+    """Whether an end-of-image marker follows the first scan (ITU T.81, annex B).
 
-    Searched from the scan on: the preview inside EXIF has an end of its own.
+    The search starts at the scan: the EXIF preview has its own end-of-image marker.
     """
     at = 2
     while at + 4 <= len(data) and data[at] == 0xFF:
@@ -284,8 +285,9 @@ def _jpeg_ends(data: bytes) -> bool:
     return False
 
 
-def _png_is_whole(data: bytes) -> bool:
-    """True if every chunk up to IEND is there with its checksum (PNG specification, section 5)."""
+def _png_is_complete(data: bytes) -> bool:
+    """Whether every chunk up to IEND is present with a correct checksum (PNG specification,
+    section 5)."""
     at = 8
     while at + 12 <= len(data):
         length = int.from_bytes(data[at : at + 4], "big")

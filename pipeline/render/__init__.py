@@ -1,10 +1,11 @@
-"""The differentiable rasterizer for 3D Gaussians: one interface, several backends.
+"""Differentiable rasterizer for 3D Gaussians: one interface with several backends.
 
 ``Backend`` (``backend.py``) is the interface: project, bin, blend, backward, loss, optimiser. The
-default is ``cpu``, kernels in C++ that are compiled at first use, or beforehand by
-``python -m pipeline.render.cpu.build``; ``reference`` is the method in readable torch, float64.
-``forward``, ``backward``, ``l1_ssim``, ``adam_step`` and ``frame_adam`` are the default's
-operators; ``render`` wraps the first two in autograd. Importing this package imports no torch.
+default backend is ``cpu``: C++ kernels that are compiled at first use, or beforehand by
+``python -m pipeline.render.cpu.build``. ``reference`` is a readable implementation in torch,
+float64. ``forward``, ``backward``, ``l1_ssim``, ``adam_step`` and ``frame_adam`` are operators of
+the default backend; ``render`` wraps the first two for autograd. Importing this package does not
+import torch.
 """
 
 from __future__ import annotations
@@ -56,7 +57,7 @@ __all__ = [
 
 
 def __getattr__(name: str) -> Any:
-    # Import statements rather than names in strings: stages' keys follow them to the code.
+    # Import statements, not names in strings: the keys of stages are computed from imports.
     if name in ("Backend", "make_backend"):
         from pipeline.render import backend
 

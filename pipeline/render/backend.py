@@ -1,10 +1,9 @@
-"""What a backend of the rasterizer does; ``cpu`` and ``reference_backend`` are two of them.
+"""Interface of the rasterizer's backends, ``cpu`` and ``reference_backend``.
 
-Training, evaluation and all else call these operators and know nothing of how they are computed.
-Tensors are float32 on the CPU as they come in and go out; a backend may compute elsewhere and in
-another precision. The same inputs give the same bits at any number of threads.
+Inputs and outputs are float32 tensors on the CPU; a backend may compute on another device and in
+another precision. Results do not depend on the number of threads.
 
-A further backend is a class that derives from ``Backend``, and a line in ``make_backend``.
+To add a backend, derive a class from ``Backend`` and add it to ``make_backend``.
 """
 
 from __future__ import annotations
@@ -35,31 +34,34 @@ BACKENDS = ("cpu", "reference")
 
 
 class Backend(ABC, Generic[Projected, Binned]):
-    """The operators, in the order of a training step. Implementations may trust what they get to
-    be checked (``checks``), except where they are called one by one."""
+    """The operators, in the order of a training step.
+
+    ``forward`` checks its inputs (see ``checks``); ``project``, ``bin`` and ``blend`` do not check
+    again. All other operators check their own inputs.
+    """
 
     @abstractmethod
     def facts(self) -> Mapping[str, str]:
-        """What decides the last bits beside the inputs, by name: an instruction set, a compiler, a
-        device. Compiles or loads what is missing."""
+        """What determines the rounding of results besides the inputs, by name: instruction set,
+        compiler, device. Compiles or loads the backend if necessary."""
 
     @abstractmethod
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
-        """Gaussians to ellipses on the image, with their colours."""
+        """Project Gaussians to 2D Gaussians on the image plane and evaluate their colours."""
 
     @abstractmethod
     def bin(self, projected: Projected) -> Binned:
-        """Which ellipses each part of the image is covered by, front to back.
+        """List the Gaussians that overlap each tile of the image, front to back.
 
         Raises:
-            UserError: more of them than memory is meant for.
+            UserError: the number of (Gaussian, tile) pairs exceeds the backend's limit.
         """
 
     @abstractmethod
     def blend(self, binned: Binned) -> Forward:
-        """The image."""
+        """Composite the image from front to back."""
 
     @abstractmethod
     def backward(
@@ -73,15 +75,17 @@ class Backend(ABC, Generic[Projected, Binned]):
         camera: bool = False,
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
-        """The gradients of a scalar, given its gradients on the images.
+        """Gradients of a scalar with respect to the parameters, from its gradients on the images.
 
         Args:
-            d_color: (H, W, 3) float32; d_alpha, d_depth: (H, W) float32 or None.
-            means2d_abs: sum absolute values too; about a fifth of the time.
-            camera: give the camera's gradients, too.
-            sh_adam: move the harmonics of the Gaussians in view by Adam at once, in place, instead
-                of giving their gradients: those are four fifths of all, and would only be written
-                to be read again.
+            fwd: the result of ``forward``.
+            d_color: (H, W, 3) float32.
+            d_alpha, d_depth: (H, W) float32 or None.
+            means2d_abs: compute ``Gradients.means2d_abs``.
+            camera: compute ``Gradients.camera``.
+            sh_adam: update the SH coefficients of the Gaussians with a gradient in place by Adam
+                instead of returning their gradients. SH coefficients are four fifths of all
+                parameters: this saves the memory traffic of their gradients.
         """
 
     @abstractmethod
@@ -91,19 +95,21 @@ class Backend(ABC, Generic[Projected, Binned]):
         target: torch.Tensor,
         ssim_weight: float,
         mask: torch.Tensor | None = None,
-        square_weight: float = 0.0,
+        l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
-        """The loss (1 - w) E + w (1 - SSIM), and its gradient on the render. E is the mean of
-        |d| + k d^2 over the differences d: with k = 0, 3DGS's L1.
+        """The loss (1 - w) E + w (1 - SSIM) and its gradient with respect to the rendered image.
+
+        E is the mean of |d| + k d^2 over the differences d; with k = 0 it is the L1 loss of 3DGS.
 
         Args:
-            rendered: (H, W, 3) float32 in [0, 1] or thereabouts.
-            target: (H, W, 3) float32, or uint8 of which 255 is 1.
+            rendered: (H, W, 3) float32, about [0, 1].
+            target: (H, W, 3) float32, or uint8 where 255 represents 1.
             ssim_weight: w in [0, 1].
-            mask: (H, W) bool or uint8, not zero where a pixel is left out: the render is replaced
+            mask: (H, W) bool or uint8, non-zero for ignored pixels: the rendered image is replaced
                 by the target there, and both means are over the other pixels.
-            square_weight: k >= 0.
+            l2_weight: k >= 0.
+            threads: number of threads, 0 for all.
         """
 
     @abstractmethod
@@ -120,13 +126,15 @@ class Backend(ABC, Generic[Projected, Binned]):
         eps: float = 1e-15,
         threads: int = 0,
     ) -> None:
-        """One step of Adam in place, as torch.optim.Adam takes it; ``step`` counts from 1.
+        """One step of Adam, in place, as ``torch.optim.Adam``.
 
-        All four tensors: float32, contiguous, of one shape. ``lr`` may be several rates, which
-        repeat over the elements: one for each element of a row, say.
-
-        Rows of 3 or 4 may share a second moment, that of their mean square: ``exp_avg_sq`` is
-        (N, 1) then, and ``lr`` one rate. Where the rows' space is turned, the steps turn with it.
+        Args:
+            param, grad, exp_avg, exp_avg_sq: float32, contiguous, of the same shape. If ``param``
+                is (N, 3) or (N, 4), ``exp_avg_sq`` may be (N, 1): rows then share the second moment
+                of their mean square, which makes steps equivariant under rotation.
+            lr: learning rate. Several rates are repeated over the elements, for example one for
+                each column; a shared second moment requires a single rate.
+            step: number of this step, starting at 1.
         """
 
     @abstractmethod
@@ -140,13 +148,12 @@ class Backend(ABC, Generic[Projected, Binned]):
         adam: FrameAdam,
         threads: int = 0,
     ) -> None:
-        """One step of Adam over ``means`` (N, 3) and ``quats`` (N, 4) in place, along and about
-        each Gaussian's own axes (``reference.frame_adam``). float32, contiguous.
+        """One step of Adam over ``means`` (N, 3) and ``quats`` (N, 4), in place, in the local frame
+        of each Gaussian (``reference.frame_adam``). float32, contiguous.
 
-        A mean goes as many of the scales along each axis as Adam says, so a flat Gaussian slides in
-        its plane, and hardly leaves it; where the world is turned or grows, the steps turn and grow
-        with it. A quaternion of no direction is not turned. Axes and scales are those before the
-        step.
+        Steps of a mean are relative to the scale along each axis, so a flat Gaussian moves mostly
+        in its plane. Steps are equivariant under rotation and scaling of the world. Quaternions of
+        almost zero norm are not updated. Axes and scales are those before the step.
         """
 
     def forward(
@@ -159,18 +166,18 @@ class Backend(ABC, Generic[Projected, Binned]):
         camera: RasterCamera,
         options: RasterOptions,
     ) -> Forward:
-        """Draw a view, without autograd: project, bin, blend.
+        """Render a view, without autograd: project, bin, blend.
 
         Args:
-            means: (N, 3) float32, world.
+            means: (N, 3) float32, world coordinates.
             log_scales: (N, 3) float32.
-            quats: (N, 4) float32 wxyz, of any length.
+            quats: (N, 4) float32 (wxyz), not necessarily normalised.
             opacity_logits: (N,) float32.
             sh: (N, K, 3) float32, K >= (options.sh_degree + 1)^2.
 
         Raises:
-            ValueError: shapes or types that do not fit, a camera that is none.
-            UserError: more Gaussians in a view than memory is meant for; no compiler.
+            ValueError: a tensor has a wrong shape or type, or the camera is invalid.
+            UserError: too many (Gaussian, tile) pairs, or the backend cannot be compiled.
         """
         parameters = checks.parameters(
             means, log_scales, quats, opacity_logits, sh, options.sh_degree
@@ -182,7 +189,7 @@ class Backend(ABC, Generic[Projected, Binned]):
 @cache
 def make_backend(name: str = "cpu") -> Backend:
     """The backend of this name, one of ``BACKENDS``."""
-    # Imports that are written out: stages' keys hash the code that they lead to.
+    # Explicit imports: the keys of stages are computed from imports.
     if name == "cpu":
         from pipeline.render.cpu.backend import CpuBackend
 

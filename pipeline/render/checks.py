@@ -1,4 +1,4 @@
-"""Checks of what comes into a backend: types, shapes, and cameras that can be drawn with."""
+"""Checks of a backend's inputs: types, shapes and cameras."""
 
 from __future__ import annotations
 
@@ -14,14 +14,15 @@ Parameters = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch
 """means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,), sh (N, K, 3)."""
 
 
-def plain(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> torch.Tensor:
-    """The tensor detached and contiguous.
+def checked(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> torch.Tensor:
+    """The tensor, detached and contiguous.
 
     Raises:
-        ValueError: not float32 on the CPU, or of another shape (None: any size).
+        ValueError: not float32 on the CPU, or not of this shape (None: any size).
     """
     fits = value.dim() == len(shape) and all(
-        want is None or want == have for want, have in zip(shape, value.shape, strict=True)
+        expected is None or expected == size
+        for expected, size in zip(shape, value.shape, strict=True)
     )
     if value.dtype != torch.float32 or value.device.type != "cpu" or not fits:
         raise ValueError(
@@ -39,21 +40,21 @@ def parameters(
     sh: torch.Tensor,
     degree: int,
 ) -> Parameters:
-    """The five arrays of Gaussians, checked by ``plain``, with harmonics up to ``degree``."""
+    """The parameters of Gaussians, checked, with SH coefficients up to ``degree``."""
     n = means.shape[0]
     if not 0 <= degree <= 3 or sh.dim() != 3 or sh.shape[1] < (degree + 1) ** 2:
         raise ValueError(f"sh_degree {degree} does not fit sh of shape {tuple(sh.shape)}")
     return (
-        plain("means", means, (n, 3)),
-        plain("log_scales", log_scales, (n, 3)),
-        plain("quats", quats, (n, 4)),
-        plain("opacity_logits", opacity_logits, (n,)),
-        plain("sh", sh, (n, None, 3)),
+        checked("means", means, (n, 3)),
+        checked("log_scales", log_scales, (n, 3)),
+        checked("quats", quats, (n, 4)),
+        checked("opacity_logits", opacity_logits, (n,)),
+        checked("sh", sh, (n, None, 3)),
     )
 
 
 def check_camera(camera: RasterCamera, near: float) -> None:
-    """ValueError where nothing can be drawn with the camera."""
+    """Raise ValueError if the camera is invalid."""
     pose = camera.world_to_camera.detach()
     if pose.shape != (4, 4):
         raise ValueError(f"world_to_camera: expected (4, 4), found {tuple(pose.shape)}")
@@ -76,25 +77,25 @@ def image_gradients(
     d_depth: torch.Tensor | None,
     size: tuple[int, int],
 ) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
-    """Gradients on the images of a view of ``size`` (width, height), checked by ``plain``."""
+    """Gradients on the images of a view of ``size`` (width, height), checked by ``checked``."""
     width, height = size
     return (
-        plain("d_color", d_color, (height, width, 3)),
-        None if d_alpha is None else plain("d_alpha", d_alpha, (height, width)),
-        None if d_depth is None else plain("d_depth", d_depth, (height, width)),
+        checked("d_color", d_color, (height, width, 3)),
+        None if d_alpha is None else checked("d_alpha", d_alpha, (height, width)),
+        None if d_depth is None else checked("d_depth", d_depth, (height, width)),
     )
 
 
 def images(
     rendered: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
-    """A loss's images: rendered (H, W, 3), the target float32 or uint8, the mask uint8."""
-    rendered = plain("rendered", rendered, (None, None, 3))
+    """The images of a loss, checked: rendered (H, W, 3), target float32 or uint8, mask uint8."""
+    rendered = checked("rendered", rendered, (None, None, 3))
     size = tuple(rendered.shape)
     if target.dtype == torch.uint8 and tuple(target.shape) == size:
         target = target.contiguous()
     else:
-        target = plain("target", target, size)
+        target = checked("target", target, size)
     if mask is not None:
         if mask.dtype not in (torch.bool, torch.uint8) or tuple(mask.shape) != size[:2]:
             raise ValueError(
@@ -105,13 +106,13 @@ def images(
 
 
 def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
-    """ValueError where the moments do not fit ``sh``, or the rates are none."""
+    """Raise ValueError if the moments do not fit ``sh`` or the rates are invalid."""
     for tensor in (adam.exp_avg, adam.exp_avg_sq):
         if tensor.dtype != torch.float32 or tensor.shape != sh.shape or not tensor.is_contiguous():
             raise ValueError("sh_adam: moments must be float32, contiguous and shaped as sh")
     if adam.last.dtype != torch.int32 or adam.last.shape != sh.shape[:1]:
         raise ValueError(f"sh_adam: last must be int32 of shape ({len(sh)},)")
-    values = [adam.rate0, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
+    values = [adam.dc_rate, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
     if adam.step < 1 or not torch.tensor(values, dtype=torch.float64).isfinite().all():
         raise ValueError(f"sh_adam: step {adam.step} must be at least 1 and the rates finite")
 
@@ -124,7 +125,7 @@ def check_adam(
     lr: float | Sequence[float],
     step: int,
 ) -> None:
-    """ValueError where ``adam_step`` cannot be taken."""
+    """Raise ValueError if the arguments of ``adam_step`` are invalid."""
     shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
     for tensor in (param, grad, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
@@ -147,7 +148,7 @@ def check_frame_adam(
     adam: FrameAdam,
 ) -> None:
     """ValueError where ``frame_adam`` cannot be taken."""
-    moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
+    moments = (adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg, adam.rotation_avg_sq)
     fours = (quats, d_quats)
     for tensor in (means, log_scales, d_means, *moments, *fours):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
@@ -157,6 +158,6 @@ def check_frame_adam(
             raise ValueError(
                 f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
             )
-    rates = torch.tensor([adam.mean_rate, adam.turn_rate], dtype=torch.float64)
+    rates = torch.tensor([adam.mean_rate, adam.rotation_rate], dtype=torch.float64)
     if adam.step < 1 or not rates.isfinite().all():
         raise ValueError(f"frame_adam: step {adam.step} must be at least 1 and rates finite")

@@ -1,4 +1,4 @@
-"""The default backend's operators as functions, and the drawing of a view in autograd."""
+"""The default backend's operators as functions, and rendering with autograd."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class _Render(torch.autograd.Function):
         ctx.fwd = fwd
         ctx.set_materialize_grads(False)
         ctx.mark_non_differentiable(fwd.median_depth, fwd.radii)
-        # Copies: what the caller writes to, backward must not read.
+        # Copies: the caller may write to them, and backward reads the originals.
         color, alpha, depth = fwd.color.clone(), fwd.alpha.clone(), fwd.depth.clone()
         return color, alpha, depth, fwd.median_depth, fwd.radii, fwd.num_visible, fwd.num_dropped
 
@@ -44,6 +44,7 @@ def render(
     camera: RasterCamera,
     options: RasterOptions,
 ) -> RenderOutput:
-    """Draw a view; color, alpha and depth carry gradients to the five tensors. See ``forward``."""
+    """Render a view; color, alpha and depth are differentiable with respect to the five tensors.
+    See ``Backend.forward``."""
     outputs = _Render.apply(camera, options, means, log_scales, quats, opacity_logits, sh)
     return RenderOutput(*outputs)

@@ -1,9 +1,10 @@
-"""The rasterizer in plain torch, one function per operator: slow, readable, in any float dtype.
+"""Reference implementation of the rasterizer in torch, one function per operator, in any float
+dtype.
 
-Read this to learn the method; tests hold the C++ kernels to it. It follows "3D Gaussian Splatting
-for Real-Time Radiance Field Rendering" (Kerbl et al. 2023) and the projection of "EWA Splatting"
-(Zwicker et al. 2002). Every function is differentiable by autograd. Memory grows with pixels times
-Gaussians: small scenes only.
+It documents the method, and tests compare the C++ kernels with it. It follows "3D Gaussian
+Splatting for Real-Time Radiance Field Rendering" (Kerbl et al. 2023) and the projection of "EWA
+Splatting" (Zwicker et al. 2002). Every function is differentiable by autograd. Memory is
+proportional to pixels times Gaussians: for small scenes only.
 
 N Gaussians, V visible ones among them, an image of H x W pixels.
 """
@@ -20,7 +21,7 @@ import torch.nn.functional as F
 
 from pipeline.render.types import FrameAdam, RasterCamera, RasterOptions, RenderOutput, ShAdam
 
-# The same numbers, with their reasons, are in csrc/constants.h.
+# The same constants as in cpu/csrc/constants.h, which has their reasons.
 DILATION = 0.3
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
@@ -41,8 +42,8 @@ class Projection:
         means2d: (V, 2) pixels.
         conics: (V, 3) the inverse 2D covariance's xx, xy, yy, in 1/px^2.
         depths: (V,) camera z.
-        opacities: (V,) in (0, 1), the compensation included.
-        radii: (N,) pixels; 0 for what is not visible.
+        opacities: (V,) in (0, 1), including the compensation.
+        radii: (N,) pixels; 0 for Gaussians that are not visible.
         num_dropped: Gaussians left out because a value is not finite or degenerate.
     """
 
@@ -56,7 +57,7 @@ class Projection:
 
 
 def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
-    """(N, 4) quaternions wxyz of any length -> (N, 3, 3) rotations (Kerbl et al. 2023, eq. 10)."""
+    """(N, 4) quaternions (wxyz) of any norm -> (N, 3, 3) rotations (Kerbl et al. 2023, eq. 10)."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
         1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y),
@@ -66,12 +67,12 @@ def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
-def moved(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
-    """The camera after a ``change`` (10,), whose gradient at zero is ``CameraGradients``.
+def perturbed(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
+    """The camera after a ``change`` (10,); the gradient at zero is ``CameraGradients``.
 
-    A point at x in the camera's frame comes to exp([r]) x + t, r and t the first six values ([r]:
-    the matrix of the cross product with r, radians; t in the world's unit); the others add to
-    fx, fy, cx, cy, in pixels. The fields of what is returned are tensors.
+    The first six values are a rotation vector r (radians) and a translation t (world units): a
+    point x in the camera's frame moves to exp([r]) x + t, where [r] is the cross product matrix.
+    The other four are added to fx, fy, cx, cy, in pixels. The fields of the result are tensors.
     """
     skew = torch.zeros(3, 3, dtype=change.dtype)
     skew = skew.index_put(
@@ -96,20 +97,20 @@ def project(
     camera: RasterCamera,
     options: RasterOptions,
 ) -> Projection:
-    """World Gaussians -> 2D Gaussians on the image plane.
+    """Project 3D Gaussians to 2D Gaussians on the image plane.
 
-    Covariance in 3D: Sigma = R S S^T R^T (Kerbl et al., eq. 6). On the image, to first order about
-    the centre: Sigma' = J W Sigma W^T J^T (Zwicker et al., eq. 31) with W the camera's rotation and
+    The 3D covariance is Sigma = R S S^T R^T (Kerbl et al., eq. 6). The 2D covariance, to first
+    order, is Sigma' = J W Sigma W^T J^T (Zwicker et al., eq. 31) with W the camera's rotation and
 
         J = [[fx / z, 0, -fx u / z], [0, fy / z, -fy v / z]],  u = x / z, v = y / z.
 
-    u and v are clamped in J to the image plus 0.3 tan(fov / 2) on each side (for a centred
-    principal point: 1.3 tan(fov / 2)), where the first order stops being one. Dilation by 0.3 px^2
-    is a low-pass filter; `antialias` keeps the energy by scaling the opacity with
+    In J, u and v are clamped to the image plus 0.3 tan(fov / 2) on each side (1.3 tan(fov / 2) for
+    a central principal point): further out the linearisation is inaccurate. Dilation by 0.3 px^2 is
+    a low-pass filter; ``antialias`` preserves the energy by scaling the opacity with
     sqrt(det Sigma' / det(Sigma' + 0.3 I)) (Yu et al. 2024, "Mip-Splatting", eq. 9).
 
-    Visible: z > near, opacity at least 1/255 and the ellipse {alpha >= 1/255} has a bounding box
-    that holds a pixel centre.
+    A Gaussian is visible if z > near, its opacity is at least 1/255, and the bounding box of the
+    ellipse {alpha >= 1/255} contains a pixel centre.
     """
     dtype = means.dtype
     pose = camera.world_to_camera.to(dtype)
@@ -139,13 +140,13 @@ def project(
     half = jacobian @ pose[:3, :3] @ axes
     cov = half @ half.mT
     xx, xy, yy = cov[:, 0, 0], cov[:, 0, 1], cov[:, 1, 1]
-    # |a|^2 |b|^2 - (a.b)^2 = |a x b|^2 (Lagrange): nothing cancels for a needle.
-    det_plain = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
-    det = det_plain + DILATION * (xx + yy + DILATION)
+    # Lagrange's identity |a|^2 |b|^2 - (a.b)^2 = |a x b|^2 avoids cancellation for thin Gaussians.
+    det_undilated = torch.linalg.cross(half[:, 0], half[:, 1]).square().sum(-1)
+    det = det_undilated + DILATION * (xx + yy + DILATION)
     xx, yy = xx + DILATION, yy + DILATION
     opacities = torch.sigmoid(opacity_logits[index])
     if options.antialias:
-        opacities = opacities * (det_plain / det).clamp(min=COMPENSATION_MIN).sqrt()
+        opacities = opacities * (det_undilated / det).clamp(min=COMPENSATION_MIN).sqrt()
     means2d = torch.stack([camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy], -1)
 
     with torch.no_grad():
@@ -202,9 +203,10 @@ def sh_basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
     return torch.stack(terms, -1)
 
 
-class _NotNegative(torch.autograd.Function):
-    """max(0, x), whose gradient under 0 is not lost if a step against it would raise x. 3DGS drops
-    it (``RasterOptions.black_stays``): what has once become black in all views stays so."""
+class _ClampAtZero(torch.autograd.Function):
+    """max(0, x), with the gradient of x below 0 if a gradient step would increase x. 3DGS uses the
+    plain clamp (``RasterOptions.clamp_color_gradient``), with which a Gaussian that is black in all
+    views stays black."""
 
     @staticmethod
     def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
@@ -218,33 +220,38 @@ class _NotNegative(torch.autograd.Function):
 
 
 def sh_colors(
-    means: torch.Tensor, sh: torch.Tensor, camera: RasterCamera, degree: int, stays: bool = False
+    means: torch.Tensor,
+    sh: torch.Tensor,
+    camera: RasterCamera,
+    degree: int,
+    clamp_gradient: bool = False,
 ) -> torch.Tensor:
-    """(V, 3) RGB seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
+    """(V, 3) RGB as seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
 
-    The direction runs from the camera's centre to the Gaussian's; its dependence on the mean is
-    part of the gradient. Where the clamp holds, only a gradient that would raise the colour passes
-    (``_NotNegative``); with ``stays`` none.
+    The direction is from the camera's centre to the mean; the gradient includes its dependence on
+    the mean. A clamped colour receives only gradients that would increase it (``_ClampAtZero``), or
+    none with ``clamp_gradient``.
     """
     pose = camera.world_to_camera.to(means.dtype)
     center = -pose[:3, :3].T @ pose[:3, 3]
     basis = sh_basis(F.normalize(means - center, dim=-1, eps=1e-30), degree)
     colors = (basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5
-    if stays:
+    if clamp_gradient:
         return torch.relu(colors)
-    clamped: torch.Tensor = _NotNegative.apply(colors)
+    clamped: torch.Tensor = _ClampAtZero.apply(colors)
     return clamped
 
 
 @dataclass(frozen=True)
 class Blend:
-    """A blended image, and how near each pixel came to one of the method's thresholds.
+    """A composited image.
 
     Attributes:
-        color: (H, W, 3), the background included.
-        alpha, depth, median_depth: (H, W), see RenderOutput.
-        margin: (H, W) the smallest relative distance to a cut-off (alpha at 1/255 and at its
-            maximum, transmittance at its minimum): other roundings may decide otherwise there.
+        color: (H, W, 3), including the background.
+        alpha, depth, median_depth: (H, W), see ``RenderOutput``.
+        margin: (H, W) smallest relative distance of a pixel to a threshold of the method (alpha at
+            1/255 and at its maximum, transmittance at its minimum). If it is small, different
+            rounding may change the pixel.
         pairs: number of contributing (pixel, Gaussian) pairs.
     """
 
@@ -261,12 +268,12 @@ def blend(
 ) -> Blend:
     """Front to back alpha compositing (Kerbl et al. 2023, eq. 3).
 
-        alpha_i = min(opacity_i exp(-d^T conic_i d / 2), 0.999), left out below 1/255
+        alpha_i = min(opacity_i exp(-d^T conic_i d / 2), 0.999), skipped below 1/255
         T_i = prod_{j < i} (1 - alpha_j),  C = sum_i T_i alpha_i c_i + T_n background
 
-    in order of depth, equal depths by index. A pixel stops before the Gaussian that would take its
-    transmittance below 1e-4. Gradients go to the first ``gradients_per_pixel`` that a pixel draws.
-    ``projection.means2d`` may be (H W, V, 2), a centre for each pixel.
+    in order of depth, equal depths by index. A pixel stops before the Gaussian that would lower its
+    transmittance below 1e-4. Only the first ``gradients_per_pixel`` contributing Gaussians of a
+    pixel receive gradients. ``projection.means2d`` may be (H W, V, 2), a centre for each pixel.
     """
     dtype, height, width = colors.dtype, camera.height, camera.width
     order = torch.sort(projection.depths.detach().float(), stable=True).indices
@@ -281,21 +288,21 @@ def blend(
     power = -0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) - conic[:, 1] * dx * dy
     raw = projection.opacities[order] * power.exp()
     alpha = torch.where(raw >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
-    # Transmittance never grows, so "has not stopped" is one comparison with the running product.
+    # Transmittance is monotonic: a comparison with the running product finds where a pixel stops.
     alive = torch.cumprod(1 - alpha, 1) >= TRANSMITTANCE_MIN
-    drawn = torch.where(alive, alpha, torch.zeros_like(alpha))
-    beyond = torch.cumsum(drawn > 0, 1) > (options.gradients_per_pixel or math.inf)
-    drawn = torch.where(beyond, drawn.detach(), drawn)
-    after = torch.cumprod(1 - drawn, 1)
+    used = torch.where(alive, alpha, torch.zeros_like(alpha))
+    beyond = torch.cumsum(used > 0, 1) > (options.gradients_per_pixel or math.inf)
+    used = torch.where(beyond, used.detach(), used)
+    after = torch.cumprod(1 - used, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
-    weight = before * drawn
+    weight = before * used
 
-    def composed(values: torch.Tensor) -> torch.Tensor:
+    def composite(values: torch.Tensor) -> torch.Tensor:
         if not beyond.any():
             return weight @ values
         return (weight * ~beyond) @ values + (weight * beyond) @ values.detach()
 
-    rgb = composed(color)
+    rgb = composite(color)
     opaque = weight.sum(1)
     if options.background is not None:
         rgb = rgb + (1 - opaque).unsqueeze(-1) * torch.tensor(options.background, dtype=dtype)
@@ -314,8 +321,8 @@ def blend(
         )
     shape = (height, width)
     return Blend(
-        rgb.reshape(height, width, 3), opaque.reshape(shape), composed(depth).reshape(shape),
-        median.reshape(shape), margin.reshape(shape), int((drawn > 0).sum()),
+        rgb.reshape(height, width, 3), opaque.reshape(shape), composite(depth).reshape(shape),
+        median.reshape(shape), margin.reshape(shape), int((used > 0).sum()),
     )  # fmt: skip
 
 
@@ -328,14 +335,14 @@ def render(
     camera: RasterCamera,
     options: RasterOptions,
 ) -> RenderOutput:
-    """Draw a view, differentiably. Same signature as ``pipeline.render.render``."""
+    """Render a view, differentiable by autograd. Same signature as ``pipeline.render.render``."""
     projection = project(means, log_scales, quats, opacity_logits, sh, camera, options)
     colors = sh_colors(
         means[projection.index],
         sh[projection.index],
         camera,
         options.sh_degree,
-        options.black_stays,
+        options.clamp_color_gradient,
     )
     image = blend(projection, colors, camera, options)
     return RenderOutput(
@@ -353,22 +360,24 @@ def l1_ssim(
     target: torch.Tensor,
     ssim_weight: float,
     mask: torch.Tensor | None = None,
-    square_weight: float = 0.0,
+    l2_weight: float = 0.0,
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """(1 - w) E + w (1 - SSIM) -> (loss, E, ssim), scalars. E is the mean of |d| + k d^2: with
-    k = 0, as in 3DGS, L1. Squares make what is far off, a highlight say, count for more.
+    """(1 - w) E + w (1 - SSIM) -> (loss, E, ssim), scalars.
 
-    SSIM (Wang et al. 2004, eq. 13) in an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the
-    image, its mean over pixels and channels. Values in [0, 1]. With a mask (true = left out), the
-    render's masked pixels are replaced by the target's, and both means are over the others.
+    E is the mean of |d| + k d^2 (k = ``l2_weight``); with k = 0 it is the L1 loss of 3DGS. The
+    squared term gives large errors, such as highlights, more weight.
+
+    SSIM (Wang et al. 2004, eq. 13) uses an 11 x 11 Gaussian window of sigma 1.5 with zero padding,
+    and its mean is over pixels and channels. Values are in [0, 1]. Masked pixels (True = ignored)
+    of the rendered image are replaced by the target's, and both means are over the other pixels.
     """
     dtype = rendered.dtype
-    goal = target.to(dtype) / 255 if target.dtype == torch.uint8 else target.to(dtype)
-    keep = torch.ones(rendered.shape[:2], dtype=dtype)
+    truth = target.to(dtype) / 255 if target.dtype == torch.uint8 else target.to(dtype)
+    valid = torch.ones(rendered.shape[:2], dtype=dtype)
     if mask is not None:
-        keep = 1 - mask.to(dtype)
-        rendered = torch.where(mask.bool().unsqueeze(-1), goal, rendered)
-    count = keep.sum() * 3
+        valid = 1 - mask.to(dtype)
+        rendered = torch.where(mask.bool().unsqueeze(-1), truth, rendered)
+    count = valid.sum() * 3
     if count == 0:
         zero = (rendered * 0).sum()
         return zero, zero, zero + 1
@@ -381,16 +390,16 @@ def l1_ssim(
         planes = image.permute(2, 0, 1).unsqueeze(1)
         return F.conv2d(planes, kernel, padding=SSIM_WINDOW // 2).squeeze(1).permute(1, 2, 0)
 
-    mu_x, mu_y = blur(rendered), blur(goal)
+    mu_x, mu_y = blur(rendered), blur(truth)
     var_x = blur(rendered * rendered) - mu_x**2
-    var_y = blur(goal * goal) - mu_y**2
-    cov = blur(rendered * goal) - mu_x * mu_y
+    var_y = blur(truth * truth) - mu_y**2
+    cov = blur(rendered * truth) - mu_x * mu_y
     ssim_map = ((2 * mu_x * mu_y + SSIM_C1) * (2 * cov + SSIM_C2)) / (
         (mu_x**2 + mu_y**2 + SSIM_C1) * (var_x + var_y + SSIM_C2)
     )
-    d = rendered - goal
-    error = ((d.abs() + square_weight * d * d) * keep.unsqueeze(-1)).sum() / count
-    ssim = (ssim_map * keep.unsqueeze(-1)).sum() / count
+    d = rendered - truth
+    error = ((d.abs() + l2_weight * d * d) * valid.unsqueeze(-1)).sum() / count
+    ssim = (ssim_map * valid.unsqueeze(-1)).sum() / count
     return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
 
 
@@ -405,8 +414,7 @@ def adam_step(
     beta2: float = 0.999,
     eps: float = 1e-15,
 ) -> None:
-    """Adam (Kingma & Ba 2015, algorithm 1), in place; `step` counts from 1. Several rates
-    repeat over the elements. Rows (N, K) with `exp_avg_sq` (N, 1) share a second moment."""
+    """Adam (Kingma & Ba 2015, algorithm 1), in place; see ``Backend.adam_step``."""
     pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
     repeats = -(-param.numel() // len(pattern))
     rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
@@ -427,47 +435,49 @@ def frame_adam(
     d_quats: torch.Tensor,
     adam: FrameAdam,
 ) -> None:
-    """Adam over means (N, 3) and quaternions (N, 4) in each Gaussian's own frame; all in place, of
-    one float type.
+    """Adam over means (N, 3) and quaternions (N, 4) in the local frame of each Gaussian, in place.
+    All tensors have the same float type.
 
-    A mean is moved by way of y, mean = R S y with S = diag(scales), whose gradient is
-    S R^T dL/dmean: the mean of N(mean, R S S R^T) has the identity for Fisher information there
-    (the metric of Amari 1998). A quaternion q is moved by way of t, q (1 + t_x i + t_y j + t_z k),
-    half the angles about the axes. R, S and q are those before the step."""
+    The mean is parametrised as mean = R S y with S = diag(scales); the gradient with respect to y
+    is S R^T dL/dmean. In y, the Fisher information of the mean of N(mean, R S S R^T) is the
+    identity, so the gradient is the natural gradient (Amari 1998). A quaternion q is updated to
+    q (1 + t_x i + t_y j + t_z k), where t are half the rotation angles about the local axes. R, S
+    and q are those before the step.
+    """
     norm = quats.norm(dim=1, keepdim=True)
-    turns = norm.square() >= QUAT_NORM2_MIN
-    plain = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
-    unit = torch.where(turns, quats / norm.where(turns, torch.ones_like(norm)), plain)
+    valid = norm.square() >= QUAT_NORM2_MIN
+    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
+    unit = torch.where(valid, quats / norm.where(valid, torch.ones_like(norm)), identity)
     frame = rotation_from_quat(unit) * log_scales.exp()[:, None, :]
     w, x, y, z = unit.unbind(1)
     tangents = torch.stack(
         [torch.stack(t, 1) for t in ((-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))], 2
     )  # (N, 4, 3): q i, q j, q k
-    tangents = torch.where(turns[..., None], tangents * norm[..., None], 0.0)
+    tangents = torch.where(valid[..., None], tangents * norm[..., None], 0.0)
     for param, grad, axes, exp_avg, exp_avg_sq, rate in (
         (means, d_means, frame, adam.mean_avg, adam.mean_avg_sq, adam.mean_rate),
-        (quats, d_quats, tangents, adam.turn_avg, adam.turn_avg_sq, adam.turn_rate),
+        (quats, d_quats, tangents, adam.rotation_avg, adam.rotation_avg_sq, adam.rotation_rate),
     ):
-        own = torch.zeros_like(exp_avg)
-        own_grad = torch.einsum("nij,ni->nj", axes, grad)
-        adam_step(
-            own, own_grad, exp_avg, exp_avg_sq, rate, adam.step, adam.beta1, adam.beta2, adam.eps
-        )
-        param.add_(torch.einsum("nij,nj->ni", axes, own))
+        local = torch.zeros_like(exp_avg)
+        local_grad = torch.einsum("nij,ni->nj", axes, grad)
+        betas = adam.beta1, adam.beta2
+        adam_step(local, local_grad, exp_avg, exp_avg_sq, rate, adam.step, *betas, adam.eps)
+        param.add_(torch.einsum("nij,nj->ni", axes, local))
 
 
-def sh_adam(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:
-    """Adam over the harmonics (N, K, 3) of the Gaussians that the view asks of, ``asked`` (N,)
-    bool; all in place, of sh's type but for ``adam.last``.
+def sh_adam(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
+    """Adam over the SH coefficients (N, K, 3) of the Gaussians with a gradient, ``updated`` (N,)
+    bool; in place. All tensors but ``adam.last`` have the type of ``sh``.
 
-    n steps without a gradient multiply the moments by beta1^n and beta2^n, and move the parameter
-    by m / sqrt(v) times r + r^2 + ... + r^n, r = beta1 / sqrt(beta2); the bias corrections and
-    rates of the present step are taken for all of them. What is left then is a usual step.
+    First the n skipped steps with zero gradient are applied: they multiply the moments by beta1^n
+    and beta2^n and change the parameter by m / sqrt(v) times r + r^2 + ... + r^n, where
+    r = beta1 / sqrt(beta2), with the bias corrections and rates of the current step. Then follows
+    an ordinary step.
     """
-    rows = torch.nonzero(asked)[:, 0]
+    rows = torch.nonzero(updated)[:, 0]
     missed = (adam.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
     rates = torch.full(sh.shape[1:], adam.rate, dtype=sh.dtype)
-    rates[0] = adam.rate0
+    rates[0] = adam.dc_rate
     ratio = adam.beta1 / math.sqrt(adam.beta2)
     drift = ratio * (1 - ratio**missed) / (1 - ratio)
     m, v, p = adam.exp_avg[rows], adam.exp_avg_sq[rows], sh[rows]

@@ -1,4 +1,5 @@
-"""The float64 reference as a backend: what a new one is held to. Small scenes only."""
+"""The float64 reference implementation as a backend, to which others are compared. For small
+scenes only."""
 
 from __future__ import annotations
 
@@ -25,12 +26,13 @@ from pipeline.render.types import (
 
 @dataclass(frozen=True)
 class Projected:
-    """Float64 copies that carry gradients, and the visible Gaussians on the image plane.
+    """The visible Gaussians on the image plane, with an autograd graph in float64.
 
     Attributes:
-        parameters: as they came in.
-        leaves: the five arrays.
-        change: (10,) zeros, of which ``camera`` is the function that ``reference.moved`` is.
+        parameters: the input parameters.
+        leaves: their float64 copies, which require gradients.
+        change: (10,) zeros that require gradients.
+        camera: ``reference.perturbed`` of the input camera and ``change``.
     """
 
     parameters: Parameters
@@ -43,8 +45,8 @@ class Projected:
 
 @dataclass(frozen=True)
 class State:
-    """A drawn view; ``centres`` (pixels, V, 2) are the ellipses' centres as each pixel uses them,
-    so that absolute gradients can be summed by pixel."""
+    """State of a rendered view for ``backward``. ``centres`` (pixels, V, 2) are the 2D means,
+    expanded for each pixel so that absolute gradients can be summed over pixels."""
 
     projected: Projected
     centres: torch.Tensor
@@ -52,7 +54,8 @@ class State:
 
 
 class ReferenceBackend(Backend[Projected, Projected]):
-    """``reference``'s functions, differentiated by autograd; pixels times Gaussians of memory."""
+    """The functions of ``reference``, differentiated by autograd. Memory is proportional to pixels
+    times Gaussians."""
 
     def facts(self) -> Mapping[str, str]:
         return {"instruction_set": "float64 reference", "compiler": f"torch {torch.__version__}"}
@@ -62,10 +65,12 @@ class ReferenceBackend(Backend[Projected, Projected]):
     ) -> Projected:
         leaves = [tensor.double().requires_grad_() for tensor in parameters]
         change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
-        moved = reference.moved(camera, change)
+        perturbed = reference.perturbed(camera, change)
         means, log_scales, quats, opacity_logits, sh = leaves
-        projection = reference.project(means, log_scales, quats, opacity_logits, sh, moved, options)
-        return Projected(parameters, leaves, change, moved, options, projection)
+        projection = reference.project(
+            means, log_scales, quats, opacity_logits, sh, perturbed, options
+        )
+        return Projected(parameters, leaves, change, perturbed, options, projection)
 
     def bin(self, projected: Projected) -> Projected:
         return projected
@@ -75,7 +80,11 @@ class ReferenceBackend(Backend[Projected, Projected]):
         projection = binned.projection
         visible = projection.index
         colors = reference.sh_colors(
-            leaves[0][visible], leaves[4][visible], camera, options.sh_degree, options.black_stays
+            leaves[0][visible],
+            leaves[4][visible],
+            camera,
+            options.sh_degree,
+            options.clamp_color_gradient,
         )
         centres = projection.means2d.expand(camera.height * camera.width, -1, -1)
         image = reference.blend(replace(projection, means2d=centres), colors, camera, options)
@@ -119,8 +128,8 @@ class ReferenceBackend(Backend[Projected, Projected]):
         d_abs[index] = d_centres.abs().sum(0).float()
         d_sh = arrays[4]
         if sh_adam is not None:
-            asked = torch.cat([g.reshape(count, -1) for g in arrays], 1).any(1)
-            _step_sh(projected.parameters[4], d_sh, asked, sh_adam)
+            updated = torch.cat([g.reshape(count, -1) for g in arrays], 1).any(1)
+            _step_sh(projected.parameters[4], d_sh, updated, sh_adam)
             d_sh = d_sh[:0]
         return Gradients(
             arrays[0].float(), arrays[1].float(), arrays[2].float(), arrays[3].float(),
@@ -134,13 +143,13 @@ class ReferenceBackend(Backend[Projected, Projected]):
         target: torch.Tensor,
         ssim_weight: float,
         mask: torch.Tensor | None = None,
-        square_weight: float = 0.0,
+        l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
         rendered, target, mask = checks.images(rendered, target, mask)
         leaf = rendered.double().requires_grad_()
-        left_out = None if mask is None else mask.bool()
-        loss, error, ssim = reference.l1_ssim(leaf, target, ssim_weight, left_out, square_weight)
+        ignored = None if mask is None else mask.bool()
+        loss, error, ssim = reference.l1_ssim(leaf, target, ssim_weight, ignored, l2_weight)
         (grad,) = torch.autograd.grad(loss, leaf)
         return LossResult(
             float(loss.detach()), float(error.detach()), float(ssim.detach()), grad.float()
@@ -174,26 +183,30 @@ class ReferenceBackend(Backend[Projected, Projected]):
         threads: int = 0,
     ) -> None:
         checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
-        moments = (adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq)
+        moments = (adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg, adam.rotation_avg_sq)
         with _in_double(means, quats, *moments) as (m, q, *doubles):
-            mean, mean_sq, turn, turn_sq = doubles
+            mean, mean_sq, rotation, rotation_sq = doubles
             precise = replace(
-                adam, mean_avg=mean, mean_avg_sq=mean_sq, turn_avg=turn, turn_avg_sq=turn_sq
+                adam,
+                mean_avg=mean,
+                mean_avg_sq=mean_sq,
+                rotation_avg=rotation,
+                rotation_avg_sq=rotation_sq,
             )
             gradients = d_means.double(), d_quats.double()
             reference.frame_adam(m, q, log_scales.double(), *gradients, precise)
 
 
-def _step_sh(sh: torch.Tensor, grad: torch.Tensor, asked: torch.Tensor, adam: ShAdam) -> None:
+def _step_sh(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
     checks.check_sh_adam(adam, sh)
     with _in_double(sh, adam.exp_avg, adam.exp_avg_sq) as (p, first, second):
         precise = replace(adam, exp_avg=first, exp_avg_sq=second)
-        reference.sh_adam(p, grad, asked, precise)
+        reference.sh_adam(p, grad, updated, precise)
 
 
 @contextmanager
 def _in_double(*tensors: torch.Tensor) -> Iterator[list[torch.Tensor]]:
-    """Float64 copies; what they hold in the end goes back into the tensors."""
+    """Float64 copies of tensors, whose values are copied back at the end."""
     with torch.no_grad():
         doubles = [tensor.double() for tensor in tensors]
         yield doubles

@@ -1,4 +1,4 @@
-"""Values that pass in and out of the rasterizer. Importable without torch."""
+"""Inputs and outputs of the rasterizer. Importable without torch."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class RasterCamera:
-    """One pinhole view, COLMAP's convention: x right, y down, z forward.
+    """A pinhole camera in COLMAP's convention: x right, y down, z forward.
 
-    Pixel centres lie at half integers: pixel (column i, row j) samples (i + 0.5, j + 0.5).
+    Pixel centres are at half integers: pixel (column i, row j) samples (i + 0.5, j + 0.5).
 
     Attributes:
         width, height: image size in pixels.
@@ -34,46 +34,46 @@ class RasterCamera:
 
 @dataclass(frozen=True)
 class RasterOptions:
-    """How a view is drawn.
+    """Options of rendering.
 
     Attributes:
         sh_degree: active spherical harmonics degree, 0 to 3; coefficients above are ignored.
-        background: RGB behind everything; None adds none (the same image as black).
-        antialias: scale opacities by Mip-Splatting's compensation, so that the 0.3 px
-            dilation changes a Gaussian's size but not its energy.
-        near: Gaussians whose centre has camera z <= near are not drawn. In scene units, and
-            scenes from photographs have an arbitrary scale: choose it well under the distance
-            of the nearest thing worth drawing.
-        black_stays: a colour that is clamped at 0 has no gradient (3DGS); otherwise one that would
-            raise it passes.
-        gradients_per_pixel: a pixel's gradients go only to so many Gaussians, the first that it
-            draws (the limit that Kerbl et al. 2023, sec. 7.3, compare with having none); 0: to all.
-        threads: 0 for all. The result does not depend on it.
+        background: RGB of the background; None for none (the same image as black).
+        antialias: scale opacities by Mip-Splatting's compensation, so that the 0.3 px dilation
+            changes a Gaussian's size but not its energy.
+        near: distance of the near plane in world units: Gaussians whose mean has camera z <= near
+            are not rendered. Choose it well below the distance of the nearest surface.
+        clamp_color_gradient: a colour clamped at 0 has no gradient (3DGS); otherwise gradients that
+            would increase it pass.
+        gradients_per_pixel: number of contributing Gaussians of a pixel, from the front, that
+            receive gradients (the limit discussed by Kerbl et al. 2023, section 7.3); 0 for all.
+        threads: number of threads, 0 for all. The result does not depend on it.
     """
 
     sh_degree: int = 3
     background: tuple[float, float, float] | None = None
     antialias: bool = False
     near: float = 0.01
-    black_stays: bool = False
+    clamp_color_gradient: bool = False
     gradients_per_pixel: int = 0
     threads: int = 0
 
 
 @dataclass(frozen=True)
 class Forward:
-    """A drawn view and what ``backward`` needs of it. Do not write to its tensors.
+    """A rendered view, with the state that ``backward`` needs. Do not write to its tensors.
 
     Attributes:
-        color: (H, W, 3) float32, the background included.
+        color: (H, W, 3) float32, including the background.
         alpha: (H, W) float32, 1 - transmittance.
-        radii: (N,) float32 pixels along the long axis out to where alpha falls to 1/255;
-            0: not visible.
-        num_visible: Gaussians that touch the image.
-        num_dropped: Gaussians left out because a value is not finite or degenerate.
-        num_intersections: (Gaussian, tile) pairs, what memory and time go with.
-        draw_depths: draws ``depth`` and ``median_depth``.
-        state: the backend's own.
+        radii: (N,) float32, semi-major axis of the ellipse {alpha >= 1/255} in pixels; 0 for
+            Gaussians that are not visible.
+        num_visible: number of Gaussians that overlap the image.
+        num_dropped: number of Gaussians left out because a value is not finite or degenerate.
+        num_intersections: number of (Gaussian, tile) pairs, to which memory and time are
+            proportional.
+        render_depths: renders ``depth`` and ``median_depth``.
+        state: private data of the backend.
     """
 
     color: torch.Tensor
@@ -82,34 +82,34 @@ class Forward:
     num_visible: int
     num_dropped: int
     num_intersections: int
-    draw_depths: Callable[[], tuple[torch.Tensor, torch.Tensor]]
+    render_depths: Callable[[], tuple[torch.Tensor, torch.Tensor]]
     state: Any
 
     @cached_property
     def _depths(self) -> tuple[torch.Tensor, torch.Tensor]:
-        # At first use: a training step that needs neither does not pay for them.
-        return self.draw_depths()
+        # Computed at first use: most training steps need no depths.
+        return self.render_depths()
 
     @property
     def depth(self) -> torch.Tensor:
-        """(H, W) float32, sum of weight * camera z, not divided by alpha."""
+        """(H, W) float32 sum of weight * camera z, not divided by alpha."""
         return self._depths[0]
 
     @property
     def median_depth(self) -> torch.Tensor:
-        """(H, W) float32, camera z of the Gaussian that takes the transmittance below 0.5; 0 where
-        none does."""
+        """(H, W) float32 camera z of the Gaussian at which the transmittance falls below 0.5; 0 if
+        it does not."""
         return self._depths[1]
 
 
 @dataclass(frozen=True)
 class CameraGradients:
-    """dL/d(change of the camera), float64; ``reference.moved`` says what a change does.
+    """dL/d(change of the camera), float64; ``reference.perturbed`` defines a change.
 
     Attributes:
-        rotation: (3,) the scene turned about the camera's centre, radians about its axes.
-        translation: (3,) the scene shifted in the camera's frame, world unit.
-        focal, principal: (2,) focal lengths and principal point, pixels.
+        rotation: (3,) per radian of rotation of the scene about the camera's axes.
+        translation: (3,) per world unit of translation of the scene along the camera's axes.
+        focal, principal: (2,) per pixel of focal length and principal point.
     """
 
     rotation: torch.Tensor
@@ -120,14 +120,15 @@ class CameraGradients:
 
 @dataclass(frozen=True)
 class Gradients:
-    """dL/d(parameter), float32, each shaped as its parameter; zero for what is not visible.
+    """dL/d(parameter), float32, each shaped as its parameter; zero for Gaussians that are not
+    visible.
 
     Attributes:
-        sh: without rows where ``backward`` used it up (``ShAdam``).
-        means2d: (N, 2) dL/d(pixel position of the centre).
-        means2d_abs: (N, 2) the sum over pixels of the absolute value of each pixel's share of
-            means2d (AbsGS, Ye et al. 2024); None when not asked for.
-        camera: None when not asked for.
+        sh: without rows if ``backward`` applied it (``ShAdam``).
+        means2d: (N, 2) gradient of the projected mean, per pixel.
+        means2d_abs: (N, 2) sum over pixels of the absolute values of each pixel's contribution to
+            ``means2d`` (AbsGS, Ye et al. 2024); None if not requested.
+        camera: None if not requested.
     """
 
     means: torch.Tensor
@@ -142,23 +143,23 @@ class Gradients:
 
 @dataclass(frozen=True)
 class ShAdam:
-    """Adam over the spherical harmonics of what the view asks of (``backward``'s ``sh_adam``).
+    """Sparse Adam over the SH coefficients of the Gaussians with a gradient (``Backend.backward``).
 
-    A Gaussian of which n steps asked nothing, out of view or behind what is opaque, gets in the
-    next that does what n steps without a gradient would have done (``reference.sh_adam``): the
-    same as dense Adam, but for the colour it is drawn with in that one step.
+    A Gaussian without a gradient in n steps (outside the view or occluded) receives the effect of
+    these n steps of dense Adam with zero gradient at its next update (``reference.sh_adam``). The
+    result equals dense Adam, except for the colour that is rendered in that step.
 
     Attributes:
-        exp_avg, exp_avg_sq: (N, K, 3) float32, moved in place.
-        last: (N,) int32, the last step that asked of each Gaussian, 0 before the first; in place.
-        rate0, rate: learning rates of the constant coefficient and of the others.
-        step: from 1.
+        exp_avg, exp_avg_sq: (N, K, 3) float32, updated in place.
+        last: (N,) int32 last step with a gradient, 0 before the first; updated in place.
+        dc_rate, rate: learning rates of the constant coefficient and of the others.
+        step: number of the current step, starting at 1.
     """
 
     exp_avg: torch.Tensor
     exp_avg_sq: torch.Tensor
     last: torch.Tensor
-    rate0: float
+    dc_rate: float
     rate: float
     step: int
     beta1: float = 0.9
@@ -168,23 +169,24 @@ class ShAdam:
 
 @dataclass(frozen=True)
 class FrameAdam:
-    """Adam over means and rotations, in each Gaussian's own frame (``frame_adam``).
+    """Adam over means and rotations in the local frame of each Gaussian (``Backend.frame_adam``).
 
     Attributes:
-        mean_avg, mean_avg_sq: (N, 3) float32, moments of a mean along the three axes, each in
-            units of the scale there; moved in place.
-        turn_avg, turn_avg_sq: (N, 3) float32, moments of a turn about the three axes; in place.
-        mean_rate: learning rate of the means, in scales.
-        turn_rate: of the rotations, in steps of a quaternion of length 1: half the angle.
-        step: from 1.
+        mean_avg, mean_avg_sq: (N, 3) float32 moments of the mean along the local axes, in units of
+            the scales; updated in place.
+        rotation_avg, rotation_avg_sq: (N, 3) float32 moments of the rotation about the local axes;
+            updated in place.
+        mean_rate: learning rate of the means, in units of the scales.
+        rotation_rate: learning rate of the rotations, for unit quaternions (half the angle).
+        step: number of the current step, starting at 1.
     """
 
     mean_avg: torch.Tensor
     mean_avg_sq: torch.Tensor
-    turn_avg: torch.Tensor
-    turn_avg_sq: torch.Tensor
+    rotation_avg: torch.Tensor
+    rotation_avg_sq: torch.Tensor
     mean_rate: float
-    turn_rate: float
+    rotation_rate: float
     step: int
     beta1: float = 0.9
     beta2: float = 0.999
@@ -193,18 +195,7 @@ class FrameAdam:
 
 @dataclass(frozen=True)
 class RenderOutput:
-    """A drawn view; color, alpha and depth carry gradients.
-
-    Attributes:
-        color: (H, W, 3).
-        alpha: (H, W) 1 - transmittance.
-        depth: (H, W) sum of weight * camera z, not divided by alpha.
-        median_depth: (H, W) camera z of the Gaussian that takes the transmittance below 0.5;
-            0 where none does.
-        radii: (N,) pixels along the long axis out to where alpha falls to 1/255; 0: not visible.
-        num_visible: Gaussians that touch the image.
-        num_dropped: Gaussians left out because a value is not finite or degenerate.
-    """
+    """A rendered view; color, alpha and depth are differentiable. Fields as in ``Forward``."""
 
     color: torch.Tensor
     alpha: torch.Tensor

@@ -1,4 +1,4 @@
-"""Rendering Gaussians into views, for evaluation and for looking at."""
+"""Render scenes from views, for evaluation and display."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from pipeline.splats.gaussians import Gaussians
 
 
 class Render(NamedTuple):
-    """One picture.
+    """A rendered view.
 
     Attributes:
-        rgb: (H, W, 3) float32, over the background, clamped to [0, 1].
+        rgb: (H, W, 3) float32 over the background, clamped to [0, 1].
         alpha: (H, W) float32 in [0, 1].
-        depth: (H, W) float32, camera z summed by weight, not divided by alpha; world unit.
-        median_depth: (H, W) float32, camera z of the Gaussian that takes the transmittance below
-            one half; 0 where none does.
+        depth: (H, W) float32 sum of weight * camera z in world units, not divided by alpha.
+        median_depth: (H, W) float32 camera z of the Gaussian at which the transmittance falls below
+            0.5; 0 if it does not.
     """
 
     rgb: NDArray[np.float32]
@@ -32,13 +32,13 @@ class Render(NamedTuple):
 
 
 def near_plane(extent: float) -> float:
-    """The near plane's distance for a scene of size ``extent``, both in the world's unit: what is
-    nearer to a camera than this share of the cameras' spread is a floater."""
+    """Distance of the near plane for a scene of size ``extent``, in world units: Gaussians closer
+    to a camera are floaters."""
     return 0.01 * extent
 
 
 def raster_camera(view: View, factor: int = 1) -> RasterCamera:
-    """The rasterizer's camera for a view at 1 / ``factor`` of its size."""
+    """The rasterizer's camera of a view, downscaled by ``factor``."""
     width, height = reduced_size(view, factor)
     sx, sy = width / view.width, height / view.height
     return RasterCamera(
@@ -52,8 +52,8 @@ def raster_camera(view: View, factor: int = 1) -> RasterCamera:
     )
 
 
-def within(options: RasterOptions, gaussians: Gaussians) -> RasterOptions:
-    """The options with no higher degree of harmonics than the Gaussians have."""
+def limit_sh_degree(options: RasterOptions, gaussians: Gaussians) -> RasterOptions:
+    """The options with the SH degree limited to that of the Gaussians."""
     return replace(options, sh_degree=min(options.sh_degree, gaussians.sh_degree))
 
 
@@ -63,7 +63,7 @@ def render_view(
     options: RasterOptions | None = None,
     backend: Backend | None = None,
 ) -> Render:
-    """Render ``gaussians`` as ``view`` sees them, at the view's size."""
+    """Render ``gaussians`` from ``view``, at the view's size."""
     result = _forward(gaussians, view, options, backend)
     return Render(
         result.color.clamp(0.0, 1.0).numpy(),
@@ -79,7 +79,7 @@ def render_rgb(
     options: RasterOptions | None = None,
     backend: Backend | None = None,
 ) -> NDArray[np.float32]:
-    """The colours of ``render_view`` alone, without the time that depths take."""
+    """Render only the colours of ``render_view``; faster, since no depths are rendered."""
     result = _forward(gaussians, view, options, backend)
     return np.asarray(result.color.clamp(0.0, 1.0).numpy())
 
@@ -87,11 +87,11 @@ def render_rgb(
 def _forward(
     gaussians: Gaussians, view: View, options: RasterOptions | None, backend: Backend | None
 ) -> Forward:
-    options = within(options or RasterOptions(), gaussians)
+    options = limit_sh_degree(options or RasterOptions(), gaussians)
     backend = backend or make_backend()
     return backend.forward(*gaussians.parameters(), raster_camera(view), options)
 
 
 def to_bytes(image: Any) -> NDArray[np.uint8]:
-    """[0, 1] floats to 8 bit, rounded."""
+    """Convert floats in [0, 1] to uint8, rounded."""
     return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""SIFT keypoints of all photographs of a scene, cached photograph by photograph."""
+"""Feature extraction for all photographs of a scene, with a cache for each photograph."""
 
 from __future__ import annotations
 
@@ -18,19 +18,21 @@ from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
-# Part of the cache key: raise it whenever the same photograph would give other keypoints.
+# Part of the cache key: increase it when a change of the code changes keypoints.
 ALGORITHM_VERSION = 2
 
-# Fewer keypoints than this seldom carry a verified pair (15 inliers after a ratio test).
+# With fewer keypoints than this, a photograph rarely has a verified pair, and a warning is given.
 FEW_FEATURES = 100
 
 
 @dataclass(frozen=True)
 class FeatureReport:
-    """Attributes:
-    counts: photograph's name -> number of keypoints.
-    num_cached: photographs whose keypoints were found in the cache.
-    decisions, warnings: for people.
+    """Result of the features stage.
+
+    Attributes:
+        counts: photograph name -> number of keypoints.
+        num_cached: number of photographs whose keypoints were found in the cache.
+        decisions, warnings: sentences for the log.
     """
 
     counts: dict[str, int]
@@ -42,13 +44,13 @@ class FeatureReport:
 def extract_features(
     manifest: Manifest, config: schema.Features, out: Path, *, cache: Path, threads: int
 ) -> FeatureReport:
-    """Write the keypoints of each photograph to ``out`` (see ``keypoint_file``).
+    """Extract SIFT features of each photograph and write them to ``out`` (see ``keypoint_file``).
 
-    The bits do not depend on ``threads``, nor on what the cache holds.
+    The files depend neither on ``threads`` nor on the content of the cache.
 
     Args:
-        cache: folder that may outlive this scene's results. What this call did not use is dropped
-            from it once that is more than what it did.
+        cache: folder for keypoints that may outlive the results. Unused files are removed if there
+            are more of them than used ones.
 
     Raises:
         UserError: a photograph or mask cannot be read, or changed since it was inspected.
@@ -57,7 +59,7 @@ def extract_features(
     cache.mkdir(parents=True, exist_ok=True)
     keys = {photo.name: _cache_key(photo, config) for photo in manifest.photos}
     absent = [p for p in manifest.photos if not (cache / f"{keys[p.name]}.npz").exists()]
-    # One of each: copies of a photograph have one key, and would write one file at once.
+    # One photograph of each key: identical photographs would write the same file concurrently.
     missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
         progress = Progress("extracting features", len(missing), "photographs")
@@ -73,7 +75,7 @@ def extract_features(
     for photo in manifest.photos:
         source = cache / f"{keys[photo.name]}.npz"
         target = keypoint_file(out, photo.name)
-        # A copy: damage to a stage's output must not reach the cache.
+        # A copy, not a link: changes of a stage's output must not affect the cache.
         shutil.copyfile(source, target)
         counts[photo.name] = len(Keypoints.read(target))
     _prune(cache, {f"{key}.npz" for key in keys.values()})
@@ -95,7 +97,8 @@ def extract_features(
 
 
 def _cache_key(photo: Photo, config: schema.Features) -> str:
-    """Extraction compares the bytes it decodes with the digests that are in the key."""
+    """Hash of everything that determines the keypoints. Extraction compares the files that it
+    decodes with the digests in the key."""
     facts = {
         "photo": photo.digest,
         "mask": photo.mask_digest,
@@ -106,9 +109,9 @@ def _cache_key(photo: Photo, config: schema.Features) -> str:
 
 
 def _prune(cache: Path, used: set[str]) -> None:
-    others = [file for file in cache.glob("*.npz") if file.name not in used]
-    if len(others) > len(used):
-        for file in others:
+    unused = [file for file in cache.glob("*.npz") if file.name not in used]
+    if len(unused) > len(used):
+        for file in unused:
             file.unlink()
 
 
@@ -124,11 +127,11 @@ def _extract_opencv(
     from pipeline.sfm import sift
 
     def extract(photo: Photo) -> None:
-        picture = sift.Picture(photo, config.max_long_side_px)
+        picture = sift.DetectionImage(photo, config.max_long_side_px)
         sift.detect(picture, config.max_features).write(targets[photo.name])
 
-    # A thread a photograph (OpenCV lets go of the interpreter), none inside: the same bits
-    # for any number of them.
+    # One thread per photograph (OpenCV releases the GIL) and none within OpenCV: the result does
+    # not depend on the number of threads.
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
@@ -137,7 +140,7 @@ def _extract_opencv(
                 for _ in pool.map(extract, photos):
                     progress.advance()
             except BaseException:
-                # One bad photograph: do not go through the others first.
+                # Do not extract the remaining photographs after an error.
                 pool.shutdown(cancel_futures=True)
                 raise
     finally:
@@ -151,8 +154,8 @@ def _extract_colmap(
     threads: int,
     progress: Progress,
 ) -> None:
-    """COLMAP's extractor, on the same grey pictures. It knows no limit on the number of
-    features but keeps whole octaves, so the largest ones are kept here."""
+    """Extract with COLMAP's SIFT from the same grey images. COLMAP limits the number of features by
+    whole octaves, so the ones of the largest scales are selected here."""
     from pipeline.sfm import sift
 
     batch = max(8, 4 * threads)
@@ -161,7 +164,7 @@ def _extract_colmap(
         with tempfile.TemporaryDirectory(prefix="splatmake-sift-") as folder:
             pictures = {}
             for index, photo in enumerate(chunk):
-                picture = sift.Picture(photo, config.max_long_side_px)
+                picture = sift.DetectionImage(photo, config.max_long_side_px)
                 sift.write_grey(picture, str(Path(folder) / f"{index:06d}.png"))
                 pictures[photo.name] = picture
             found = run_isolated(_colmap_sift, Path(folder), config.max_features, threads)
@@ -169,24 +172,24 @@ def _extract_colmap(
                 keypoints, descriptors = found[f"{index:06d}.png"]
                 picture = pictures[photo.name]
                 if picture.usable is not None:
-                    at = np.floor(keypoints[:, :2]).astype(np.int64)
+                    pixel = np.floor(keypoints[:, :2]).astype(np.int64)
                     height, width = picture.usable.shape
-                    at = np.clip(at, 0, [width - 1, height - 1])
-                    keep = picture.usable[at[:, 1], at[:, 0]] > 0
+                    pixel = np.clip(pixel, 0, [width - 1, height - 1])
+                    keep = picture.usable[pixel[:, 1], pixel[:, 0]] > 0
                     keypoints, descriptors = keypoints[keep], descriptors[keep]
                 table = keypoints.astype(np.float64)
-                strongest = np.argsort(-table[:, 2], kind="stable")[: config.max_features]
-                table = table[strongest]
-                picture.finish(
-                    table[:, :2], table[:, 2], table[:, 3], descriptors[strongest]
-                ).write(targets[photo.name])
+                largest = np.argsort(-table[:, 2], kind="stable")[: config.max_features]
+                table = table[largest]
+                picture.finish(table[:, :2], table[:, 2], table[:, 3], descriptors[largest]).write(
+                    targets[photo.name]
+                )
         progress.advance(len(chunk))
 
 
 def _colmap_sift(
     folder: Path, max_features: int, threads: int
 ) -> dict[str, tuple[np.ndarray, np.ndarray]]:
-    """Picture's name -> keypoints (F, 4) x, y, scale, orientation and descriptors (F, 128)."""
+    """File name -> (F, 4) keypoints (x, y, scale, orientation) and (F, 128) descriptors."""
     import pycolmap
 
     from pipeline.sfm.quiet import quiet_colmap

@@ -1,4 +1,4 @@
-"""SIFT of one photograph by OpenCV. The only module of this package that imports cv2."""
+"""SIFT features of one photograph by OpenCV."""
 
 from __future__ import annotations
 
@@ -11,19 +11,19 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.sfm.keypoints import Keypoints, root_sift
 
-# COLMAP's peak threshold (0.02 / 3); OpenCV divides this value by its layers. Half of OpenCV's
-# default: weakly textured scenes need the faint ones, and only the strongest are kept anyway.
+# COLMAP's peak threshold is 0.02 / 3; OpenCV divides this value by its 3 octave layers. Half of
+# OpenCV's default: weakly textured scenes need weak keypoints, and the number is limited anyway.
 CONTRAST_THRESHOLD = 0.02
 
 
-class Picture:
-    """A photograph prepared for detection.
+class DetectionImage:
+    """A photograph prepared for feature detection: downscaled, grey, with its mask.
 
     Attributes:
         grey: (h, w) uint8.
         rgb: (h, w, 3) uint8.
-        usable: (h, w) uint8, zero where no feature may lie; None where all may.
-        scale: (2,) stored pixels in one pixel of ``grey``, x and y.
+        usable: (h, w) uint8, zero for masked or transparent pixels; None without a mask or alpha.
+        scale: (2,) size of a pixel of ``grey`` in pixels of the stored image, x and y.
     """
 
     def __init__(self, photo: Photo, max_long_side_px: int):
@@ -52,14 +52,17 @@ class Picture:
         orientation: NDArray[np.float64],
         descriptors: NDArray[np.uint8],
     ) -> Keypoints:
-        """Keypoints in stored pixels, largest scale first, from those found in ``grey``.
+        """Convert keypoints detected in ``grey`` to keypoints of the stored image, sorted by
+        scale, largest first.
 
         Args:
             xy: (F, 2) in pixels of ``grey``, pixel centres at .5.
+            scale, orientation: (F,) sigma in pixels of ``grey``, and radians.
+            descriptors: (F, 128).
         """
-        at = np.floor(xy).astype(np.int64)
-        rows = np.clip(at[:, 1], 0, self.grey.shape[0] - 1)
-        columns = np.clip(at[:, 0], 0, self.grey.shape[1] - 1)
+        pixel = np.floor(xy).astype(np.int64)
+        rows = np.clip(pixel[:, 1], 0, self.grey.shape[0] - 1)
+        columns = np.clip(pixel[:, 0], 0, self.grey.shape[1] - 1)
         order = np.lexsort((orientation, xy[:, 1], xy[:, 0], -scale))
         return Keypoints(
             xy=(xy * self.scale).astype(np.float32)[order],
@@ -70,16 +73,14 @@ class Picture:
         )
 
 
-def detect(picture: Picture, max_features: int) -> Keypoints:
-    """SIFT keypoints of a picture: the ``max_features`` of strongest response where usable.
-
-    RootSIFT descriptors (Arandjelovic and Zisserman 2012), times 512, as COLMAP stores them.
-    """
+def detect(picture: DetectionImage, max_features: int) -> Keypoints:
+    """SIFT keypoints with RootSIFT descriptors (``keypoints.root_sift``): the ``max_features`` of
+    strongest response among the usable pixels."""
     sift = cv2.SIFT_create(  # type: ignore[attr-defined]
-        # OpenCV takes the strongest before it looks at the mask; with one, do it here instead.
+        # OpenCV selects the strongest before it applies the mask: with a mask, select below.
         nfeatures=max_features if picture.usable is None else 0,
         contrastThreshold=CONTRAST_THRESHOLD,
-        # Without it keypoints are biased by a quarter of a pixel: 0.025 degrees of rotation.
+        # Otherwise keypoints are biased by a quarter of a pixel.
         enable_precise_upscale=True,
     )
     if picture.usable is None:
@@ -88,12 +89,12 @@ def detect(picture: Picture, max_features: int) -> Keypoints:
         found = sift.detect(picture.grey, picture.usable)
         found = sorted(found, key=lambda k: (-k.response, k.pt, k.size, k.angle))[:max_features]
         found, descriptors = sift.compute(picture.grey, found)
-    # Ties in response let OpenCV keep a few more.
+    # OpenCV returns more keypoints if responses are equal.
     found = list(found)[:max_features]
     table = np.array([(*k.pt, k.size, k.angle) for k in found], np.float64).reshape(-1, 4)
     if descriptors is None or not found:
         descriptors = np.zeros((0, 128), np.float32)
-    # OpenCV's pixel centres are integers, COLMAP's are at .5; its size is a diameter.
+    # OpenCV's pixel centres are at integers, COLMAP's at .5; OpenCV's size is a diameter.
     return picture.finish(
         table[:, :2] + 0.5,
         table[:, 2] / 2,
@@ -102,14 +103,14 @@ def detect(picture: Picture, max_features: int) -> Keypoints:
     )
 
 
-def write_grey(picture: Picture, path: str) -> None:
+def write_grey(picture: DetectionImage, path: str) -> None:
     """Write ``picture.grey`` as PNG."""
     if not cv2.imwrite(path, picture.grey):
-        raise UserError("cannot be written", file=path, fix="look at free space and rights")
+        raise UserError("cannot be written", file=path, fix="check free space and permissions")
 
 
 def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
-    """8-bit BGR over black, and the alpha channel where there is one."""
+    """8-bit BGR composited over black, and the alpha channel, None without one."""
     if pixels.dtype == np.uint16:
         alpha_scale, pixels8 = 65535.0, (pixels // 257).astype(np.uint8)
     else:
@@ -127,7 +128,7 @@ def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
 
 
 def _read_mask(photo: Photo, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """(h, w) uint8: 1 where the photograph's mask is not zero."""
+    """(h, w) uint8: 1 for non-zero pixels of the photograph's mask."""
     assert photo.mask is not None
     mask = read_picture(photo.mask, photo.mask_digest)
     if mask.ndim == 3:

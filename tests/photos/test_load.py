@@ -1,4 +1,4 @@
-"""Pictures arrive as stored, and damaged ones are refused by name."""
+"""Images are loaded as stored; damaged files are errors that name them."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ def gradient(height: int = 24, width: int = 36) -> np.ndarray:
     return np.stack([x * 7, y * 10, (x + y) * 4], axis=2).astype(np.uint8)
 
 
-def test_png_comes_back_bit_for_bit_in_rgb_order(tmp_path: Path) -> None:
+def test_png_is_loaded_losslessly_in_rgb_order(tmp_path: Path) -> None:
     rgb = gradient()
     Image.fromarray(rgb).save(tmp_path / "a.png")
     assert np.array_equal(load_rgb(tmp_path / "a.png"), rgb)
 
 
 @pytest.mark.parametrize("orientation", [1, 3, 6, 8])
-def test_exif_orientation_never_turns_pixels(tmp_path: Path, orientation: int) -> None:
+def test_exif_orientation_is_not_applied(tmp_path: Path, orientation: int) -> None:
     exif = Image.Exif()
     exif[0x0112] = orientation
     Image.fromarray(gradient()).save(tmp_path / "a.jpg", quality=95, exif=exif)
@@ -54,7 +54,7 @@ def test_grey_palette_and_16_bit_have_three_channels(tmp_path: Path) -> None:
     assert np.array_equal(load_rgba(tmp_path / "deep.png")[0], rgb)
 
 
-def test_alpha_is_split_off_also_of_grey(tmp_path: Path) -> None:
+def test_alpha_is_separated_for_colour_and_grey(tmp_path: Path) -> None:
     rgb, alpha = gradient(), gradient()[..., 1]
     Image.fromarray(np.dstack([rgb, alpha])).save(tmp_path / "rgba.png")
     Image.fromarray(np.dstack([rgb[..., 0], alpha]), "LA").save(tmp_path / "la.png")
@@ -64,7 +64,7 @@ def test_alpha_is_split_off_also_of_grey(tmp_path: Path) -> None:
         assert np.array_equal(read[..., 0], rgb[..., 0])
 
 
-def test_hidden_colours_do_not_bleed_when_resized(tmp_path: Path) -> None:
+def test_transparent_colours_have_no_influence_when_resized(tmp_path: Path) -> None:
     rgba = np.zeros((8, 8, 4), np.uint8)
     rgba[..., 1] = 255  # green where transparent
     rgba[:, ::2] = (200, 10, 30, 255)
@@ -74,10 +74,10 @@ def test_hidden_colours_do_not_bleed_when_resized(tmp_path: Path) -> None:
     assert np.all(view.rgb == (200, 10, 30)) and np.all(view.alpha == 128)
 
 
-def test_resizing_averages_areas_and_masks_count_where_they_are_whole(tmp_path: Path) -> None:
+def test_images_are_resized_by_area_and_partly_masked_pixels_are_masked(tmp_path: Path) -> None:
     rgb = gradient()
     mask = np.zeros((24, 36), np.uint8)
-    mask[:, :19] = 1  # non-zero counts, however dark
+    mask[:, :19] = 1  # any non-zero value is valid
     Image.fromarray(rgb).save(tmp_path / "a.png")
     Image.fromarray(mask).save(tmp_path / "m.png")
     view = load_view(view_of(tmp_path / "a.png", tmp_path / "m.png", 18, 12))
@@ -89,19 +89,19 @@ def test_resizing_averages_areas_and_masks_count_where_they_are_whole(tmp_path: 
 
 
 @pytest.mark.parametrize("suffix", ["jpg", "png", "webp", "tif"])
-@pytest.mark.parametrize("kept", [0.0, 0.3, 0.95])
-def test_cut_off_picture_is_refused_by_name(tmp_path: Path, suffix: str, kept: float) -> None:
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.95])
+def test_a_truncated_file_is_an_error(tmp_path: Path, suffix: str, share: float) -> None:
     rng = np.random.default_rng(0)
     picture = Image.fromarray(rng.integers(0, 255, (64, 64, 3), np.uint8))
     path = tmp_path / f"photo.{suffix}"
     picture.save(path)
     data = path.read_bytes()
-    path.write_bytes(data[: int(len(data) * kept)])
+    path.write_bytes(data[: int(len(data) * share)])
     with pytest.raises(UserError, match=f"photo.{suffix}"):
         load_rgb(path)
 
 
-def test_cut_off_jpeg_is_seen_behind_a_whole_exif_preview(tmp_path: Path) -> None:
+def test_a_truncated_jpeg_with_a_complete_exif_preview_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.jpg"
     Image.fromarray(gradient()).save(path)
     whole = path.read_bytes()
@@ -109,11 +109,11 @@ def test_cut_off_jpeg_is_seen_behind_a_whole_exif_preview(tmp_path: Path) -> Non
     path.write_bytes(whole[:2] + preview + whole[2:])
     assert load_rgb(path).shape == (24, 36, 3)
     path.write_bytes(path.read_bytes()[:-40])
-    with pytest.raises(UserError, match="cut off"):
+    with pytest.raises(UserError, match="truncated"):
         load_rgb(path)
 
 
-def test_damaged_png_is_refused(tmp_path: Path) -> None:
+def test_a_damaged_png_is_an_error(tmp_path: Path) -> None:
     path = tmp_path / "a.png"
     Image.fromarray(gradient()).save(path)
     data = bytearray(path.read_bytes())
@@ -123,9 +123,9 @@ def test_damaged_png_is_refused(tmp_path: Path) -> None:
         load_rgb(path)
 
 
-def test_text_called_jpg_missing_file_and_turned_picture(tmp_path: Path) -> None:
-    (tmp_path / "text.jpg").write_text("this is no picture")
-    with pytest.raises(UserError, match=r"text\.jpg: not a picture"):
+def test_text_missing_files_and_rotated_images_are_errors(tmp_path: Path) -> None:
+    (tmp_path / "text.jpg").write_text("not an image")
+    with pytest.raises(UserError, match=r"text\.jpg: not a readable image"):
         load_rgb(tmp_path / "text.jpg")
     with pytest.raises(UserError, match=r"gone\.png: cannot be read"):
         load_rgb(tmp_path / "gone.png")
@@ -134,7 +134,7 @@ def test_text_called_jpg_missing_file_and_turned_picture(tmp_path: Path) -> None
         load_view(view_of(tmp_path / "a.png", None, 24, 36))
 
 
-def test_a_file_that_is_not_the_recorded_one_is_refused_by_name(tmp_path: Path) -> None:
+def test_a_file_with_another_digest_is_an_error(tmp_path: Path) -> None:
     Image.fromarray(gradient()).save(tmp_path / "a.png")
     Image.new("L", (36, 24), 255).save(tmp_path / "m.png")
     np.save(tmp_path / "d.npy", np.ones((24, 36)))

@@ -10,10 +10,10 @@ Scene = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tens
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 
-def camera(width: int, height: int, *, turned: bool = False) -> RasterCamera:
-    """A camera at about the origin looking along z, its principal point off the centre."""
+def camera(width: int, height: int, *, rotated: bool = False) -> RasterCamera:
+    """A camera near the origin that faces along z, with an off-centre principal point."""
     pose = torch.eye(4, dtype=torch.float64)
-    if turned:
+    if rotated:
         c, s = torch.cos(torch.tensor(0.3)).item(), torch.sin(torch.tensor(0.3)).item()
         pose[:3, :3] = torch.tensor([[c, 0, s], [0, 1, 0], [-s, 0, c]], dtype=torch.float64)
         pose[:3, 3] = torch.tensor([0.4, -0.2, 0.3])
@@ -21,7 +21,7 @@ def camera(width: int, height: int, *, turned: bool = False) -> RasterCamera:
 
 
 def random_scene(seed: int, count: int, *, degree: int = 3, size: float = 0.07) -> Scene:
-    """Gaussians of about ``size`` in front of ``camera``, some off the image, float32."""
+    """Gaussians of scale about ``size`` in front of ``camera``, some outside the image, float32."""
     gen = torch.Generator().manual_seed(seed)
 
     def normal(*shape: int) -> torch.Tensor:
@@ -33,7 +33,7 @@ def random_scene(seed: int, count: int, *, degree: int = 3, size: float = 0.07) 
     return means, log_scales, normal(count, 4), normal(count) * 1.5, sh
 
 
-def relative(found: torch.Tensor, wanted: torch.Tensor) -> float:
+def relative(found: torch.Tensor, expected: torch.Tensor) -> float:
     """Relative L2 distance."""
-    wanted = wanted.double()
-    return float((found.double() - wanted).norm() / wanted.norm().clamp(min=1e-30))
+    expected = expected.double()
+    return float((found.double() - expected).norm() / expected.norm().clamp(min=1e-30))

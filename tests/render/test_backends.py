@@ -1,4 +1,4 @@
-"""Every backend keeps the interface's promises, held to the float64 reference."""
+"""Every backend fulfils the interface and agrees with the float64 reference."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from pipeline.render.backend import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 
 REFERENCE = make_backend("reference")
-CAMERA = camera(31, 22, turned=True)
+CAMERA = camera(31, 22, rotated=True)
 OPTIONS = RasterOptions(background=(0.2, 0.5, 0.9))
 
 
@@ -31,7 +31,7 @@ def noise(*shape: int, seed: int = 0) -> torch.Tensor:
     return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
 
 
-def test_images_and_gradients_are_the_references(backend: Backend, scene: Scene) -> None:
+def test_images_and_gradients_equal_the_reference(backend: Backend, scene: Scene) -> None:
     gradients = []
     images = []
     for each in (backend, REFERENCE):
@@ -40,31 +40,31 @@ def test_images_and_gradients_are_the_references(backend: Backend, scene: Scene)
         d = noise(22, 31, 3), noise(22, 31, seed=1), noise(22, 31, seed=2)
         gradients.append(each.backward(drawn, *d, camera=True))
         assert drawn.num_visible > 0 == drawn.num_dropped
-    for found, wanted in zip(*images, strict=True):
+    for found, expected in zip(*images, strict=True):
         assert found.dtype == torch.float32
-        assert torch.allclose(found, wanted, atol=2e-5)
-    found, wanted = gradients
+        assert torch.allclose(found, expected, atol=2e-5)
+    found, expected = gradients
     for name in (*NAMES, "means2d", "means2d_abs"):
         assert getattr(found, name).dtype == torch.float32
-        assert relative(getattr(found, name), getattr(wanted, name)) < 1e-5, name
+        assert relative(getattr(found, name), getattr(expected, name)) < 1e-5, name
     for name in ("rotation", "translation", "focal", "principal"):
-        assert relative(getattr(found.camera, name), getattr(wanted.camera, name)) < 1e-5, name
+        assert relative(getattr(found.camera, name), getattr(expected.camera, name)) < 1e-5, name
 
 
-def test_project_bin_and_blend_make_up_forward(backend: Backend, scene: Scene) -> None:
+def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> None:
     parts = backend.blend(backend.bin(backend.project(scene, CAMERA, OPTIONS)))
     assert torch.equal(parts.color, backend.forward(*scene, CAMERA, OPTIONS).color)
 
 
 @pytest.mark.parametrize("target", [torch.rand(22, 31, 3), torch.full((22, 31, 3), 90).byte()])
-def test_the_loss_is_the_references(backend: Backend, target: torch.Tensor) -> None:
+def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -> None:
     rendered, mask = noise(22, 31, 3).sigmoid(), noise(22, 31) > 1
-    found, wanted = (
+    found, expected = (
         each.l1_ssim(rendered, target, 0.2, mask, 0.5) for each in (backend, REFERENCE)
     )
-    assert found.loss == pytest.approx(wanted.loss, rel=1e-5)
+    assert found.loss == pytest.approx(expected.loss, rel=1e-5)
     assert found.grad.dtype == torch.float32
-    assert relative(found.grad, wanted.grad) < 1e-5
+    assert relative(found.grad, expected.grad) < 1e-5
 
 
 def copies(*tensors: torch.Tensor) -> list[torch.Tensor]:
@@ -76,7 +76,7 @@ def stepped(step: Callable[..., object], tensors: list[torch.Tensor]) -> list[to
     return tensors
 
 
-def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> None:
+def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> None:
     n = len(scene[0])
     means, log_scales, quats, _, sh = scene
     moments = [0.1 * noise(n, 3, seed=3), noise(n, 3, seed=4).square()]
@@ -90,7 +90,7 @@ def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> N
             each.adam_step(m, d_means, a, b, 0.01, 3)
 
         def frame(m: torch.Tensor, q: torch.Tensor, *state: torch.Tensor, each=each) -> None:
-            adam = FrameAdam(*state, mean_rate=0.02, turn_rate=0.01, step=3)
+            adam = FrameAdam(*state, mean_rate=0.02, rotation_rate=0.01, step=3)
             each.frame_adam(m, q, log_scales, d_means, d_quats, adam)
 
         def harmonics(s: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
@@ -105,11 +105,11 @@ def test_optimiser_steps_are_the_references(backend: Backend, scene: Scene) -> N
             + stepped(frame, copies(means, quats, *moments))
             + stepped(harmonics, copies(sh, 0.01 * noise(*sh.shape), 0.01 * noise(*sh.shape) ** 2))
         )
-    for found, wanted in zip(*results, strict=True):
-        assert torch.allclose(found, wanted, rtol=1e-4, atol=2e-6)
+    for found, expected in zip(*results, strict=True):
+        assert torch.allclose(found, expected, rtol=1e-4, atol=2e-6)
 
 
-def test_bad_input_is_refused(backend: Backend, scene: Scene) -> None:
+def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:
     with pytest.raises(ValueError, match="means: expected float32"):
         backend.forward(scene[0].double(), *scene[1:], CAMERA, OPTIONS)
     with pytest.raises(ValueError, match="focal lengths must be positive"):
@@ -123,6 +123,6 @@ def test_bad_input_is_refused(backend: Backend, scene: Scene) -> None:
     assert set(backend.facts()) == {"instruction_set", "compiler"}
 
 
-def test_an_unknown_backend_is_named() -> None:
+def test_an_unknown_backend_is_an_error() -> None:
     with pytest.raises(ValueError, match="no backend 'x'; there are cpu, reference"):
         make_backend("x")

@@ -1,4 +1,4 @@
-"""The twin is the reference: its derivatives hold against finite differences in float64."""
+"""The gradients of the reference implementation equal finite differences in float64."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import torch
 from pipeline.render import RasterOptions, reference
 from tests.render.scenes import camera, random_scene
 
-CAMERA = camera(11, 9, turned=True)
+CAMERA = camera(11, 9, rotated=True)
 
 
 def doubles(count: int = 6, seed: int = 3, size: float = 0.4) -> list[torch.Tensor]:
@@ -16,10 +16,10 @@ def doubles(count: int = 6, seed: int = 3, size: float = 0.4) -> list[torch.Tens
 
 
 @pytest.mark.parametrize("antialias", [False, True])
-def test_projection_has_the_right_gradient(antialias: bool) -> None:
+def test_gradient_of_the_projection(antialias: bool) -> None:
     options = RasterOptions(antialias=antialias)
     scene = doubles()
-    # Off the image, so that the Jacobian's clamp is part of what is checked.
+    # Two Gaussians outside the image: the clamp of the Jacobian is tested, too.
     with torch.no_grad():
         scene[0][0] = torch.tensor([6.0, 0.1, 4.0])
         scene[0][1] = torch.tensor([0.1, -6.0, 4.0])
@@ -34,40 +34,42 @@ def test_projection_has_the_right_gradient(antialias: bool) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_sh_colors_have_the_right_gradient(degree: int) -> None:
+def test_gradient_of_the_sh_colors(degree: int) -> None:
     means, _, _, _, sh = doubles()
     assert torch.autograd.gradcheck(
         lambda m, s: reference.sh_colors(m, s, CAMERA, degree), [means, sh], eps=1e-6, atol=1e-8
     )
 
 
-def test_a_moved_camera_has_the_right_gradient() -> None:
-    """Of the projection and of the colours, which see the camera's centre."""
+def test_gradient_of_the_camera() -> None:
+    """Of the projection and of the colours, which depend on the camera's centre."""
     scene = [t.detach() for t in doubles()]
 
     def outputs(change: torch.Tensor) -> tuple[torch.Tensor, ...]:
-        cam = reference.moved(CAMERA, change)
+        cam = reference.perturbed(CAMERA, change)
         p = reference.project(*scene, cam, RasterOptions())
         return p.means2d, p.conics, p.depths, reference.sh_colors(scene[0], scene[4], cam, 3)
 
     change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
     assert torch.autograd.gradcheck(outputs, [change], eps=1e-6, atol=1e-7)
-    # A turn to the right by a quarter brings what is ahead to the left edge of the world.
+    # A rotation of the camera to the right by 90 degrees moves a point ahead to the left.
     quarter = torch.zeros(10, dtype=torch.float64)
     quarter[1] = -torch.pi / 2
     ahead = torch.tensor([0.0, 0.0, 1.0, 0.0], dtype=torch.float64)
-    turned = reference.moved(camera(11, 9), quarter).world_to_camera
+    turned = reference.perturbed(camera(11, 9), quarter).world_to_camera
     assert torch.allclose(turned @ ahead, torch.tensor([-1.0, 0, 0, 0], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("background", [None, (0.2, 0.4, 0.9)])
-def test_blending_has_the_right_gradient(background: tuple[float, float, float] | None) -> None:
+def test_gradient_of_blending(background: tuple[float, float, float] | None) -> None:
     options = RasterOptions(background=background)
     scene = doubles(size=0.15)
     with torch.no_grad():
         p = reference.project(*scene, CAMERA, options)
         colors = reference.sh_colors(scene[0][p.index], scene[4][p.index], CAMERA, 3)
-        assert reference.blend(p, colors, CAMERA, options).margin.min() > 1e-4  # no cut-off is near
+        assert (
+            reference.blend(p, colors, CAMERA, options).margin.min() > 1e-4
+        )  # no threshold is close
 
     def image(*inputs: torch.Tensor) -> tuple[torch.Tensor, ...]:
         moved = reference.Projection(p.index, *inputs[:4], p.radii, 0)
@@ -80,7 +82,7 @@ def test_blending_has_the_right_gradient(background: tuple[float, float, float] 
 
 
 @pytest.mark.parametrize("masked", [False, True])
-def test_loss_has_the_right_gradient(masked: bool) -> None:
+def test_gradient_of_the_loss(masked: bool) -> None:
     gen = torch.Generator().manual_seed(0)
     rendered = torch.rand(7, 6, 3, generator=gen, dtype=torch.float64).requires_grad_()
     target = torch.rand(7, 6, 3, generator=gen, dtype=torch.float64)
@@ -91,7 +93,7 @@ def test_loss_has_the_right_gradient(masked: bool) -> None:
 
 
 def test_sh_basis_is_orthonormal() -> None:
-    """A wrong constant or sign in the basis shows as a broken inner product on the sphere."""
+    """The inner products on the sphere reveal wrong constants and signs."""
     nodes, weights = (torch.tensor(v) for v in __import__("numpy").polynomial.legendre.leggauss(8))
     phi = torch.arange(16, dtype=torch.float64) * (2 * torch.pi / 16)
     z, angle = torch.meshgrid(nodes, phi, indexing="ij")

@@ -1,4 +1,4 @@
-"""Features: where they lie, which pixels they come from, and what the cache spares."""
+"""Features: positions, masks, image formats and the cache."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def saved(folder: Path, file: str, pixels: np.ndarray, **facts):
 
 
 def masked(mask: Path) -> dict[str, str]:
-    """A photograph's facts about its mask."""
+    """Fields of ``Photo`` for a mask."""
     return {"mask": str(mask), "mask_digest": digest_of(mask)}
 
 
-def test_the_strongest_are_kept_largest_first(tmp_path, pixels):
+def test_the_strongest_keypoints_are_selected_and_sorted_by_scale(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
     found, report = extract(tmp_path, [photo])
     keypoints = found["a.png"]
@@ -56,12 +56,12 @@ def test_the_strongest_are_kept_largest_first(tmp_path, pixels):
     assert (keypoints.rgb == pixels[at[:, 1], at[:, 0], ::-1]).all()
 
 
-def test_a_blob_lies_where_it_is_drawn(tmp_path):
+def test_a_blob_is_detected_at_its_centre(tmp_path):
     # A Gaussian blob about (100.5, 80.5) in COLMAP's pixels: the centre of pixel (100, 80).
     y, x = np.mgrid[0:200, 0:240]
     blob = 200 * np.exp(-((x - 100) ** 2 + (y - 80) ** 2) / (2 * 6.0**2))
     photo = saved(tmp_path, "a.png", blob.astype(np.uint8))
-    for long_side in (1600, 120):  # as it is, and reduced to half
+    for long_side in (1600, 120):  # at full and at half resolution
         config = schema.Features(max_long_side_px=long_side)
         keypoints = extract(tmp_path, [photo], config)[0]["a.png"]
         nearest = np.linalg.norm(keypoints.xy - [100.5, 80.5], axis=1).min()
@@ -69,7 +69,7 @@ def test_a_blob_lies_where_it_is_drawn(tmp_path):
         assert keypoints.scale[0] == pytest.approx(6.0, rel=0.2)
 
 
-def test_colmaps_extractor_agrees_on_places_and_descriptors(tmp_path, pixels):
+def test_colmaps_extractor_agrees_on_positions_and_descriptors(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
     config = schema.Features(max_features=100_000)
     ours = extract(tmp_path, [photo], config)[0]["a.png"]
@@ -79,7 +79,7 @@ def test_colmaps_extractor_agrees_on_places_and_descriptors(tmp_path, pixels):
     close = distance.min(1) < 1.0
     assert close.mean() > 0.5
     offset = (ours.xy - theirs.xy[distance.argmin(1)])[close]
-    # Half a pixel of disagreement in convention would show here.
+    # Different conventions for pixel centres would differ by half a pixel.
     assert np.abs(np.median(offset, axis=0)).max() < 0.05
     a = ours.descriptors[close].astype(float)
     b = theirs.descriptors[distance.argmin(1)][close].astype(float)
@@ -87,14 +87,14 @@ def test_colmaps_extractor_agrees_on_places_and_descriptors(tmp_path, pixels):
     assert np.median(cosine) > 0.9
 
 
-def test_masked_pixels_have_no_features_and_lose_none_elsewhere(tmp_path, pixels):
+def test_masked_pixels_have_no_features(tmp_path, pixels):
     mask = np.zeros(pixels.shape[:2], np.uint8)
     mask[:, :150] = 1  # non-zero is enough
     cv2.imwrite(str(tmp_path / "mask.png"), mask)
     photo = saved(tmp_path, "a.png", pixels, **masked(tmp_path / "mask.png"))
     keypoints = extract(tmp_path, [photo])[0]["a.png"]
     assert (keypoints.xy[:, 0] <= 151).all()
-    # The strongest are chosen among the allowed ones: there are still as many as were asked for.
+    # The strongest are selected among the unmasked ones.
     assert len(keypoints) == CONFIG.max_features
 
 
@@ -119,7 +119,7 @@ def test_sixteen_bits_and_grey_and_eight_bits_agree(tmp_path, pixels):
         np.testing.assert_array_equal(found[name].xy, found["grey8.png"].xy)
 
 
-def test_the_stored_grid_counts_whatever_the_orientation(tmp_path, pixels):
+def test_exif_orientation_is_not_applied(tmp_path, pixels):
     exif = Image.Exif()
     exif[274] = 6
     picture = Image.fromarray(pixels[..., ::-1])
@@ -130,7 +130,7 @@ def test_the_stored_grid_counts_whatever_the_orientation(tmp_path, pixels):
     np.testing.assert_array_equal(found["plain.jpg"].xy, found["turned.jpg"].xy)
 
 
-def test_one_more_photograph_extracts_one(tmp_path):
+def test_adding_a_photograph_extracts_one(tmp_path):
     photos, _ = corner.write_scene(tmp_path / "photos", 3)
     _, first = extract(tmp_path, photos[:2])
     _, second = extract(tmp_path, photos)
@@ -144,7 +144,7 @@ def test_copies_of_a_photograph_are_extracted_once(tmp_path, pixels):
     assert len(list((tmp_path / "cache").iterdir())) == 1
 
 
-def test_what_changes_the_keypoints_misses_the_cache(tmp_path, pixels):
+def test_changed_photographs_masks_and_options_are_extracted_again(tmp_path, pixels):
     mask = tmp_path / "mask.png"
     cv2.imwrite(str(mask), np.ones(pixels.shape[:2], np.uint8))
     photo = saved(tmp_path, "a.png", pixels, **masked(mask))
@@ -158,7 +158,7 @@ def test_what_changes_the_keypoints_misses_the_cache(tmp_path, pixels):
 
 @pytest.mark.parametrize("backend", ["opencv", "colmap"])
 @pytest.mark.parametrize("changed", ["a.png", "mask.png"])
-def test_a_file_changed_since_inspect_is_named_and_nothing_is_cached(
+def test_a_file_changed_since_inspect_is_an_error_and_nothing_is_cached(
     tmp_path, pixels, changed, backend
 ):
     cv2.imwrite(str(tmp_path / "mask.png"), np.ones(pixels.shape[:2], np.uint8))
@@ -169,14 +169,14 @@ def test_a_file_changed_since_inspect_is_named_and_nothing_is_cached(
     assert not list((tmp_path / "cache").iterdir())
 
 
-def test_the_cache_keeps_two_settings_and_does_not_grow_for_ever(tmp_path, pixels):
+def test_the_cache_distinguishes_options_and_is_pruned(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
-    for limit, cached, kept in ((400, 0, 1), (300, 0, 2), (400, 1, 2), (200, 0, 1)):
+    for limit, cached, stored in ((400, 0, 1), (300, 0, 2), (400, 1, 2), (200, 0, 1)):
         _, report = extract(tmp_path, [photo], schema.Features(max_features=limit))
-        assert (report.num_cached, len(list((tmp_path / "cache").iterdir()))) == (cached, kept)
+        assert (report.num_cached, len(list((tmp_path / "cache").iterdir()))) == (cached, stored)
 
 
-def test_bytes_do_not_depend_on_threads_or_cache(tmp_path):
+def test_files_do_not_depend_on_threads_or_cache(tmp_path):
     photos, _ = corner.write_scene(tmp_path / "photos", 3)
     for threads in (1, 2):
         extract(tmp_path / str(threads), photos, threads=threads)
@@ -185,7 +185,7 @@ def test_bytes_do_not_depend_on_threads_or_cache(tmp_path):
     assert first == second and len(first) == 3
 
 
-def test_names_that_differ_only_by_folders_have_files_of_their_own(tmp_path, pixels):
+def test_similar_names_in_different_folders_have_distinct_files(tmp_path, pixels):
     photos = [
         saved(tmp_path / "x" / "y", "a.png", pixels, name="x/y/a.png"),
         saved(tmp_path / "z", "a.png", pixels[:, ::-1], name="x_y_a.png"),
@@ -195,18 +195,18 @@ def test_names_that_differ_only_by_folders_have_files_of_their_own(tmp_path, pix
     assert len(list((tmp_path / "features").iterdir())) == 3
 
 
-def test_an_empty_wall_is_a_warning_with_its_name(tmp_path):
+def test_a_photograph_without_features_is_a_warning(tmp_path):
     photo = saved(tmp_path, "wall.png", np.full((200, 300), 128, np.uint8))
     found, report = extract(tmp_path, [photo])
     assert len(found["wall.png"]) == 0
     assert report.warnings == ["wall.png: only 0 features"]
 
 
-def test_unreadable_photographs_are_named(tmp_path, pixels):
+def test_unreadable_photographs_are_an_error(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
     (tmp_path / "a.png").write_text("not a picture")
     photo = photo.model_copy(update={"digest": digest_of(tmp_path / "a.png")})
-    with pytest.raises(UserError, match=r"a\.png: not a picture that can be read"):
+    with pytest.raises(UserError, match=r"a\.png: not a readable image"):
         extract(tmp_path, [photo])
     (tmp_path / "a.png").unlink()
     with pytest.raises(UserError, match=r"a\.png: cannot be read"):

@@ -1,1 +1,1 @@
-"""The kernels in C++ and their Python interface."""
+"""C++ kernels and their Python interface."""

@@ -1,4 +1,4 @@
-"""The rasterizer's operators on the C++ kernels. float32, contiguous, CPU."""
+"""The backend of C++ kernels. float32, contiguous tensors on the CPU."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from pipeline.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class Projected:
-    """The kernels' values after ``project``; layouts in csrc/types.h."""
+    """Result of ``project``; layouts are in csrc/types.h."""
 
     inputs: Parameters
     view: torch.Tensor  # (17,) float64
@@ -45,7 +45,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class Binned:
-    """And after ``bin``."""
+    """Result of ``bin``."""
 
     projected: Projected
     entries: torch.Tensor  # (M, 3) int32
@@ -55,7 +55,7 @@ class Binned:
 
 @dataclass(frozen=True)
 class State:
-    """What ``backward`` reads of a drawn view."""
+    """State of a rendered view for ``backward``."""
 
     inputs: Parameters
     view: torch.Tensor
@@ -87,7 +87,7 @@ def _pack_view(camera: RasterCamera, near: float) -> torch.Tensor:
 
 
 class CpuBackend(Backend[Projected, Binned]):
-    """One thread a tile or a block of Gaussians; vectors of what the processor has."""
+    """Multithreaded kernels for the vector instructions of the processor."""
 
     def facts(self) -> Mapping[str, str]:
         built = build.load()
@@ -110,9 +110,9 @@ class CpuBackend(Backend[Projected, Binned]):
         )
         if not fits:
             raise UserError(
-                f"{p.num_visible} Gaussians cover more than 2^27 image tiles of 16 x 16 pixels in "
-                "one view",
-                fix="draw smaller images, or look for Gaussians grown far too large",
+                f"{p.num_visible} Gaussians overlap more than 2^27 tiles of 16 x 16 pixels in one "
+                "view",
+                fix="render smaller images, or remove Gaussians that are far too large",
             )
         return Binned(projected, entries, tile_begin, slots)
 
@@ -127,14 +127,14 @@ class CpuBackend(Backend[Projected, Binned]):
             block_end, binned.slots,
         )  # fmt: skip
 
-        def draw_depths() -> tuple[torch.Tensor, torch.Tensor]:
+        def render_depths() -> tuple[torch.Tensor, torch.Tensor]:
             depth, median = ops.blend_depth(
                 p.records, entries, tile_begin, p.view, *p.size, p.threads
             )
             return depth, median
 
         return Forward(
-            color, alpha, p.radii, p.num_visible, p.num_dropped, entries.shape[0], draw_depths,
+            color, alpha, p.radii, p.num_visible, p.num_dropped, entries.shape[0], render_depths,
             state,
         )  # fmt: skip
 
@@ -161,8 +161,8 @@ class CpuBackend(Backend[Projected, Binned]):
         d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_camera = (
             ops.project_backward(
                 *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias,
-                s.records, fwd.radii, s.slots, slot_gradients, s.options.black_stays, means2d_abs,
-                camera, *_moments(sh_adam, s.inputs[4]), threads,
+                s.records, fwd.radii, s.slots, slot_gradients, s.options.clamp_color_gradient,
+                means2d_abs, camera, *_moments(sh_adam, s.inputs[4]), threads,
             )
         )  # fmt: skip
         parts = d_camera.split([3, 3, 2, 2]) if camera else None
@@ -177,11 +177,11 @@ class CpuBackend(Backend[Projected, Binned]):
         target: torch.Tensor,
         ssim_weight: float,
         mask: torch.Tensor | None = None,
-        square_weight: float = 0.0,
+        l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
         images = checks.images(rendered, target, mask)
-        return LossResult(*_ops().l1_ssim(*images, ssim_weight, square_weight, _threads(threads)))
+        return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
 
     def adam_step(
         self,
@@ -214,11 +214,12 @@ class CpuBackend(Backend[Projected, Binned]):
         threads: int = 0,
     ) -> None:
         checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
-        rates = torch.tensor([adam.mean_rate, adam.turn_rate], dtype=torch.float64)
+        rates = torch.tensor([adam.mean_rate, adam.rotation_rate], dtype=torch.float64)
         _ops().frame_adam(
             means.detach(), quats.detach(), log_scales.detach(), d_means.detach(),
-            d_quats.detach(), adam.mean_avg, adam.mean_avg_sq, adam.turn_avg, adam.turn_avg_sq,
-            rates, adam.step, adam.beta1, adam.beta2, adam.eps, _threads(threads),
+            d_quats.detach(), adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg,
+            adam.rotation_avg_sq, rates, adam.step, adam.beta1, adam.beta2, adam.eps,
+            _threads(threads),
         )  # fmt: skip
 
 
@@ -226,5 +227,5 @@ def _moments(adam: ShAdam | None, sh: torch.Tensor) -> tuple[torch.Tensor | None
     if adam is None:
         return None, None, None, None
     checks.check_sh_adam(adam, sh)
-    values = [adam.rate0, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
+    values = [adam.dc_rate, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
     return adam.exp_avg, adam.exp_avg_sq, adam.last, torch.tensor(values, dtype=torch.float64)

@@ -1,7 +1,7 @@
-"""Compiles the kernels: ``python -m pipeline.render.cpu.build``, or by itself at first use.
+"""Compile the kernels: ``python -m pipeline.render.cpu.build``, or automatically at first use.
 
-``--target x86-64-v2 x86-64-v3`` compiles them for other processors than this one, beside each
-other. Importing this module imports no torch.
+``--target x86-64-v2 x86-64-v3`` compiles them for other processors. Importing this module does not
+import torch.
 """
 
 from __future__ import annotations
@@ -19,9 +19,8 @@ from pipeline.runtime.native import Built, compiler
 __all__ = ["build", "compiler", "flags", "library", "load", "source_files", "source_hash"]
 
 SOURCES = Path(__file__).parent / "csrc"
-# No -ffast-math: it folds the rounding inside exp2 away. -ffp-contract=fast is GCC's default, said
-# aloud: a * b + c is one rounding everywhere. The last flag keeps clang from remarking on warnings
-# that only GCC has.
+# No -ffast-math: it removes the rounding step of exp2. -ffp-contract=fast is GCC's default; with it
+# clang rounds a * b + c once, too. The last flag silences clang about options of GCC.
 FLAGS = [
     *("-std=c++17", "-O3", "-fno-math-errno", "-fno-trapping-math"),
     *("-ffp-contract=fast", "-pthread", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-maybe-uninitialized"),
@@ -41,13 +40,13 @@ def _library(
         flags=FLAGS,
         compile_only=compile_only,
         link_only=link_only,
-        # Without a local version (+cpu, +cu128): those builds share libtorch_cpu's interface.
+        # Without the local version (+cpu, +cu128): these builds have the same libtorch_cpu ABI.
         facts={"torch": importlib.metadata.version("torch").partition("+")[0]},
     )
 
 
 def flags(target: str | None = None) -> list[str]:
-    """The compiler's flags for a target; by default the one in use here."""
+    """The compiler's flags for a target, by default the best one for this machine."""
     chosen = targets.usable()[0] if target is None else targets.named(target)
     return [*chosen.flags, *FLAGS]
 
@@ -58,7 +57,7 @@ def source_files() -> list[Path]:
 
 
 def source_hash() -> str:
-    """Hex digest of csrc: what a result depends on. Cheap, and needs neither torch nor compiler."""
+    """Hex digest of the sources in csrc. Needs neither torch nor a compiler."""
     return _library().source_hash()
 
 
@@ -70,16 +69,20 @@ def _torch_root() -> Path:
 
 
 def library() -> native.NativeLibrary:
-    """The kernels as a library of torch's operators. Raises UserError where torch is missing."""
+    """The kernels as a library of torch operators.
+
+    Raises:
+        UserError: torch is not installed.
+    """
     torch_root = _torch_root()
     link = [f"-L{torch_root / 'lib'}", "-ltorch_cpu", "-ltorch", "-lc10"]
-    if sys.platform == "darwin":  # Linux finds torch's libraries by the names of the loaded ones
+    if sys.platform == "darwin":  # Linux uses the libraries that torch has loaded.
         link.append(f"-Wl,-rpath,{torch_root / 'lib'}")
     return _library(("-isystem", str(torch_root / "include")), tuple(link))
 
 
 def build() -> Built:
-    """The library for this machine, compiled if it is not there yet.
+    """The library for this machine, compiled if necessary.
 
     Raises:
         UserError: see ``NativeLibrary.build``.
@@ -88,7 +91,7 @@ def build() -> Built:
 
 
 def load() -> Built:
-    """Makes torch.ops.splatmake available in this process, building it where it is missing."""
+    """Load torch.ops.splatmake into this process; compiles the library if necessary."""
     global _loaded
     if _loaded is not None:
         return _loaded

@@ -11,7 +11,7 @@ import torch
 from numpy.typing import NDArray
 
 from pipeline.render import Backend, RasterOptions, make_backend
-from pipeline.render.views import raster_camera, within
+from pipeline.render.views import limit_sh_degree, raster_camera
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.poses import PoseRefinement
@@ -42,7 +42,7 @@ def fit_pose(
         backend: None: the default.
     """
     backend = backend or make_backend()
-    options = within(options, gaussians)
+    options = limit_sh_degree(options, gaussians)
     poses = PoseRefinement.of([view], gaussians, extent, limit=math.inf)
     camera = raster_camera(view)
     target = torch.from_numpy(np.ascontiguousarray(photo))

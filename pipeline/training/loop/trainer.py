@@ -175,7 +175,7 @@ class Trainer:
             background=background,
             antialias=self.config.antialias,
             near=self.scene.near,
-            black_stays=self.experiments.clamp_color_gradient,
+            clamp_color_gradient=self.experiments.clamp_color_gradient,
             gradients_per_pixel=self.experiments.gradients_per_pixel,
             threads=self.threads,
         )

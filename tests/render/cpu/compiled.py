@@ -26,7 +26,7 @@ def compiled(
 ) -> Path:
     """A folder with ``driver`` and the object file of each kernel."""
     sources = [p for p in build.source_files() if p.suffix == ".cpp" and p.stem != "binding"]
-    # Last: of a function that several files have, the linker takes the first, the kernels' own.
+    # The driver is last: of duplicate functions the linker takes the first, which is the kernels'.
     sources.append(DRIVER)
     command = [*compiler, *flags, "-I", str(build.SOURCES)]
 
@@ -36,7 +36,7 @@ def compiled(
         with ThreadPoolExecutor(2) as pool:
             jobs = []
             for source, target in zip(sources, objects, strict=True):
-                # The driver's own speed is of no interest.
+                # The driver need not be optimised.
                 more = ["-O0"] if source == DRIVER else []
                 step = [*command, *more, "-c", str(source), "-o", str(target)]
                 jobs.append(pool.submit(run, step))

@@ -31,7 +31,7 @@ class Instruction:
 
     @property
     def target(self) -> int | None:
-        """Where a jump leads inside the file."""
+        """Target address of a jump inside the file."""
         if not (_JUMP_X86.fullmatch(self.name) or _JUMP_ARM.fullmatch(self.name)):
             return None
         place = self.operands.split(",")[-1].strip()
@@ -39,7 +39,7 @@ class Instruction:
 
     @property
     def arithmetic(self) -> str | None:
-        """``"packed"``, ``"scalar"``, or None for all that is no floating-point arithmetic."""
+        """``"packed"``, ``"scalar"``, or None if it is not floating-point arithmetic."""
         if found := _X86_ARITHMETIC.fullmatch(self.name):
             return "packed" if found[1] == "p" else "scalar"
         if _ARM_ARITHMETIC.fullmatch(self.name) or _ARM_COMPARISON.fullmatch(self.name):
@@ -48,9 +48,9 @@ class Instruction:
 
     @property
     def moves_a_lane(self) -> bool:
-        """One lane of a vector taken out, put in, or stored alone."""
+        """Whether it extracts, inserts or stores a single lane of a vector."""
         if self.name in ("mov", "ins", "umov", "smov", "st1", "ld1"):  # AArch64
-            # Between two vectors it is a shuffle.
+            # A move between two vectors is a shuffle.
             return len(re.findall(r"v\d+\.[sd]\}?\[\d\]", self.operands)) == 1
         stored = _X86_STORE.fullmatch(self.name) and self.operands.endswith(")")
         return bool(stored or _X86_LANE.fullmatch(self.name))
@@ -89,7 +89,7 @@ def _functions(text: str) -> Iterator[tuple[str, list[Instruction]]]:
 
 
 def _loops(name: str, body: list[Instruction]) -> Iterator[Loop]:
-    """Ranges that a jump backwards closes and that hold no other such range."""
+    """Ranges that end with a backward jump and contain no other such range."""
     place = {instruction.address: i for i, instruction in enumerate(body)}
     ranges = {
         (place[i.target], last)

@@ -1,8 +1,9 @@
 // Runs every kernel without torch, for builds under sanitizers and for other instruction sets.
 //
-//   driver               ordinary and wild scenes; prints what is wrong and exits with 1, or
-//   "clean" driver OUTPUT        writes an ordinary scene's image and gradients driver INPUT OUTPUT
-//   reads a scene and a view, writes what the kernels make of them
+//   driver               runs ordinary and arbitrary scenes; prints errors and exits with 1, or
+//                        prints "clean"
+//   driver OUTPUT        writes the image and gradients of an ordinary scene
+//   driver INPUT OUTPUT  reads a scene and a view, writes the kernels' results
 
 #include <cmath>
 #include <cstdio>
@@ -23,7 +24,7 @@ using namespace splat;
 
 namespace {
 
-// An array on the heap of exactly its size, so that the sanitizer sees every step beyond it.
+// A heap array of exactly its size, so that the sanitizer detects accesses beyond it.
 template <class T>
 struct Array {
     size_t size;
@@ -74,7 +75,7 @@ void expect_finite(Array<T>& values, const char* what) {
         }
 }
 
-// All kernels over one view; the image and the gradients go to `out` if there is one.
+// Runs all kernels over one view; writes the image and the gradients to `out`, if any.
 void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, std::FILE* out) {
     const View view = {width,
                        height,
@@ -145,8 +146,8 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     const double rate = 1e-2;
     adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
-    // From the origin, and from no direction where a quaternion has none: a NaN that was given
-    // stays one, what is not drawn is not moved.
+    // Steps from zero; invalid quaternions and Gaussians that are not drawn are not updated, so NaN
+    // inputs stay NaN.
     Array<float> moved(3 * n), turned(4 * n),
         frame[4] = {Array<float>(3 * n), Array<float>(3 * n), Array<float>(3 * n),
                     Array<float>(3 * n)};
@@ -169,8 +170,8 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     }
 }
 
-// What test_targets.py writes: these, then the Gaussians' fields, then dL/d of color, alpha and
-// depth, then the loss's target.
+// The file that test_targets.py writes: these, then the Gaussians' fields, the gradients of color,
+// alpha and depth, and the target of the loss.
 struct Header {
     int64_t count, degree, width, height, antialias, per_pixel, threads;
     double fx, fy, cx, cy, rotation[9], translation[3], near, background[3];
@@ -183,7 +184,7 @@ void read(std::FILE* in, T* to, size_t count) {
     std::exit(2);
 }
 
-// One view of the scene in a file; threads and results are as the file's reader expects them.
+// Renders the view of a scene file.
 int run_file(const char* input, const char* output) {
     std::FILE *in = std::fopen(input, "rb"), *out = std::fopen(output, "wb");
     if (!in || !out) return 2;
@@ -262,14 +263,14 @@ int main(int argc, char** argv) {
         return 0;
     }
     constexpr float infinity = std::numeric_limits<float>::infinity();
-    const float wild[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
+    const float extreme[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
                           1e-12f,        1e12f,    88,        -88, 27.6f,  -27.6f, 12,     100};
     const int64_t sizes[][2] = {{1, 1}, {2, 3}, {17, 31}, {16, 16}, {53, 7}, {5, 90}};
     for (int round = 0; round < 300; round++) {
         Scene scene = ordinary(random, random() % 40, int(random() % 4));
         for (int hit = int(random() % 16); hit > 0; hit--) {
             Array<float>& field = *scene.fields[random() % 5];
-            const float value = wild[random() % 16];
+            const float value = extreme[random() % 16];
             if (field.size) field[random() % field.size] = value;
         }
         const int64_t* size = sizes[random() % 6];

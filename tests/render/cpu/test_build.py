@@ -1,4 +1,4 @@
-"""Building: the cache, what is said where it cannot be, sanitizers, other instruction sets."""
+"""Building the kernels: cache, error messages, sanitizers, other instruction sets."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ CHECKS_BY_CALLS = {
 }
 
 
-def test_source_hash_needs_no_torch_and_follows_the_sources(
+def test_source_hash_needs_no_torch_and_depends_on_the_sources(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     code = (
@@ -42,7 +42,9 @@ def test_source_hash_needs_no_torch_and_follows_the_sources(
     assert same == done.stdout.strip() != build.source_hash()
 
 
-def test_no_compiler_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_missing_compiler_is_a_user_error(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setenv("CXX", "no-such-compiler")
     monkeypatch.setenv("SPLATMAKE_CACHE", str(tmp_path))
     with pytest.raises(UserError, match=r"no C\+\+ compiler found \(no-such-compiler\)") as error:
@@ -51,7 +53,7 @@ def test_no_compiler_is_one_clear_line(tmp_path: Path, monkeypatch: pytest.Monke
     assert not list(tmp_path.iterdir())
 
 
-def test_a_failing_compiler_leaves_nothing_behind(
+def test_a_failing_compiler_leaves_no_files(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     compiler = tmp_path / "broken"
@@ -67,7 +69,7 @@ def test_a_failing_compiler_leaves_nothing_behind(
     assert not list(cache.iterdir())
 
 
-# The real compiler on empty sources; links once two builds have come to that.
+# The real compiler on empty sources; it links once two builds have reached linking.
 COMPILER = """#!/bin/sh
 [ "$1" = --version ] && exec NAME --version
 for word; do
@@ -86,7 +88,7 @@ exec NAME "$@"
 """
 
 
-def test_two_builds_at_once_leave_one_whole_library(tmp_path: Path) -> None:
+def test_concurrent_builds_leave_one_complete_library(tmp_path: Path) -> None:
     tools, cache = tmp_path / "tools", tmp_path / "cache"
     tools.mkdir()
     (tools / "empty.cpp").touch()
@@ -112,10 +114,10 @@ def test_two_builds_at_once_leave_one_whole_library(tmp_path: Path) -> None:
 @pytest.mark.slow
 @pytest.mark.parametrize("kinds", ["address,undefined", "thread"])
 def test_sanitizers_find_nothing(tmp_path_factory: pytest.TempPathFactory, kinds: str) -> None:
-    """Every kernel over 300 wild scenes, on one to three threads."""
+    """Every kernel on 300 scenes with arbitrary values, on one to three threads."""
     flags = [*targets.usable()[0].flags, "-std=c++17", "-O1", "-g1", "-pthread", "-Wno-psabi"]
     flags += [f"-fsanitize={kinds}", "-fno-sanitize-recover=all"]
-    if "address" in kinds:  # checks by calls: inline ones take most of a minute to compile
+    if "address" in kinds:  # checks by calls: inline checks compile slowly
         flags += CHECKS_BY_CALLS["clang" if "clang" in build.compiler()[0] else "gcc"]
     driver = compiled(tmp_path_factory, build.compiler(), flags) / "driver"
     done = subprocess.run([driver], capture_output=True, text=True, timeout=600)
@@ -126,10 +128,10 @@ def test_sanitizers_find_nothing(tmp_path_factory: pytest.TempPathFactory, kinds
 
 
 @pytest.mark.slow
-def test_other_instruction_sets_give_the_same_answers(
+def test_other_instruction_sets_give_equal_results(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory
 ) -> None:
-    """The same scene for every target that this machine can run: equal to rounding."""
+    """The same scene for every target that this machine can run: equal up to rounding."""
     names = [target.name for target in targets.of_this_architecture() if not target.missing]
     if len(names) < 2:
         unsupported("one target alone runs on this processor")

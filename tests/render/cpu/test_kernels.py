@@ -1,4 +1,4 @@
-"""The C++ kernels against the float64 twin, and what they promise by themselves."""
+"""The C++ kernels compared with the float64 reference, and properties of their results."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ CASES = [
 ]
 
 
-def twin_image(scene: Scene, cam: render.RasterCamera, options: RasterOptions):
+def reference_image(scene: Scene, cam: render.RasterCamera, options: RasterOptions):
     inputs = [t.double().requires_grad_() for t in scene]
     projection = reference.project(*inputs, cam, options)
     colors = reference.sh_colors(
@@ -34,13 +34,13 @@ def twin_image(scene: Scene, cam: render.RasterCamera, options: RasterOptions):
 
 
 @pytest.mark.parametrize(("seed", "count", "size", "options"), CASES)
-def test_kernels_match_the_twin(
+def test_kernels_equal_the_reference(
     seed: int, count: int, size: tuple[int, int], options: RasterOptions
 ) -> None:
-    """Colour to 2e-6, gradients to 1e-5, away from pixels where a cut-off hangs on a rounding."""
-    scene, cam = random_scene(seed, count), camera(*size, turned=seed % 2 == 1)
+    """Colours to 2e-6, gradients to 1e-5, except for pixels close to a threshold of the method."""
+    scene, cam = random_scene(seed, count), camera(*size, rotated=seed % 2 == 1)
     fwd = render.forward(*scene, cam, options)
-    inputs, projection, image = twin_image(scene, cam, options)
+    inputs, projection, image = reference_image(scene, cam, options)
     sure = image.margin > 1e-5
     assert sure.double().mean() > 0.99
     assert fwd.num_visible == len(projection.index) > 0
@@ -61,53 +61,53 @@ def test_kernels_match_the_twin(
         total = (image.color * d_color).sum()
         for part, weight in zip((image.alpha, image.depth), extra, strict=True):
             total = total + (0 if weight is None else (part * weight).sum())
-        wanted = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
-        for name, want in zip(NAMES, wanted, strict=False):
-            assert relative(getattr(found, name), want) <= 1e-5, name
-        assert relative(found.means2d[projection.index], wanted[5]) <= 1e-5
+        expected = torch.autograd.grad(total, [*inputs, projection.means2d], retain_graph=True)
+        for name, value in zip(NAMES, expected, strict=False):
+            assert relative(getattr(found, name), value) <= 1e-5, name
+        assert relative(found.means2d[projection.index], expected[5]) <= 1e-5
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_what_is_out_of_view_is_told_sixteen_at_a_time(seed: int) -> None:
-    """Clusters of 16 all about the camera, from grains to giants that just reach into the image:
-    what the quick look leaves out is what the twin does not see, and nothing else."""
+def test_culling_of_groups_of_sixteen(seed: int) -> None:
+    """Clusters of 16 Gaussians of all sizes around the camera, some of which just reach into the
+    image: the culling of groups agrees with the reference."""
     gen = torch.Generator().manual_seed(seed)
     clusters = 400
     scene = random_scene(seed, 16 * clusters)
-    place = 6 * torch.randn(clusters, 3, generator=gen)
+    centre = 6 * torch.randn(clusters, 3, generator=gen)
     size = 10 ** (3 * torch.rand(clusters, generator=gen) - 2.5)
 
     def each(values: torch.Tensor) -> torch.Tensor:
         return values.repeat_interleave(16, 0)
 
     shift = torch.randn(16 * clusters, 3, generator=gen) * each(size)[:, None]
-    scene[0][:] = each(place) + 0.3 * shift
+    scene[0][:] = each(centre) + 0.3 * shift
     scene[1][:] += each(size).log()[:, None] - math.log(0.07)
-    scene[2][:: 16 * 37] = 0.0  # no rotation: dropped, and counted, wherever it is
-    cam, options = camera(40, 30, turned=seed % 2 == 1), RasterOptions()
+    scene[2][:: 16 * 37] = 0.0  # invalid rotations are dropped and counted anywhere
+    cam, options = camera(40, 30, rotated=seed % 2 == 1), RasterOptions()
     fwd = render.forward(*scene, cam, options)
-    wanted = reference.project(*(t.double() for t in scene), cam, options)
+    expected = reference.project(*(t.double() for t in scene), cam, options)
     seen = torch.nonzero(fwd.radii)[:, 0]
-    assert torch.equal(seen, wanted.index)
-    assert fwd.num_dropped == wanted.num_dropped >= 10
+    assert torch.equal(seen, expected.index)
+    assert fwd.num_dropped == expected.num_dropped >= 10
     whole = (fwd.radii.view(clusters, 16) > 0).sum(1)
     assert (whole == 0).sum() > 100 and ((whole > 0) & (whole < 16)).sum() > 20
 
 
 @pytest.mark.parametrize(("seed", "count", "size", "options"), CASES[:6])
-def test_the_cameras_gradients_match_the_twin(
+def test_camera_gradients_equal_the_reference(
     seed: int, count: int, size: tuple[int, int], options: RasterOptions
 ) -> None:
-    """Ten sums over all Gaussians, in which much cancels: 1e-5 of what they are sums of."""
-    scene, cam = random_scene(seed, count, size=0.15), camera(*size, turned=seed % 2 == 1)
+    """Sums over all Gaussians, in spite of cancellation, to a relative error of 1e-5."""
+    scene, cam = random_scene(seed, count, size=0.15), camera(*size, rotated=seed % 2 == 1)
     change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
-    _, _, image = twin_image(scene, reference.moved(cam, change), options)
+    _, _, image = reference_image(scene, reference.perturbed(cam, change), options)
     gen = torch.Generator().manual_seed(seed + 100)
     sure = image.margin > 1e-5
     d_color = torch.randn(*image.color.shape, generator=gen) * sure[..., None]
     d_depth = torch.randn(*image.depth.shape, generator=gen) * sure
     total = (image.color * d_color).sum() + (image.depth * d_depth).sum()
-    (wanted,) = torch.autograd.grad(total, change)
+    (expected,) = torch.autograd.grad(total, change)
     fwd = render.forward(*scene, cam, options)
     found = [
         render.backward(
@@ -122,23 +122,23 @@ def test_the_cameras_gradients_match_the_twin(
     parts = [torch.cat([f.rotation, f.translation, f.focal, f.principal]) for f in found]
     assert torch.equal(*parts)
     for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
-        assert relative(parts[0][part], wanted[part]) <= 1e-5, part
+        assert relative(parts[0][part], expected[part]) <= 1e-5, part
     assert render.backward(fwd, d_color).camera is None
 
 
-def test_absolute_gradients_are_the_sum_of_each_pixels() -> None:
-    """AbsGS: |dL/d(mean2d)| pixel by pixel, which no sum of signed gradients gives."""
+def test_absolute_gradients_are_summed_over_pixels() -> None:
+    """AbsGS: sum of |dL/d(mean2d)| of each pixel."""
     scene, cam, options = random_scene(7, 30, size=0.2), camera(19, 18), RasterOptions()
     gen = torch.Generator().manual_seed(1)
     d_color = torch.randn(18, 19, 3, generator=gen)
     found = render.backward(render.forward(*scene, cam, options), d_color)
-    _, projection, image = twin_image(scene, cam, options)
+    _, projection, image = reference_image(scene, cam, options)
     per_pixel = (image.color * d_color).sum(-1).reshape(-1)
-    wanted = torch.zeros(len(projection.index), 2, dtype=torch.float64)
+    expected = torch.zeros(len(projection.index), 2, dtype=torch.float64)
     for value in per_pixel:
-        wanted += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
+        expected += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
     assert found.means2d_abs is not None
-    assert relative(found.means2d_abs[projection.index], wanted) <= 1e-5
+    assert relative(found.means2d_abs[projection.index], expected) <= 1e-5
     assert (
         render.backward(
             render.forward(*scene, cam, options), d_color, means2d_abs=False
@@ -156,8 +156,8 @@ def single(mean: tuple[float, float, float], sigma: float, opacity: float = 0.9)
     )  # fmt: skip
 
 
-def test_pixel_centres_lie_at_half_integers() -> None:
-    """A Gaussian projected to (20.5, 10.5) peaks in column 20, row 10, alike on all sides."""
+def test_pixel_centres_are_at_half_integers() -> None:
+    """A Gaussian projected to (20.5, 10.5) peaks in column 20, row 10, and is symmetric."""
     cam = render.RasterCamera(41, 33, 50.0, 50.0, 20.5, 10.5, torch.eye(4))
     scene = single((0.0, 0.0, 2.0), 0.08)
     alpha = render.forward(*scene, cam, RasterOptions(sh_degree=0)).alpha
@@ -167,7 +167,7 @@ def test_pixel_centres_lie_at_half_integers() -> None:
     assert (around - around[0]).abs().max() < 1e-6 and around[0] < 0.9
 
 
-def test_equal_depths_are_drawn_in_order_of_index() -> None:
+def test_equal_depths_are_composited_in_order_of_index() -> None:
     first, second = single((0.0, 0.0, 2.0), 0.2), single((0.0, 0.0, 2.0), 0.2)
     second[4].mul_(-1)  # dark
     cam, options = camera(16, 16), RasterOptions(sh_degree=0)
@@ -178,7 +178,7 @@ def test_equal_depths_are_drawn_in_order_of_index() -> None:
 
 def test_results_are_bit_identical_for_any_number_of_threads() -> None:
     for seed in range(100):
-        # Some large enough for each of three threads to have parts of its own
+        # Some scenes are large enough for three threads.
         count, height = (1500, 110) if seed % 10 == 0 else (20 + 3 * seed, 40)
         scene, cam = random_scene(seed, count), camera(30 + 7 * (seed % 29), height)
         d_color = torch.randn(height, cam.width, 3, generator=torch.Generator().manual_seed(seed))
@@ -203,9 +203,8 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
             assert all(torch.equal(a, b) for a, b in zip(runs[0], other, strict=True))
 
 
-def test_what_is_black_may_become_brighter_but_not_darker() -> None:
-    """A colour clamped at zero keeps the gradient that would raise it, and no other; with
-    ``black_stays`` none, which is 3DGS's way."""
+def test_clamped_colours_receive_only_gradients_that_increase_them() -> None:
+    """With ``clamp_color_gradient``, as in 3DGS, they receive none."""
     cam, sh = camera(20, 20), torch.zeros(1, 1, 3)
     sh[..., 0], sh[..., 1], sh[..., 2] = -5.0, -5.0, 0.5  # red and green under zero
     scene = (
@@ -218,16 +217,16 @@ def test_what_is_black_may_become_brighter_but_not_darker() -> None:
     found = render.backward(fwd, d_color).sh[0, 0]
     assert found[0] < 0 and found[1] == 0 and found[2] > 0
     assert found[0] == -found[2]
-    options = RasterOptions(sh_degree=0, black_stays=True)
-    stayed = render.backward(render.forward(*scene, cam, options), d_color).sh[0, 0]
-    assert stayed[0] == stayed[1] == 0 and stayed[2] == found[2]
+    options = RasterOptions(sh_degree=0, clamp_color_gradient=True)
+    clamped = render.backward(render.forward(*scene, cam, options), d_color).sh[0, 0]
+    assert clamped[0] == clamped[1] == 0 and clamped[2] == found[2]
     leaf = sh.clone().requires_grad_()
     (reference.render(*scene[:4], leaf, cam, options).color * d_color).sum().backward()
     assert leaf.grad is not None
-    torch.testing.assert_close(stayed, leaf.grad[0, 0], rtol=1e-5, atol=1e-6)
+    torch.testing.assert_close(clamped, leaf.grad[0, 0], rtol=1e-5, atol=1e-6)
 
 
-def test_autograd_face_gives_the_same_gradients() -> None:
+def test_autograd_gives_the_same_gradients() -> None:
     scene, cam = random_scene(11, 150), camera(40, 30)
     leaves = [t.clone().requires_grad_() for t in scene]
     options = RasterOptions(background=(0.1, 0.2, 0.3))
@@ -242,7 +241,7 @@ def test_autograd_face_gives_the_same_gradients() -> None:
 
 
 def test_a_step_against_the_gradient_lowers_the_loss() -> None:
-    """Forward and backward agree with each other: the loss falls as its gradient foretells."""
+    """Forward and backward are consistent: the loss decreases as the gradient predicts."""
     scene, cam = random_scene(12, 400), camera(64, 48)
     target = render.forward(*random_scene(13, 400), cam, RasterOptions()).color
 
@@ -259,7 +258,7 @@ def test_a_step_against_the_gradient_lowers_the_loss() -> None:
     assert after - before == pytest.approx(-0.002, rel=0.3)
 
 
-def test_bad_arguments_are_refused_with_their_name() -> None:
+def test_invalid_arguments_are_errors_that_name_them() -> None:
     scene, cam = random_scene(0, 5), camera(8, 8)
     with pytest.raises(ValueError, match="quats"):
         render.forward(

@@ -1,4 +1,4 @@
-"""The fused loss and optimizer against the twin, scikit-image and torch.optim."""
+"""The loss and the optimisers compared with the reference, scikit-image and torch.optim."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.
 @pytest.mark.parametrize("size", [(40, 53), (1, 1), (3, 200), (17, 5)])
 @pytest.mark.parametrize("kind", ["float", "bytes", "masked", "byte mask"])
 @pytest.mark.parametrize("square", [0.0, 2.5])
-def test_loss_matches_the_twin(size: tuple[int, int], kind: str, square: float) -> None:
+def test_loss_equals_the_reference(size: tuple[int, int], kind: str, square: float) -> None:
     rendered, target = images(*size)
     mask = torch.rand(*size, generator=torch.Generator().manual_seed(5)) > 0.7
     if kind != "float":
@@ -43,8 +43,8 @@ def test_loss_matches_the_twin(size: tuple[int, int], kind: str, square: float) 
         assert not found.grad[mask].any()
 
 
-def test_flat_images_keep_their_digits() -> None:
-    """Variances are differences of near numbers; on a flat bright image float32 must still do."""
+def test_loss_of_flat_images_is_accurate() -> None:
+    """Variances are differences of nearly equal numbers on a flat, bright image."""
     target = torch.full((40, 40, 3), 0.97)
     rendered = target + 1e-3 * torch.randn(40, 40, 3, generator=torch.Generator().manual_seed(1))
     leaf = rendered.double().requires_grad_()
@@ -55,7 +55,7 @@ def test_flat_images_keep_their_digits() -> None:
     assert relative(found.grad, grad) <= 1e-2
 
 
-def test_ssim_is_scikit_images_away_from_the_border() -> None:
+def test_ssim_equals_scikit_image_away_from_the_border() -> None:
     from skimage.metrics import structural_similarity
 
     rendered, target = images(48, 60)
@@ -65,7 +65,7 @@ def test_ssim_is_scikit_images_away_from_the_border() -> None:
     )  # fmt: skip
     inside = torch.zeros(48, 60, dtype=torch.bool)
     inside[5:-5, 5:-5] = True
-    # Only border pixels masked and alike on both: the mean is over the inside.
+    # Border pixels are masked and equal in both images: the mean is over the inside.
     both = torch.where(inside[..., None], rendered, target)
     _, map_of_both = structural_similarity(
         both.double().numpy(), target.double().numpy(), channel_axis=-1, data_range=1.0,
@@ -76,13 +76,13 @@ def test_ssim_is_scikit_images_away_from_the_border() -> None:
     assert abs(found.ssim - float(ssim_map[5:-5, 5:-5].mean())) > 1e-6  # the mask matters
 
 
-def test_everything_masked_is_no_loss() -> None:
+def test_the_loss_of_a_fully_masked_image_is_zero() -> None:
     rendered, target = images(9, 9)
     found = render.l1_ssim(rendered, target, 0.2, torch.ones(9, 9, dtype=torch.bool))
     assert found.loss == 0 and not found.grad.any()
 
 
-def test_masked_pixels_may_hold_anything() -> None:
+def test_masked_pixels_may_have_any_value() -> None:
     rendered, target = images(20, 20)
     mask = torch.zeros(20, 20, dtype=torch.bool)
     mask[4:9, 3:7] = True
@@ -93,7 +93,7 @@ def test_masked_pixels_may_hold_anything() -> None:
 
 
 @pytest.mark.parametrize("shape", [(1,), (15,), (16,), (1001, 3), (7, 4, 3), (0, 3)])
-def test_adam_takes_torchs_steps(shape: tuple[int, ...]) -> None:
+def test_adam_equals_torch(shape: tuple[int, ...]) -> None:
     gen = torch.Generator().manual_seed(2)
     ours = torch.randn(shape, generator=gen)
     theirs = ours.double().requires_grad_()
@@ -109,7 +109,7 @@ def test_adam_takes_torchs_steps(shape: tuple[int, ...]) -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(11, 3), (37, 12), (5, 27), (129, 48)])
-def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
+def test_learning_rates_repeat_over_rows(rows: int, columns: int) -> None:
     gen = torch.Generator().manual_seed(3)
     rates = torch.rand(columns, generator=gen, dtype=torch.float64).tolist()
     ours, grad = (torch.randn(rows, columns, generator=gen) for _ in range(2))
@@ -126,7 +126,7 @@ def test_rates_repeat_over_the_rows(rows: int, columns: int) -> None:
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 3), (16, 4), (37, 3), (1001, 4), (0, 3)])
-def test_rows_that_share_a_second_moment_step_as_the_twins(rows: int, columns: int) -> None:
+def test_adam_with_shared_second_moments_equals_the_reference(rows: int, columns: int) -> None:
     gen = torch.Generator().manual_seed(5)
     ours = torch.randn(rows, columns, generator=gen)
     theirs = ours.double()
@@ -142,7 +142,7 @@ def test_rows_that_share_a_second_moment_step_as_the_twins(rows: int, columns: i
 
 
 class Framed(NamedTuple):
-    """What ``frame_adam`` moves and by what."""
+    """Parameters and state of ``frame_adam``."""
 
     means: torch.Tensor
     quats: torch.Tensor
@@ -165,15 +165,15 @@ class Framed(NamedTuple):
         return Framed.of(self.means.double(), self.quats.double(), self.log_scales.double())
 
     def step(self, number: int, d_means: torch.Tensor, d_quats: torch.Tensor) -> None:
-        move = render.frame_adam if self.means.dtype == torch.float32 else reference.frame_adam
+        update = render.frame_adam if self.means.dtype == torch.float32 else reference.frame_adam
         adam = replace(self.adam, step=number)
-        move(self.means, self.quats, self.log_scales, d_means, d_quats, adam)
+        update(self.means, self.quats, self.log_scales, d_means, d_quats, adam)
 
 
 @pytest.mark.parametrize("rows", [1, 16, 37, 1001, 0])
-def test_steps_in_own_frames_are_the_twins(rows: int) -> None:
+def test_frame_adam_equals_the_reference(rows: int) -> None:
     ours = Framed.random(rows, 5)
-    ours.quats[:1] = 0  # of no direction: not turned
+    ours.quats[:1] = 0  # not updated
     theirs = ours.double()
     before = ours.quats.clone()
     gen = torch.Generator().manual_seed(6)
@@ -187,39 +187,39 @@ def test_steps_in_own_frames_are_the_twins(rows: int) -> None:
     assert torch.allclose(ours.means.double(), theirs.means, rtol=1e-5, atol=1e-5)
     assert torch.allclose(ours.quats.double(), theirs.quats, rtol=1e-5, atol=1e-5)
     for a, b in ((ours.adam.mean_avg_sq, theirs.adam.mean_avg_sq),
-                 (ours.adam.turn_avg_sq, theirs.adam.turn_avg_sq)):  # fmt: skip
+                 (ours.adam.rotation_avg_sq, theirs.adam.rotation_avg_sq)):  # fmt: skip
         assert torch.allclose(a.double(), b, rtol=1e-3, atol=1e-6)
     assert torch.equal(ours.quats[:1], before[:1])
 
 
-def test_steps_in_own_frames_turn_and_grow_with_the_world() -> None:
-    """x -> c T x: gradients of means go with T / c, quaternions are multiplied from the left."""
+def test_frame_adam_is_equivariant_under_similarities() -> None:
+    """x -> c T x: gradients of means are multiplied by T / c, quaternions from the left."""
     gen = torch.Generator().manual_seed(7)
-    plain = Framed.random(50, 8)
-    turn = torch.randn(4, generator=gen, dtype=torch.float64)
-    turn /= turn.norm()
-    matrix, size = reference.rotation_from_quat(turn[None])[0], 7.0
-    w, x, y, z = turn.tolist()
+    original = Framed.random(50, 8)
+    rotation = torch.randn(4, generator=gen, dtype=torch.float64)
+    rotation /= rotation.norm()
+    matrix, size = reference.rotation_from_quat(rotation[None])[0], 7.0
+    w, x, y, z = rotation.tolist()
     left = torch.tensor(
         [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64
     )
     world = Framed.of(
-        (size * plain.means.double() @ matrix.T).float(),
-        (plain.quats.double() @ left.T).float(),
-        plain.log_scales + math.log(size),
+        (size * original.means.double() @ matrix.T).float(),
+        (original.quats.double() @ left.T).float(),
+        original.log_scales + math.log(size),
     )
     for step in range(1, 10):
         d_means = torch.randn(50, 3, generator=gen, dtype=torch.float64)
         d_quats = torch.randn(50, 4, generator=gen, dtype=torch.float64)
-        plain.step(step, d_means.float(), d_quats.float())
+        original.step(step, d_means.float(), d_quats.float())
         world.step(step, (d_means @ matrix.T / size).float(), (d_quats @ left.T).float())
-    means = size * plain.means.double() @ matrix.T
+    means, quats = size * original.means.double() @ matrix.T, original.quats.double() @ left.T
     assert torch.allclose(world.means.double(), means, rtol=0, atol=size * 1e-5)
-    assert torch.allclose(world.quats.double(), plain.quats.double() @ left.T, rtol=0, atol=1e-5)
+    assert torch.allclose(world.quats.double(), quats, rtol=0, atol=1e-5)
 
 
-def test_a_flat_gaussian_slides_in_its_plane() -> None:
-    """As many scales along every axis; also where scales or gradients leave float32."""
+def test_frame_adam_steps_are_relative_to_the_scales() -> None:
+    """Also for scales and gradients that overflow float32."""
     log_scales = torch.tensor([[0.0, -3.0, 2.0], [-200.0, 200.0, torch.nan], [0.0, 0.0, 0.0]])
     quats = torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [torch.inf, torch.nan, 1e30, 0]])
     scene = Framed.of(torch.zeros(3, 3), quats, log_scales)
@@ -230,21 +230,21 @@ def test_a_flat_gaussian_slides_in_its_plane() -> None:
     assert all(moment.isfinite().all() for moment in (scene.adam.mean_avg, scene.adam.mean_avg_sq))
 
 
-def test_rows_that_share_a_second_moment_turn_with_their_space() -> None:
+def test_adam_with_shared_second_moments_is_equivariant_under_rotation() -> None:
     gen = torch.Generator().manual_seed(6)
-    turn = torch.linalg.qr(torch.randn(3, 3, generator=gen, dtype=torch.float64))[0]
+    rotation = torch.linalg.qr(torch.randn(3, 3, generator=gen, dtype=torch.float64))[0]
     rows = torch.randn(50, 3, generator=gen, dtype=torch.float64)
-    turned = (rows @ turn.T).float()
+    rotated = (rows @ rotation.T).float()
     ours = rows.float()
     moments = [(torch.zeros(50, 3), torch.zeros(50, 1)) for _ in range(2)]
     for step in range(1, 10):
         grad = torch.randn(50, 3, generator=gen, dtype=torch.float64)
         render.adam_step(ours, grad.float(), *moments[0], 1e-2, step)
-        render.adam_step(turned, (grad @ turn.T).float(), *moments[1], 1e-2, step)
-    assert torch.allclose(turned.double(), ours.double() @ turn.T, rtol=0, atol=1e-5)
+        render.adam_step(rotated, (grad @ rotation.T).float(), *moments[1], 1e-2, step)
+    assert torch.allclose(rotated.double(), ours.double() @ rotation.T, rtol=0, atol=1e-5)
 
 
-def test_adam_refuses_what_it_cannot_update_in_place() -> None:
+def test_invalid_arguments_of_adam_are_errors() -> None:
     a = torch.zeros(4, 4)
     with pytest.raises(ValueError, match="contiguous"):
         render.adam_step(a.T[:, :2], a, a, a, 0.1, 1)
@@ -268,22 +268,22 @@ def test_adam_refuses_what_it_cannot_update_in_place() -> None:
 
 
 def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:
-    """A scene of which the camera sees a part; and a gradient on the picture."""
+    """A scene that is partly behind the camera, and a gradient on the image."""
     scene, cam = random_scene(5, 333, degree=degree), camera(70, 50)
-    scene[0][::3, 2] *= -1  # behind it
+    scene[0][::3, 2] *= -1  # behind the camera
     d_color = torch.randn(50, 70, 3, generator=torch.Generator().manual_seed(9))
-    d_color[:, :20] = 0.0  # nothing is asked there
+    d_color[:, :20] = 0.0  # no gradient there
     return scene, cam, d_color
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
-def test_harmonics_in_view_move_as_the_twins_do(degree: int) -> None:
+def test_sh_adam_equals_the_reference(degree: int) -> None:
     scene, cam, d_color = sh_scene(degree)
     gen = torch.Generator().manual_seed(4)
     fwd = render.forward(*scene, cam, RasterOptions(sh_degree=degree))
     plain = render.backward(fwd, d_color)
     sh = scene[4]
-    # Some have waited for longer than any table.
+    # Some were updated last many steps ago.
     last = torch.randint(0, 1000, (len(sh),), generator=gen, dtype=torch.int32)
     last[::2] = 998
     ours = ShAdam(
@@ -298,22 +298,22 @@ def test_harmonics_in_view_move_as_the_twins_do(degree: int) -> None:
     )
     expected, untouched = sh.double(), ours.exp_avg.clone()
     gradients = (plain.means, plain.log_scales, plain.quats, plain.opacity_logits, plain.sh)
-    asked = torch.cat([g.reshape(len(sh), -1) for g in gradients], 1).any(1)
-    reference.sh_adam(expected, plain.sh.double(), asked, theirs)
-    moved = render.backward(fwd, d_color, sh_adam=ours)
-    # Of some in view nothing is asked.
-    assert 0 < asked.sum() < (fwd.radii > 0).sum() < len(sh)
+    updated = torch.cat([g.reshape(len(sh), -1) for g in gradients], 1).any(1)
+    reference.sh_adam(expected, plain.sh.double(), updated, theirs)
+    fused = render.backward(fwd, d_color, sh_adam=ours)
+    # Some visible Gaussians have no gradient.
+    assert 0 < updated.sum() < (fwd.radii > 0).sum() < len(sh)
     assert torch.allclose(sh.double(), expected, rtol=0, atol=2e-6)
     assert relative(ours.exp_avg, theirs.exp_avg) < 1e-5
     assert relative(ours.exp_avg_sq, theirs.exp_avg_sq) < 1e-5
     assert torch.equal(ours.last, theirs.last)
-    assert torch.equal(ours.exp_avg[~asked], untouched[~asked])
-    assert len(moved.sh) == 0 and torch.equal(moved.means, plain.means)
+    assert torch.equal(ours.exp_avg[~updated], untouched[~updated])
+    assert len(fused.sh) == 0 and torch.equal(fused.means, plain.means)
 
 
-def test_what_was_out_of_view_catches_up_with_dense_adam() -> None:
-    """A gradient in every tenth step: at each the parameter is where dense Adam has it, but for
-    what rates and corrections of other steps make of the drift."""
+def test_sh_adam_approximates_dense_adam_after_skipped_steps() -> None:
+    """With a gradient in every tenth step, the parameter equals dense Adam's up to the bias
+    corrections of the skipped steps."""
     gen = torch.Generator().manual_seed(6)
     dense = torch.randn(200, 1, 3, generator=gen, dtype=torch.float64)
     sparse, (m, v) = dense.clone(), torch.zeros(2, 200, 1, 3, dtype=torch.float64)
@@ -321,31 +321,31 @@ def test_what_was_out_of_view_catches_up_with_dense_adam() -> None:
         torch.zeros_like(dense), torch.zeros_like(dense),
         torch.zeros(200, dtype=torch.int32), 1e-3, 1e-3, 1,
     )  # fmt: skip
-    everyone = torch.ones(200, dtype=torch.bool)
+    updated = torch.ones(200, dtype=torch.bool)
     start = dense.clone()
     for step in range(1, 2001):
         seen = step % 10 == 0
         grad = torch.randn(dense.shape, generator=gen, dtype=torch.float64) + 0.3
         reference.adam_step(dense, grad if seen else torch.zeros_like(grad), m, v, 1e-3, step)
         if seen:
-            reference.sh_adam(sparse, grad, everyone, dataclasses.replace(state, step=step))
+            reference.sh_adam(sparse, grad, updated, dataclasses.replace(state, step=step))
     assert (sparse - dense).norm() < 0.01 * (dense - start).norm()
 
 
-def test_harmonics_refuse_moments_that_do_not_fit() -> None:
+def test_sh_adam_with_invalid_moments_is_an_error() -> None:
     scene, cam, d_color = sh_scene(1)
     fwd = render.forward(*scene, cam, RasterOptions(sh_degree=1))
     like, last = torch.zeros_like(scene[4]), torch.zeros(333, dtype=torch.int32)
-    for wrong, says in (
+    for wrong, message in (
         (ShAdam(like[:5], like, last, 0.1, 0.1, 1), "moments"),
         (ShAdam(like, like, last.long(), 0.1, 0.1, 1), "last"),
         (ShAdam(like, like, last, 0.1, 0.1, 0), "step"),
     ):
-        with pytest.raises(ValueError, match=says):
+        with pytest.raises(ValueError, match=message):
             render.backward(fwd, d_color, sh_adam=wrong)
 
 
-def test_harmonics_of_a_gradient_beyond_float32s_squares_stay_finite() -> None:
+def test_sh_adam_stays_finite_for_gradients_whose_squares_overflow() -> None:
     scene, cam, d_color = sh_scene(3)
     fwd = render.forward(*scene, cam, RasterOptions())
     adam = ShAdam(

@@ -26,7 +26,7 @@ from tests.tools import need, unsupported
 
 COMPILER = os.environ.get("CXX") or "g++"
 
-# As in test_kernels.py; a processor without fused multiply-adds rounds twice as often.
+# As in test_kernels.py; without fused multiply-add the rounding errors are larger.
 COLOR, DEPTH, MEDIAN, RADIUS, GRADIENT = 2e-6, 2e-5, 1e-5, 1e-4, 1e-5
 CASES = [
     (1, 700, (97, 53), RasterOptions(background=(0.2, 0.5, 0.9), threads=2)),
@@ -36,8 +36,8 @@ CASES = [
 
 
 def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[str]]:
-    """The command that compiles for a target, and what runs its programs here. Skips, or fails,
-    where one of them is missing."""
+    """The command that compiles for a target, and the one that runs its programs on this machine.
+    Skips, or fails, if one of them is missing."""
     need(compiler)
     here = processor.architecture()
     if target.architecture == here:
@@ -54,7 +54,7 @@ def toolchain(compiler: str, target: targets.Target) -> tuple[list[str], list[st
 
 @dataclass(frozen=True)
 class Case:
-    """A scene with its view, and what the reference makes of it."""
+    """A scene, a view and the results of the reference."""
 
     scene: Scene
     cam: RasterCamera
@@ -98,10 +98,10 @@ class Case:
 
 
 def make_case(seed: int, count: int, size: tuple[int, int], options: RasterOptions) -> Case:
-    scene, cam = random_scene(seed, count), camera(*size, turned=seed % 2 == 1)
+    scene, cam = random_scene(seed, count), camera(*size, rotated=seed % 2 == 1)
     inputs = [t.double().requires_grad_() for t in scene]
     change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
-    moved = reference.moved(cam, change)
+    moved = reference.perturbed(cam, change)
     projection = reference.project(*inputs, moved, options)
     colors = reference.sh_colors(inputs[0][projection.index], inputs[4][projection.index], moved, 3)
     image = reference.blend(projection, colors, moved, options)
@@ -115,9 +115,9 @@ def make_case(seed: int, count: int, size: tuple[int, int], options: RasterOptio
     target = torch.rand(image.color.shape, generator=gen)
     total = (image.color * d_color).sum() + (image.alpha * d_alpha).sum()
     total = total + (image.depth * d_depth).sum()
-    *wanted, d_camera = torch.autograd.grad(total, [*inputs, projection.means2d, change])
+    *expected, d_camera = torch.autograd.grad(total, [*inputs, projection.means2d, change])
     incoming = [d_color, d_alpha, d_depth, target]
-    return Case(scene, cam, options, incoming, sure, projection, image, wanted, d_camera)
+    return Case(scene, cam, options, incoming, sure, projection, image, expected, d_camera)
 
 
 @pytest.fixture(scope="module")
@@ -126,7 +126,7 @@ def cases() -> list[Case]:
 
 
 def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor) -> None:
-    """The bounds of test_kernels.py and test_loss_adam.py."""
+    """Check the tolerances of test_kernels.py and test_loss_adam.py."""
     image, sure, index = case.image, case.sure, case.projection.index
     assert torch.equal(torch.nonzero(found["radii"])[:, 0], index)
     assert (found["radii"] - case.projection.radii).abs().max() <= RADIUS
@@ -134,8 +134,8 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
     assert (found["alpha"] - image.alpha).abs()[sure].max() <= COLOR
     assert (found["depth"] - image.depth).abs()[sure].max() <= DEPTH
     assert (found["median"] - image.median_depth).abs()[sure].max() <= MEDIAN
-    for name, want in zip(NAMES, case.gradients, strict=False):
-        assert relative(found[name], want) <= GRADIENT, name
+    for name, value in zip(NAMES, case.gradients, strict=False):
+        assert relative(found[name], value) <= GRADIENT, name
     assert relative(found["means2d"][index], case.gradients[5]) <= GRADIENT
     for part in (slice(0, 3), slice(3, 6), slice(6, 8), slice(8, 10)):
         assert relative(found_camera[part], case.camera_gradient[part]) <= GRADIENT, part
@@ -153,8 +153,8 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
 def test_every_target_matches_the_reference(
     tmp_path: Path, tmp_path_factory: pytest.TempPathFactory, cases: list[Case], target: str
 ) -> None:
-    """The reference's image and gradients, and 300 wild scenes without a value that is not
-    finite."""
+    """Images and gradients equal the reference's, and 300 scenes with arbitrary values give finite
+    results."""
     chosen = targets.named(target)
     command, emulator = toolchain(COMPILER, chosen)
     driver = compiled(tmp_path_factory, command, build.flags(target)) / "driver"

@@ -1,4 +1,4 @@
-"""Threads: whoever calls, however many, beside whatever else, the bits are the same."""
+"""Results do not depend on the number of threads, concurrent callers or forks."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.render.scenes import camera, random_scene
 
 
 def draw(threads: int) -> bytes:
-    """A view's picture and all its gradients."""
+    """The bytes of a rendered view and its gradients."""
     fwd = render.forward(*random_scene(3, 4000), camera(203, 151), RasterOptions(threads=threads))
     gradients = render.backward(fwd, torch.ones_like(fwd.color))
     tensors = (fwd.color, gradients.means, gradients.sh, gradients.log_scales)
@@ -28,7 +28,7 @@ def test_more_threads_than_processors_change_nothing(threads: int) -> None:
 
 
 def test_callers_on_several_threads_at_once_change_nothing() -> None:
-    """Only one of them has the helpers; the others do their loops alone."""
+    """One caller uses the worker threads; the others run their loops on their own thread."""
     expected = draw(1)
     with ThreadPoolExecutor(4) as pool:
         assert set(pool.map(draw, [2] * 24)) == {expected}
@@ -36,7 +36,7 @@ def test_callers_on_several_threads_at_once_change_nothing() -> None:
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="no fork on this system")
 @pytest.mark.filterwarnings("ignore:.*fork.*:DeprecationWarning")
-def test_a_fork_without_the_helpers_neither_hangs_nor_differs() -> None:
+def test_a_forked_process_neither_hangs_nor_differs() -> None:
     expected = draw(2)
     child = os.fork()
     if child == 0:

@@ -25,11 +25,11 @@ X86 = platform.machine().lower() in ("x86_64", "amd64")
 LANES = 16
 MOST_SCALAR, MOST_SCALAR_SHARE = 4 * LANES, 0.15
 MOST_MOVES, MOST_MOVES_SHARE = 6 * LANES, 0.2
-LEAST_PACKED = 16  # in some loop of each kernel: otherwise no loop was recognised
+LEAST_PACKED = 16  # in at least one loop of each kernel: otherwise no loop was recognised
 
 
 def _tools(target: str) -> tuple[list[str], str]:
-    """Compiler and objdump for a target; skips where this machine has none."""
+    """Compiler and objdump for a target; skips if this machine has none."""
     if (target == "aarch64") == X86:
         if not X86:
             unsupported("no cross compiler for x86-64 is looked for")
@@ -67,8 +67,8 @@ def test_inner_loops_are_vector_code(target: str, tmp_path_factory: pytest.TempP
         )
 
 
-def test_scalar_code_is_noticed(tmp_path: Path) -> None:
-    """The bounds are checked on a loop that the compiler may not vectorise."""
+def test_scalar_code_is_detected(tmp_path: Path) -> None:
+    """The check fails for a loop that the compiler must not vectorise."""
     compiler, objdump = _tools("x86-64-v3" if X86 else "aarch64")
     source = tmp_path / "scalar.cpp"
     statements = "".join(f"s[{i}] = s[{i}] * a[{i}] + 1.5f;" for i in range(80))

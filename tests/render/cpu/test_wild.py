@@ -1,4 +1,4 @@
-"""Wild inputs: never a crash, never a value that is not finite; what is bad is left out."""
+"""Arbitrary inputs: no crash and no value that is not finite; invalid Gaussians are left out."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ SIZES = [(1, 1), (2, 3), (17, 31), (16, 16), (61, 7)]
 def check(
     scene: Scene, cam: render.RasterCamera, options: RasterOptions, seed: int = 0
 ) -> render.Forward:
-    """Draws, goes back, and holds every output to being finite."""
+    """Run forward and backward and check that all outputs are finite."""
     fwd = render.forward(*scene, cam, options)
     for image in (fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii):
         assert image.isfinite().all()
@@ -57,7 +57,7 @@ def check(
         max_size=12,
     ),
 )
-def test_any_values_anywhere(
+def test_arbitrary_values(
     seed: int,
     count: int,
     size: tuple[int, int],
@@ -70,12 +70,14 @@ def test_any_values_anywhere(
         flat = scene[field].view(-1)
         if len(flat):
             flat[place % len(flat)] = value
-    check(scene, camera(*size, turned=True), RasterOptions(sh_degree=degree, antialias=antialias))
+    check(scene, camera(*size, rotated=True), RasterOptions(sh_degree=degree, antialias=antialias))
 
 
 @pytest.mark.parametrize("name", NAMES)
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_dropped_and_counted(name: str, value: float) -> None:
+def test_gaussians_with_values_that_are_not_finite_are_dropped_and_counted(
+    name: str, value: float
+) -> None:
     scene, cam = random_scene(1, 50), camera(32, 32)
     clean = check(scene, cam, RasterOptions())
     victim = int(clean.radii.argmax())
@@ -123,14 +125,14 @@ def test_extremes(fields: dict[str, object], antialias: bool) -> None:
 
 
 @pytest.mark.parametrize("family", FAMILIES)
-def test_stress_families_stay_finite_and_near_the_twin(family: str) -> None:
-    """A few calls of what ``python -m benchmarks.raster_stress`` does by the million."""
+def test_stress_families_stay_finite_and_close_to_the_reference(family: str) -> None:
+    """A small sample of ``python -m benchmarks.raster_stress``."""
     tally = Tally()
     for call in range(2):
         run(family, call, tally)
     assert tally.not_finite == 0
-    # Of what is thin and large at once, float32 keeps fewer digits, and a gradient is a difference
-    # of what it cannot tell apart.
+    # For Gaussians that are thin and large, float32 is less accurate, and gradients are differences
+    # of nearly equal numbers.
     colour, gradient = {
         "any value anywhere": (1e-2, math.inf),
         "needles 1e6 : 1": (4e-6, 0.1),
@@ -151,21 +153,21 @@ def test_a_hundred_thousand_in_one_pixel() -> None:
     assert fwd.alpha.max() > 0.999
 
 
-def test_needles_keep_their_digits() -> None:
-    """A needle 1e5 px long, seen along a diagonal: float32 moments about its centre would fail."""
-    from tests.render.cpu.test_kernels import twin_image
+def test_thin_gaussians_are_accurate() -> None:
+    """A Gaussian 1e5 px long, on a diagonal: float32 moments about its centre would fail."""
+    from tests.render.cpu.test_kernels import reference_image
 
     scene = random_scene(5, 40)
     scene[1][:] = torch.tensor([math.log(300.0), math.log(3e-4), math.log(3e-4)])
     scene[3].clamp_(max=0)
     cam = camera(48, 40)
     fwd = check(scene, cam, RasterOptions())
-    _, _, image = twin_image(scene, cam, RasterOptions())
+    _, _, image = reference_image(scene, cam, RasterOptions())
     sure = image.margin > 1e-3
     assert (fwd.color - image.color).abs().amax(-1)[sure].max() < 2e-4
 
 
-def test_nothing_to_draw_is_the_background() -> None:
+def test_an_empty_scene_renders_the_background() -> None:
     empty: Scene = tuple(t[:0] for t in random_scene(0, 1))  # type: ignore[assignment]
     fwd = check(empty, camera(20, 10), RasterOptions(background=(0.1, 0.2, 0.3)))
     assert torch.equal(fwd.color, torch.tensor([0.1, 0.2, 0.3]).expand(10, 20, 3))

@@ -10,18 +10,18 @@
 namespace splat {
 namespace {
 
-// Scales beyond e to the plus or minus this, 1e-12 and 1e12, count as that, NaN as the least.
+// Log scales are clamped to plus or minus this (1e-12 and 1e12); NaN becomes the minimum.
 constexpr float kLnUnitMax = 28.0f;
 
-// Gradients beyond this count as that: their squares stay in float32.
+// Gradients are clamped to this, so that their squares are finite in float32.
 constexpr float kGradientMax = 1e18f;
 
 constexpr float kLog2E = 1.4426950408889634f;
 
-// Squared length of a quaternion beyond which the square of a component may leave float32.
+// Squared norm of a quaternion above which the square of a component may overflow float32.
 constexpr float kNorm2Max = 1e37f;
 
-// What a step's rates are multiplied by, and a second moment's root.
+// Bias corrections of a step: factors of the learning rates and of the root of the second moment.
 struct Corrections {
     double to_rate;
     float to_root;
@@ -64,7 +64,7 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
                const AdamSettings& s, int threads) {
     const float beta1 = float(s.beta1), beta2 = float(s.beta2), eps = float(s.eps);
     const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
-    // Every pattern of rates starts anew after as many vectors as it has rates.
+    // The pattern of rates repeats after as many vectors as it has rates.
     std::vector<float> rates(16 * s.num_rates);
     const Corrections correct(s);
     for (size_t i = 0; i < rates.size(); i++)
@@ -109,10 +109,10 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
                 const AdamSettings& s, int threads) {
     const Corrections correct(s);
     const float mean_rate = float(s.rates[0] * correct.to_rate);
-    const float turn_rate = float(s.rates[1] * correct.to_rate);
+    const float rotation_rate = float(s.rates[1] * correct.to_rate);
     const float beta1 = float(s.beta1), beta2 = float(s.beta2), eps = float(s.eps);
     const float rest1 = float(1 - s.beta1), rest2 = float(1 - s.beta2);
-    // From gradients to Adam's normalised steps, in place; moments as rows of 3.
+    // Replaces gradients by Adam's normalised steps; moments are rows of 3.
     const auto normalised = [=](f32x16(&g)[3], float* exp_avg, float* exp_avg_sq, int count) {
         f32x16 m[3], v[3];
         read_rows(exp_avg, count, m);
@@ -141,16 +141,16 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
                     kLog2E;
         exp2(log2_scale, scale);
 
-        // A quaternion of no direction has the world's axes, and is not turned.
+        // A quaternion of almost zero norm counts as the identity and is not updated.
         const f32x16 norm2 = q[0] * q[0] + q[1] * q[1] + q[2] * q[2] + q[3] * q[3];
-        const Mask16 turns = (norm2 >= float(kQuatNorm2Min)) & (norm2 < kNorm2Max);
-        const f32x16 norm = sqrt(select(turns, norm2, splat16(1.0f))), inverse = 1.0f / norm;
+        const Mask16 valid = (norm2 >= float(kQuatNorm2Min)) & (norm2 < kNorm2Max);
+        const f32x16 norm = sqrt(select(valid, norm2, splat16(1.0f))), inverse = 1.0f / norm;
         f32x16 unit[4];
         for (int i = 0; i < 4; i++)
-            unit[i] = select(turns, q[i] * inverse, splat16(i ? 0.0f : 1.0f));
+            unit[i] = select(valid, q[i] * inverse, splat16(i ? 0.0f : 1.0f));
         const f32x16 w = unit[0], x = unit[1], y = unit[2], z = unit[3];
 
-        // Columns of R: the axes.
+        // Columns of R: the local axes.
         const f32x16 axes[3][3] = {
             {1.0f - 2.0f * (y * y + z * z), 2.0f * (x * y + w * z), 2.0f * (x * z - w * y)},
             {2.0f * (x * y - w * z), 1.0f - 2.0f * (x * x + z * z), 2.0f * (y * z + w * x)},
@@ -164,16 +164,16 @@ void frame_adam(float* means, float* quats, const float* log_scales, const float
         for (int i = 0; i < 3; i++)
             mean[i] -= axes[0][i] * along[0] + axes[1][i] * along[1] + axes[2][i] * along[2];
 
-        // q times i, j and k: where it goes when turned about its own axes.
+        // q i, q j and q k: the tangents of rotations about the local axes.
         const f32x16 tangents[3][4] = {{-x, w, z, -y}, {-y, -z, w, x}, {-z, y, -x, w}};
         f32x16 about[3];
         for (int k = 0; k < 3; k++) {
             const f32x16(&t)[4] = tangents[k];
-            about[k] = keep(turns, norm * (t[0] * d_quat[0] + t[1] * d_quat[1] + t[2] * d_quat[2] +
+            about[k] = keep(valid, norm * (t[0] * d_quat[0] + t[1] * d_quat[1] + t[2] * d_quat[2] +
                                            t[3] * d_quat[3]));
         }
-        normalised(about, moments.turn + 3 * first, moments.turn_sq + 3 * first, count);
-        for (int k = 0; k < 3; k++) about[k] = keep(turns, turn_rate * norm * about[k]);
+        normalised(about, moments.rotation + 3 * first, moments.rotation_sq + 3 * first, count);
+        for (int k = 0; k < 3; k++) about[k] = keep(valid, rotation_rate * norm * about[k]);
         for (int i = 0; i < 4; i++)
             q[i] -=
                 tangents[0][i] * about[0] + tangents[1][i] * about[1] + tangents[2][i] * about[2];

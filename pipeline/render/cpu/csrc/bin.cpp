@@ -10,16 +10,16 @@
 namespace splat {
 namespace {
 
-// Parts of the Gaussians for each thread: visible ones are not spread evenly.
+// Number of parts for each thread: visible Gaussians are distributed unevenly.
 constexpr int kPartsPerThread = 4;
 
-// Columns of cells that are tested at once: a bit each.
+// Number of columns of cells tested at a time, one bit each.
 constexpr int kColumns = 32;
 
-// Windows that are worked on at once.
+// Number of windows processed at a time.
 constexpr int kWindows = 64;
 
-// Bits [first, last] of each lane that is `inside`, whole numbers; those of [0, kColumns).
+// Bits [first, last], limited to [0, kColumns), of each lane in `inside`; whole numbers.
 SPLAT_INLINE u32x16 bit_range(Mask16 inside, f32x16 first, f32x16 last) {
     const f32x16 end = splat16(kColumns - 1), zero = {};
     const Mask16 some = inside & (last >= first) & (last >= zero) & (end >= first);
@@ -29,21 +29,22 @@ SPLAT_INLINE u32x16 bit_range(Mask16 inside, f32x16 first, f32x16 last) {
     return bit_cast<u32x16>(keep(some, bit_cast<f32x16>(from_first & to_last)));
 }
 
-// Four rows of cells of a Gaussian's box, and kColumns columns from a tile's first one on.
+// Up to four rows of cells of a Gaussian's bounding box, and kColumns columns from the first of a
+// tile.
 struct Window {
     const Record* record;
-    uint32_t gaussian, tile;        // tile: of the first cell
-    uint32_t rows_down, row_count;  // of cells, from the tile's first row; 1 to 4
-    uint32_t columns;               // of cells
-    float left, top;                // the first pixel's centre, from the Gaussian's
+    uint32_t gaussian, tile;        // tile of the first cell
+    uint32_t rows_down, row_count;  // first row of cells in the tile, and their number, 1 to 4
+    uint32_t columns;               // number of columns of cells
+    float left, top;                // first pixel centre relative to the Gaussian's centre
 };
 
 SPLAT_INLINE void list_windows(const Record& r, uint32_t gaussian, uint32_t tiles_x,
                                std::vector<Window>& windows) {
     constexpr uint32_t kAcross = kTile / kCell;
     const uint32_t left = r.cell_left / kAcross * kAcross;
-    // A low box takes one window wherever it begins, a high one begins with a row of tiles: so no
-    // two windows share a tile.
+    // A low box has one window that starts anywhere; the windows of a high box are aligned to rows
+    // of tiles. So no two windows share a tile.
     const bool low = uint32_t(r.cell_bottom - r.cell_top) < kAcross;
     const uint32_t top = low ? r.cell_top : r.cell_top / kAcross * kAcross;
     for (uint32_t y = top; y <= r.cell_bottom; y += kAcross)
@@ -56,11 +57,11 @@ SPLAT_INLINE void list_windows(const Record& r, uint32_t gaussian, uint32_t tile
         }
 }
 
-// The blocks of a window in which the ellipse {alpha >= 1/255} comes near a pixel centre: a bit a
-// column of cells, in every kBlockRows-th lane for a row of blocks. In a row of pixels the ellipse
-// is an interval,
+// The blocks of a window in which the ellipse {alpha >= 1/255} comes close to a pixel centre: one
+// bit per column of cells, in every kBlockRows-th lane, one per row of blocks. In a row of pixels
+// the ellipse is an interval,
 //     |uu d_x + uw d_y| <= sqrt(reach - (ww d_y)^2),
-// found for the 16 rows at once.
+// computed for 16 rows at once.
 SPLAT_INLINE u32x16 blocks_hit(const Window& window) {
     const Record& r = *window.record;
     const float reach = r.log2_opacity - kLog2AlphaMin + kBinSlack;
@@ -70,31 +71,31 @@ SPLAT_INLINE u32x16 blocks_hit(const Window& window) {
     const Mask16 inside = left_over >= zero;
     const f32x16 middle = dy * slope - window.left;
     const f32x16 half = sqrt(max(left_over, zero)) * inv_uu + abs(dy * slope) * 2e-6f + 1e-3f;
-    // Column c has the pixels 4 c + [0, 3].
+    // Column c contains the pixels 4 c + [0, 3].
     const f32x16 first = ceil((middle - half - 3.0f) * 0.25f);
     const f32x16 last = floor((middle + half) * 0.25f);
     const uint32_t here = ~0u >> (kColumns - (window.columns + 3) / 4 * 4);
     return any_of<kBlockRows>(bit_range(inside, first, last)) & here;
 }
 
-// Bits of a tile's blocks, and of those in a row of cells.
+// Bit masks of a tile's blocks, and of its blocks in a row of cells.
 constexpr uint64_t kTileBits = (uint64_t(1) << kBlocks) - 1;
 constexpr int kRowBits = kBlocks / (kTile / kCell);
 
-// Positive floats order as their bits do.
+// Positive floats are ordered like their bit patterns.
 SPLAT_INLINE uint32_t depth_bits(float depth) {
     uint32_t bits;
     std::memcpy(&bits, &depth, 4);
     return bits;
 }
 
-// An entry on its way into order.
+// An entry while it is sorted.
 struct TilePair {
     Entry entry;
     uint32_t depth;
 };
 
-// Sorts a tile's list by depth, and by place in the list where depths are equal.
+// Sorts a tile's list by depth, and equal depths by position in the list.
 class TileSorter {
   public:
     void sort(const TilePair* pairs, int64_t count, Entry* to) {
@@ -107,7 +108,7 @@ class TileSorter {
     }
 
   private:
-    using Key = uint64_t;  // depth, place
+    using Key = uint64_t;  // depth, position
     static constexpr int kPlaceBits = 32, kMostBits = 11;
 
     void sort_keys(const TilePair* pairs, int64_t count) {
@@ -118,12 +119,12 @@ class TileSorter {
         }
         for (int64_t i = 0; i < count; i++)
             keys_[i] = Key(pairs[i].depth - low) << kPlaceBits | uint32_t(i);
-        if (low >= high) return;  // none, or all alike
-        // Two passes by the leading bits of the depth, twice as many as number the list: few agree
-        // in them. The least significant first, which is stable.
+        if (low >= high) return;  // empty, or all equal
+        // Two passes of radix sort by the leading bits of the depth, twice as many bits as number
+        // the list, so that few entries agree in them. Least significant digit first: stable.
         const int depth_bits = 32 - __builtin_clz(high - low);
-        const int wanted = 32 - __builtin_clz(uint32_t(count));
-        const int bits = std::min({wanted, kMostBits, (depth_bits + 1) / 2});
+        const int needed = 32 - __builtin_clz(uint32_t(count));
+        const int bits = std::min({needed, kMostBits, (depth_bits + 1) / 2});
         const int shift = kPlaceBits + std::max(depth_bits - 2 * bits, 0);
         const uint32_t buckets = 1u << bits;
         uint32_t place[2][1 << kMostBits];
@@ -144,7 +145,7 @@ class TileSorter {
             }
         for (int64_t i = 0; i < count; i++) other_[place[0][digit(keys_[i], 0)]++] = keys_[i];
         for (int64_t i = 0; i < count; i++) keys_[place[1][digit(other_[i], 1)]++] = other_[i];
-        // What agrees in the leading bits by the rest.
+        // Entries that agree in the leading bits, by the remaining bits.
         for (int64_t i = 1; i < count; i++) {
             if (keys_[i - 1] < keys_[i]) continue;
             int64_t begin = i - 1, end = i + 1;
@@ -181,13 +182,13 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
         Part& part = parts_[number];
         part.begin = count * number / parts;
         part.end = count * (number + 1) / parts;
-        // Blocks that are not hit are counted too, as nothing, and there may be some beyond.
+        // Blocks that are not hit are written too but not counted, and may exceed the count.
         part.tile_count.assign(tiles_ + tiles_x + 2, 0);
         part.make_room(2 * (part.end - part.begin));
         std::vector<Window> windows;
         alignas(64) uint32_t hit[kWindows][16];
-        // Step by step for many windows, because a Gaussian's numbers of windows and tiles are
-        // mispredicted: the processor loses no more than the one step's work.
+        // Each step runs for many windows: the numbers of windows and tiles of a Gaussian are
+        // mispredicted, and a misprediction then costs only the work of one step.
         const auto list_pairs = [&] {
             for (size_t begin = 0; begin < windows.size(); begin += kWindows) {
                 const int here = int(std::min(windows.size() - begin, size_t(kWindows)));
@@ -204,8 +205,8 @@ bool Binner::find(const Record* records, const float* radii, int64_t count, cons
                         next += blocks != 0;
                         part.tile_count[tile] += blocks != 0;
                     };
-                    // Two tiles at once, since most windows have no more: of each row of blocks
-                    // 8 bits, 4 for each tile.
+                    // Two tiles at once, since most windows have at most two: 8 bits of each row
+                    // of blocks, 4 per tile.
                     for (uint32_t column = 0; column < window.columns; column += 8) {
                         const uint64_t both =
                             native::split_nibbles(native::first_bytes<kBlockRows>(hit[i], column));

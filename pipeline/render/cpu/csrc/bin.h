@@ -1,4 +1,4 @@
-// Stage 2: which Gaussians touch which tile, front to back.
+// Stage 2: lists the Gaussians that overlap each tile, front to back.
 #pragma once
 
 #include <vector>
@@ -8,14 +8,14 @@
 
 namespace splat {
 
-// Tests the visible Gaussians' ellipses row by row against the blocks of the tiles, in order of
-// index; lists the pairs by tile without disturbing that order; sorts each tile's list by depth,
-// stably, so that equal depths stay in order of index. The result does not depend on the number
-// of threads: every part of the Gaussians writes where the parts before it end.
+// Tests the ellipses of the visible Gaussians against the blocks of the tiles, in order of index;
+// lists the pairs of each tile in that order; sorts each list by depth, stably, so that equal
+// depths stay in order of index. The result does not depend on the number of threads: every part
+// of the Gaussians writes after the parts before it.
 class Binner {
   public:
-    // Finds the pairs. False when there would be more than kMaxIntersections. `slots` (N): zeros
-    // where a Gaussian touches nothing; whole after `write`.
+    // Finds the pairs. Returns false if there are more than kMaxIntersections. `slots` (N) are zero
+    // for Gaussians that overlap no tile, and complete after `write`.
     bool find(const Record* records, const float* radii, int64_t count, const View& view,
               int threads, Slots* slots);
 
@@ -25,11 +25,11 @@ class Binner {
     void write(Entry* entries, int64_t* tile_begin);
 
   private:
-    // One Gaussian in one tile.
+    // One (Gaussian, tile) pair.
     struct Found {
         uint32_t tile, depth, gaussian, blocks;
     };
-    // A run of the Gaussians.
+    // A contiguous range of Gaussians.
     struct Part {
         int64_t begin, end;
         Scratch<Found> found;

@@ -1,5 +1,5 @@
-// The kernels as torch.ops.splatmake.*, on torch's stable ABI. Shapes are checked in ops.py; types
-// here, by the pointers taken.
+// The kernels as torch.ops.splatmake.*, on torch's stable ABI. Shapes are checked in checks.py,
+// types here by the typed data pointers.
 
 #include <torch/csrc/stable/library.h>
 #include <torch/csrc/stable/ops.h>
@@ -26,7 +26,7 @@ const float* floats(const Tensor& t) { return t.const_data_ptr<float>(); }
 const float* floats(const OptionalTensor& t) { return t ? floats(*t) : nullptr; }
 float* mutable_floats(const Tensor& t) { return t.mutable_data_ptr<float>(); }
 
-// A tensor of junk, in memory that goes back to be used again.
+// An uninitialised tensor in memory that is reused.
 template <class T>
 Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type) {
     std::vector<int64_t> strides(shape.size());
@@ -72,7 +72,7 @@ splat::Pairs pairs_from(const Tensor& entries, const Tensor& tile_begin) {
             tile_begin.const_data_ptr<int64_t>()};
 }
 
-// (N, 16) records, (N) radii, visible, dropped
+// (N, 16) records, (N) radii, number of visible and of dropped Gaussians
 std::tuple<Tensor, Tensor, int64_t, int64_t> project(const Tensor& means, const Tensor& log_scales,
                                                      const Tensor& quats,
                                                      const Tensor& opacity_logits, const Tensor& sh,
@@ -151,15 +151,15 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
 }
 
 // Gradients of means, log_scales, quats, opacity_logits, sh, means2d, means2d_abs and the camera's
-// parameters (float64; both of no rows when not asked for). With exp_avg, exp_avg_sq, last and
-// sh_adam, 6 float64, step and ShAdamSettings, sh is moved and has no gradients (0 rows).
+// parameters (float64); the last two have no rows if not requested. With exp_avg, exp_avg_sq, last
+// and sh_adam (6 float64: ShAdamSettings), sh is updated in place and its gradient has no rows.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
     int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool black_stays, bool absolute, bool camera,
-    OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last, OptionalTensor sh_adam,
-    int64_t threads) {
+    const Tensor& slots, const Tensor& slot_gradients, bool clamp_color_gradient, bool absolute,
+    bool camera, OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last,
+    OptionalTensor sh_adam, int64_t threads) {
     const int64_t n = means.size(0);
     std::optional<splat::ShAdam> adam;
     if (sh_adam) {
@@ -176,7 +176,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     Tensor d_camera =
         new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
     splat::View seen = view_from(view, width, height, sh_degree, antialias);
-    seen.black_stays = black_stays;
+    seen.clamp_color_gradient = clamp_color_gradient;
     splat::project_view_backward(
         gaussians_from(means, log_scales, quats, opacity_logits, sh), seen, int(threads),
         records_from(records), floats(radii),
@@ -193,14 +193,14 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
 // loss, error, ssim, (H, W, 3) gradient
 std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const Tensor& target,
                                                    OptionalTensor mask, double ssim_weight,
-                                                   double square_weight, int64_t threads) {
+                                                   double l2_weight, int64_t threads) {
     const bool bytes = target.scalar_type() == ScalarType::Byte;
     Tensor grad = new_floats({rendered.size(0), rendered.size(1), 3});
     const splat::LossValues values = splat::l1_ssim(
         {rendered.size(1), rendered.size(0), floats(rendered), bytes ? nullptr : floats(target),
          bytes ? target.const_data_ptr<uint8_t>() : nullptr,
          mask ? mask->const_data_ptr<uint8_t>() : nullptr},
-        {ssim_weight, square_weight}, int(threads), mutable_floats(grad));
+        {ssim_weight, l2_weight}, int(threads), mutable_floats(grad));
     return {values.loss, values.error, values.ssim, grad};
 }
 
@@ -220,13 +220,13 @@ void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
 
 void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scales,
                 const Tensor& d_means, const Tensor& d_quats, const Tensor& mean_avg,
-                const Tensor& mean_avg_sq, const Tensor& turn_avg, const Tensor& turn_avg_sq,
-                const Tensor& rates, int64_t step, double beta1, double beta2, double eps,
-                int64_t threads) {
+                const Tensor& mean_avg_sq, const Tensor& rotation_avg,
+                const Tensor& rotation_avg_sq, const Tensor& rates, int64_t step, double beta1,
+                double beta2, double eps, int64_t threads) {
     splat::frame_adam(mutable_floats(means), mutable_floats(quats), floats(log_scales),
                       floats(d_means), floats(d_quats),
                       {mutable_floats(mean_avg), mutable_floats(mean_avg_sq),
-                       mutable_floats(turn_avg), mutable_floats(turn_avg_sq)},
+                       mutable_floats(rotation_avg), mutable_floats(rotation_avg_sq)},
                       means.size(0), {rates.const_data_ptr<double>(), 2, beta1, beta2, eps, step},
                       int(threads));
 }
@@ -255,21 +255,22 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
         "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
-        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool black_stays, "
+        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool "
+        "clamp_color_gradient, "
         "bool absolute, "
         "bool camera, Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? "
         "sh_adam, "
         "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, float "
-        "square_weight, int threads) -> (float, float, float, Tensor)");
+        "l2_weight, int threads) -> (float, float, float, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
     m.def(
         "frame_adam(Tensor(a!) means, Tensor(b!) quats, Tensor log_scales, Tensor d_means, "
-        "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) turn_avg, "
-        "Tensor(f!) turn_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
+        "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) rotation_avg, "
+        "Tensor(f!) rotation_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
         "int threads) -> ()");
 }
 

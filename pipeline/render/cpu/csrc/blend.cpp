@@ -9,12 +9,12 @@ namespace splat {
 namespace {
 
 constexpr int kSize = 64, kAbreast = 4;
-// Alphas computed before compositing starts. With 16 registers: all of a batch. One loop that
-// computes and composites exceeds the processor's reorder window, so that its latencies add up.
+// Number of alphas computed before compositing; all of a batch if there are 16 registers. A single
+// loop that computes and composites exceeds the reorder window, so that latencies add up.
 constexpr int kAlphas = kRegisterBytes == 64 ? kAbreast : kSize;
 using Gaussian = Batch<kSize>::Gaussian;
 
-// What a block's pixels add up.
+// Sums of a block's pixels.
 struct Color {
     Pixels rgb[3] = {};
 
@@ -33,7 +33,7 @@ struct Depth {
     }
 };
 
-// Lists a block's pairs of a batch, in order, and nothing after them; returns how many.
+// Lists a block's pairs of a batch in order, followed by kNothing; returns their number.
 SPLAT_INLINE int list_pairs(const u32x16* blocks, int batch, int block, uint32_t* pair) {
     int count = 0;
     for (int n = 0; n < batch; n += 16) {
@@ -44,15 +44,15 @@ SPLAT_INLINE int list_pairs(const u32x16* blocks, int batch, int block, uint32_t
     return count;
 }
 
-// Composites one tile. Goes through a batch block by block, so that a block's pixels stay in
-// registers. transmittance (kBlocks): what is left behind all. block_end (kBlocks): how many
-// entries there are until the last of a block's pixels stops, or all.
+// Composites one tile, batch by batch and block by block, so that a block's pixels stay in
+// registers. transmittance (kBlocks): after all Gaussians. block_end (kBlocks): number of entries
+// until the last of a block's pixels stops, or of all entries.
 template <class Sum>
 SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const View& view,
                             int64_t index, const Tile& tile, Pixels* transmittance, Sum* sums,
                             int32_t* block_end) {
     const int64_t begin = pairs.tile_begin[index], end = pairs.tile_begin[index + 1];
-    Pixels going[kBlocks];  // transmittance of pixels that have not stopped, else 0
+    Pixels going[kBlocks];  // transmittance of pixels that have not stopped, otherwise 0
     uint32_t alive = 0;
     for (int block = 0; block < kBlocks; block++) {
         going[block] = tile.start(block);
@@ -90,7 +90,7 @@ SPLAT_INLINE void composite(const Record* records, const Pairs& pairs, const Vie
                     behind = select(s.drawn, s.after, behind);
                     before = s.after;
                 }
-                // A pixel stops for good; its transmittance would soon be denormal.
+                // A stopped pixel stays at 0; its transmittance would become denormal.
                 const PixelMask still = before >= kTransmittanceMin;
                 before = keep(still, before);
                 if (!any(still)) {

@@ -10,21 +10,21 @@ struct Pairs {
     const int64_t* tile_begin;
 };
 
-// color (H, W, 3) with the background (3) under it; alpha (H, W); block_end (tiles, kBlocks): the
-// number of the tile's entries behind which no pixel of the block draws.
+// color (H, W, 3), over the background (3); alpha (H, W); block_end (tiles, kBlocks): number of the
+// tile's entries after which no pixel of the block changes.
 void blend(const Record* records, const Pairs& pairs, const View& view, const float* background,
            int threads, float* color, float* alpha, int32_t* block_end);
 
-// depth (H, W) sum of weight * z; median (H, W) z where the transmittance falls below 1/2, else 0.
+// depth (H, W) sum of weight * z; median (H, W) z at which the transmittance falls below 1/2, or 0.
 void blend_depth(const Record* records, const Pairs& pairs, const View& view, int threads,
                  float* depth, float* median);
 
-// The gradient slots (intersections, kSlotFloats). d_alpha and d_depth may be null; depth is
-// blend_depth's, needed with d_depth only. Absolute moments are filled in if asked for. A pixel's
-// gradients go to the per_pixel Gaussians that it draws first; 0: to all.
+// Writes the gradient slots (intersections, kSlotFloats). d_alpha and d_depth may be null; depth is
+// the output of blend_depth, needed with d_depth only. Absolute moments are computed on request.
+// Only the first per_pixel contributing Gaussians of a pixel receive gradients; 0: all.
 struct ImageGradientsIn {
-    const float *color, *alpha, *depth;        // what forward made
-    const float *d_color, *d_alpha, *d_depth;  // dL/d of it
+    const float *color, *alpha, *depth;        // outputs of forward
+    const float *d_color, *d_alpha, *d_depth;  // their gradients
     const float* background;
     bool absolute;
     int64_t per_pixel;

@@ -3,9 +3,9 @@
 //
 //     dL/d(alpha_i) = T_i e_i - S_i / (1 - alpha_i).
 //
-// A Gaussian's share of a tile is reduced to moments of v = alpha dL/d(alpha) = dL/d(ln alpha)
-// over (u, w) (see Record), and written to its slot by whoever does the tile: no two writers, and
-// a sum whose order is fixed.
+// A Gaussian's contribution in a tile is reduced to moments of v = alpha dL/d(alpha) =
+// dL/d(ln alpha) over (u, w) (see Record), and written to its slot by the thread of the tile: one
+// writer, and a fixed order of summation.
 
 #include "blend.h"
 #include "threads.h"
@@ -21,7 +21,7 @@ struct BlockTargets {
     Pixels rgb[3], alpha, depth;
     Pixels transmittance;  // 0 once stopped
     Pixels behind;         // S: starts as the whole sum, ends as 0
-    Pixels left;           // Gaussians that still receive gradients, where that is limited
+    Pixels left;           // number of Gaussians that may still receive gradients, if limited
 
     // Pixels outside the image have zero gradients.
     SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
@@ -29,7 +29,7 @@ struct BlockTargets {
         Pixels color[3];
         tile.read(block, in.color, view.width, color);
         tile.read(block, in.d_color, view.width, rgb);
-        // The background shows through 1 - alpha.
+        // The weight of the background is 1 - alpha.
         Pixels under = {};
         behind = Pixels{};
         for (int c = 0; c < 3; c++) {
@@ -56,7 +56,7 @@ struct BlockTargets {
         left = broadcast<Pixels>(float(in.per_pixel));
     }
 
-    // A pixel whose number of Gaussians is used up has zero gradients from then on.
+    // A pixel that has reached the limit of Gaussians has zero gradients from then on.
     SPLAT_INLINE void count(const Step& s) {
         left -= keep(s.weight > 0.0f, broadcast<Pixels>(1.0f));
         const PixelMask more = left > 0.0f;
@@ -67,8 +67,8 @@ struct BlockTargets {
     }
 };
 
-// The pairs of a batch, Gaussian by Gaussian, and their alphas: one flat list, because the end of a
-// short loop over a Gaussian's blocks would be mispredicted as often as not.
+// The pairs of a batch, sorted by Gaussian, and their alphas: one flat list, because the end of a
+// short loop over a Gaussian's blocks would often be mispredicted.
 struct GaussianPairs {
     Pixels alpha[kSize * kBlocks + kAbreast];
     uint32_t pair[kSize * kBlocks + kBlocks];
@@ -89,7 +89,7 @@ struct GaussianPairs {
     }
 };
 
-// One Gaussian over one block: adds to the lanes' moments.
+// Adds one Gaussian's moments over one block to the lanes.
 template <bool kDepthGradient, bool kAbsolute, bool kLimited>
 SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels alpha,
                                 BlockTargets& t, Pixels (&moments)[12]) {
@@ -101,7 +101,7 @@ SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels
     if (kDepthGradient) e += t.depth * g.depth;
     t.behind -= s.weight * e;
     const Pixels odds = quotient(alpha, 1.0f - alpha);
-    // Where alpha is held at its maximum it does not move with the Gaussian.
+    // A clamped alpha has no gradient.
     const Pixels v = keep(s.drawn & (alpha < kAlphaMax), s.weight * e - odds * t.behind);
     const Pixels vu = v * u, vw = v * w;
     moments[kV] += v;

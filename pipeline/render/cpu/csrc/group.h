@@ -9,7 +9,7 @@ namespace splat {
 
 constexpr int kGroup = 16;
 
-// 16 rows of K floats, of which `count` are there; zeros stand for the others.
+// Reads 16 rows of K floats, of which `count` exist; the others are zeros.
 template <int K>
 SPLAT_INLINE void read_rows(const float* from, int count, f32x16 (&columns)[K]) {
     alignas(64) float padded[16 * K];
@@ -38,8 +38,8 @@ SPLAT_INLINE void write_column(f32x16 column, int count, float* to) {
         std::memcpy(to, &column, count * sizeof(float));
 }
 
-// A group is projected in float64 in parts of one register. `widened` gives the float64 lanes of
-// part `number`; `narrowed` joins a value per part into one float32 vector.
+// A group is projected in float64 in parts of one register each. `widened` converts part `number`
+// to float64; `narrowed` joins the parts' values into one float32 vector.
 constexpr int kGroupParts = kGroup / kProjectLanes;
 SPLAT_INLINE Lanes widened(const f32x16& v, int number) {
     return widen(load<Vector<float, kProjectLanes>>(reinterpret_cast<const float*>(&v) +
@@ -52,8 +52,8 @@ SPLAT_INLINE f32x16 narrowed(const Part (&parts)[kGroupParts], const Of& of) {
     return join<kGroupParts>(lanes);
 }
 
-// A group's parameters but for the spherical harmonics. Zeros, which no quaternion survives,
-// beyond the last Gaussian.
+// A group's parameters except for the SH coefficients. Zeros after the last Gaussian: a zero
+// quaternion is invalid.
 struct Group {
     int64_t first;
     int count;
@@ -89,7 +89,7 @@ struct CameraCenter {
             xyz[i] = -(v.rotation[i] * v.translation[0] + v.rotation[3 + i] * v.translation[1] +
                        v.rotation[6 + i] * v.translation[2]);
     }
-    // Directions to a part's Gaussians, and the inverse lengths.
+    // Unit directions to a part's Gaussians, and the inverse distances.
     struct Toward {
         Vec3 unit;
         Lanes inv_length;

@@ -1,15 +1,14 @@
-// The window is a product of two rows of 11 taps, and a row of an (H, W, 3) image is a flat array
-// whose taps lie 3 apart: all is done on flat rows of vectors.
+// The window is separable into two rows of 11 taps. A row of an (H, W, 3) image is a flat array
+// whose taps are 3 apart: all operations are on flat rows of vectors.
 //
 // With m_x, m_y, m_2, m_xy the blurred x, y, x^2 + y^2, x y,
 //     SSIM = (2 m_x m_y + C1)(2 (m_xy - m_x m_y) + C2)
 //            / ((m_x^2 + m_y^2 + C1)(m_2 - m_x^2 - m_y^2 + C2)),
 //     dL/dx = blur(dL/dm_x) + 2 x blur(dL/dm_2) + y blur(dL/dm_xy),
-// as the window is even. A strip of the image is walked from top to bottom once, with the last 12
-// rows of the two images and of the three derivatives at hand, so that they stay in the cache: the
-// derivatives follow the images 5 rows behind, and the gradient follows those. Two rows are found
-// at a time, for they look at nearly the same ones; in the same order, so that a row's sums do not
-// depend on which of the two it is.
+// as the window is symmetric. A strip of the image is processed once from top to bottom; the last
+// 12 rows of the two images and of the three derivatives stay in the cache. The derivatives follow
+// 5 rows behind the images, and the gradient 5 rows behind those. Two rows are computed at a time,
+// since they use nearly the same rows, and in the same order of summation.
 
 #include "loss.h"
 
@@ -26,14 +25,14 @@ namespace splat {
 namespace {
 
 constexpr int kRadius = 5, kTaps = 2 * kRadius + 1;  // of the window, pixels
-constexpr int kRows = kTaps + 1;                     // what two rows look at
-constexpr int kReach = 16;  // how far a blur looks to each side, floats: 3 kRadius in vectors
+constexpr int kRows = kTaps + 1;                     // rows in the windows of two rows
+constexpr int kReach = 16;  // floats of a window on each side: 3 kRadius in whole vectors
 constexpr float kC1 = 1e-4f, kC2 = 9e-4f;
 
-// Floats of a strip's row, at most: the rows at hand take some 300 KB, less than half an L2 cache.
+// Maximum floats of a strip's row: the buffered rows take about 300 KB, less than half an L2 cache.
 constexpr int64_t kStripFloats = 1024;
 
-// Fewest rows for a thread to begin in the middle of a strip: it goes through 10 more on each side.
+// Minimum rows of a band that starts in the middle of a strip: it processes 10 more on each side.
 constexpr int64_t kBandRows = 32;
 
 struct Window {
@@ -58,8 +57,7 @@ template <int kFirst, int... kEach>
 SPLAT_INLINE Lanes lanes_from(Lanes left, Lanes right, std::integer_sequence<int, kEach...>) {
     return shuffle<(kFirst + kEach)...>(left, right);
 }
-// Shifted from three whole vectors: a load of ten others, each across two cache lines, takes twice
-// as long.
+// Shifted from three aligned vectors: ten loads across two cache lines each take twice as long.
 SPLAT_INLINE Lanes blur_across(const float* centre, const Window& k) {
     const Lanes left = load<Lanes>(centre - 16), here = load<Lanes>(centre),
                 right = load<Lanes>(centre + 16);
@@ -83,7 +81,7 @@ SPLAT_INLINE Lanes blur_across(const float* centre, const Window& k) {
 #endif
 static_assert(kRadius == 5 && kReach == 16, "blur_across");
 
-// The last kRows rows of something.
+// A ring buffer of the last kRows rows.
 struct Ring {
     float* memory;
     int64_t stride;
@@ -91,11 +89,11 @@ struct Ring {
     float* row(int64_t y) const { return memory + (y + 2 * kRows) % kRows * stride; }
 };
 
-// The columns [begin, end) of an image's rows of `values` floats. Its buffers hold 2 kReach floats
-// more on each side: what the blur of a blur looks at.
+// Columns [begin, end) of an image's rows of `values` floats. The buffers have 2 kReach more floats
+// on each side, for the blur of a blur.
 class Strip {
   public:
-    // `count`: the values that the means are over.
+    // `count`: number of values that the means are over.
     Strip(const LossImages& in, const Window& window, const LossWeights& weights, int64_t count,
           int64_t begin, int64_t end)
         : in_(in),
@@ -151,7 +149,7 @@ class Strip {
         double error, ssim;
     };
 
-    // Row y of the images, zeros beyond them and, in both, nothing to tell where a mask hides them.
+    // Row y of the images: zeros outside, and equal values in both where the mask is set.
     void read(int64_t y) {
         float *x = x_.row(y), *target = y_.row(y);
         const bool outside = y < 0 || y >= in_.height;
@@ -177,16 +175,16 @@ class Strip {
                 x[i - origin_] = target[i - origin_], keep[i - origin_] = 0;
     }
 
-    // 1 where values count, 0 beyond the image and where a mask hides it.
+    // 1 for valid values, 0 outside the image and for masked values.
     const float* weights(int64_t y) const { return in_.mask ? keep_.row(y) : inside_; }
 
-    // Adds a row's taps to two sums, of the row kRadius below the first of kRows and of the next.
+    // Adds a row's taps to the sums of two rows: kRadius below the first of kRows, and the next.
     SPLAT_INLINE void add_row(int row, Lanes value, Lanes (&sums)[2]) const {
         if (row < kTaps) sums[0] += value * window_.tap[std::abs(row - kRadius)];
         if (row > 0) sums[1] += value * window_.tap[std::abs(row - 1 - kRadius)];
     }
 
-    // m_x, m_y, m_2 and m_xy of rows y and y + 1, blurred from top to bottom alone, to line_.
+    // Vertically blurred m_x, m_y, m_2 and m_xy of rows y and y + 1, to line_.
     void blur_images_down(int64_t y) {
         const float *xs[kRows], *ys[kRows];
         for (int t = 0; t < kRows; t++)
@@ -210,8 +208,8 @@ class Strip {
         }
     }
 
-    // Row y of the three derivatives, from what blur_images_down left; its own sums of |x - y| and
-    // SSIM.
+    // Row y of the three derivatives, from the output of blur_images_down; adds to the sums of
+    // |x - y| and SSIM.
     Sums differentiate(int64_t y, float* const* line) {
         if (y < 0 || y >= in_.height) {
             for (const Ring& ring : {d_m_, d_2_, d_xy_})
@@ -229,7 +227,7 @@ class Strip {
             const Lanes a1 = 2.0f * product + kC1;
             const Lanes a2 = 2.0f * (blur_across(line[3] + i, window_) - product) + kC2;
             const Lanes b1 = squares + kC1;
-            // No variance is negative, whatever rounding says.
+            // Rounding may make variances negative.
             const Lanes variance = max(blur_across(line[2] + i, window_) - squares, Lanes{});
             const Lanes b2 = variance + kC2;
             const Lanes inverse = reciprocal(b1 * b2);
@@ -255,7 +253,7 @@ class Strip {
         return sums;
     }
 
-    // The derivatives of rows y and y + 1, blurred from top to bottom alone, to line_.
+    // Vertically blurred derivatives of rows y and y + 1, to line_.
     void blur_derivatives_down(int64_t y) {
         const Ring rings[3] = {d_m_, d_2_, d_xy_};
         for (int k = 0; k < 3; k++) {
@@ -271,7 +269,7 @@ class Strip {
         }
     }
 
-    // Row y of the gradient, from what blur_derivatives_down left.
+    // Row y of the gradient, from the output of blur_derivatives_down.
     void write(int64_t y, float* const* line, float* grad) {
         for (int64_t i = 2 * kReach; i < 2 * kReach + end_ - begin_; i += kLanes) {
             const Lanes a = load<Lanes>(x_.row(y) + i), b = load<Lanes>(y_.row(y) + i);
@@ -302,7 +300,7 @@ class Strip {
     float *line_[2][4], *inside_;
 };
 
-// Values that no mask hides.
+// Number of unmasked values.
 int64_t count_values(const LossImages& in) {
     const int64_t pixels = in.width * in.height;
     if (!in.mask) return 3 * pixels;
@@ -320,8 +318,8 @@ LossValues l1_ssim(const LossImages& in, const LossWeights& weights, int threads
         std::memset(grad, 0, height * values * sizeof(float));
         return {0, 0, 1};
     }
-    // Strips follow from the image alone, so that sums do not depend on the threads; every row is
-    // found in the same way in whatever band it lies.
+    // Strips depend on the image only, and rows are computed identically in any band: sums do not
+    // depend on the number of threads.
     const int64_t strips = (values + kStripFloats - 1) / kStripFloats;
     const int64_t across = (values + 16 * strips - 1) / (16 * strips) * 16;
     const int64_t bands = std::max(std::min(int64_t(threads), height / kBandRows), int64_t(1));

@@ -1,5 +1,5 @@
-// 3DGS's loss, (1 - w) E + w (1 - SSIM), with its gradient. Its E is L1; here k squared errors
-// may join: |d| + k d^2.
+// The loss of 3DGS, (1 - w) E + w (1 - SSIM), with its gradient. E is the mean of |d| + k d^2; with
+// k = 0 it is the L1 loss of 3DGS.
 #pragma once
 
 #include <cstdint>
@@ -9,9 +9,9 @@ namespace splat {
 struct LossImages {
     int64_t width, height;
     const float* rendered;        // (H, W, 3)
-    const float* target_float;    // (H, W, 3), or null:
-    const uint8_t* target_bytes;  // (H, W, 3), 255 is 1
-    const uint8_t* mask;          // (H, W), not 0: left out; may be null
+    const float* target_float;    // (H, W, 3), or null: target_bytes is used
+    const uint8_t* target_bytes;  // (H, W, 3), 255 represents 1
+    const uint8_t* mask;          // (H, W), non-zero: ignored; may be null
 };
 
 struct LossWeights {
@@ -22,8 +22,8 @@ struct LossValues {
     double loss, error, ssim;
 };
 
-// SSIM of Wang et al. 2004 in an 11 x 11 Gaussian window of sigma 1.5, zeros beyond the image;
-// means over the pixels that the mask leaves and the three channels. Writes grad (H, W, 3).
+// SSIM (Wang et al. 2004) in an 11 x 11 Gaussian window of sigma 1.5 with zero padding; means over
+// the unmasked pixels and the three channels. Writes grad (H, W, 3).
 LossValues l1_ssim(const LossImages& images, const LossWeights& weights, int threads, float* grad);
 
 }  // namespace splat

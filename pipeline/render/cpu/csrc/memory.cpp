@@ -29,7 +29,7 @@ class Pool {
         const size_t unit = bytes < kHugePage ? 4096 : kHugePage;
         const size_t size = (bytes + unit) / unit * unit;
         const std::lock_guard<std::mutex> lock(mutex_);
-        // The smallest that fits, unless it is needed for something much larger.
+        // The smallest block that fits, unless it is much larger.
         size_t best = free_.size();
         for (size_t i = 0; i < free_.size(); i++)
             if (free_[i].size >= size && free_[i].size <= 2 * size &&
@@ -56,7 +56,7 @@ class Pool {
         used_ -= found->second;
         unused_ += found->second;
         sizes_.erase(found);
-        // Blocks that have waited longest go first: those of sizes no longer asked for.
+        // Least recently freed blocks are released first: their sizes are no longer in use.
         while (used_ + unused_ > most_used_ + most_used_ / 2) {
             unused_ -= free_.front().size;
             ::operator delete(free_.front().memory, free_.front().alignment());
@@ -75,12 +75,12 @@ class Pool {
     }
 
     std::mutex mutex_;
-    std::vector<Block> free_;                  // the one that has waited longest first
-    std::unordered_map<void*, size_t> sizes_;  // of those in use
+    std::vector<Block> free_;                  // least recently freed first
+    std::unordered_map<void*, size_t> sizes_;  // of the blocks in use
     size_t used_ = 0, unused_ = 0, most_used_ = 0;
 };
 
-// Never destroyed: tensors may be freed after everything static.
+// Never destroyed: tensors may be freed after static objects.
 Pool& pool() {
     static Pool* const one = new Pool;
     return *one;
@@ -89,7 +89,7 @@ Pool& pool() {
 }  // namespace
 
 #if defined(__SANITIZE_ADDRESS__)
-// Exactly as much as was asked for, so that the sanitizer sees every step beyond it.
+// Exactly the requested size, so that the sanitizer detects accesses beyond it.
 void* take_memory(size_t bytes) { return ::operator new(bytes, std::align_val_t(kLine)); }
 void give_back_memory(void* memory) { ::operator delete(memory, std::align_val_t(kLine)); }
 #else

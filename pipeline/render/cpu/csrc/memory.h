@@ -1,17 +1,17 @@
-// Memory that outlives its use: a training step frees what the next one asks for, and touching
-// fresh pages of the system each time would cost a fifth of a large step.
+// A memory pool: each training step frees what the next one allocates, and page faults of new
+// memory would take a considerable share of a step.
 #pragma once
 
 #include <cstddef>
 
 namespace splat {
 
-// At least `bytes` bytes of junk on a cache line's boundary, in huge pages where the system has
-// them: records and slots are met in any order, each on another small page. From any thread.
+// At least `bytes` uninitialised bytes, aligned to a cache line, in huge pages if available:
+// records and slots are accessed in random order. Thread-safe.
 void* take_memory(size_t bytes);
 void give_back_memory(void* memory);
 
-// An array of junk.
+// An uninitialised array.
 template <class T>
 class Scratch {
   public:

@@ -11,7 +11,7 @@ namespace {
 
 constexpr double kHalfLog2e = 0.72134752044448170368;  // log2(e) / 2
 
-// Slack of the boxes in which binning looks for pixels, in pixels: its own arithmetic is float32.
+// Tolerance of the bounding boxes for binning, in pixels: binning computes in float32.
 constexpr double kBoxSlack = 0.01;
 
 // Pixel centres [first, last] of [0, size) in [center - extent, center + extent].
@@ -24,11 +24,11 @@ SPLAT_INLINE PixelRange pixel_range(Lanes center, Lanes extent, int64_t size) {
     return {select(first > 0.0, first, all_lanes(0.0)), select(last < end, last, end)};
 }
 
-// How many standard deviations a Gaussian of full opacity reaches, rounded up.
+// Extent of a Gaussian of full opacity in standard deviations, rounded up.
 constexpr double kMostReach = 3.34;
 
-// 0 where every input is finite. float32 values cannot overflow a float64 sum: it is finite when
-// they are.
+// 0 if every input is finite. float32 values cannot overflow a float64 sum: it is finite if they
+// are.
 SPLAT_INLINE Lanes finite_sum(const Inputs& in, Lanes norm2) {
     const Lanes sum = (in.mean.x + in.mean.y + in.mean.z) +
                       (in.log_scale.x + in.log_scale.y + in.log_scale.z) +
@@ -36,12 +36,12 @@ SPLAT_INLINE Lanes finite_sum(const Inputs& in, Lanes norm2) {
     return sum - sum;
 }
 
-// Tells groups that are out of view with a fraction of the projection's work. What is near in the
-// arrays is near in space, so that in a trained scene most groups end here.
+// Culls groups that are outside the view, at a fraction of the cost of the projection. Gaussians
+// are sorted in space, so that most groups of a trained scene are culled.
 class OutOfView {
   public:
     explicit OutOfView(const View& view) : view_(view) {
-        // The Jacobian's rows are f / z (1, u) long, u clamped.
+        // The Jacobian's rows have the length f / z |(1, u)|, u clamped.
         const auto length = [](double focal, double center, double size) {
             const double u = (center > size - center ? center : size - center) / focal;
             return kMostReach * focal * std::hypot(1.0, u + kFrustumMargin * 0.5 * size / focal);
@@ -49,8 +49,8 @@ class OutOfView {
         reach_x_ = length(view.fx, view.cx, double(view.width));
         reach_y_ = length(view.fy, view.cy, double(view.height));
     }
-    // Whether none of a part's Gaussians can be drawn, and none is to be counted as dropped: true
-    // only where a bound on their ellipses is sure of it.
+    // Whether none of a part's Gaussians can be visible or dropped, according to conservative
+    // bounds on their ellipses.
     SPLAT_INLINE bool sure(const Inputs& in) const {
         const Vec3 cam = in_camera(in.mean, view_);
         const Lanes inv_z = reciprocal(cam.z);
@@ -58,13 +58,13 @@ class OutOfView {
         const Lanes y = view_.fy * cam.y * inv_z + view_.cy;
         const auto larger = [](Lanes a, Lanes b) { return select(a > b, a, b); };
         const Lanes longest = larger(in.log_scale.x, larger(in.log_scale.y, in.log_scale.z));
-        // The root of a^2 + kDilation is under a + 0.55; a pixel for roundings.
+        // sqrt(a^2 + kDilation) < a + 0.55; one pixel of tolerance for rounding.
         const Lanes scale = exp(longest) * inv_z;
         const Lanes reach_x = reach_x_ * scale + (0.55 * kMostReach + 1.0);
         const Lanes reach_y = reach_y_ * scale + (0.55 * kMostReach + 1.0);
         const LaneMask beside = (x + reach_x < 0.0) | (x - reach_x > double(view_.width)) |
                                 (y + reach_y < 0.0) | (y - reach_y > double(view_.height));
-        // Far from every overflow for which a Gaussian would be dropped.
+        // Far from any overflow for which a Gaussian would be dropped.
         const LaneMask tame = (larger(reach_x, reach_y) < 1e12) & (cam.z < 1e12) &
                               (larger(x, -x) < 1e12) & (larger(y, -y) < 1e12);
         const Lanes norm2 = in.quat[0] * in.quat[0] + in.quat[1] * in.quat[1] +
@@ -79,11 +79,11 @@ class OutOfView {
     double reach_x_, reach_y_;
 };
 
-// A part's Gaussians on the image.
+// A part's projected Gaussians.
 struct Seen {
     Lanes x, y, depth, uu, uw, ww, log2_opacity, radius;
-    PixelRange columns, rows;  // with slack
-    uint32_t drawn, dropped;   // a bit each
+    PixelRange columns, rows;  // with tolerance
+    uint32_t drawn, dropped;   // one bit per Gaussian
 };
 
 SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
@@ -112,7 +112,7 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
 
     const LaneMask usable = (finite_sum(in, p.norm2) == 0.0) & (p.norm2 >= kQuatNorm2Min);
     const LaneMask in_front = p.cam.z > view.near;
-    // The centre may lie anywhere, but the depth is kept in float32.
+    // The centre may be anywhere, but the depth is stored in float32.
     const LaneMask sound = (p.det > 0.0) & (p.xx < kCovarianceMax) & (p.yy < kCovarianceMax) &
                            (p.x - p.x == 0.0) & (p.y - p.y == 0.0) & (p.cam.z < 1e38);
     const PixelRange across = pixel_range(p.x, extent_x, view.width);
@@ -124,7 +124,7 @@ SPLAT_INLINE Seen see(const Inputs& in, const View& view) {
     return s;
 }
 
-// The records of a group, one a vector.
+// The records of a group, one per vector.
 SPLAT_INLINE void make_records(const Seen (&seen)[kGroupParts], const f32x16 (&rgb)[3],
                                f32x16 (&records)[16]) {
     const auto all = [&](Lanes Seen::* field) {
@@ -195,10 +195,10 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                 ShBlock sh;
                 sh.read(view.sh_degree, in.sh + sh_width * group.first, sh_width, drawn);
                 f32x16 rgb[3], rows[16];
-                const uint32_t sane =
+                const uint32_t in_range =
                     sh_colors(directions(toward), view.sh_degree, sh, kShMax, rgb);
-                dropped += __builtin_popcount(drawn & ~sane);
-                drawn &= sane;
+                dropped += __builtin_popcount(drawn & ~in_range);
+                drawn &= in_range;
                 visible += __builtin_popcount(drawn);
                 make_records(seen, rgb, rows);
                 for (int lane = 0; lane < kGroup; lane++)

@@ -1,4 +1,4 @@
-// Stage 1: world Gaussians to Records on the image, and at the very end the way back.
+// Stage 1: projects world Gaussians to Records on the image; and its backward pass.
 #pragma once
 
 #include "sh_adam.h"
@@ -10,22 +10,23 @@ struct ProjectCounts {
     int64_t visible = 0, dropped = 0;
 };
 
-// Fills radii (N) for all, records (N) for those with radius > 0 only. Dropped: a value that is
-// not finite, a quaternion without direction, a covariance out of range, insane colour.
+// Writes radii (N) of all Gaussians, and records (N) of those with radius > 0. Dropped are
+// Gaussians with values that are not finite, invalid quaternions, or covariances or SH out of
+// range.
 ProjectCounts project_view(const Gaussians& in, const View& view, int threads, Record* records,
                            float* radii);
 
-// dL/d(parameter), each shaped as its parameter; means2d and means2d_abs (N, 2), the latter may
-// be null, and sh where it is used up at once. camera: kCameraParameters sums over the Gaussians,
-// may be null. All are written, zeros where there is nothing.
+// dL/d(parameter), each shaped as its parameter; means2d and means2d_abs (N, 2). means2d_abs may be
+// null, and sh if Adam is applied at once. camera: kCameraParameters sums over the Gaussians, may
+// be null. All elements are written.
 struct GaussianGradients {
     float *means, *log_scales, *quats, *opacity_logits, *sh, *means2d, *means2d_abs;
     double* camera;
 };
 
-// Sums the gradient slots of each Gaussian in their order and takes the sums back to its
-// parameters. A Gaussian of which any gradient leaves float32 gets zeros. With sh_adam the
-// harmonics of those in view are moved, too.
+// Sums the gradient slots of each Gaussian in order and computes the gradients of its parameters.
+// If any gradient of a Gaussian overflows float32, all of them are zero. With sh_adam, the SH
+// coefficients of Gaussians with a gradient are updated.
 void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const Record* records, const float* radii, const Slots* slots,
                            const float* slot_gradients, const GaussianGradients& out,

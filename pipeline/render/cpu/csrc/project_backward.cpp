@@ -11,7 +11,7 @@ namespace {
 
 constexpr double kLn2 = 0.69314718055994530942;
 
-// The sums of one Gaussian's slots, lanes as in a slot.
+// Sum of one Gaussian's slots, with the lanes of a slot.
 SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
     Lanes sum[kGroupParts] = {};
     for (uint32_t s = 0; s < slots.count; s++) {
@@ -21,12 +21,12 @@ SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
     return narrowed(sum, [](const Lanes& lanes) { return lanes; });
 }
 
-// What a group's image asks for: fields of the records, and sums of the slots by Moment.
+// Inputs of a group: fields of the records, and sums of the slots by Moment.
 struct GroupMoments {
     f32x16 uu, uw, ww, rgb[3];
     f32x16 moment[12];
 
-    // Zeros for the lanes that are not in `drawn`.
+    // Zeros in the lanes that are not in `drawn`.
     GroupMoments(const Record* records, const Slots* slots, const float* slot_gradients,
                  uint32_t drawn) {
         f32x16 record[16], sums[16];
@@ -44,7 +44,7 @@ struct GroupMoments {
         for (int m = 0; m < 12; m++) moment[m] = sums[sum_lane(m)];
     }
 
-    // The lanes of which anything is asked: what is drawn behind opaque things is not.
+    // The lanes with a gradient: occluded Gaussians have none.
     SPLAT_INLINE uint32_t any() const {
         const f32x16 zero = {};
         f32x16 most = zero;
@@ -73,7 +73,7 @@ struct GroupMoments {
     }
 };
 
-// Gradients of a group, but for the spherical harmonics.
+// Gradients of a group, except for the SH coefficients.
 struct GroupGradients {
     f32x16 mean[3], log_scale[3], quat[4], opacity_logit, means2d[2];
 
@@ -102,7 +102,7 @@ struct GroupGradients {
     }
 };
 
-// The gradients of `count` Gaussians from `first` on that nothing is asked of.
+// Writes zero gradients of `count` Gaussians from `first` on.
 void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t sh_width) {
     const auto clear = [&](float* to, int64_t width) {
         if (to) std::memset(to + width * first, 0, size_t(width) * count * sizeof(float));
@@ -116,8 +116,8 @@ void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t
     clear(out.sh, sh_width);
 }
 
-// A group's share in the camera's gradients. d_mean: through the direction of view, which a shift
-// of the scene in the camera's frame turns as a shift of the means does.
+// A group's contribution to the camera's gradients. d_mean: gradient through the viewing direction,
+// which a translation of the scene changes like a translation of the means.
 void add_camera(const Group& group, const View& view, const ImageGradients (&image)[kGroupParts],
                 const InputGradients (&gradients)[kGroupParts], const f32x16 (&d_mean)[3],
                 uint32_t sound, double* out) {
@@ -145,7 +145,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
                            const ShAdam* sh_adam) {
     const CameraCenter center(view);
     const int64_t count = groups(in), sh_width = 3 * in.sh_coefficients;
-    // A group's sums each in their place, so that threads do not matter.
+    // Sums of each group, added in order: the result does not depend on the number of threads.
     std::vector<double> camera(out.camera ? kCameraParameters * count : 0);
     parallel_for(count, 32, threads, [&](int64_t number) {
         const Group group(in, number);
@@ -158,8 +158,8 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
             write_zeros(out, first, group.count, sh_width);
             return;
         }
-        const GroupMoments asked(records + first, slots + first, slot_gradients, drawn);
-        drawn &= asked.any();
+        const GroupMoments moments(records + first, slots + first, slot_gradients, drawn);
+        drawn &= moments.any();
         if (!drawn) {
             write_zeros(out, first, group.count, sh_width);
             return;
@@ -169,23 +169,22 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         CameraCenter::Toward toward[kGroupParts];
         for (int part = 0; part < kGroupParts; part++) {
             const Inputs inputs = group.part(part);
-            image[part] = asked.part(part);
+            image[part] = moments.part(part);
             gradients[part] = project_backward(project(inputs, view), image[part], view);
             toward[part] = center.toward(inputs.mean);
         }
         GroupGradients g(gradients, image);
 
-        // Colour: where it was clamped to zero it does not fall further, but may come back. 3DGS
-        // has it stand still (view.black_stays): a sixth of bonsai's Gaussians were black in every
-        // view then, for good.
-        Mask16 sound = mask(drawn);  // every gradient fits into float32
+        // A clamped colour receives only gradients that increase it. In 3DGS it receives none
+        // (view.clamp_color_gradient): a Gaussian that is black in all views stays black.
+        Mask16 sound = mask(drawn);  // every gradient is finite in float32
         const f32x16 zero = {}, most = splat16(1e37f);
         const auto check = [&](f32x16& v) { sound = sound & (most >= abs(v)); };
         f32x16 d_rgb[3], d_mean[3];
         for (int c = 0; c < 3; c++) {
-            const f32x16 d = asked.moment[kRed + c];
-            const f32x16 rising = view.black_stays ? zero : min(d, zero);
-            d_rgb[c] = select(asked.rgb[c] > zero, d, rising);
+            const f32x16 d = moments.moment[kRed + c];
+            const f32x16 rising = view.clamp_color_gradient ? zero : min(d, zero);
+            d_rgb[c] = select(moments.rgb[c] > zero, d, rising);
             check(d_rgb[c]);
         }
         ShBlock sh;
@@ -194,7 +193,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         for (int k = 0; k < 3; k++) g.mean[k] += d_mean[k];
 
         f32x16 absolute[2];
-        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * asked.moment[kAbsX + k];
+        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * moments.moment[kAbsX + k];
         g.each(check);
         for (f32x16& v : absolute) check(v);
         const auto clear = [&](f32x16& v) { v = keep(sound, v); };

@@ -1,6 +1,6 @@
-// The projection of some Gaussians at a time, in float64, and its derivative. Sources: Kerbl et al.
-// 2023 (covariance), Zwicker et al. 2002 (EWA), Yu et al. 2024 (compensation); twin.py's project
-// says the same in fewer words.
+// Projection of several Gaussians at a time, in float64, and its derivative. Sources: Kerbl et al.
+// 2023 (covariance), Zwicker et al. 2002 (EWA), Yu et al. 2024 (compensation). `project` in
+// reference.py is a readable equivalent.
 #pragma once
 
 #include "simd_math.h"
@@ -8,7 +8,7 @@
 
 namespace splat {
 
-// One register: about a hundred values are live at once, and wider vectors would be spilled more.
+// One register: about a hundred values are live, and wider vectors would be spilled more often.
 constexpr int kProjectLanes = kRegisterBytes / int(sizeof(double));
 using Lanes = Vector<double, kProjectLanes>;
 using LaneMask = Mask<double, kProjectLanes>;
@@ -35,15 +35,16 @@ struct Inputs {
 };
 
 struct Projected {
-    // Intermediate values that backward needs again
-    Lanes norm2, inv_norm, q[4];  // the quaternion's squared length, and it normalised
+    // Intermediate values for backward
+    Lanes norm2, inv_norm, q[4];  // squared norm of the quaternion, its inverse norm, normalised
     Vec3 r[3], m[3];              // rows of R and of M = R S
     Lanes scale[3];
-    Vec3 cam;                // centre in the camera's frame
-    Lanes inv_z, u, v;       // 1/z; x/z and y/z, clamped
-    Vec3 t[2];               // rows of T = J W
-    Vec3 h[2];               // rows of H = T M; Sigma' = H H^T
-    Lanes plain_det, ratio;  // det of Sigma' undilated; to the dilated one, with antialias only
+    Vec3 cam;           // centre in the camera's frame
+    Lanes inv_z, u, v;  // 1/z; x/z and y/z, clamped
+    Vec3 t[2];          // rows of T = J W
+    Vec3 h[2];          // rows of H = T M; Sigma' = H H^T
+    Lanes plain_det,
+        ratio;  // undilated det of Sigma', and its ratio to the dilated one (antialias)
     Lanes sigmoid;
     // Results
     Lanes x, y;        // pixels
@@ -91,7 +92,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     p.xy = dot(p.h[0], p.h[1]);
     p.xx = xx + kDilation;
     p.yy = yy + kDilation;
-    // Lagrange's identity |a|^2 |b|^2 - (a.b)^2 = |a x b|^2: nothing cancels for a needle.
+    // Lagrange's identity |a|^2 |b|^2 - (a.b)^2 = |a x b|^2 avoids cancellation for thin Gaussians.
     const Vec3 a = p.h[0], b = p.h[1];
     const Vec3 cross = {a.y * b.z - a.z * b.y, a.z * b.x - a.x * b.z, a.x * b.y - a.y * b.x};
     p.plain_det = dot(cross, cross);
@@ -106,7 +107,7 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     return p;
 }
 
-// dL/d(what the image sees of a Gaussian)
+// dL/d(projected Gaussian)
 struct ImageGradients {
     Lanes x, y;        // centre, pixels
     Lanes xx, xy, yy;  // dilated covariance; xy counts both off-diagonal entries
@@ -117,7 +118,7 @@ struct ImageGradients {
 struct InputGradients {
     Vec3 mean, log_scale;
     Lanes quat[4], opacity_logit;
-    // Of intermediate values, for the camera's share: the centre in its frame, T's rows.
+    // Intermediate gradients for the camera: of the centre in its frame, and of the rows of T.
     Vec3 cam, t[2];
 };
 
@@ -127,7 +128,7 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
     Lanes d_xx = g.xx, d_xy = g.xy, d_yy = g.yy;
     out.opacity_logit = g.ln_opacity * (1.0 - p.sigmoid);
     if (view.antialias) {
-        // ln opacity = ln sigmoid + (ln plain_det - ln det) / 2 above the floor
+        // ln opacity = ln sigmoid + (ln plain_det - ln det) / 2 above the lower bound
         const Lanes half = select(p.ratio > kCompensationMin, 0.5 * g.ln_opacity, all_lanes(0.0));
         const Lanes plain = half / select(p.plain_det > 0.0, p.plain_det, all_lanes(1.0));
         const Lanes dilated = half / p.det;
@@ -183,14 +184,14 @@ SPLAT_INLINE InputGradients project_backward(const Projected& p, const ImageGrad
     return out;
 }
 
-// dL/d(each of the camera's parameters), but for what the direction of view does to the colour
-// (twin.py's `moved` says what the parameters mean). g and d: as project_backward took and gave
-// them.
+// dL/d(each of the camera's parameters), without the dependence of colours on the viewing direction
+// (`perturbed` in reference.py defines the parameters). g and d: input and output of
+// project_backward.
 SPLAT_INLINE void camera_backward(const Projected& p, const ImageGradients& g,
                                   const InputGradients& d, const View& view,
                                   Lanes (&out)[kCameraParameters]) {
     const Vec3 w[3] = {row(view.rotation, 0), row(view.rotation, 1), row(view.rotation, 2)};
-    // T = (f / z) (W_i - u W_2), and a turn moves the columns of W as it moves the centre.
+    // T = (f / z) (W_i - u W_2); a rotation changes the columns of W like the centre.
     const Lanes scale_x = view.fx * p.inv_z, scale_y = view.fy * p.inv_z;
     const Vec3 d_w[3] = {scale_x * d.t[0], scale_y * d.t[1],
                          (-scale_x * p.u) * d.t[0] + (-scale_y * p.v) * d.t[1]};
@@ -200,7 +201,7 @@ SPLAT_INLINE void camera_backward(const Projected& p, const ImageGradients& g,
     out[3] = d.cam.x;
     out[4] = d.cam.y;
     out[5] = d.cam.z;
-    // Where u is clamped it stands at a place of the image, and goes as (c_x + ...) / f_x.
+    // A clamped u is at a fixed position in the image, and changes as (c_x + ...) / f_x.
     const Lanes free_u = p.cam.x * p.inv_z, free_v = p.cam.y * p.inv_z, zero = all_lanes(0.0);
     const Lanes along_u = dot(d.t[0], w[2]) * p.inv_z, along_v = dot(d.t[1], w[2]) * p.inv_z;
     const Lanes held_u = select(free_u == p.u, zero, along_u);

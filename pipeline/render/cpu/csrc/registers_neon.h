@@ -1,5 +1,5 @@
-// Operations on one NEON register of 128 bits (aarch64). Arithmetic needs no entry here: GCC and
-// Clang define + - * / & | on register types.
+// Operations on one NEON register of 128 bits (aarch64). GCC and Clang define + - * / & | on
+// register types.
 #pragma once
 
 #include <arm_neon.h>
@@ -18,7 +18,7 @@ namespace native {
 SPLAT_INLINE float32x4_t minus_product(float32x4_t a, float32x4_t b, float32x4_t c) {
     return vfmsq_f32(a, b, c);
 }
-// min and max are b where a or b is NaN, on every instruction set; NEON's own give NaN.
+// min and max return b if a or b is NaN, on every instruction set; NEON's instructions return NaN.
 SPLAT_INLINE float32x4_t min(float32x4_t a, float32x4_t b) {
     return vbslq_f32(vcltq_f32(a, b), a, b);
 }

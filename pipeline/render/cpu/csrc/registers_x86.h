@@ -1,5 +1,5 @@
 // Operations on one x86 register: 128 bits with SSE4.1, 256 with AVX2, 512 with AVX-512 (F, BW, DQ,
-// VL). Arithmetic needs no entry here: GCC and Clang define + - * / & | on register types.
+// VL). GCC and Clang define + - * / & | on register types.
 #pragma once
 
 #include <immintrin.h>
@@ -26,7 +26,7 @@ constexpr int kRegisterBytes = SPLAT_AVX512 ? 64 : SPLAT_AVX2 ? 32 : 16;
 
 namespace native {
 
-// min and max are b where a or b is NaN, on every instruction set.
+// min and max return b if a or b is NaN, on every instruction set.
 SPLAT_INLINE __m128 min(__m128 a, __m128 b) { return _mm_min_ps(a, b); }
 SPLAT_INLINE __m128 max(__m128 a, __m128 b) { return _mm_max_ps(a, b); }
 SPLAT_INLINE __m128d min(__m128d a, __m128d b) { return _mm_min_pd(a, b); }
@@ -176,10 +176,10 @@ SPLAT_INLINE uint64_t split_nibbles(uint64_t bytes) {
     return uint64_t(_mm_cvtsi128_si64(_mm_packus_epi16(pairs, pairs)));
 }
 
-// ---- Masks: a mask register with AVX-512, lanes of 0 or -1 elsewhere ----
+// ---- Masks: a mask register with AVX-512, otherwise lanes of 0 or -1 ----
 
 #if SPLAT_AVX512
-// Bits of a mask register. A class of its own for each number of lanes.
+// Bits of a mask register. A separate class for each number of lanes.
 template <int N>
 struct MaskBits {
     uint16_t bits;

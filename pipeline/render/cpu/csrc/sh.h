@@ -8,8 +8,8 @@ namespace splat {
 
 constexpr int sh_count(int degree) { return (degree + 1) * (degree + 1); }
 
-// The basis at unit directions, and if asked for its derivatives with respect to x, y, z taken
-// as independent.
+// The basis at unit directions, and optionally its derivatives with respect to x, y, z as
+// independent variables.
 template <bool kDerivative>
 SPLAT_INLINE void sh_basis(int degree, f32x16 x, f32x16 y, f32x16 z, f32x16* basis, f32x16* dx,
                            f32x16* dy, f32x16* dz) {
@@ -46,7 +46,7 @@ SPLAT_INLINE void sh_basis(int degree, f32x16 x, f32x16 y, f32x16 z, f32x16* bas
     term(15, -c0 * x * (xx - 3 * yy), -3 * c0 * (xx - yy), 6 * c0 * x * y, o);
 }
 
-// From the camera's centre to 16 Gaussians'.
+// Directions from the camera's centre to 16 Gaussians.
 struct Directions {
     f32x16 x, y, z;  // unit
     f32x16 inv_length;
@@ -57,8 +57,7 @@ struct Directions {
 struct ShBlock {
     f32x16 value[48];
 
-    // From rows of `width` floats, of which the active ones are read and only for the lanes in
-    // `lanes`; zeros stand for the rest.
+    // Reads rows of `width` floats: the active floats of the lanes in `lanes`; others are zeros.
     SPLAT_INLINE void read(int degree, const float* sh, int64_t width, uint32_t lanes) {
         const int active = 3 * sh_count(degree);
         for (int lane = 0; lane < 16; lane++) {
@@ -73,11 +72,11 @@ struct ShBlock {
         }
         for (int j = 0; 16 * j < active; j++) transpose(value + 16 * j);
     }
-    // Half the way back: value[16 j + lane] are floats 16 j to 16 j + 15 of that lane's row.
+    // Transposes back: value[16 j + lane] are floats 16 j to 16 j + 15 of that lane's row.
     SPLAT_INLINE void to_rows(int degree) {
         for (int j = 0; 16 * j < 3 * sh_count(degree); j++) transpose(value + 16 * j);
     }
-    // The rest of it: `count` rows, zeros after the active floats.
+    // Writes `count` rows after to_rows, with zeros after the active floats.
     SPLAT_INLINE void write(int degree, float* sh, int64_t width, int count) const {
         const int active = 3 * sh_count(degree);
         for (int lane = 0; lane < count; lane++) {
@@ -94,26 +93,26 @@ struct ShBlock {
     }
 };
 
-// max(0, 1/2 + sum_k basis_k sh_k). Returns the lanes of which every coefficient is a sane number.
+// max(0, 1/2 + sum_k basis_k sh_k). Returns the lanes whose coefficients are all at most kShMax.
 SPLAT_INLINE uint32_t sh_colors(const Directions& d, int degree, const ShBlock& sh, float limit,
                                 f32x16 (&rgb)[3]) {
     f32x16 basis[16];
     sh_basis<false>(degree, d.x, d.y, d.z, basis, nullptr, nullptr, nullptr);
     for (f32x16& c : rgb) c = splat16(0.5f);
     const f32x16 bound = splat16(limit), zero = {};
-    Mask16 sane = bound >= zero;
+    Mask16 in_range = bound >= zero;
     for (int k = 0; k < sh_count(degree); k++)
         for (int c = 0; c < 3; c++) {
             const f32x16 value = sh.value[3 * k + c];
-            sane = sane & (bound >= abs(value));
+            in_range = in_range & (bound >= abs(value));
             rgb[c] += basis[k] * value;
         }
     for (f32x16& c : rgb) c = max(c, zero);
-    return bits(sane);
+    return bits(in_range);
 }
 
-// Given dL/d(rgb), already zero where the clamp holds the colour: replaces the coefficients by
-// their gradients, and gives the view direction's share of dL/d(mean).
+// Given dL/d(rgb) after the clamp: replaces the coefficients by their gradients, and returns
+// dL/d(mean) through the viewing direction.
 SPLAT_INLINE void sh_backward(const Directions& d, int degree, const f32x16 (&d_rgb)[3],
                               ShBlock& sh, f32x16 (&d_mean)[3]) {
     f32x16 basis[16], dx[16], dy[16], dz[16];
@@ -121,10 +120,10 @@ SPLAT_INLINE void sh_backward(const Directions& d, int degree, const f32x16 (&d_
     f32x16 gx = {}, gy = {}, gz = {};
     for (int k = 0; k < sh_count(degree); k++) {
         f32x16* const value = sh.value + 3 * k;
-        const f32x16 pull = value[0] * d_rgb[0] + value[1] * d_rgb[1] + value[2] * d_rgb[2];
-        gx += pull * dx[k];
-        gy += pull * dy[k];
-        gz += pull * dz[k];
+        const f32x16 d_basis = value[0] * d_rgb[0] + value[1] * d_rgb[1] + value[2] * d_rgb[2];
+        gx += d_basis * dx[k];
+        gy += d_basis * dy[k];
+        gz += d_basis * dz[k];
         for (int c = 0; c < 3; c++) value[c] = basis[k] * d_rgb[c];
     }
     // d(v / |v|) = (I - d d^T) dv / |v|

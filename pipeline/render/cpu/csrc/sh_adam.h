@@ -1,7 +1,7 @@
-// Adam for spherical harmonics inside the backward pass, where their gradients are still in
-// registers, and of the Gaussians alone that the view asks of: four fifths of a Gaussian are
-// harmonics, and most are out of most views, or hidden. What updates without a gradient would have
-// done, moments that decay and a drift that fades with them, is made good at the next one with one.
+// Adam for SH coefficients inside the backward pass, while their gradients are in registers, and
+// only for Gaussians with a gradient: SH are four fifths of the parameters, and most Gaussians are
+// outside a view or occluded. The effect of skipped steps (decay of the moments and the resulting
+// change of the parameter) is applied at the next update.
 #pragma once
 
 #include <cmath>
@@ -12,7 +12,7 @@
 namespace splat {
 
 struct ShAdamSettings {
-    double rate0, rate;  // of the constant coefficient and of the others
+    double rate0, rate;  // learning rates of the constant coefficient and of the others
     double beta1, beta2, eps;
     int64_t step;  // from 1
 };
@@ -32,12 +32,12 @@ class ShAdam {
         eps_ = float(s.eps);
         beta1_ = float(s.beta1), rest1_ = float(1 - s.beta1);
         beta2_ = float(s.beta2), rest2_ = float(1 - s.beta2);
-        // A step without a gradient moves by m / sqrt(v), which falls by this each time.
+        // A step with zero gradient changes the parameter by m / sqrt(v), which decays by this.
         ratio_ = float(s.beta1 / std::sqrt(s.beta2));
         for (int missed = 0; missed < kTable; missed++) table_[missed] = after(missed);
     }
 
-    // gradient: of the group whose first Gaussian is `first`, after ShBlock::to_rows.
+    // gradient: of the group that starts at Gaussian `first`, after ShBlock::to_rows.
     SPLAT_INLINE void update(int degree, const ShBlock& gradient, int64_t first, int64_t width,
                              uint32_t lanes) const {
         const int active = 3 * sh_count(degree);
@@ -67,8 +67,8 @@ class ShAdam {
     }
 
   private:
-    // What so many steps without a gradient, and the decay of the next, do to the moments; and how
-    // far they move the parameter, in moves of the last step.
+    // Factors of the moments after a number of steps with zero gradient and the decay of the next
+    // one; and the change of the parameter, in units of the last step's change.
     struct Past {
         float keep1, keep2, drift;
     };
@@ -80,12 +80,12 @@ class ShAdam {
                 ratio_ * (1 - std::pow(ratio_, n)) / (1 - ratio_)};
     }
 
-    // A moment of infinity, of a gradient beyond 1e19, stands still as a division would have it.
+    // An infinite moment (of a gradient above 1e19) gives no change, as a division would.
     SPLAT_INLINE f32x16 inverse_root(f32x16 v) const {
         return reciprocal(min(sqrt(v) * scale_ + eps_, splat16(1e37f)));
     }
 
-    // The common case without a copy through memory.
+    // The common case, without a copy through memory.
     static SPLAT_INLINE f32x16 read(const float* from, int count) {
         if (count == 16) return load<f32x16>(from);
         f32x16 value = {};

@@ -1,5 +1,5 @@
-// Rearrangements of lanes. Between registers of a pair they are renamings; within a register they
-// are constant shuffles.
+// Permutations of lanes: between the registers of a pair without instructions, within a register by
+// constant shuffles.
 #pragma once
 
 #include <utility>
@@ -86,7 +86,7 @@ SPLAT_INLINE void interleave(const Vector<float, N> (&columns)[K], float* to) {
 
 #if SPLAT_AVX512
 
-// A vector holds one of 4 rows, which begins with 4 pixels.
+// A vector contains one of 4 rows, which starts with 4 pixels.
 template <int kRows, int K>
 class PixelRows {
     static_assert(kRows == 4);
@@ -192,7 +192,7 @@ SPLAT_INLINE void swap_blocks(Vector<float, N>& a, Vector<float, N>& b,
     b = shuffle<(kLanes & kStep ? N + kLanes : kLanes + kStep)...>(a, b);
     a = first;
 }
-// Of each block of 2 kStep lanes, a's upper half for b's lower one.
+// In each block of 2 kStep lanes, swaps a's upper half with b's lower half.
 template <int kStep, int N>
 SPLAT_INLINE void swap_blocks(Vector<float, N>& a, Vector<float, N>& b) {
     if constexpr (kOneRegister<float, N>) {
@@ -231,7 +231,7 @@ SPLAT_INLINE Vector<float, N> swapped(Vector<float, N> v) {
         return {swapped<kDistance>(v.low), swapped<kDistance>(v.high)};
 }
 
-// In every lane: the bits set in any of its kCount lanes, 2 or 4: 0 to kCount - 1 and so on.
+// In every lane: bitwise or of its group of kCount lanes (2 or 4): lanes 0 to kCount - 1 and so on.
 template <int kCount>
 SPLAT_INLINE u32x16 any_of(u32x16 v) {
     v |= bit_cast<u32x16>(swapped<1>(bit_cast<f32x16>(v)));
@@ -239,7 +239,7 @@ SPLAT_INLINE u32x16 any_of(u32x16 v) {
     return v;
 }
 
-// Of each block of 2 kStep lanes the sum of its halves: a's blocks, then b's.
+// The sum of the halves of each block of 2 kStep lanes: a's blocks, then b's.
 template <int kStep, int N, int... kLanes>
 SPLAT_INLINE Vector<float, N> fold(Vector<float, N> a, Vector<float, N> b,
                                    std::integer_sequence<int, kLanes...>) {
@@ -271,8 +271,8 @@ SPLAT_INLINE Vector<float, N> within(Vector<float, N> a, Vector<float, N> b) {
         return {within<kFirst, kSecond>(a.low, b.low), within<kFirst, kSecond>(a.high, b.high)};
 }
 
-// Lane sums of 12 vectors in a fixed order: sum(v[i]) lands in lane sum_lane(i), the other lanes
-// are junk. Each step halves the lanes of two vectors into one.
+// Lane sums of 12 vectors in a fixed order: sum(v[i]) is in lane sum_lane(i), the other lanes are
+// undefined. Each step adds the halves of two vectors into one.
 constexpr int sum_lane(int i) { return 4 * (i % 4) + i / 4; }
 
 template <int N>

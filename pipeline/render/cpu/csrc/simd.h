@@ -1,6 +1,6 @@
-// Vectors of a fixed number of lanes in registers that the target has. A vector that fits is one
-// register; a longer one is a pair of vectors of half the lanes. So a 16-lane float32 vector is one
-// AVX-512 register, two of AVX2 or four of SSE and NEON, and the arithmetic is written once.
+// Vectors with a fixed number of lanes, independent of the target. A vector that fits is one
+// register; a longer one is a pair of vectors of half the lanes. A 16-lane float32 vector is one
+// AVX-512 register, two AVX2 registers, or four SSE or NEON registers.
 //
 // GCC and Clang could split long vectors themselves, but GCC does it lane by lane through memory.
 #pragma once
@@ -36,7 +36,7 @@ struct Vector<T, N, true> {
     Register lanes;
 };
 
-// A truth value per lane of Vector<T, N>.
+// One boolean per lane of Vector<T, N>.
 template <class T, int N, bool = kOneRegister<T, N>>
 struct Mask {
     Mask<T, N / 2> low, high;
@@ -52,7 +52,7 @@ struct Mask<T, N, true> {
 
 using f32x16 = Vector<float, 16>;
 using i32x16 = Vector<int32_t, 16>;
-using u32x16 = Vector<uint32_t, 16>;  // wraps around: for bits, and lanes that may hold junk
+using u32x16 = Vector<uint32_t, 16>;  // wraps around: for bits, and lanes with undefined values
 using Mask16 = Mask<float, 16>;
 
 template <int N>
@@ -186,7 +186,7 @@ SPLAT_INLINE Unsigned<N> shift_left(Unsigned<N> v, Signed<N> bits) {
         return {shift_left(v.low, bits.low), shift_left(v.high, bits.high)};
 }
 
-// min and max are b where a or b is NaN.
+// min and max return b if a or b is NaN.
 #define SPLAT_FUNCTION(name)                                         \
     template <class T, int N>                                        \
     SPLAT_INLINE Vector<T, N> name(Vector<T, N> a, Vector<T, N> b) { \
@@ -238,7 +238,7 @@ SPLAT_COMPARISON(ge, >=)
 SPLAT_COMPARISON(gt, >)
 SPLAT_COMPARISON(eq, ==)
 #undef SPLAT_COMPARISON
-// False where a lane is NaN, as all comparisons.
+// False for NaN, as all comparisons.
 #define SPLAT_COMPARISON(op, expression)                                  \
     template <class T, int N>                                             \
     SPLAT_INLINE Mask<T, N> operator op(Vector<T, N> a, Vector<T, N> b) { \
@@ -285,7 +285,7 @@ SPLAT_INLINE Vector<T, N> select(Mask<T, N> m, Vector<T, N> yes, Vector<T, N> no
         return {select(m.low, yes.low, no.low), select(m.high, yes.high, no.high)};
 }
 
-// 0 where not m.
+// v if m, otherwise 0.
 template <class T, int N>
 SPLAT_INLINE Vector<T, N> keep(Mask<T, N> m, Vector<T, N> v) {
 #if SPLAT_AVX512
@@ -300,7 +300,7 @@ SPLAT_INLINE Vector<T, N> keep(Mask<T, N> m, Vector<T, N> v) {
 #endif
 }
 
-// a b, and 0 where not m.
+// a b if m, otherwise 0.
 template <class T, int N>
 SPLAT_INLINE Vector<T, N> product(Mask<T, N> m, Vector<T, N> a, Vector<T, N> b) {
 #if SPLAT_AVX512
@@ -310,7 +310,7 @@ SPLAT_INLINE Vector<T, N> product(Mask<T, N> m, Vector<T, N> a, Vector<T, N> b) 
 #endif
 }
 
-// A bit per lane, the first in bit 0.
+// One bit per lane, the first lane in bit 0.
 template <class T, int N>
 SPLAT_INLINE uint32_t bits(Mask<T, N> m) {
 #if SPLAT_AVX512
@@ -334,7 +334,7 @@ SPLAT_INLINE bool any(Mask<T, N> m) {
 #endif
 }
 
-// Lanes of which bit number `bit` is set.
+// Lanes in which bit number `bit` is set.
 template <int N>
 SPLAT_INLINE Mask<float, N> has_bit(Unsigned<N> v, int bit) {
 #if SPLAT_AVX512
@@ -379,7 +379,7 @@ alignas(64) constexpr float kLaneNumbers[16] = {0, 1, 2,  3,  4,  5,  6,  7,
                                                 8, 9, 10, 11, 12, 13, 14, 15};
 SPLAT_INLINE f32x16 lane_numbers() { return load<f32x16>(kLaneNumbers); }
 
-// Towards zero; junk where the result does not fit.
+// Truncates; undefined if the result does not fit.
 template <int N>
 SPLAT_INLINE Signed<N> to_int(Vector<float, N> v) {
     if constexpr (kOneRegister<float, N>)
@@ -388,7 +388,7 @@ SPLAT_INLINE Signed<N> to_int(Vector<float, N> v) {
         return {to_int(v.low), to_int(v.high)};
 }
 
-// Between float32 and float64, where the latter is one register.
+// Between float32 and float64, if the latter is one register.
 template <int N>
 SPLAT_INLINE Vector<double, N> widen(Vector<float, N> v) {
     return {native::widen(v.lanes)};
@@ -417,7 +417,7 @@ SPLAT_INLINE Vector<float, kCount * N> join(const Vector<float, N>* parts) {
 // ---- Bits as numbers ----
 
 #if !SPLAT_AVX512
-// The places of the bits of a byte, lowest first.
+// The positions of the bits of a byte, lowest first.
 struct BitPlaces {
     uint8_t of[256][8];
     constexpr BitPlaces() : of() {
@@ -429,8 +429,8 @@ struct BitPlaces {
 alignas(64) constexpr BitPlaces kBitPlaces;
 #endif
 
-// Writes base + kStep i for every bit i of kBits, lowest first; returns how many. May write junk
-// up to to[kBits - 1].
+// Writes base + kStep i for every set bit i of kBits, lowest first; returns their number. May write
+// undefined values up to to[kBits - 1].
 template <int kBits, uint32_t kStep>
 SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
 #if SPLAT_AVX512

@@ -54,8 +54,8 @@ SPLAT_INLINE Vector<double, N> inverse_sqrt(Vector<double, N> x) {
 constexpr float kExp2[] = {1.0000001192092896f,  0.6931469440460205f,   0.24022120237350464f,
                            0.05550713092088699f, 0.009675540961325169f, 0.001327647129073739f};
 
-// 2^x in float32, relative error under 2e-7 for x in [-126, 126]; junk, but no trap, outside.
-// Rounds by adding 1.5 * 2^23, whose low bits then hold the exponent. Takes several vectors, since
+// 2^x in float32, relative error below 2e-7 for x in [-126, 126]; undefined outside, without traps.
+// Rounds by adding 1.5 * 2^23, whose low bits then contain the exponent. Several vectors at once:
 // one alone is a chain of dependent operations.
 template <int N, int kCount>
 SPLAT_INLINE void exp2(const Vector<float, N> (&x)[kCount], Vector<float, N> (&out)[kCount]) {

@@ -15,10 +15,10 @@
 namespace splat {
 namespace {
 
-// How long a thread looks for work before it sleeps: longer than the serial part of a step.
+// Time that a thread polls for work before it sleeps: longer than the serial part of a step.
 constexpr auto kWatch = std::chrono::milliseconds(10);
-// Looks between two offers to let another thread have the processor. The offer is what makes
-// watching bearable beside other work: two trainings at once share two processors fairly.
+// Number of polls between two yields of the processor. Yielding lets other processes run: two
+// training runs share two processors fairly.
 constexpr int kLooks = 16;
 
 inline void pause() {
@@ -29,16 +29,16 @@ inline void pause() {
 #endif
 }
 
-// Threads that join the loop that is open, if they come in time: nobody waits for those that do
-// not, so that a sleeper that is slow to wake costs no more than its help.
+// Worker threads join the open loop if they are in time; the caller does not wait for those that
+// are not, so a thread that wakes slowly does not delay the loop.
 class Crew {
   public:
-    // A body that throws ends the program: its neighbours are at work on what it would take along.
+    // A body that throws ends the program: other threads still use the loop's data.
     void run(int64_t count, int64_t grain, int threads, RangeBody body,
              const void* context) noexcept {
         const int64_t ranges = (count + grain - 1) / grain;
         const int helpers = int(std::min<int64_t>({threads, ranges, kMostHelpers + 1})) - 1;
-        // One loop at a time: another caller's, and a loop within a loop, run on their own.
+        // One parallel loop at a time: loops of other callers and nested loops run serially.
         if (helpers < 1 || busy_.exchange(true, std::memory_order_acquire)) {
             if (count > 0) body(context, 0, count);
             return;
@@ -46,7 +46,7 @@ class Crew {
         hire(helpers);
         body_ = body, context_ = context, count_ = count, grain_ = grain;
         next_.store(0, std::memory_order_relaxed);
-        // Generation, open, nobody in it yet.
+        // Next generation, open, no threads inside.
         const uint64_t generation = state_.load(std::memory_order_relaxed) / kGeneration + 1;
         state_.store(generation * kGeneration + kOpen + uint64_t(helpers) * kPlace);
         if (sleepers_.load() > 0) {
@@ -76,7 +76,7 @@ class Crew {
         try {
             for (; hired_ < helpers; hired_++) std::thread([this] { serve(); }).detach();
         } catch (const std::system_error&) {
-            // No more to be had: those that are there do it.
+            // No more threads can be created: continue with the existing ones.
         }
     }
 
@@ -88,7 +88,7 @@ class Crew {
         }
     }
 
-    // There is a loop to join that this thread, whose last was `done`, has not been in.
+    // Whether there is an open loop that this thread, whose last one was `done`, has not joined.
     bool open(uint64_t done) const { return can_join(state_.load(), done); }
     static bool can_join(uint64_t state, uint64_t done) {
         return state / kGeneration != done && state & kOpen && state / kPlace % 256;
@@ -103,7 +103,7 @@ class Crew {
         return false;
     }
 
-    // Looks for a loop to join, for a while.
+    // Polls for a loop to join, for a limited time.
     bool watch(uint64_t& done) {
         const auto since = std::chrono::steady_clock::now();
         for (int looks = 0; !join(done); looks++) {
@@ -117,7 +117,7 @@ class Crew {
     void serve() {
         uint64_t done = 0;
         for (;;) {
-            // Whoever is woken too late for a loop watches for the next: there will be one.
+            // A thread that wakes too late for a loop polls for the next one.
             while (!watch(done)) {
                 std::unique_lock<std::mutex> lock(mutex_);
                 sleepers_++;
@@ -143,7 +143,8 @@ class Crew {
     alignas(64) std::atomic<int64_t> next_{0};
 };
 
-// Never destroyed: its threads outlive everything static. A fork has none of them and begins anew.
+// Never destroyed: its threads outlive static objects. A forked process has none of them and starts
+// its own.
 Crew& crew() {
     alignas(Crew) static unsigned char memory[sizeof(Crew)];
     static Crew* const one = [] {

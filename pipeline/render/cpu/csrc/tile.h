@@ -1,5 +1,5 @@
-// What the blending kernels, forward and backward, share: a tile's pixels and a Gaussian seen
-// from it.
+// Common parts of the forward and backward blending kernels: a tile's pixels, and Gaussians
+// relative to it.
 #pragma once
 
 #include "blend.h"
@@ -31,7 +31,7 @@ struct Tile {
         rows = int(view.height - y < kTile ? view.height - y : kTile);
     }
 
-    // Transmittance of a block before the first Gaussian: 1 inside, 0 outside, where nothing draws.
+    // Transmittance of a block before the first Gaussian: 1 inside the image, 0 outside.
     SPLAT_INLINE Pixels start(int block) const {
         const PixelMask inside =
             (splat::columns() < float(columns - kBlockColumns * (block % kBlocksAcross))) &
@@ -39,8 +39,8 @@ struct Tile {
         return keep(inside, broadcast<Pixels>(1.0f));
     }
 
-    // Calls visit(row in the block, pixel in an image of this width, number of pixels) for each of
-    // a block's rows that the image has.
+    // Calls visit(row in the block, pixel in an image of this width, number of pixels) for each row
+    // of a block inside the image.
     template <class Visit>
     SPLAT_INLINE void each_row(int block, int64_t width, const Visit& visit) const {
         const int left = kBlockColumns * (block % kBlocksAcross);
@@ -51,7 +51,7 @@ struct Tile {
             for (int row = 0; row < down; row++)
                 visit(row, (y + top + row) * width + x + left, across);
     }
-    // A block of an image of K floats a pixel, a vector a channel; zeros outside it.
+    // Reads a block of an image with K floats per pixel, one vector per channel; zeros outside.
     template <int K>
     SPLAT_INLINE void read(int block, const float* image, int64_t width,
                            Pixels (&channels)[K]) const {
@@ -62,7 +62,7 @@ struct Tile {
                  });
         pixels.to_channels(channels);
     }
-    // Prefetches a tile's cache lines of an image of K floats per pixel for writing.
+    // Prefetches a tile's cache lines of an image with K floats per pixel for writing.
     template <int K>
     SPLAT_INLINE void expect(int64_t width, const float* image) const {
         for (int row = 0; row < rows; row++)
@@ -81,11 +81,11 @@ struct Tile {
     }
 };
 
-// Prefetches the next batch's records a few at a time between other work: their addresses are
-// scattered, and many requests at once would queue.
+// Prefetches the records of the next batch a few at a time: their addresses are scattered, and many
+// requests at once would be queued.
 class Ahead {
   public:
-    // Of the `count` entries from number `next` of all on: past the end of a tile lies another.
+    // `count` entries from number `next` on: after a tile's entries follow those of the next tile.
     SPLAT_INLINE Ahead(const Record* records, const Pairs& pairs, const View& view, int64_t next,
                        int64_t count)
         : records_(records), next_(pairs.entries + next) {
@@ -102,29 +102,29 @@ class Ahead {
     const Entry *next_, *end_;
 };
 
-// The next Gaussians of a tile, as seen from it, and (Gaussian, block) pairs of them, numbered
-// kBlocks * place in the batch + block.
+// The next Gaussians of a tile, relative to it, and their (Gaussian, block) pairs, numbered
+// kBlocks * position in the batch + block.
 //
 // log2(alpha) = log2_opacity - u^2 - w^2 (see Record), where u and w are those of a block's first
-// pixel plus what a pixel's place in the block adds. The tile's first pixel's are found in
-// float64, so that a centre a thousand pixels away costs no digits.
+// pixel plus the offset of the pixel in the block. Those of the tile's first pixel are computed in
+// float64, so that distant centres do not lose accuracy.
 template <int kSize>
 struct Batch {
-    // w relative to a block's first pixel is stored where it is exact: for rows 0 and 1.
+    // w relative to a block's first pixel is stored for rows 0 and 1, where it is exact.
     static constexpr bool kKeepsDown = kBlockRows == 2;
-    // One vector holds a tile's blocks, which are as wide as high: u of their first pixels is u
-    // in a block, scaled.
+    // One vector has a lane per block of a tile, and blocks are square: u of their first pixels is
+    // u in a block, scaled.
     static constexpr bool kSquareBlocks = kBlocks == kBlockPixels && kBlockColumns == kBlockRows;
     struct Nothing {};
     using Down = std::conditional_t<kKeepsDown, Pixels, Nothing>;
     struct alignas(64) Gaussian {
-        Pixels across;                   // u in a block, less its first pixel's
-        Down down;                       // the same of w
-        float uu, uw, ww, log2_opacity;  // as in the Record
+        Pixels across;                   // u in a block, relative to its first pixel
+        Down down;                       // the same for w
+        float uu, uw, ww, log2_opacity;  // as in Record
         float rgb[3], depth;
-        uint32_t slot, blocks;  // as in the Entry
+        uint32_t slot, blocks;  // as in Entry
     };
-    static constexpr uint32_t kNothing = kSize * kBlocks;  // a pair that draws nothing, to fill up
+    static constexpr uint32_t kNothing = kSize * kBlocks;  // padding: a pair that draws nothing
 
     int count;
     Gaussian gaussian[kSize + 1];
@@ -137,7 +137,7 @@ struct Batch {
         std::memset(first_w + kNothing, 0, kBlocks * sizeof(float));
     }
 
-    // Takes them from entries [from, end).
+    // Reads the Gaussians of entries [from, end).
     SPLAT_INLINE void fill(const Record* records, const Entry* entries, int64_t from, int64_t end,
                            const Tile& tile) {
         count = int(end - from < kSize ? end - from : kSize);
@@ -152,7 +152,7 @@ struct Batch {
             const Pixels across = columns() * r.uu + rows() * r.uw;
             g.across = across;
             if constexpr (kKeepsDown) g.down = rows() * r.ww;
-            // Lanes are blocks here: they are laid out in a tile as pixels are in a block.
+            // Lanes are blocks here, arranged in a tile like pixels in a block.
             const float u = float(r.uu * dx + r.uw * dy), w = float(r.ww * dy);
             if constexpr (kSquareBlocks) {
                 store(first_u + kBlocks * n, float(kBlockColumns) * across + u);
@@ -178,8 +178,8 @@ struct Batch {
             return rows() * of(pair).ww + first_w[pair];
     }
 
-    // The alphas of some pairs at once, because one alone is a chain of some fifty cycles; 0 where
-    // less than kAlphaMin.
+    // The alphas of several pairs at once, since one alone is a chain of about fifty cycles; 0 if
+    // below kAlphaMin.
     template <int kCount>
     SPLAT_INLINE void alphas(const uint32_t* pairs, Pixels* alpha) const {
         Pixels power[kCount], raw[kCount];
@@ -188,17 +188,17 @@ struct Batch {
             power[k] = of(pairs[k]).log2_opacity - here_u * here_u - here_w * here_w;
         }
         exp2(power, raw);
-        // Junk where nothing is seen could be denormal, which costs a hundred cycles.
+        // Undefined values of invisible lanes could be denormal, which is slow.
         for (int k = 0; k < kCount; k++)
             alpha[k] = keep(power[k] >= kLog2AlphaMin, min(raw[k], broadcast<Pixels>(kAlphaMax)));
     }
 };
 
-// The blending of one Gaussian over one block of pixels.
+// Blending of one Gaussian over one block of pixels.
 struct Step {
-    Pixels after;     // transmittance behind it, if it is drawn
+    Pixels after;     // transmittance after it, if it is drawn
     PixelMask drawn;  // contributes, or has an alpha of 0
-    Pixels weight;    // transmittance before * alpha where drawn, else 0
+    Pixels weight;    // transmittance before * alpha if drawn, otherwise 0
 
     SPLAT_INLINE Step(Pixels alpha, Pixels before) {
         after = minus_product(before, alpha, before);

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.compare``: ``splatmake compare`` by its earlier name."""
+"""``python -m benchmarks.compare``: earlier name of ``splatmake compare``."""
 
 import sys
 

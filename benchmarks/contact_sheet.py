@@ -2,8 +2,8 @@
 
     python -m benchmarks.contact_sheet results/benchmark.json --scene demo --out sheet.png
 
-Below each stand the configuration and the PSNR of this view. ``--configs`` takes some, in that
-order; ``--view`` another view than the one in the middle of the first configuration's PSNRs;
+The captions are the configuration and the PSNR of the view. ``--configs`` selects configurations,
+in that order; ``--view`` selects the view (default: the one of median PSNR in the first);
 ``--photograph`` puts the photograph first.
 """
 
@@ -33,12 +33,12 @@ def sheet(
     columns: int,
     photograph: bool = False,
 ) -> Image.Image:
-    """The picture.
+    """The contact sheet as an image.
 
     Args:
-        batch: ``benchmark.json`` beside the runs' folders.
-        configs: which, in order; all where empty.
-        view: its name; else the median one of the first configuration.
+        batch: ``benchmark.json``, next to the folders of the runs.
+        configs: configurations, in order; empty: all.
+        view: name of the view; None: the median one of the first configuration.
         width: of one render, pixels.
         photograph: put the undistorted photograph of the view before the renders.
 
@@ -48,8 +48,8 @@ def sheet(
     try:
         rows = json.loads(batch.read_text())["runs"]
     except (OSError, ValueError, KeyError) as error:
-        raise UserError(f"expected a batch's benchmark.json: {error}", file=batch) from error
-    done: dict[str, Run] = {}  # the first seed of each
+        raise UserError(f"expected a benchmark.json: {error}", file=batch) from error
+    done: dict[str, Run] = {}  # first seed of each configuration
     for row in rows:
         if row["scene"] == scene and row["status"] == "ok":
             done.setdefault(row["config"], Run(scene, row["config"], row["seed"]))
@@ -63,7 +63,7 @@ def sheet(
         )
     tiles: list[tuple[str, Image.Image]] = []
     for config in configs or done:
-        # Without seeds of its own, a batch's folders name none.
+        # Folders of a batch without seeds have no seed in their name.
         named = batch.parent / done[config].name
         folder = named if named.is_dir() else batch.parent / Run(scene, config, None).name
         per_view = json.loads((folder / "metrics.json").read_text())["per_view"]
@@ -71,7 +71,7 @@ def sheet(
         found = next((v for v in per_view if v["name"] == view), None)
         if found is None:
             names = ", ".join(v["name"] for v in per_view)
-            raise UserError(f"no held-out view {view}", file=folder, fix=f"take of these: {names}")
+            raise UserError(f"no test view {view}", file=folder, fix=f"choose one of: {names}")
         picture = _scaled(folder / "evaluate" / "renders" / found["render"], width)
         if photograph and not tiles:
             original = folder / "undistort" / "images" / found["name"]
@@ -113,9 +113,9 @@ def main() -> int:
     )
     parser.add_argument("batch", type=Path, metavar="benchmark.json")
     parser.add_argument("--scene", required=True)
-    parser.add_argument("--configs", nargs="+", default=[], help="which, in order (default: all)")
+    parser.add_argument("--configs", nargs="+", default=[], help="configurations, in order (default: all)")
     parser.add_argument("--view", help="name of a test view (default: the median one)")
-    parser.add_argument("--photograph", action="store_true", help="the photograph first")
+    parser.add_argument("--photograph", action="store_true", help="put the photograph first")
     parser.add_argument("--width", type=int, default=240, help="of a render, pixels")
     parser.add_argument("--columns", type=int, default=4)
     parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.jpg")

@@ -1,8 +1,8 @@
-"""``python -m benchmarks.memory``: what training takes at most, beside what the plan says.
+"""``python -m benchmarks.memory``: peak memory of training, against the estimate of the plan.
 
-Trains a made scene of many views and Gaussians for a few steps that pass through every phase:
-coarse and full pictures, all SH bands, density control, a checkpoint. What it looks like does not
-matter to memory, so every view is the same picture of noise.
+Trains a synthetic scene of many views and Gaussians for a few steps with every phase: coarse and
+full images, all SH bands, density control, a checkpoint. All views are the same noise image,
+because memory does not depend on the content.
 """
 
 from __future__ import annotations
@@ -29,11 +29,11 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
 from pipeline.training.loop.train import train
 
-PIXELS_ACROSS = 3.0  # of a Gaussian's 3-sigma radius
+PIXELS_ACROSS = 3.0  # 3-sigma radius of a Gaussian
 
 
 def made_views(count: int, width: int, height: int, folder: Path) -> list[View]:
-    """``count`` views of one picture, around the origin."""
+    """``count`` views of one image, around the origin."""
     rng = np.random.default_rng(0)
     small = rng.integers(0, 256, (height // 8 + 1, width // 8 + 1, 3), np.uint8)
     picture = Image.fromarray(small).resize((width, height), Image.Resampling.BICUBIC)
@@ -52,7 +52,7 @@ def made_views(count: int, width: int, height: int, folder: Path) -> list[View]:
 
 
 def made_gaussians(count: int, focal: float) -> Gaussians:
-    """Small ones all over the middle of the scene."""
+    """Small Gaussians spread over the middle of the scene."""
     rng = np.random.default_rng(1)
     scale = PIXELS_ACROSS / 3 * 2.3 / focal
     return Gaussians.from_arrays({
@@ -72,7 +72,7 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=200)
     parser.add_argument("--size", type=int, nargs=2, default=[1600, 1067], metavar=("W", "H"))
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--memory-mb", type=int, help="train.memory_mb: pictures from disk")
+    parser.add_argument("--memory-mb", type=int, help="train.memory_mb: images are read from disk")
     parser.add_argument("--threads", type=int, default=usable_cores())
     parser.add_argument("--json", type=Path, help="write the figures as data")
     args = parser.parse_args()

@@ -1,11 +1,10 @@
-"""Deliberate faults, one at a time, and the test that notices each.
+"""Mutation tests: deliberate faults, one at a time, each of which a test must detect.
 
     python -m benchmarks.mutants            # all: some twenty minutes on two cores
-    python -m benchmarks.mutants sh_sign    # these
+    python -m benchmarks.mutants sh_sign    # selected ones
 
-Each fault is put into a copy of the project, whose tests then run up to the first failure. First
-the same tests run without a fault: they must pass, or a failure would say nothing. The exit code
-is 1 if a fault survives.
+Each fault is inserted into a copy of the project, whose tests then run up to the first failure.
+Before, the same tests must pass without a fault. The exit code is 1 if a fault survives.
 """
 
 from __future__ import annotations
@@ -33,10 +32,10 @@ class Mutant:
 
     Attributes:
         file: relative to the project.
-        old: occurs there exactly once.
-        new: what takes its place.
-        what: the mistake it stands for.
-        tests: of these files or folders at least one test must fail.
+        old: text to replace; occurs exactly once.
+        new: replacement.
+        what: description of the fault.
+        tests: files or folders; at least one of their tests must fail.
     """
 
     file: str
@@ -132,7 +131,7 @@ MUTANTS: dict[str, Mutant] = {
         f"{_CSRC}/project.cpp",
         "kMostReach = 3.34",
         "kMostReach = 2.0",
-        "the bound by which Gaussians out of view are told, too small",
+        "the bound for Gaussians out of view too small",
         _KERNELS,
     ),
     "camera_turn": Mutant(
@@ -195,7 +194,7 @@ MUTANTS: dict[str, Mutant] = {
         "pipeline/training/density/gradient.py",
         "idle & (opacity < RECYCLED_OPACITY)",
         "kept & (opacity < RECYCLED_OPACITY)",
-        "what is faint recycled though the loss pulls at it",
+        "faint Gaussians are recycled although their gradient is large",
         ("tests/training/density/test_density.py",),
     ),
     "alpha_unasked": Mutant(
@@ -209,7 +208,7 @@ MUTANTS: dict[str, Mutant] = {
         "pipeline/training/density/gradient.py",
         "gradient[:, 0] * (0.5 * width)",
         "gradient[:, 0] * width",
-        "the pull on a mean measured in widths rather than in NDC",
+        "the gradient of a mean in units of the width instead of NDC",
         ("tests/training/density/test_density.py",),
     ),
     "exposure_gradient": Mutant(
@@ -230,14 +229,14 @@ MUTANTS: dict[str, Mutant] = {
         "pipeline/scene/views.py",
         "return every > 0 and index % every == 0",
         "return every > 0 and index % every == 1",
-        "held out: the second of every eight views instead of the first",
+        "the second of every eight views is the test view instead of the first",
         ("tests/scene/test_views.py",),
     ),
     "leak": Mutant(
         "pipeline/training/scene.py",
         "training = [view for view in views if not view.is_test]",
         "training = list(views)",
-        "training on the held-out views",
+        "training on the test views",
         ("tests/e2e/test_regression.py",),
     ),
     "undistort_half_pixel": Mutant(

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.page``: a scene's page in a browser against the program's own renders.
+"""``python -m benchmarks.page``: renders of a page in a browser against the rasterizer's.
 
 make demo && python -m benchmarks.page results/demo
 
@@ -36,7 +36,7 @@ FLAGS = [
     *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
     "--no-first-run",
 ]
-MILLISECONDS = 600_000  # the processor draws every pixel
+MILLISECONDS = 600_000  # the browser renders on the CPU
 CAMERAS = 3
 
 
@@ -77,7 +77,7 @@ def main() -> int:
 
 
 def drawn(browser: str, page: Path, views: list[View]) -> Iterator[Any]:
-    """(H, W, 3) uint8 of each view, as the page's viewer draws it."""
+    """(H, W, 3) uint8 of each view, rendered by the viewer of the page."""
     from playwright.sync_api import sync_playwright
 
     with sync_playwright() as driver:

@@ -1,5 +1,8 @@
-"""Wild inputs by the million: counts values that are not finite, and holds the float32 kernels to
-the float64 twin. ``python -m benchmarks.raster_stress --cases 1000000``."""
+"""Stress test of the rasterizer with millions of extreme inputs: counts non-finite values, and
+compares the float32 kernels with the float64 reference.
+
+    python -m benchmarks.raster_stress --cases 1000000
+"""
 
 from __future__ import annotations
 
@@ -9,7 +12,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
-os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads, for the twin
+os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads, of the reference
 
 import numpy as np
 import torch
@@ -19,14 +22,14 @@ from pipeline.render import RasterCamera, RasterOptions, backward, forward, refe
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import Progress
 
-PER_CALL = 512  # Gaussians drawn together; each is a case
+PER_CALL = 512  # Gaussians per call; each is a case
 SIZES = [(1, 1), (2, 3), (16, 16), (17, 31), (13, 7), (23, 19)]
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
-WILD = np.array(
+EXTREME = np.array(
     [np.nan, np.inf, -np.inf, 0, -0.0, 1e-45, 1e-38, -1e38, 1e38, 3.4e38, 1e-12, 1e12, 88, -88]
 )
-# A pixel so near a cut-off may be decided otherwise in float32. Beyond this a gradient counts as
-# overflow, and the kernels give zeros.
+# Pixels within MARGIN of a cut-off may differ in float32. Gradients beyond LARGEST are treated as
+# overflow: the kernels return zeros.
 MARGIN, LARGEST = 1e-4, 1e30
 
 Rng = np.random.Generator
@@ -34,7 +37,7 @@ Rng = np.random.Generator
 
 @dataclass
 class Case:
-    """``PER_CALL`` Gaussians before the camera, for a family to spoil. Arrays as NAMES say."""
+    """``PER_CALL`` Gaussians in front of a camera, to be modified by a family of inputs."""
 
     rng: Rng
     arrays: dict[str, NDArray[np.float64]] = field(init=False)
@@ -65,14 +68,14 @@ def _not_finite(case: Case) -> None:
     for name in case.rng.choice(NAMES, 3):
         flat = case.arrays[name].reshape(PER_CALL, -1)
         for row in np.flatnonzero(case.rng.random(PER_CALL) < 0.1):
-            flat[row, case.rng.integers(flat.shape[1])] = case.rng.choice(WILD[:3])
+            flat[row, case.rng.integers(flat.shape[1])] = case.rng.choice(EXTREME[:3])
 
 
 def _any_value(case: Case) -> None:
     for name in NAMES:
         flat = case.arrays[name].reshape(-1)
         hit = case.rng.random(flat.size) < 0.03
-        flat[hit] = case.rng.choice(WILD, hit.sum())
+        flat[hit] = case.rng.choice(EXTREME, hit.sum())
 
 
 def _quaternions(case: Case) -> None:
@@ -165,7 +168,7 @@ class Tally:
 
 
 def run(name: str, call: int, tally: Tally) -> None:
-    """One call: ``PER_CALL`` cases of a family, forward, backward and the twin."""
+    """One call: ``PER_CALL`` cases of a family, forward, backward and the reference."""
     rng = np.random.default_rng([list(FAMILIES).index(name), call])
     case = Case(rng)
     with np.errstate(all="ignore"):

@@ -1,4 +1,5 @@
-"""The judge of reconstructions against the truth, on a corpus made by code and on real photographs.
+"""The verdict on reconstructions (good, weak, failed) against ground truth, on synthetic captures
+and on real photographs.
 
 python -m benchmarks.judge [--cases NAME ...] [--seeds 0-4] [--data FOLDER] [--json FILE]
 """

@@ -1,4 +1,4 @@
-"""Every case's truth, verdict and evidence, and how often they agree."""
+"""Truth, verdict and evidence of every case, and a confusion table."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap
 
 GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
-# What is printed of the evidence.
+# Printed fields of the evidence: name, heading, format.
 SHOWN = (
     ("explained_matches", "expl", "{:.2f}"),
     ("agreeing_pairs", "agree", "{:.2f}"),
@@ -43,7 +43,7 @@ SHOWN = (
 
 @dataclass(frozen=True)
 class Row:
-    """One case; ``truth`` is None where there is no truth to measure against."""
+    """Result of a case; ``truth`` is None without ground truth."""
 
     case: str
     seed: int
@@ -70,7 +70,7 @@ def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) ->
 
 
 def run_folder(name: str, seed: int, found: Matched, mapper: Mapper | None, budget: int) -> Row:
-    """Photographs, as the pipeline's plan would have them matched and mapped."""
+    """A folder of photographs, matched and mapped by the plan of the pipeline."""
     start = time.process_time()
     best, records = map_until_good(
         found.database, mapper or found.mapper, found.total, found.min_share, seed, budget
@@ -127,16 +127,16 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
 
 
 def show(row: Row) -> str:
-    told = "?" if row.truth is None else row.truth.grade
+    truth = "?" if row.truth is None else row.truth.grade
     facts = " ".join(
         f"{short} {form.format(row.evidence[key])}"
         for key, short, form in SHOWN
         if row.evidence.get(key) is not None
     )
-    wrong = "  <-- WRONG" if {told, row.verdict} == {"good", "failed"} else ""
+    wrong = "  <-- WRONG" if {truth, row.verdict} == {"good", "failed"} else ""
     share = "" if row.truth is None else f" {row.truth.share:.2f}"
     return (
-        f"{row.case:<22} {row.seed:>2}  truth {told:<6}{share}  verdict {row.verdict:<6} "
+        f"{row.case:<22} {row.seed:>2}  truth {truth:<6}{share}  verdict {row.verdict:<6} "
         f"{row.registered:>3}/{row.total:<3} {row.attempts} tried {row.cpu_s:>6.1f} s  {facts}"
         f"{'  | ' + '; '.join(row.reasons) if row.reasons else ''}{wrong}"
     )
@@ -164,8 +164,10 @@ def main() -> int:
         "--data", nargs="*", type=Path, default=[], help="scenes' folders, or results/NAME"
     )
     parser.add_argument("--mapper", choices=["incremental", "global"], default="incremental")
-    parser.add_argument("--budget", type=int, default=Sfm().max_attempts, help="attempts at most")
-    parser.add_argument("--json", type=Path, help="write all of it here")
+    parser.add_argument(
+        "--budget", type=int, default=Sfm().max_attempts, help="largest number of attempts"
+    )
+    parser.add_argument("--json", type=Path, help="write the results as JSON")
     args = parser.parse_args()
     unknown = set(args.cases or []) - {*CASES, *PICTURES}
     if unknown:

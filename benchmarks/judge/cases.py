@@ -1,4 +1,4 @@
-"""The corpus: captures that succeed, captures that fail, and captures that only seem to succeed."""
+"""Synthetic captures: successful ones, failing ones, and ones with plausible but wrong models."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ ORBIT_RADIUS = 2.6
 
 
 def _things(rng: np.random.Generator, count: int = 2600) -> Surface:
-    """A few balls on a heap: all sides differ."""
+    """A few balls: all sides differ."""
     total = ball(rng, np.array([0.0, 0.0, 0.7]), 0.6, count // 2)
     for centre, radius in (((0.9, 0.3, 0.35), 0.35), ((-0.7, 0.6, 0.4), 0.4)):
         total = total + ball(rng, np.array(centre), radius, count // 4)
@@ -51,7 +51,7 @@ def orbit(rng: np.random.Generator, count: int = 18, **facts: Any) -> Made:
 
 
 def _facing(rng: np.random.Generator, count: int, step: float, relief: float) -> Made:
-    """A row along a wall of so much relief (its height is 4)."""
+    """A row of cameras along a wall with this relief (its height is 4)."""
     length = 6 + step * count
     wall = plane(rng, (-3, 3, 0), (length, 0, 0), (0, 0, 4), int(500 * length), relief)
     shots = []
@@ -63,7 +63,7 @@ def _facing(rng: np.random.Generator, count: int, step: float, relief: float) ->
 
 
 def _street(rng: np.random.Generator, count: int, step: float, **facts: Any) -> Made:
-    """Forwards along a street, as a dash camera sees it."""
+    """Forward motion along a street, as of a dash camera."""
     length = 30 + count * step
     sides = (
         plane(rng, (-4, length, 0), (0, -length, 0), (0, 0, 6), int(120 * length), -0.6)
@@ -80,7 +80,7 @@ def _street(rng: np.random.Generator, count: int, step: float, **facts: Any) -> 
 
 
 def _turning(rng: np.random.Generator, count: int, sway: float) -> Made:
-    """Turned on the spot in a room of side 7; ``sway`` is how far the hand moves, metres."""
+    """Rotation on the spot in a room of side 7; ``sway`` is the movement of the camera, metres."""
     shots = []
     for i in range(count):
         angle = 2 * np.pi * i / count
@@ -169,14 +169,14 @@ def _two_rooms(rng: np.random.Generator) -> Made:
 
 
 def _mixed(rng: np.random.Generator) -> Made:
-    """Three heaps' photographs in one folder, none of which has half of them."""
+    """Photographs of three scenes in one folder, none with half of them."""
     heaps = [_things(rng) + room(rng, 7.0, 3500) for _ in range(3)]
     shots = [replace(shot, scene=k) for k in range(3) for shot in _ring(rng, 15)]
     return Made(heaps, shots, solid=_SOLID)
 
 
 def _outliers(rng: np.random.Generator) -> Made:
-    """Three of ten photographs show something else each."""
+    """Three of ten photographs each show a different scene."""
     good = orbit(rng, 18)
     scenes, shots = list(good.scenes), list(good.shots)
     for k in range(8):
@@ -204,7 +204,7 @@ def _two_photos_many_times(rng: np.random.Generator) -> Made:
 
 
 def _mirrored(rng: np.random.Generator) -> Made:
-    """Each third photograph is turned left to right."""
+    """Every third photograph is mirrored."""
     good = orbit(rng, 30)
     shots = [replace(shot, mirrored=i % 3 == 0) for i, shot in enumerate(good.shots)]
     return replace(good, shots=shots)
@@ -230,17 +230,17 @@ def _wrong_priors_each(rng: np.random.Generator) -> Made:
 
 
 def _sparse_texture(rng: np.random.Generator) -> Made:
-    """Almost no texture: a few dozen keypoints a picture."""
+    """Almost no texture: a few dozen keypoints per image."""
     return Made([_things(rng, 120) + room(rng, 7.0, 100)], _ring(rng, 20), solid=_SOLID)
 
 
 def _plain(rng: np.random.Generator) -> Made:
-    """A little more of it: enough for a chain of pairs to be verified, hardly for more."""
+    """Slightly more texture: enough for a chain of verified pairs."""
     return Made([_things(rng, 320) + room(rng, 7.0, 250)], _ring(rng, 24), solid=_SOLID)
 
 
 CASES: dict[str, Case] = {
-    # That should go well.
+    # Should succeed.
     "orbit": orbit,
     "orbit_prior_right": _with_prior(orbit, 1.0),
     "orbit_camera_each": _cameras_each,
@@ -255,10 +255,10 @@ CASES: dict[str, Case] = {
     "outliers_30": _outliers,
     "duplicates": _duplicates,
     "mirrored_third": _mirrored,
-    # Parts of it.
+    # Partial models.
     "two_rooms": _two_rooms,
     "mixed_three": _mixed,
-    # What seems to succeed, or fails.
+    # Plausible but wrong models, and failures.
     **{f"prior_x{f}": _with_prior(orbit, f) for f in (0.3, 0.5, 0.7, 1.5, 2.0, 3.0)},
     **{
         f"row_prior_x{f}": _with_prior(lambda rng: _facing(rng, 14, 0.35, 0.8), f)

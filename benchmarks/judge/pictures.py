@@ -1,5 +1,4 @@
-"""Cases that need pictures: rendered ones, and photographs from a folder; both matched as the
-pipeline would."""
+"""Cases with images: rendered ones, and photographs from a folder, matched as by the pipeline."""
 
 from __future__ import annotations
 
@@ -27,13 +26,13 @@ PICTURES: dict[str, Look] = {
     "pictures_blurred": "blurred",
 }
 VIEWS, WIDTH, HEIGHT = 14, 320, 240
-# Heavy blur: sigma in pixels of 320.
+# Sigma of the blur, pixels, at a width of 320.
 BLUR = 5.0
 
 
 @dataclass(frozen=True)
 class Matched:
-    """A scene's database, and what its plan says of mapping it."""
+    """Database of a scene with the options of mapping from its plan."""
 
     database: Path
     total: int
@@ -43,8 +42,8 @@ class Matched:
 
 
 def write_pictures(name: str, seed: int, folder: Path) -> None:
-    """Render a case of ``PICTURES``: the demo's room, as it is, without texture, or blurred."""
-    # In a process of its own: cv2 and pycolmap do not go together.
+    """Render a case of ``PICTURES``: the demo scene, unchanged, without texture, or blurred."""
+    # Runs in a separate process, because cv2 and pycolmap conflict.
     import cv2
     import numpy as np
     from PIL import Image
@@ -58,7 +57,7 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
 
     look = PICTURES[name]
     names = [f"view_{i:03d}.png" for i in range(VIEWS)]
-    # An arc: as many views of a whole ring would be too far from each other.
+    # An arc: the same number of views on a full ring would be too far apart.
     views = orbit(names, seed)
     camera = lens("simple_radial", WIDTH, HEIGHT)
     through = rays(camera)
@@ -69,7 +68,7 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
         if look == "blurred":
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), BLUR), np.float64)
         if look == "bare":
-            # Painted over: shading and edges stay, texture goes.
+            # Removes the texture; shading and edges remain.
             light = np.asarray(cv2.GaussianBlur(light, (0, 0), 12.0), np.float64) * 0.2 + 0.3
         noisy = srgb(light) + rng.normal(0, 0.004, light.shape)
         Image.fromarray(to_bytes(noisy)).save(folder / "images" / posed.name)
@@ -78,8 +77,8 @@ def write_pictures(name: str, seed: int, folder: Path) -> None:
 
 
 def match_folder(folder: Path, work: Path, seed: int) -> Matched:
-    """Features and matches of a scene's photographs, by its plan, given poses ignored; or those of
-    a finished scene (``results/NAME``)."""
+    """Features and matches of the photographs of a scene, by its plan, without its given poses; or
+    those of a finished scene (``results/NAME``)."""
     if (folder / "plan.json").is_file():
         return _finished(folder, work)
     config = Config(poses="ignore", seed=seed)
@@ -119,6 +118,6 @@ def _match(
 ) -> None:
     from pipeline.sfm.matching import match_features
 
-    # No verified pair: this stage already says so. Mapping then finds no model.
+    # No verified pair, which this stage reports. Mapping then finds no model.
     with contextlib.suppress(UserError):
         match_features(manifest, features, matches, sfm, out, seed=seed)

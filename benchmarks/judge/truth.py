@@ -1,4 +1,4 @@
-"""What a model is worth, by its poses against the truth: the same for every case."""
+"""Grades a model by the errors of its poses."""
 
 from __future__ import annotations
 
@@ -16,13 +16,14 @@ from pipeline.scene.reconstruction import Reconstruction
 Array = NDArray[np.float64]
 Grade = Literal["good", "weak", "failed"]
 
-# A view is right within these, after the similarity that makes most views right.
+# Error bounds of a correct view, after the similarity with the most correct views.
 ROTATION_DEG, CENTRE_SHARE = 5.0, 0.05
-# Of the views with a pose (and a true one): as many right is a good model, fewer than that failed.
+# Shares of correct views among those with a pose and a true one: good from the first, failed below
+# the second.
 GOOD_SHARE, FAILED_SHARE = 0.9, 0.6
-# A model of less than this share of the photographs is no model of the scene.
+# A model with a smaller share of the photographs has failed.
 LEAST_REGISTERED = 0.5
-# Cameras that moved less than this share of the distance to what they saw saw no depth.
+# Cameras that moved less, as a share of their distance to the scene, observe no depth.
 MIN_TRUE_MOTION = 0.01
 HYPOTHESES = 600
 
@@ -122,7 +123,7 @@ def _residuals(r_found: Array, c_found: Array, r_true: Array, c_true: Array) -> 
         shift = c_true[i] - scale * world @ c_found[i]
         right = consider(scale, world, shift)
         if right.sum() >= 3:
-            # On a line the centres leave a turn about it open: the rotations settle it.
+            # Collinear centres leave a rotation about their line, which the cameras determine.
             u, _, vt = np.linalg.svd(np.einsum("nij,nik->jk", r_true[right], r_found[right]))
             world = u @ np.diag([1.0, 1.0, np.linalg.det(u @ vt)]) @ vt
             scale, _, _ = umeyama(c_found[right] @ world.T, c_true[right])

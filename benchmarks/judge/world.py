@@ -1,8 +1,8 @@
-"""Made scenes: points on surfaces that cameras see, match and mistake, as a database of matches.
+"""Synthetic captures without images: a database of keypoints and matches of surface points.
 
-No pictures: a keypoint is where a surface point falls, half a pixel off. Which points are found
-again in which pictures follows what SIFT does: not from the back, not at a grazing angle, less
-with every degree between the views, not at another scale, and never all of them.
+Keypoints are projected surface points with noise. The probability of a match follows SIFT: none for
+back faces, grazing angles and large scale changes; otherwise it falls with the angle between the
+views.
 """
 
 from __future__ import annotations
@@ -28,24 +28,24 @@ Ints = NDArray[np.int64]
 WIDTH, HEIGHT = 640, 480
 FOCAL, RADIAL = 560.0, -0.06
 NOISE_PX = 0.5
-# Of the points in view a detector finds this share, and of those in two pictures the matcher this.
+# Share of the points in view that are detected, and of those in two images that are matched.
 DETECTED, MATCHED = 0.75, 0.85
-# Matching falls off with the angle between two views (SIFT: half is gone at 30 degrees).
+# Angle between two views at which half of the matches of SIFT are lost.
 HALF_ANGLE_DEG = 30.0
 MAX_GRAZING_DEG = 72.0
 MAX_SCALE_RATIO = 2.5
-# Of a pair's matches, wrong ones that passed the ratio test; and those by chance between any two.
+# Wrong matches of a pair that pass the ratio test: a share of the correct ones, plus a number.
 WRONG_SHARE, WRONG_MATCHES = 0.08, 4
 MIN_INLIERS = 15
 
 
 @dataclass(frozen=True)
 class Surface:
-    """Points that can be seen and what they look like.
+    """Points of a surface with their appearance.
 
     Attributes:
         xyz, normal: (P, 3).
-        look: (P,) points of one number look the same.
+        look: (P,) appearance: points with equal numbers look the same.
     """
 
     xyz: Array
@@ -66,13 +66,13 @@ class Shot:
     """One photograph.
 
     Attributes:
-        rotation, centre: where the camera truly was, world to camera.
-        scene: surfaces of other scenes are not seen.
-        mirrored: turned left to right after it was taken.
-        prior: focal length that EXIF claims over the true one; None where it claims none.
-        blur: keypoints' noise, pixels, on top.
+        rotation, centre: true pose, world to camera.
+        scene: index of the visible scene.
+        mirrored: the photograph is flipped horizontally.
+        prior: focal length in EXIF over the true one; None without EXIF.
+        blur: additional noise of the keypoints, pixels.
         copy_of: index of the photograph that this is a copy of.
-        camera: photographs of one number share a camera.
+        camera: photographs with equal numbers share a camera.
     """
 
     rotation: Array
@@ -87,19 +87,19 @@ class Shot:
 
 @dataclass(frozen=True)
 class Made:
-    """A made scene: what was photographed, and how."""
+    """A synthetic capture: scenes and photographs."""
 
     scenes: Sequence[Surface]
     shots: Sequence[Shot]
     radial: float = RADIAL
     solid: Sequence[tuple[Triple, float]] = field(default_factory=tuple)
-    """Spheres (centre, radius) that hide what is behind them."""
+    """Spheres (centre, radius) that occlude what is behind them."""
 
 
 def plane(
     rng: np.random.Generator, origin: Triple, u: Triple, v: Triple, count: int, relief: float = 0.0
 ) -> Surface:
-    """A parallelogram's points; its normal is u x v, along which they rise up to ``relief``."""
+    """Points on a parallelogram with normal u x v, raised along it by up to ``relief``."""
     first, second, corner = (np.asarray(a, np.float64) for a in (u, v, origin))
     normal = np.cross(first, second)
     normal /= np.linalg.norm(normal)
@@ -138,12 +138,12 @@ def looking(centre: Triple, target: Triple, roll: float = 0.0, **facts: Any) -> 
 
 @dataclass(frozen=True)
 class Written:
-    """A made scene's photographs and truth.
+    """Photographs and ground truth of a synthetic capture.
 
     Attributes:
-        truths: cameras of each scene, and of each scene's mirror image: no model can hold more
-            than one of them.
-        depth: median distance of what they saw.
+        truths: cameras of each scene, and of each mirrored scene: a model can contain only
+            one of them.
+        depth: median distance of the visible points.
     """
 
     manifest: Manifest
@@ -171,7 +171,7 @@ def write(made: Made, path: Path, seed: int) -> Written:
         for i in range(len(seen)):
             for j in range(i + 1, len(seen)):
                 matches = _match(made, i, j, seen, rng)
-                # Fewer can't be verified, and are what takes longest to try.
+                # Fewer cannot be verified, and trying takes longest.
                 if len(matches) >= MIN_INLIERS:
                     database.write_matches(i + 1, j + 1, matches.astype(np.uint32))
     options = pycolmap.TwoViewGeometryOptions(min_num_inliers=MIN_INLIERS)
@@ -187,8 +187,8 @@ def write(made: Made, path: Path, seed: int) -> Written:
 
 
 def _truth(made: Made, names: Sequence[str], like: Shot) -> Reconstruction:
-    """The cameras that show what ``like`` shows. A photograph turned left to right is what a
-    camera sees that was mirrored together with the world, both in x."""
+    """The cameras of the scene that ``like`` shows. A flipped photograph is that of a camera and a
+    world both mirrored in x."""
     params = np.array([FOCAL, WIDTH / 2, HEIGHT / 2, made.radial])
     mirror = np.diag([-1.0, 1.0, 1.0]) if like.mirrored else np.eye(3)
     images = {}
@@ -201,7 +201,7 @@ def _truth(made: Made, names: Sequence[str], like: Shot) -> Reconstruction:
 
 @dataclass(frozen=True)
 class _Seen:
-    """Keypoints of a photograph: (F, 2) xy and what each shows, sorted by point."""
+    """Keypoints of a photograph: (F, 2) xy, and the point of each, sorted by point."""
 
     xy: Array
     point: Ints
@@ -216,7 +216,7 @@ def _see(made: Made, shot: Shot, rng: np.random.Generator) -> _Seen:
     ahead = local[:, 2] > 0.1
     flat = local[:, :2] / np.where(ahead, local[:, 2], 1.0)[:, None]
     r2 = (flat**2).sum(1, keepdims=True)
-    # Beyond the distortion's turning point rays would come back into the picture.
+    # Outside its monotonic range, the distortion would map rays back into the image.
     ahead &= (r2 < 1.0)[:, 0]
     xy = FOCAL * flat * (1 + made.radial * r2) + (WIDTH / 2, HEIGHT / 2)
     to_camera = shot.centre - surface.xyz
@@ -234,11 +234,11 @@ def _see(made: Made, shot: Shot, rng: np.random.Generator) -> _Seen:
     return _Seen(found, index, surface.look[index], ray[index], depth[index])
 
 
-def _hidden(points: Array, eye: Array, centre: Array, radius: float) -> NDArray[np.bool_]:
-    """Whether a sphere stands between the eye and each point (the sphere's own are not hidden)."""
-    way = points - eye
-    along = np.clip(((centre - eye) * way).sum(1) / (way**2).sum(1), 0, 1)
-    nearest = eye + along[:, None] * way
+def _hidden(points: Array, camera: Array, centre: Array, radius: float) -> NDArray[np.bool_]:
+    """Whether a sphere occludes each point; points of the sphere itself are not occluded."""
+    way = points - camera
+    along = np.clip(((centre - camera) * way).sum(1) / (way**2).sum(1), 0, 1)
+    nearest = camera + along[:, None] * way
     return np.asarray(np.linalg.norm(nearest - centre, axis=1) < 0.97 * radius)
 
 
@@ -249,7 +249,7 @@ def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generat
         return np.zeros((0, 2), np.int64)
     right = np.zeros((0, 2), np.int64)
     if first.scene == second.scene and first.mirrored == second.mirrored:
-        # Of several that look the same the ratio test lets none through.
+        # The ratio test rejects points with several equal counterparts.
         ua, ca = np.unique(a.look, return_counts=True)
         ub, cb = np.unique(b.look, return_counts=True)
         alone = np.intersect1d(ua[ca == 1], ub[cb == 1])
@@ -266,7 +266,7 @@ def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generat
         likely = np.full(len(row), MATCHED)
         if not same and len(row):
             normal = made.scenes[first.scene].normal
-            # Each copy of a look is compared as it presents itself to its camera.
+            # Points of equal appearance are compared by their viewing angles.
             angle = _presented_angle(
                 a.ray[row], normal[a.point[row]], b.ray[column], normal[b.point[column]]
             )
@@ -278,7 +278,7 @@ def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generat
     wrong = rng.poisson(WRONG_MATCHES + WRONG_SHARE * len(right))
     noise = np.column_stack([rng.integers(0, len(a.xy), wrong), rng.integers(0, len(b.xy), wrong)])
     both = np.concatenate([right, noise])
-    # A keypoint is matched once; the right ones come first.
+    # A keypoint is matched once; correct matches come first.
     _, keep = np.unique(both[:, 0], return_index=True)
     both = both[np.sort(keep)]
     _, keep = np.unique(both[:, 1], return_index=True)
@@ -286,8 +286,8 @@ def _match(made: Made, i: int, j: int, seen: list[_Seen], rng: np.random.Generat
 
 
 def _presented_angle(ray_a: Array, normal_a: Array, ray_b: Array, normal_b: Array) -> Array:
-    """Degrees between the ways in which two points present themselves: of one point, the angle
-    between its rays; of two that look the same, the difference of their slants."""
+    """Angle in degrees between two observations: for one point, between its rays; for two points of
+    equal appearance, the difference of their viewing angles."""
     same = (np.abs(normal_a - normal_b) < 1e-9).all(1)
     rays = np.degrees(np.arccos(np.clip((ray_a * ray_b).sum(1), -1, 1)))
     slant_a, slant_b = (

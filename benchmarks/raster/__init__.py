@@ -1,1 +1,1 @@
-"""How fast the rasterizer is, and how right: ``python -m benchmarks.raster --help``."""
+"""Speed and accuracy of the rasterizer: ``python -m benchmarks.raster --help``."""

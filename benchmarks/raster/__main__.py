@@ -1,4 +1,4 @@
-"""Times the rasterizer's operators, or drawing alone, and compares them with the reference.
+"""Times the rasterizer's operators, or rendering alone, and compares them with the reference.
 
 See docs/explanation/rasterizer.md.
 """
@@ -15,10 +15,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-# torch's threads, which the twin runs on, must not spin: they would take our kernels' time.
+# torch's threads (of the reference) must not spin: they would slow down the kernels.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
-from benchmarks.raster.accuracy import Accuracy, accuracy, twin_ratio
+from benchmarks.raster.accuracy import Accuracy, accuracy, reference_ratio
 from benchmarks.raster.drawing import report_drawings
 from benchmarks.raster.library import Library, heading, measured_library, measured_on
 from benchmarks.raster.measure import (
@@ -71,18 +71,20 @@ def _arguments() -> argparse.Namespace:
         "--in-view", type=_share, default=1.0, help="share of the Gaussians that the view shows"
     )
     parser.add_argument(
-        "--draw", action="store_true", help="measure drawing alone, in frames a second"
+        "--draw", action="store_true", help="measure rendering alone, in frames per second"
     )
     parser.add_argument("--threads", type=int, nargs="+", default=[1, 2])
-    parser.add_argument("--seconds", type=float, default=4.0, help="spent on a scene's times")
+    parser.add_argument("--seconds", type=float, default=4.0, help="time to measure each scene")
     parser.add_argument(
         "--model", type=Path, help="measure this export folder instead: point_cloud.ply, sparse/0"
     )
     parser.add_argument(
-        "--probe", type=Path, help="another program to run in turns; benchmarks/raster/probe.py"
+        "--probe",
+        type=Path,
+        help="another program to run in alternation; see benchmarks/raster/probe.py",
     )
     parser.add_argument("--turns", type=int, default=9, help="with --probe")
-    parser.add_argument("--json", type=Path, help="write the same as data")
+    parser.add_argument("--json", type=Path, help="write the results as JSON")
     return parser.parse_args()
 
 
@@ -91,7 +93,7 @@ def _header(step: Step, pairs: int, error: Accuracy, library: Library) -> None:
         f"\n{heading(library)}\n"
         f"{step.scene.name}; {step.threads} threads; {pairs / 1e6:.3f}M contributing pairs, "
         f"{step.drawn.num_intersections} (Gaussian, tile) pairs\n"
-        f"error against the float64 twin: colour {error.colour:.1e}, "
+        f"error against the float64 reference: colour {error.colour:.1e}, "
         f"gradients {error.gradient:.1e} relative\n"
         f"{'':24} {'ms':>8} {'quartiles':>17} {'CPU ms':>8} {'Mpairs/s':>9} {'of peak':>8} "
         f"{'of bound':>9} {'quartiles':>12}"
@@ -99,7 +101,7 @@ def _header(step: Step, pairs: int, error: Accuracy, library: Library) -> None:
 
 
 def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict[str, Any]:
-    """Prints one number of threads' table; the same as data."""
+    """Print the table of one number of threads; returns its data."""
     pairs, blocks, error = contributing_pairs(step), block_pairs(step), accuracy(step)
     costs = step.costs(pairs)
     _header(step, pairs, error, library)
@@ -115,7 +117,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
             f"{cpu.median:8.2f} {found['pairs_per_s'] / 1e6:9.1f}"
         )
         if name in costs:
-            # Of the peak just before each step: a virtual machine's cores change their speed.
+            # Relative to the peak just before each step: the speed of virtual machines varies.
             shares = [
                 costs[name].seconds(replace(peak, flops=t.flops)) * 1e3 / t.times[name].cpu
                 for t in turns
@@ -142,7 +144,7 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
 
 
 def _speedups(first: Step, turns: list[Turn], other: Step, others: list[Turn]) -> dict[str, Any]:
-    """Of more threads over fewer, turn by turn."""
+    """Speed-up of more threads over fewer, turn by turn."""
     found = {
         name: Spread.of(
             [a.times[name].wall / b.times[name].wall for a, b in zip(turns, others, strict=True)]
@@ -172,7 +174,7 @@ def _against_the_probe(step: Step, probe: Path, turns: int) -> dict[str, Any]:
 
 
 def _scenes(args: argparse.Namespace) -> list[Callable[[], Scene]]:
-    """Made one by one: the largest are some hundred megabytes."""
+    """Scenes are created one by one, because of their size in memory."""
     if args.model:
         return [partial(trained, args.model, size) for size in args.sizes or [None]]
     return [
@@ -196,19 +198,20 @@ def main() -> None:
 
 
 def _operators(args: argparse.Namespace, library: Library) -> dict[str, Any]:
-    """Prints the tables of a training step's operators; the same as data."""
+    """Print the tables of the operators of a training step; returns their data."""
     calibration = Calibration()
     results, speedups, peaks, ratios = [], [], [], []
     for threads in args.threads:
         peak = calibration.peak(threads)
         peaks.append(peak)
-        ratio = twin_ratio(threads)
+        ratio = reference_ratio(threads)
         ratios.append({"threads": threads, **asdict(ratio)})
         print(
             f"{peak}\n"
-            f"{threads} threads: {ratio.scene}, forward and backward: twin {ratio.twin:.0f} ms, "
-            f"kernels {ratio.kernels:.2f} ms, 1 : {ratio.twin / ratio.kernels:.0f} (the twin holds "
-            "every pixel of every Gaussian: no larger scene fits)"
+            f"{threads} threads: {ratio.scene}, forward and backward: reference "
+            f"{ratio.reference:.0f} ms, kernels {ratio.kernels:.2f} ms, "
+            f"1 : {ratio.reference / ratio.kernels:.0f} (the reference "
+            "stores every pixel of every Gaussian: larger scenes do not fit)"
         )
     for make in _scenes(args):
         scene = make()
@@ -224,7 +227,7 @@ def _operators(args: argparse.Namespace, library: Library) -> dict[str, Any]:
     return {
         **measured_on(library),
         "peak": [{**asdict(p), "per_cycle": p.per_cycle} for p in peaks],
-        "twin": ratios,
+        "reference": ratios,
         "results": results,
         "speedups": speedups,
     }

@@ -1,4 +1,4 @@
-"""The kernels against the float64 twin, inside a window in the middle of the image."""
+"""Errors of the kernels against the float64 reference, in a window at the image centre."""
 
 from __future__ import annotations
 
@@ -17,16 +17,22 @@ NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 
 @dataclass(frozen=True)
 class Accuracy:
-    """``colour``: largest error, of pixels that hang on no cut-off; ``gradient``: the largest
-    relative L2 error of the five parameters' gradients."""
+    """Errors against the reference.
+
+    Attributes:
+        colour: largest error of pixels that are not near a cut-off.
+        gradient: largest relative L2 error of the gradients of the five parameters.
+    """
 
     colour: float
     gradient: float
 
 
 def accuracy(step: Step) -> Accuracy:
-    """Of a random scalar of the window's colours. Gaussians that miss the window are left out of
-    the twin, which could not hold them all."""
+    """Errors in the window, for the gradient of a random linear function of its colours.
+
+    Gaussians outside the window are excluded from the reference, to limit its memory.
+    """
     scene, camera = step.scene, step.scene.camera
     w, h = min(WINDOW, camera.width), min(WINDOW, camera.height)
     left, top = (camera.width - w) // 2, (camera.height - h) // 2
@@ -44,30 +50,30 @@ def accuracy(step: Step) -> Accuracy:
     moved = replace(projection, means2d=projection.means2d - torch.tensor([left, top]))
     image = reference.blend(moved, colors, replace(camera, width=w, height=h), options)
     window = (slice(top, top + h), slice(left, left + w))
-    sure = image.margin > 1e-5
-    error = (step.drawn.color[window] - image.color.detach()).abs().amax(-1)[sure]
-    d_window = torch.randn(h, w, 3, generator=torch.Generator().manual_seed(2)) * sure[..., None]
+    certain = image.margin > 1e-5
+    error = (step.drawn.color[window] - image.color.detach()).abs().amax(-1)[certain]
+    d_window = torch.randn(h, w, 3, generator=torch.Generator().manual_seed(2)) * certain[..., None]
     d_color = torch.zeros(camera.height, camera.width, 3)
     d_color[window] = d_window
-    found = backward(step.drawn, d_color)
-    wanted = torch.autograd.grad((image.color * d_window).sum(), inputs)
+    gradients = backward(step.drawn, d_color)
+    expected = torch.autograd.grad((image.color * d_window).sum(), inputs)
     relative = [
-        float((getattr(found, name)[rows] - want).norm() / want.norm().clamp(min=1e-30))
-        for name, want in zip(NAMES, wanted, strict=True)
+        float((getattr(gradients, name)[rows] - value).norm() / value.norm().clamp(min=1e-30))
+        for name, value in zip(NAMES, expected, strict=True)
     ]
     return Accuracy(float(error.max()), max(relative))
 
 
 @dataclass(frozen=True)
-class TwinRatio:
-    """Forward and backward on a scene small enough for the twin, milliseconds."""
+class ReferenceRatio:
+    """Forward and backward on a scene small enough for the reference, milliseconds."""
 
     scene: str
-    twin: float
+    reference: float
     kernels: float
 
 
-def twin_ratio(threads: int) -> TwinRatio:
+def reference_ratio(threads: int) -> ReferenceRatio:
     scene = synthetic(1000, 96, 54, 5.0)
     options = RasterOptions(background=BACKGROUND, threads=threads)
     weight = torch.rand(54, 96, 3, generator=torch.Generator().manual_seed(3))
@@ -91,4 +97,4 @@ def twin_ratio(threads: int) -> TwinRatio:
             times.append(1e3 * (time.perf_counter() - start))
         best.append(min(times))
     torch.set_num_threads(before)
-    return TwinRatio(scene.name, *best)
+    return ReferenceRatio(scene.name, *best)

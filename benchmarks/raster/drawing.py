@@ -1,4 +1,4 @@
-"""Frames a second of drawing alone: projection, binning and blending, without gradients."""
+"""Frames per second of rendering: projection, binning and blending, without gradients."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.render import RasterOptions, forward
 
 @dataclass(frozen=True)
 class Drawing:
-    """Milliseconds a frame, over rounds through all views: on the clock, and CPU time over threads.
+    """Milliseconds per frame, over rounds of all views: wall time, and CPU time over threads.
 
     Attributes:
         visible: Gaussians that touch the image, mean over the views.
@@ -39,7 +39,7 @@ HEADER = f"{'threads':>8} {'frames/s':>9} {'ms':>9} {'quartiles':>17} {'CPU ms':
 
 
 def drawings(scene: Scene, threads: Sequence[int], seconds: float) -> list[Drawing]:
-    """The numbers of threads in turns, for ``seconds`` in all."""
+    """Measure the numbers of threads in alternation, for ``seconds`` in total."""
     options = [RasterOptions(background=BACKGROUND, threads=n) for n in threads]
     drawn = [forward(*scene.gaussians, view, options[0]) for view in scene.views]
     visible = sum(d.num_visible for d in drawn) / len(drawn)
@@ -63,7 +63,7 @@ def drawings(scene: Scene, threads: Sequence[int], seconds: float) -> list[Drawi
 
 
 def report_drawings(scene: Scene, threads: Sequence[int], seconds: float) -> dict[str, Any]:
-    """Prints the table of one scene; the same as data."""
+    """Print the table of one scene; returns its data."""
     found = drawings(scene, threads, seconds)
     camera = scene.camera
     print(

@@ -1,4 +1,4 @@
-"""What the measured kernels are compiled for, and by what: every table says so."""
+"""Instruction set and compiler of the measured kernels, stated with every table."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ class Library:
 
 
 def measured_library() -> Library:
-    """Of the kernels that this process loads."""
+    """The library that this process loads."""
     built = build.load()
     command = [*build.compiler(), *build.flags(built.target), "-x", "c++", "-dM", "-E", "/dev/null"]
     done = subprocess.run(command, capture_output=True, text=True, check=True)
@@ -56,7 +56,7 @@ def measured_on(library: Library) -> dict[str, Any]:
 
 
 def heading(library: Library) -> str:
-    """The same, as a line above a table."""
+    """The heading of a table."""
     facts = machine_facts()
     return (
         f"{facts['processor']}, {facts['cores']} cores; kernels for {library.target} "

@@ -1,4 +1,4 @@
-"""Times of the operators of a training step, and the least that each has to do."""
+"""Times of the operators of a training step, and lower bounds of their work."""
 
 from __future__ import annotations
 
@@ -20,34 +20,33 @@ from pipeline.render.cpu import build
 BACKGROUND = (0.1, 0.2, 0.3)
 SSIM_WEIGHT = Train().ssim_loss_weight
 SQUARED_ERROR_WEIGHT = DEFAULT.train.squared_error_loss_weight
-MIN_TURNS = 5  # quartiles of fewer say nothing
+MIN_TURNS = 5  # least number for quartiles
 TILE_PIXELS = 16 * 16
-# Operations on all pixels of a block that one Gaussian takes at least: place 2, exponent 2, 2^x 11,
-# its bounds 3, transmittance 3; forward colour and what is left 4; backward place again 2,
-# transmittance 1, what the pixel asks 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
-# Each is as many instructions as registers hold the block's pixels. "Of bound" is the measured time
-# over the time of these instructions at the rate at which the processor starts multiply-adds. It is
-# no strict bound: processors that have further units for additions, comparisons and bits start
-# more of those.
+# Least number of operations of one Gaussian on all pixels of a block: offset 2, exponent 2, 2^x 11,
+# clamping 3, transmittance 3; forward: colour and remaining transmittance 4; backward: offset 2,
+# transmittance 1, gradient of the pixel 4, alpha / (1 - alpha) 5, v 4, moments of v and colour 11.
+# Each takes as many instructions as registers hold the pixels of the block. "Of bound" is the
+# measured time over the time of these instructions at the rate at which the processor starts
+# multiply-adds. It is not a strict bound: processors with further units for other operations start
+# more of them.
 BLOCK_OPERATIONS = {"blend": 25, "blend backward": 48}
 
 
 @dataclass(frozen=True)
 class Cost:
-    """The least an operator has to do on a scene: float32 operations and bytes."""
+    """Lower bound of the work of an operator on a scene: float32 operations and bytes."""
 
     flops: float
     bytes: float
 
     def seconds(self, peak: Peak) -> float:
-        """At the machine's peak, whichever of the two binds."""
+        """Time at the peak of the machine, by the tighter of the two limits."""
         return max(self.flops / peak.flops, self.bytes / peak.bytes)
 
 
 @dataclass(frozen=True)
 class Timing:
-    """Milliseconds: on the clock, and CPU time over threads, which other work on the machine
-    disturbs less."""
+    """Milliseconds: wall time, and CPU time over threads, which depends less on other load."""
 
     wall: float
     cpu: float
@@ -55,7 +54,7 @@ class Timing:
 
 @dataclass(frozen=True)
 class Turn:
-    """One step: each operator's time, and the operations a second that the calibration loop had
+    """One step: the time of each operator, and the operations per second that the calibration loop
     reached just before."""
 
     flops: float
@@ -64,7 +63,7 @@ class Turn:
 
 @dataclass(frozen=True)
 class Spread:
-    """Over turns: the median and the quartiles."""
+    """Median and quartiles over turns."""
 
     median: float
     low: float
@@ -77,7 +76,7 @@ class Spread:
 
 
 class Step:
-    """A training step on a scene, taken apart. ``operators`` run in this order."""
+    """A training step on a scene, operator by operator; ``operators`` run in this order."""
 
     def __init__(self, scene: Scene, threads: int):
         build.load()
@@ -93,7 +92,7 @@ class Step:
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
         turns = torch.zeros(scene.count, 3), torch.zeros(scene.count, 3)
         last = torch.zeros(scene.count, dtype=torch.int32)
-        # Rates of 0, so that every repeat draws the same.
+        # Learning rates of 0, so that every repeat renders the same.
         rate, rates = torch.zeros(1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
         sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
         loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
@@ -146,8 +145,8 @@ class Step:
         }
 
     def costs(self, pairs: int) -> dict[str, Cost]:
-        """What the method asks for at least, given its contributing (pixel, Gaussian) pairs: the
-        operations of useful lanes (a multiply-add is two), and every array read or written once."""
+        """Lower bounds, given the number of contributing (pixel, Gaussian) pairs: the operations of
+        useful lanes (a multiply-add is two), and every array read or written once."""
         n, pixels = self.scene.count, self.state.size[0] * self.state.size[1]
         visible, tiles = int((self.drawn.radii > 0).sum()), self.drawn.num_intersections
         row = 4 * sum(g[0].numel() for g in self.state.inputs) if n else 0
@@ -161,7 +160,7 @@ class Step:
             "blend": Cost(28 * pairs, visible * record + tiles * entry + 16 * pixels),
             "loss": Cost(loss, 36 * pixels),
             "blend backward": Cost(56 * pairs, tiles * (entry + slot) + 28 * pixels),
-            # The harmonics and their moments are read and written where they are in view.
+            # SH coefficients and their moments are read and written for Gaussians in view.
             "projection, SH backward": Cost(
                 n * 800, 2 * n * (row - sh) + 6 * visible * sh + tiles * slot
             ),
@@ -170,7 +169,7 @@ class Step:
         }
 
     def once(self) -> dict[str, Timing]:
-        """Every operator's time in one step, and the whole "step"'s."""
+        """The time of every operator in one step, and of the whole step ("step")."""
         times = {}
         for name, run in self.operators.items():
             wall, cpu = time.perf_counter(), time.process_time()
@@ -184,16 +183,16 @@ class Step:
 
 
 def take_turns(steps: Sequence[Step], calibration: Calibration, seconds: float) -> list[list[Turn]]:
-    """Every step once, again and again for ``seconds`` in all: a step's turns, in its place. What
-    is compared turn by turn has seen the same minutes of the machine."""
+    """Run the steps in alternation for ``seconds`` in total; returns the turns of each step. So the
+    compared turns have run under the same load."""
     for step in steps:
-        step.once()  # touches fresh memory
+        step.once()  # touches newly allocated memory
     taken: list[list[Turn]] = [[] for _ in steps]
     end = time.monotonic() + seconds
     while time.monotonic() < end or len(taken[0]) < MIN_TURNS:
         for turns, step in zip(taken, steps, strict=True):
             flops = calibration.flops(step.threads)
-            step.once()  # in training a step follows a step: threads are awake
+            step.once()  # as in training, where steps follow each other: threads are awake
             turns.append(Turn(flops, step.once()))
     return taken
 
@@ -205,8 +204,8 @@ def block_pixels(step: Step) -> int:
 
 
 def block_pairs(step: Step) -> int:
-    """How many (Gaussian, block) pairs have to be looked at: those of the bins, up to where a
-    block's last pixel stops."""
+    """Number of (Gaussian, block) pairs to evaluate: those of the bins, up to the point at which
+    the last pixel of a block terminates."""
     state = step.state
     counts = state.tile_begin.diff()
     tile = torch.repeat_interleave(torch.arange(len(counts)), counts)
@@ -218,7 +217,7 @@ def block_pairs(step: Step) -> int:
 
 
 def contributing_pairs(step: Step) -> int:
-    """How many (pixel, Gaussian) pairs the image is made of, found in torch tile by tile."""
+    """Number of contributing (pixel, Gaussian) pairs of the image, computed in torch by tile."""
     state = step.state
     width, height = state.size
     tiles_x, tiles_y = -(-width // 16), -(-height // 16)
@@ -244,6 +243,6 @@ def contributing_pairs(step: Step) -> int:
         seen = alpha >= 1 / 255
         drawn = seen & (after >= 1e-4)
         pairs += int(drawn.sum())
-        # A pixel that stops draws no more.
+        # A terminated pixel blends no more Gaussians.
         left[:tiles] = torch.where(drawn, after, torch.where(seen, 0.0, left[:tiles]))
     return pairs

@@ -1,4 +1,4 @@
-"""What the machine can do at most: the calibration loops of peak.cpp."""
+"""Peak rates of the machine, measured by the calibration loops of peak.cpp."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from pathlib import Path
 
 from pipeline.render.cpu import build
 
-# peak.cpp names its instruction sets itself: neither the target nor the kernels' flags matter.
+# peak.cpp selects its instruction sets itself, independent of target and flags of the kernels.
 FLAGS = ["-std=c++17", "-O3", "-ffp-contract=off", "-fPIC", "-shared", "-pthread"]
-STARTS = (1, 2, 4)  # vector instructions that multiply and add a cycle, of any processor so far
+STARTS = (1, 2, 4)  # multiply-add vector instructions per cycle of existing processors
 TOLERANCE = 0.15
 
 
 @dataclass(frozen=True)
 class Peak:
-    """Of ``threads`` threads: float32 operations and bytes moved, a second.
+    """Peak of ``threads`` threads: float32 operations and bytes moved per second.
 
     Attributes:
         instruction_set: the widest that the processor has.
@@ -36,22 +36,22 @@ class Peak:
     clock: float
 
     def instructions(self, flops: float) -> float:
-        """Vector instructions a second at this rate of operations."""
+        """Vector instructions per second at this rate of operations."""
         return flops / self.lanes / (2 if self.fused else 1)
 
     @property
     def per_cycle(self) -> float:
-        """Vector instructions that one core starts in a cycle."""
+        """Vector instructions that one core starts per cycle."""
         return self.instructions(self.flops) / (self.threads * self.clock)
 
     @property
     def expected_per_cycle(self) -> int:
-        """What the processor has units for: the nearest of ``STARTS``."""
+        """The nearest of ``STARTS``: the number of units of the processor."""
         return min(STARTS, key=lambda n: abs(self.per_cycle / n - 1))
 
     @property
     def plausible(self) -> bool:
-        """Whether the rate is what the clock and a whole number of units allow."""
+        """Whether the rate is consistent with the clock and a whole number of units."""
         return abs(self.per_cycle / self.expected_per_cycle - 1) <= TOLERANCE
 
     def __str__(self) -> str:
@@ -71,7 +71,7 @@ class Peak:
 
 
 class Calibration:
-    """The loops, compiled."""
+    """The compiled loops."""
 
     def __init__(self) -> None:
         with tempfile.TemporaryDirectory() as folder:
@@ -85,12 +85,12 @@ class Calibration:
         self._loaded.peak_name.restype = ctypes.c_char_p
 
     def flops(self, threads: int) -> float:
-        """A second. Takes about 10 ms, so that it can stand before every step that is timed: a
-        virtual machine's cores change their speed within seconds."""
+        """Operations per second. Takes about 10 ms, so that it can run before every timed step: the
+        speed of virtual machines varies within seconds."""
         return self._loaded.peak_flops(threads)
 
     def peak(self, threads: int) -> Peak:
-        """The best of some readings, because other programs only make it smaller."""
+        """The maximum of several readings, because other load only reduces it."""
         return Peak(
             threads,
             max(self.flops(threads) for _ in range(5)),

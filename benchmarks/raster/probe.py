@@ -1,4 +1,4 @@
-"""Runs another rasterizer's timing program on our scenes, in turns with ours.
+"""Runs the timing program of another rasterizer on our scenes, in alternation with ours.
 
 The program is called as ``PROGRAM REPEATS FILE``. The file holds int32 width, height, N and N rows
 of 10 float32: x, y, the inverse covariance's xx, xy, yy, opacity, red, green, blue, depth. Its last
@@ -27,7 +27,7 @@ REPEATS = 5
 
 @dataclass(frozen=True)
 class Versus:
-    """Milliseconds of CPU over threads by operator, medians over the turns."""
+    """CPU milliseconds over threads by operator, medians over the turns."""
 
     ours: dict[str, float]
     theirs: dict[str, float]
@@ -38,7 +38,7 @@ class Versus:
 
     @property
     def step_ratio(self) -> float:
-        """Our whole step to their three operators."""
+        """Ratio of our whole step to their three operators."""
         return self.ours["step"] / sum(self.theirs.values())
 
 
@@ -47,7 +47,7 @@ def write_scene(step: Step, path: Path) -> None:
     records = step.state.records.numpy()[drawn]
     centres = records[:, :4].copy().view(np.float64)
     uu, uw, ww, log2_opacity = records[:, 4:8].T.astype(np.float64)
-    scale = 2 / np.log2(np.e)  # the record holds log2(e) / 2 of the inverse covariance's root
+    scale = 2 / np.log2(np.e)  # records store the root of the inverse covariance times log2(e) / 2
     conic = np.stack([uu * uu, uu * uw, uw * uw + ww * ww], 1) * scale
     rows = np.column_stack(
         [centres, conic, np.exp2(log2_opacity), records[:, 8:11], records[:, 11]]
@@ -58,7 +58,7 @@ def write_scene(step: Step, path: Path) -> None:
 
 
 def _their_times(program: Path, scene: Path, threads: int) -> list[float]:
-    # Its waiting threads spin, as ours do.
+    # Idle threads spin, as ours do.
     env = {**os.environ, "OMP_NUM_THREADS": str(threads), "OMP_WAIT_POLICY": "active"}
     done = subprocess.run(
         [program, str(REPEATS), scene], env=env, capture_output=True, text=True, check=True
@@ -74,7 +74,7 @@ def _their_times(program: Path, scene: Path, threads: int) -> list[float]:
 
 
 def versus(step: Step, program: Path, turns: int) -> Versus:
-    """``turns`` times theirs and ours, the least of a few repeats each."""
+    """Measure theirs and ours ``turns`` times, the minimum of a few repeats each."""
     theirs: list[list[float]] = []
     ours: dict[str, list[float]] = {}
     with tempfile.TemporaryDirectory() as folder:

@@ -1,4 +1,4 @@
-"""The scenes that are measured: synthetic ones of known statistics, and trained models."""
+"""Measured scenes: synthetic ones of known statistics, and trained models."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from pipeline.io.ply import read_splat_ply
 from pipeline.render import RasterCamera
 from pipeline.splats.morton import morton_order
 
-MOST_VIEWS = 16  # of a trained model, spread over its images
+MAX_VIEWS = 16  # of a trained model, evenly spread over its images
 
 Arrays = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
 
 @dataclass(frozen=True)
 class Scene:
-    """Gaussians and views of them.
+    """Gaussians with views.
 
     Attributes:
         name: for people.
@@ -43,7 +43,7 @@ class Scene:
 
 
 def synthetic(count: int, width: int, height: int, radius: float, in_view: float = 1.0) -> Scene:
-    """Gaussians spread evenly over an image, as seen from the front; seeded by ``count``.
+    """Gaussians spread evenly over an image; the seed is ``count``.
 
     A share of ``in_view`` lies in the image, the others around it, as in a scene that no view shows
     whole.
@@ -92,10 +92,10 @@ def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
     posed = sorted(model.images.values(), key=lambda image: image.name)
     lens = model.cameras[posed[0].camera_id]
     width, height = size or (lens.width, lens.height)
-    step = max(1, len(posed) // MOST_VIEWS)
+    step = max(1, len(posed) // MAX_VIEWS)
     views = [
         _view(model.cameras[image.camera_id].resized(width, height), image.world_to_camera)
-        for image in posed[::step][:MOST_VIEWS]
+        for image in posed[::step][:MAX_VIEWS]
     ]
     fields = (arrays.means, arrays.log_scales, arrays.quats, arrays.opacity_logits, arrays.sh)
     gaussians = tuple(torch.from_numpy(np.ascontiguousarray(f)) for f in fields)

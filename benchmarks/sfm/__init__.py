@@ -1,1 +1,1 @@
-"""Time against pose error of everything the plan can choose, and of pycolmap's defaults."""
+"""Time and pose error of all options of the plan, and of pycolmap's defaults."""

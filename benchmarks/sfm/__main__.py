@@ -1,5 +1,4 @@
-"""Times camera poses from photographs alone, and measures them against the poses the scene brings;
-see docs/explanation/sfm.md."""
+"""Measures time and pose error of structure from motion on scenes with known poses."""
 
 from __future__ import annotations
 
@@ -18,7 +17,7 @@ from pipeline.reporting.charts import ChartPoint, pareto_front
 from pipeline.runtime.atomic import write_json, write_text
 from pipeline.runtime.errors import UserError
 
-_OTHER = 2  # colour of what is neither the plan's choice nor the reference
+_OTHER = 2  # colour of other configurations
 
 
 def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
@@ -33,11 +32,13 @@ def _arguments(arguments: Sequence[str] | None) -> argparse.Namespace:
         nargs="+",
         default=[REFERENCE, "*"],
         metavar="PATTERN",
-        help="preset/mapper/pairs with * for anything; plan: the plan's choice under each preset; "
+        help="preset/mapper/pairs, * matches anything; plan: the choices of the plan; "
         f"{REFERENCE}: its defaults",
     )
-    parser.add_argument("--every", type=_positive, default=1, help="use one photograph in so many")
-    parser.add_argument("--repeats", type=_positive, default=1, help="runs of each, in turns")
+    parser.add_argument("--every", type=_positive, default=1, help="use every n-th photograph")
+    parser.add_argument(
+        "--repeats", type=_positive, default=1, help="runs of each configuration, in alternation"
+    )
     parser.add_argument("--threads", type=_positive, default=1)
     parser.add_argument("--json", type=Path, help="write all runs as data")
     parser.add_argument("--plot", type=Path, help="write time against centre error as SVG")
@@ -51,7 +52,7 @@ def _positive(text: str) -> int:
 
 
 def table(summaries: Sequence[Summary]) -> str:
-    """Markdown, a scene's configurations in their order; the time of pycolmap's defaults is 1."""
+    """A Markdown table by scene and configuration; times are relative to pycolmap's defaults."""
     reference = {s.scene: s.total_s for s in summaries if s.configuration == REFERENCE}
     lines = [
         f"| scene | configuration | {' | '.join(STEPS)} | CPU s | of pycolmap's | rotation, deg | "
@@ -79,8 +80,8 @@ def table(summaries: Sequence[Summary]) -> str:
 
 
 def plot(summaries: Sequence[Summary]) -> str:
-    """Time against centre error, one chart a scene, with the Pareto front. Named are the dots on
-    it, the plan's choices and pycolmap's defaults; all have tooltips."""
+    """Time against centre error, one chart per scene, with the Pareto front. Labels name the points
+    of the front, the choices of the plan and pycolmap's defaults; all points have tooltips."""
     charts = {}
     for scene in dict.fromkeys(s.scene for s in summaries):
         shown = [s for s in summaries if s.scene == scene and s.centre_permille]
@@ -99,7 +100,7 @@ def plot(summaries: Sequence[Summary]) -> str:
 
 
 def _label(s: Summary) -> str:
-    """Short enough to stand beside a dot."""
+    """A short label of a point."""
     preset, _, rest = s.configuration.partition("/")
     return " ".join([preset, *(part[:3] for part in rest.split("/") if part)])
 
@@ -109,7 +110,7 @@ def _tip(s: Summary) -> str:
 
 
 def _colour(s: Summary) -> int:
-    """The page's accent for what the plan chooses, another for pycolmap's defaults."""
+    """One colour for the choices of the plan, another one for pycolmap's defaults."""
     return 0 if s.planned else 3 if s.configuration == REFERENCE else _OTHER
 
 

@@ -1,4 +1,4 @@
-"""How mapping grows with the number of photographs: a street of that length, its matches made up.
+"""Time of mapping against the number of photographs, on synthetic matches of a street.
 
 Each camera stands a metre from the last and looks across the street, so that a point is seen by
 some five cameras, however many there are. See docs/explanation/sfm.md.
@@ -37,7 +37,7 @@ WRONG = 0.1
 
 
 def street(count: int) -> list[tuple[Array, Array]]:
-    """World to camera of each."""
+    """World-to-camera pose of each photograph."""
     rng = np.random.default_rng(0)
     found = []
     for index in range(count):
@@ -52,10 +52,10 @@ def street(count: int) -> list[tuple[Array, Array]]:
 
 
 def make_database(path: Path, count: int, points: int) -> None:
-    """Matches verified as ours are, between each camera and the next five.
+    """Verified matches between each camera and the next five.
 
     Args:
-        points: seen in each photograph, about.
+        points: approximate number per photograph.
     """
     import pycolmap
 
@@ -113,7 +113,7 @@ def name_of(index: int) -> str:
 
 
 def mapping(folder: Path, count: int, mapper: str) -> None:
-    """What stages/sfm.py calls."""
+    """As in stages/sfm.py."""
     from pipeline.sfm.mapping import reconstruct
 
     photos = [
@@ -124,7 +124,7 @@ def mapping(folder: Path, count: int, mapper: str) -> None:
     report = reconstruct(
         manifest, folder / "database.db", config, folder / mapper, threads=1, seed=0
     )
-    if report.verdict != "good":  # then the other mapper ran as well
+    if report.verdict != "good":  # the other mapper has run as well
         raise UserError(f"{mapper} mapping of {count} photographs is {report.verdict}")
 
 
@@ -135,7 +135,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--views", type=int, nargs="+", default=[50, 200, 1000])
-    parser.add_argument("--points", type=int, default=500, help="seen in each photograph, about")
+    parser.add_argument("--points", type=int, default=500, help="approximate number per photograph")
     parser.add_argument(
         "--mappers",
         nargs="+",

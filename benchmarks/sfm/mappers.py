@@ -1,4 +1,4 @@
-"""COLMAP's mapper against GLOMAP's: what mapping costs, and how far apart pictures of the scenes
+"""COLMAP's mapper against GLOMAP's: cost of mapping, and differences between renders of the scenes
 trained from either are.
 
 For each seed both map the same verified matches, the same short training follows, and random
@@ -33,15 +33,15 @@ from pipeline.sfm.isolate import run_isolated
 
 Array = NDArray[np.float64]
 Name = tuple[str, int]
-"""A model's: its mapper and seed."""
+"""Mapper and seed of a model."""
 Likeness = tuple[float, float]
-"""PSNR (dB) and SSIM of two models' pictures, means over the views."""
+"""PSNR (dB) and SSIM between the renders of two models, means over the views."""
 
 
 def compare_mappers(
     scene: Scene, raw: dict[str, object], seeds: int, views: int, threads: int
 ) -> tuple[dict[Name, Cost], dict[tuple[Name, Name], Likeness]]:
-    """Each model's mapping cost, and the likeness of each two models' pictures.
+    """Cost of mapping of each model, and similarity of the renders of each pair of models.
 
     Raises:
         UserError: a mapper's model cannot be believed.
@@ -62,7 +62,7 @@ def compare_mappers(
                 name, folder = (mapper, seed), base / f"{mapper}{seed}"
                 folder.mkdir()
                 (folder / "matches").symlink_to(matched / "matches")
-                # One attempt: the other mapper must not help out.
+                # A single attempt, so that the other mapper is not used.
                 sfm = config.sfm.model_copy(update={"mapper": mapper, "max_attempts": 1})
                 chosen = seeded.model_copy(update={"sfm": sfm})
                 arguments = (scene.manifest, chosen, folder, threads)
@@ -74,7 +74,7 @@ def compare_mappers(
 
 
 def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """What the stages undistort, init and train call, on all views; with the same seed always."""
+    """As in the stages undistort, init and train, on all views; always with the same seed."""
     from pipeline.photos.undistort import undistort
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
@@ -111,7 +111,7 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
 def _compare(
     folders: dict[Name, Path], config: Config, count: int, threads: int
 ) -> dict[tuple[Name, Name], Likeness]:
-    """Render the same views from all models, and compare each two."""
+    """Render the same views of all models, and compare each pair."""
     from pipeline.metrics.image import psnr, ssim
     from pipeline.render import RasterOptions
     from pipeline.render.views import near_plane, render_view
@@ -158,7 +158,7 @@ def between(model: Reconstruction, count: int) -> list[tuple[Array, Array]]:
         i = int(rng.integers(len(posed)))
         near = np.argsort(np.linalg.norm(centres - centres[i], axis=1), kind="stable")[1:3]
         j, t = int(rng.choice(near)), rng.uniform()
-        # Neighbours are turned little to one another: a normalised mean of quaternions will do.
+        # Rotations of neighbours differ little: a normalised mean of quaternions is enough.
         sign = 1.0 if quats[i] @ quats[j] >= 0 else -1.0
         rotation = quat_to_rotation((1 - t) * quats[i] + t * sign * quats[j])
         found.append((rotation, (1 - t) * centres[i] + t * centres[j]))
@@ -166,7 +166,7 @@ def between(model: Reconstruction, count: int) -> list[tuple[Array, Array]]:
 
 
 def _similarity(source: Reconstruction, target: Reconstruction) -> tuple[float, Array, Array]:
-    """That takes the one's world to the other's, by the centres of the images of both."""
+    """The similarity between the worlds of two models, from the centres of common images."""
     a, b = source.by_name(), target.by_name()
     names = sorted(a.keys() & b.keys())
     return umeyama(*(np.stack([each[n].centre for n in names]) for each in (a, b)))
@@ -175,7 +175,7 @@ def _similarity(source: Reconstruction, target: Reconstruction) -> tuple[float, 
 def tables(
     found: dict[str, tuple[dict[Name, Cost], dict[tuple[Name, Name], Likeness]]],
 ) -> str:
-    """Markdown: medians over the seeds, and the range of the likeness."""
+    """A Markdown table: medians over the seeds, and the range of the similarity."""
     lines = ["| scene | " + " | ".join(f"{m}, CPU s" for m in MAPPERS) + " |", "|---|---|---|"]
     for scene, (costs, _) in found.items():
         cells = [
@@ -210,9 +210,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     )
     parser.add_argument("scenes", type=Path, nargs="+", help="scene folders with known poses")
     parser.add_argument("--seeds", type=int, default=3)
-    parser.add_argument("--views", type=int, default=100, help="rendered of each model")
-    parser.add_argument("--steps", type=int, default=1000, help="of each training")
-    parser.add_argument("--side", type=int, default=400, help="longer side of the pictures, px")
+    parser.add_argument("--views", type=int, default=100, help="number of views rendered")
+    parser.add_argument("--steps", type=int, default=1000, help="steps of each training")
+    parser.add_argument("--side", type=int, default=400, help="longer side of the images, px")
     parser.add_argument("--threads", type=int, default=1)
     args = parser.parse_args(arguments)
     raw: dict[str, object] = {

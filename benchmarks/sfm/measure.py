@@ -1,4 +1,4 @@
-"""One run of one configuration, in processes of its own, and what comes of several."""
+"""Runs of a configuration in separate processes, and medians over several runs."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ STEPS = ("features", "matches", "mapping")
 
 @dataclass(frozen=True)
 class Cost:
-    """CPU seconds of a step without the imports, and the most memory it held, MiB."""
+    """CPU seconds of a step, without imports, and its peak memory, MiB."""
 
     cpu_s: float
     peak_mb: float
@@ -54,7 +54,7 @@ class Run:
 
 @dataclass(frozen=True)
 class Summary:
-    """Medians over the runs of a configuration on a scene that gave a model.
+    """Medians over the runs of a configuration on a scene, of those that gave a model.
 
     Attributes:
         cpu_s: of each step; ``total_s`` their sum.
@@ -111,7 +111,7 @@ def run_once(scene: Scene, configuration: Configuration | None, threads: int) ->
 
 
 def summarise(runs: Sequence[Run]) -> Summary:
-    """Of runs of one configuration on one scene; at least one."""
+    """Summary of at least one run of a configuration on a scene."""
     done = [run for run in runs if run.error is not None]
     timed = done or list(runs)
 
@@ -143,7 +143,7 @@ def summarise(runs: Sequence[Run]) -> Summary:
 
 
 def as_data(run: Run) -> dict[str, Any]:
-    """The run as JSON holds it."""
+    """The run as JSON."""
     return asdict(run) | {"cpu_s": run.cpu_s}
 
 
@@ -152,12 +152,12 @@ def _error(run: Run) -> PoseError:
     return run.error
 
 
-# --- the steps, each in a process of its own ------------------------------------------------
+# --- the steps, each in a separate process ------------------------------------------------
 
 
 def measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
-    """Run ``step`` in this process, which does nothing else, and say what it cost."""
-    # Libraries load once, whatever the number of photographs. cv2 comes first (see isolate).
+    """Run ``step`` in this process, which does nothing else, and report its cost."""
+    # Libraries are imported before timing. cv2 comes first (see isolate).
     if step is our_features:
         import pipeline.sfm.sift
     else:
@@ -176,7 +176,7 @@ def _used() -> float:
 
 
 def our_features(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """What stages/features.py calls."""
+    """As in stages/features.py."""
     from pipeline.sfm.features import extract_features
 
     extract_features(
@@ -185,7 +185,7 @@ def our_features(manifest: Manifest, config: Config, folder: Path, threads: int)
 
 
 def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """What stages/matches.py calls."""
+    """As in stages/matches.py."""
     from pipeline.sfm.matching import match_features
 
     match_features(
@@ -201,7 +201,7 @@ def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) 
 
 
 def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
-    """What stages/sfm.py calls."""
+    """As in stages/sfm.py."""
     from pipeline.sfm.mapping import reconstruct
 
     database = folder / "matches" / "database.db"
@@ -209,7 +209,7 @@ def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) 
 
 
 def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:
-    """pycolmap's defaults but for the threads, and for one camera where our scan finds one."""
+    """pycolmap's defaults, except for the threads, and a single camera if our scan finds one."""
     import pycolmap
 
     photo = manifest.photos[0]
@@ -225,7 +225,7 @@ def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:
 
 
 def reference_matches(manifest: Manifest, folder: Path, threads: int) -> None:
-    """Exhaustive, verified."""
+    """Exhaustive matching with verification."""
     import pycolmap
 
     options = pycolmap.FeatureMatchingOptions(num_threads=threads, use_gpu=False)
@@ -235,7 +235,7 @@ def reference_matches(manifest: Manifest, folder: Path, threads: int) -> None:
 
 
 def reference_mapping(manifest: Manifest, folder: Path, threads: int) -> None:
-    """Incremental; the model with the most images is written."""
+    """Incremental mapping; writes the model with the most images."""
     import pycolmap
 
     photo = manifest.photos[0]

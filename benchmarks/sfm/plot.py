@@ -1,4 +1,4 @@
-"""Time against error as one SVG file: a chart a scene, with its Pareto front."""
+"""Time against error as one SVG file: a chart per scene, with the Pareto front."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pipeline.reporting.charts import ChartPoint, trade_off_chart
 from pipeline.reporting.text import escape
 
 _WIDTH, _HEIGHT, _HEAD = 440, 250, 26
-# The charts take their colours from the page; a file of its own brings them.
+# Charts use the colour variables of a page, which a separate file must define.
 _STYLE = (
     "svg{--accent:#0d7d74;--train:#2f6fde;--test:#e07a10;--good:#2c8a4b;--bad:#c8362f;"
     "--ink:#16191d;--soft:#5d6673;--line:#e1e4e9;background:#fff}"
@@ -21,7 +21,7 @@ _STYLE = (
 
 
 def pareto_svg(charts: Mapping[str, Sequence[ChartPoint]]) -> str:
-    """Charts under one another, by their titles. Error labels are plain numbers."""
+    """Charts by title, from top to bottom. Error labels are plain numbers."""
     parts = []
     for index, (title, dots) in enumerate(charts.items()):
         figure = trade_off_chart(

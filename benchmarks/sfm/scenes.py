@@ -1,4 +1,4 @@
-"""What is measured: scenes with known poses, and the configurations that the plan can choose."""
+"""Measured scenes with known poses, and the configurations that the plan can choose."""
 
 from __future__ import annotations
 
@@ -49,7 +49,7 @@ class Scene:
 
 @dataclass(frozen=True)
 class Configuration:
-    """``name`` is preset/mapper/pairs. ``planned``: the plan's own choice for the scene."""
+    """``name`` is preset/mapper/pairs. ``planned``: it is the choice of the plan for the scene."""
 
     name: str
     config: Config
@@ -57,7 +57,7 @@ class Configuration:
 
 
 def load_scene(folder: Path, every: int = 1) -> Scene:
-    """The scene in ``folder``, with one in ``every`` photographs in order of their names.
+    """The scene in ``folder``, with every ``every``-th photograph, sorted by name.
 
     Raises:
         UserError: the folder brings no poses to measure against.
@@ -85,8 +85,8 @@ def load_scene(folder: Path, every: int = 1) -> Scene:
 
 
 def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]:
-    """Those whose names match one of the ``patterns`` (``*`` stands for anything), "plan" meaning
-    what the plan chooses under each preset."""
+    """Configurations that match one of the ``patterns`` (``*`` matches anything; "plan" matches the
+    choice of the plan for each preset)."""
     possible = [
         pairs
         for pairs in PAIRS
@@ -105,7 +105,7 @@ def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]
 
 
 def settled(scene: Scene, raw: Mapping[str, Any]) -> Config:
-    """What the plan makes of these options for the scene, its poses to be found anew."""
+    """The plan of the scene with these options, with poses from structure from motion."""
     config = scene_config({**raw, "poses": "ignore"}, scene.name)
     return settle(scene.scan, config).config
 

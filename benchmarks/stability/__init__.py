@@ -1,1 +1,1 @@
-"""What the whole pipeline makes of scenes at the edge of what numbers hold."""
+"""Stability of the whole pipeline on numerically extreme scenes."""

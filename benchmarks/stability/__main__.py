@@ -1,7 +1,7 @@
-"""Scenes at the edge of what numbers hold, through the whole pipeline.
+"""Runs the whole pipeline on numerically extreme scenes.
 
     python -m benchmarks.stability                  # all cases: half an hour on two cores
-    python -m benchmarks.stability posed scale_1e4  # these
+    python -m benchmarks.stability posed scale_1e4  # selected ones
 
 Each case either gives the quality it should or ends with one clear message; the exit code is 1 if
 one does neither.
@@ -25,7 +25,7 @@ from typing import Any
 from benchmarks.stability.cases import CASES, Case, write_room
 
 ROOT = Path(__file__).resolve().parents[2]
-# A tenth of a decibel is what the rounding of another world may cost.
+# Difference in PSNR that rounding in another world frame may cause.
 TOLERANCE_DB = 0.1
 CONFIG: dict[str, Any] = {
     "views": {"max_long_side_px": 200},
@@ -37,15 +37,15 @@ CONFIG: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Outcome:
-    """What came of a case.
+    """Outcome of a case.
 
     Attributes:
         code: Snakemake's exit code.
-        psnr, ssim: of held-out views; None where the run failed.
-        gaussians: how many there were in the end.
-        message: the error's, or the result's warnings.
-        traceback: a program's error showed itself.
-        right: as was expected.
+        psnr, ssim: of test views; None if the run failed.
+        gaussians: final number.
+        message: of the error, or the warnings of the result.
+        traceback: whether a traceback was printed.
+        right: whether the outcome is the expected one.
     """
 
     case: str
@@ -59,7 +59,7 @@ class Outcome:
 
 
 def run(name: str, case: Case, work: Path, references: Mapping[str, Outcome]) -> Outcome:
-    """Run one case in ``work``, which holds the room."""
+    """Run one case in ``work``, which contains the base scene."""
     folder = work / "data" / name
     folder.mkdir(parents=True)
     case.make(folder, work / "room")
@@ -104,13 +104,13 @@ def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
 
 
 def _message(text: str) -> str:
-    """The error that a user reads, on one line."""
+    """The error message for the user, on one line."""
     found = re.search(r"^error(?: in \w+ of \S+)?: (.*(?:\n  .*)*)", text, re.M)
     return " ".join(found[1].split()) if found else ""
 
 
 def table(outcomes: list[Outcome]) -> str:
-    """As Markdown."""
+    """A Markdown table."""
     lines = [
         "| case | what | PSNR (dB) | against | SSIM | Gaussians | |",
         "|---|---|---|---|---|---|---|",
@@ -140,14 +140,14 @@ def main() -> int:
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(CASES)}")
-    parser.add_argument("--work", type=Path, help="an empty folder to work in and to keep")
-    parser.add_argument("--json", type=Path, help="write what came of the cases here")
+    parser.add_argument("--work", type=Path, help="an empty folder for the runs, which is kept")
+    parser.add_argument("--json", type=Path, help="write the outcomes as JSON")
     args = parser.parse_args()
     unknown = set(args.cases) - CASES.keys()
     if unknown:
         parser.error(f"no such case: {', '.join(sorted(unknown))}")
     wanted = set(args.cases or CASES)
-    # What they are compared with is run, too.
+    # The references of the cases are run as well.
     wanted |= {CASES[name].reference for name in wanted if CASES[name].expected == "same"}
     outcomes: dict[str, Outcome] = {}
     with tempfile.TemporaryDirectory(prefix="stability-") as temporary:

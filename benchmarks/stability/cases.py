@@ -1,4 +1,4 @@
-"""The scenes: one small room, photographed and described in ways that programs stumble over."""
+"""The cases: one small scene with numerically or formally extreme photographs and poses."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ Pixels = NDArray[Any]
 Expected = Literal["same", "works", "error"]
 
 VIEWS, WIDTH, HEIGHT = 20, 200, 150
-# Where the demo's cameras look.
+# Focus of the demo cameras.
 MIDDLE = np.array([0.0, 0.0, 0.45])
-# Of the turned world: any that is not about an axis.
+# Rotation of the rotated world; not about a coordinate axis.
 TURN = quat_to_rotation(np.array([0.3, -0.7, 0.5, 0.2]))
 
 
@@ -59,14 +59,14 @@ class Case:
 
 
 def write_room(folder: Path) -> None:
-    """The room that all cases start from: PNG, pinhole cameras, poses and points."""
+    """The base scene of all cases: PNG, pinhole cameras, poses and points."""
     spec = DemoSpec(
         views=VIEWS, width=WIDTH, height=HEIGHT, format="png", distortion="none", poses="colmap"
     )
     write_demo(folder, spec)
 
 
-# ---- The world that poses are given in ----
+# ---- World frames ----
 
 
 def similar(model: Reconstruction, scale: float, rotation: Array, shift: Array) -> Reconstruction:
@@ -83,7 +83,7 @@ def similar(model: Reconstruction, scale: float, rotation: Array, shift: Array) 
 def world(
     scale: float = 1.0, shift: float = 0.0, turned: bool = False, text: bool = False
 ) -> Callable[[Path, Path], None]:
-    """Poses and points in another world; ``shift`` is how far away, along a skew direction."""
+    """Poses and points in another world; ``shift`` is its distance along an oblique direction."""
 
     def make(folder: Path, room: Path) -> None:
         rotation = TURN if turned else np.eye(3)
@@ -118,7 +118,7 @@ def transforms(scale: float, shift: float) -> Callable[[Path, Path], None]:
     return make
 
 
-# ---- Which views there are ----
+# ---- Views ----
 
 
 def photographs(folder: Path, room: Path) -> None:
@@ -197,7 +197,7 @@ def taken(
 
 
 def _untracked(points: Points, alone: bool) -> Points:
-    """The points, or those on the objects ``alone``, without who saw them."""
+    """The points, or those on the objects ``alone``, without tracks."""
     x, y, z = points.xyz.T
     kept = (np.hypot(x, y) < 1.4) & (z > 0.02) & (z < 1.1) if alone else np.full(len(points), True)
     nobody = np.zeros(int(kept.sum()) + 1, np.int64), np.zeros(0, np.int64), np.zeros((0, 2))
@@ -205,21 +205,21 @@ def _untracked(points: Points, alone: bool) -> Points:
 
 
 def ring(radius: float = 2.3, height: float = 1.25, bob: float = 0.3) -> Array:
-    """(VIEWS, 3) places on two thirds of a circle around the objects."""
+    """(VIEWS, 3) positions on two thirds of a circle around the objects."""
     angle = np.radians(np.arange(VIEWS) * 12.0)
     tall = height + bob * np.sin(3 * angle)
     return np.stack([radius * np.cos(angle), radius * np.sin(angle), tall], 1)
 
 
 def grid() -> Array:
-    """(VIEWS, 3) places in one upright plane before the objects, a centimetre of unevenness."""
+    """(VIEWS, 3) positions in a vertical plane in front of the objects, uneven by a centimetre."""
     x, z = np.meshgrid(np.linspace(-1.0, 1.0, 5), np.linspace(0.6, 1.5, 4))
     y = -2.3 + 0.005 * np.random.default_rng(0).standard_normal(x.shape)
     return np.stack([x.ravel(), y.ravel(), z.ravel()], 1)
 
 
 def spot() -> Array:
-    """(VIEWS, 3) times one place."""
+    """(VIEWS, 3) equal positions."""
     return np.tile([1.9, -1.3, 1.25], (VIEWS, 1))
 
 
@@ -228,11 +228,11 @@ def about(centres: Array, spread: float = 0.1) -> Array:
     return MIDDLE + np.random.default_rng(1).uniform(-spread, spread, centres.shape)
 
 
-# ---- What the pictures are ----
+# ---- Images ----
 
 
 def write(path: Path, pixels: Pixels) -> None:
-    """RGB, RGBA or grey pixels, 8 or 16 bits, in whatever format the name says."""
+    """RGB, RGBA or grey pixels, 8 or 16 bits, in the format of the file name."""
     order = {2: pixels, 3: pixels[..., ::-1]} if pixels.ndim == 3 else {2: pixels}
     if pixels.ndim == 3 and pixels.shape[2] == 4:
         order[3] = pixels[..., [2, 1, 0, 3]]
@@ -243,7 +243,7 @@ def write(path: Path, pixels: Pixels) -> None:
 def pictures(
     change: Callable[[Pixels, int], Pixels], given: bool, suffix: str = ".png"
 ) -> Callable[[Path, Path], None]:
-    """The room's photographs, each put through ``change(pixels, number)``."""
+    """The photographs of the base scene, each changed by ``change(pixels, number)``."""
 
     def make(folder: Path, room: Path) -> None:
         (folder / "images").mkdir()
@@ -269,7 +269,7 @@ def opaque(rgb: Pixels, number: int) -> Pixels:
 
 
 def enlarged(rgb: Pixels, number: int) -> Pixels:
-    """8000 x 6000 pixels that are the small picture's again when averaged."""
+    """8000 x 6000 pixels whose averages are the small image."""
     return rgb.repeat(40, 0).repeat(40, 1)
 
 
@@ -278,7 +278,7 @@ def shrunk(rgb: Pixels, number: int) -> Pixels:
 
 
 def exposed(factor: float, every: int = 1) -> Callable[[Pixels, int], Pixels]:
-    """Every n-th photograph's values times ``factor``, clipped."""
+    """Values of every n-th photograph multiplied by ``factor``, clipped."""
 
     def change(rgb: Pixels, number: int) -> Pixels:
         return (
@@ -294,7 +294,7 @@ def alpha(folder: Path, room: Path) -> None:
     spec = replace(
         DemoSpec(**json.loads((room / "demo.json").read_text())), alpha=True, poses="transforms"
     )
-    # The folder is there and empty, which is all that the demo asks for.
+    # The demo requires an empty folder.
     write_demo(folder, spec)
     shutil.rmtree(folder / "sparse_gt")
 
@@ -312,8 +312,8 @@ WORLDS = {
     "json": Case(transforms(1, 0), "transforms.json, no points", "works", least=20.0),
     "json_1e-4_far": Case(transforms(1e-4, 1e5), "the same x 1e-4, moved by 1e5", reference="json"),
 }
-# Rounding decides which of near-equal gradients densify, and what follows differs as from seed to
-# seed: only without density control can worlds be compared to a tenth of a decibel.
+# With density control, rounding changes which Gaussians are densified, and results differ as
+# between seeds: only without it are world frames comparable to 0.1 dB.
 _DENSE = {"experiments": {"train": {"gradient": {"stop_share": 0.7}}}}
 _MCMC = {"train": {"density": {"strategy": "mcmc"}}}
 WORLDS |= {

@@ -333,7 +333,7 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "given_world": Mutant(
         "pipeline/sfm/refine_given.py",
-        "        apply(model, fitted[0])",
+        "        apply(model, fitted.similarity)",
         "        pass",
         "adjusted poses in a world turned from the given one",
         ("tests/sfm/test_refine.py",),

@@ -23,7 +23,7 @@ from pipeline.io.colmap_records import (
     unknown_model,
 )
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 _MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
 _POINT3D = np.dtype(
@@ -97,9 +97,9 @@ def read_cameras(file: Path) -> dict[int, Camera]:
 
 def read_images(
     file: Path, cameras: dict[int, Camera]
-) -> tuple[dict[int, Posed], dict[int, NDArray[np.float64]]]:
+) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
     reader = _Reader(file)
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     for _ in range(reader.count(73)):
         number, *pose, camera_id = reader.take("I7dI")

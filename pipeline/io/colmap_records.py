@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed
+from pipeline.scene.reconstruction import PosedImage
 
 REMEDY = "export the model again from COLMAP (binary or text), or set poses: ignore"
 POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
@@ -70,7 +70,7 @@ def make_camera(
 
 def make_posed(
     file: Path, name: str, camera_id: int, quat: list[float], shift: list[float]
-) -> Posed:
+) -> PosedImage:
     q, t = np.array(quat, np.float64), np.array(shift, np.float64)
     norm = math.hypot(*quat)
     if not (1e-12 < norm < 1e12) or not np.isfinite(t).all():
@@ -79,15 +79,15 @@ def make_posed(
             file=file,
             fix=f"remove {name} from the model, or set poses: ignore",
         )
-    return Posed(name, camera_id, quat_to_rotation(q), t)
+    return PosedImage(name, camera_id, quat_to_rotation(q), t)
 
 
 def add_image(
     file: Path,
-    images: dict[int, Posed],
+    images: dict[int, PosedImage],
     cameras: dict[int, Camera],
     number: int,
-    image: Posed,
+    image: PosedImage,
 ) -> None:
     if image.camera_id not in cameras:
         raise UserError(

@@ -22,7 +22,7 @@ from pipeline.io.colmap_records import (
     unknown_model,
 )
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
@@ -81,8 +81,8 @@ def read_cameras(file: Path) -> dict[int, Camera]:
 
 def read_images(
     file: Path, cameras: dict[int, Camera]
-) -> tuple[dict[int, Posed], dict[int, NDArray[np.float64]]]:
-    images: dict[int, Posed] = {}
+) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
+    images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     lines = _lines(file)
     types: list[Callable[[str], Any]] = [_id, *[float] * 7, _id, str.strip]

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 _FIX = "export the poses again with as many rows as photographs, or set poses: ignore"
 
@@ -46,7 +46,7 @@ def read_poses_bounds(
         )
     cameras: dict[int, Camera] = {}
     numbers: dict[tuple, int] = {}
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     for i, name in enumerate(names):
         matrix = rows[i, :15].reshape(3, 5)
         down, right, backward, centre, (height, width, focal) = matrix.T
@@ -63,7 +63,7 @@ def read_poses_bounds(
         camera_id = numbers.setdefault((width, height, focal), len(numbers) + 1)
         params = np.array([focal, width / 2, height / 2])
         cameras[camera_id] = Camera("SIMPLE_PINHOLE", round(width), round(height), params)
-        images[i + 1] = Posed(name, camera_id, rotation, -rotation @ centre)
+        images[i + 1] = PosedImage(name, camera_id, rotation, -rotation @ centre)
     return Reconstruction(cameras, images), rows[:, 15:]
 
 

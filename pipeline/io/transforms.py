@@ -24,7 +24,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.io.names import NameIndex
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import View
 
 SPLITS = ("train", "test", "val")
@@ -100,14 +100,14 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     index = NameIndex(sizes)
     cameras: dict[tuple, int] = {}
     by_id: dict[int, Camera] = {}
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     found = {name: frame for frame in read_frames(path) if (name := index.find(frame.path))}
     for number, (name, frame) in enumerate(sorted(found.items()), 1):
         camera = _camera(frame, *sizes[name])
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         camera_id = cameras.setdefault(key, len(cameras) + 1)
         by_id[camera_id] = camera
-        images[number] = Posed(name, camera_id, frame.rotation, frame.translation)
+        images[number] = PosedImage(name, camera_id, frame.rotation, frame.translation)
     return Reconstruction(by_id, images)
 
 

@@ -19,7 +19,7 @@ from pipeline.plan.scan import Scan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 # Of a stage with poses: what frame they are in, where they are not as they were given.
 GEOREFERENCE = "georeference.json"
@@ -97,7 +97,7 @@ def load_given(scan: Scan) -> Given:
         model = Reconstruction(
             model.cameras,
             {
-                i: Posed(im.name[len(prefix) :], im.camera_id, im.rotation, im.translation)
+                i: PosedImage(im.name[len(prefix) :], im.camera_id, im.rotation, im.translation)
                 for i, im in model.images.items()
             },
         )
@@ -141,7 +141,7 @@ def fit_to_photos(
             lens has; ``source`` names the poses.
     """
     index = NameIndex(photos)
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     cameras: dict[int, Camera] = {}
     ids: dict[tuple[int, int, int], int] = {}
     scale: dict[int, tuple[float, float]] = {}
@@ -165,7 +165,7 @@ def fit_to_photos(
                 else camera.resized(photo.width, photo.height)
             )
         scale[number] = photo.width / camera.width, photo.height / camera.height
-        images[number] = Posed(name, ids[key], image.rotation, image.translation)
+        images[number] = PosedImage(name, ids[key], image.rotation, image.translation)
     return Reconstruction(cameras, images, _points_in(model.points, scale))
 
 

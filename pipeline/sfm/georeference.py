@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.geodesy import to_enu
-from pipeline.geometry.similarity import OUTLIER, Fit, Similarity, robust_similarity
+from pipeline.geometry.similarity import (
+    OUTLIER_SIGMAS,
+    RobustFit,
+    Similarity,
+    robust_similarity,
+)
 from pipeline.io.gcp import GroundControl
 
 Array = NDArray[np.float64]
@@ -251,7 +256,7 @@ def _tilt(target: Array, used: NDArray[np.bool_], sigma: float) -> float:
     return float(ALTITUDE_RATIO * sigma / max(float(flat[1]), 1e-12))
 
 
-def _along_line(up: Array, centres: Array, enu: Array) -> Fit | str:
+def _along_line(up: Array, centres: Array, enu: Array) -> RobustFit | str:
     """With up from the cameras: heading, scale and place from the positions on the ground, the
     height from their median."""
     upright = _turn(up, np.array([0.0, 0.0, 1.0]))
@@ -273,13 +278,13 @@ def _along_line(up: Array, centres: Array, enu: Array) -> Fit | str:
                 best = (score, proposal)
     assert best is not None
     sigma = max(best[0] / 1.1774, GPS_FLOOR_M)
-    used = np.linalg.norm(best[1](plain)[:, :2] - enu[:, :2], axis=1) <= OUTLIER * sigma
+    used = np.linalg.norm(best[1](plain)[:, :2] - enu[:, :2], axis=1) <= OUTLIER_SIGMAS * sigma
     fitted = _flat_similarity(plain[used], ground[used])
     misses = np.linalg.norm(fitted(plain)[:, :2] - enu[:, :2], axis=1)
     sigma = max(float(np.median(misses[used])) / 1.1774, GPS_FLOOR_M)
     height = float(np.median(enu[used, 2] - fitted.scale * flat[used, 2]))
     shift = fitted.translation + np.array([0.0, 0.0, height])
-    return Similarity(fitted.scale, fitted.rotation @ upright, shift), used, sigma
+    return RobustFit(Similarity(fitted.scale, fitted.rotation @ upright, shift), used, sigma)
 
 
 def _flat_similarity(source: Array, target: Array) -> Similarity:

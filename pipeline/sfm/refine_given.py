@@ -154,7 +154,7 @@ def _lay_over(
     floor = 1e-6 * float(np.median(np.linalg.norm(before - np.median(before, axis=0), axis=1)))
     fitted = robust_similarity(now, before, np.ones(3), floor)
     if fitted is not None:
-        apply(model, fitted[0])
+        apply(model, fitted.similarity)
 
 
 def _is_finite(model: pycolmap.Reconstruction) -> bool:

@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.colmap import quat_to_rotation, read_model, rotation_to_quat, write_model
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 FILES = ("cameras", "images", "points3D")
 FORMATS = pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
@@ -39,7 +39,9 @@ def make_model(
     images = {}
     for i, name in enumerate(names):
         turn = quat_to_rotation(np.array([1.0, *(0.2 * rng.normal(size=3))]))
-        images[11 + 5 * i] = Posed(name, (7, 3)[i % 2], turn, np.array([0, 0, 6.0]) + rng.random(3))
+        images[11 + 5 * i] = PosedImage(
+            name, (7, 3)[i % 2], turn, np.array([0, 0, 6.0]) + rng.random(3)
+        )
     xyz = rng.normal(size=(num_points, 3))
     start, ids, pixels = [0], [], []
     for point in xyz:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.geometry.distortion import pixels
+from pipeline.geometry.distortion import project
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.io.transforms import find_transforms, read_frames, read_transforms, write_transforms
 from pipeline.runtime.errors import UserError
@@ -28,11 +28,11 @@ def frame(matrix: np.ndarray | None = None, path: str = "images/a.png", **fields
     return {"file_path": path, "transform_matrix": matrix.tolist(), **fields}
 
 
-def project(model: Reconstruction, point: np.ndarray) -> np.ndarray:
+def project_point(model: Reconstruction, point: np.ndarray) -> np.ndarray:
     (image,) = model.images.values()
     local = image.rotation @ point + image.translation
     assert local[2] > 0, "behind the camera"
-    return pixels(model.cameras[image.camera_id], local[:2] / local[2])
+    return project(model.cameras[image.camera_id], local[:2] / local[2])
 
 
 def opengl_camera(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -53,7 +53,7 @@ def test_a_known_point_lands_on_its_pixel(tmp_path):
     model = read_transforms(tmp_path, SIZES)
     # Up in OpenGL's axes is towards smaller y in the picture.
     expected = [101 + 120 * right / ahead, 52 - 110 * up / ahead]
-    np.testing.assert_allclose(project(model, point), expected, atol=1e-9)
+    np.testing.assert_allclose(project_point(model, point), expected, atol=1e-9)
 
 
 def test_nerf_synthetic_splits_angle_and_missing_suffix(tmp_path):
@@ -71,7 +71,7 @@ def test_nerf_synthetic_splits_angle_and_missing_suffix(tmp_path):
     model.images.popitem()
     focal = 100 / math.tan(0.35)
     expected = [100 + focal * right / ahead, 50 - focal * up / ahead]
-    np.testing.assert_allclose(project(model, point), expected, atol=1e-9)
+    np.testing.assert_allclose(project_point(model, point), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e6])

@@ -16,7 +16,7 @@ from pipeline.io.colmap import read_model, write_model
 from pipeline.plan.given_poses import load_given
 from pipeline.plan.scan import Scan, scan
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from tests.io.test_llff import llff_row
 from tests.io.test_transforms import frame, write
 from tests.pictures import photos, picture
@@ -42,7 +42,7 @@ def write_sparse(
     params = {"PINHOLE": [50.0, 50, size[0] / 2, size[1] / 2]}
     params["SIMPLE_RADIAL"] = [50.0, size[0] / 2, size[1] / 2, 0.1]
     images = {
-        i + 1: Posed(name, 1, np.eye(3), np.array([0.0, 0, i]))
+        i + 1: PosedImage(name, 1, np.eye(3), np.array([0.0, 0, i]))
         for i, name in enumerate(photo_names)
     }
     points = Points(

@@ -16,7 +16,7 @@ from pipeline.config.schema import Density, Train
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
@@ -29,7 +29,7 @@ from tests.training.conftest import HEIGHT, WIDTH, camera_at
 def test_the_depth_of_a_point_is_known_where_a_view_sees_it_and_nowhere_else():
     views = [replace(camera_at(angle), name=f"{i}.png") for i, angle in enumerate((0.0, 0.4))]
     images = {
-        7 + i: Posed(v.name, 1, v.world_to_camera[:3, :3], v.world_to_camera[:3, 3])
+        7 + i: PosedImage(v.name, 1, v.world_to_camera[:3, :3], v.world_to_camera[:3, 3])
         for i, v in enumerate(views)
     }
     points = Points(

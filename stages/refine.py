@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
-from pipeline.io.posefiles import SHARED_BY
+from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
@@ -31,13 +31,16 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         few = f"a photograph with {poses.tracked} tracked points" if poses.tracked else "no tracks"
         return StagePlan(run=False, reason=f"the given poses come with {few} to adjust them to")
     if not poses.centred and freed != "yes":
-        text = f"no camera of {SHARED_BY} photographs has its principal point exactly in the middle"
+        text = (
+            f"no camera with {MIN_IMAGES_PER_CAMERA} photographs or more has its principal point "
+            "exactly at the image centre"
+        )
         return StagePlan(run=False, reason=text)
     return StagePlan(
         run=True,
-        reason="the given principal points stand in the middle, where nobody looked for them"
+        reason="given principal points are at the image centre, so they were not calibrated"
         if poses.centred
-        else "principal points are freed, as configured",
+        else "principal points are adjusted, as configured",
         decisions=["poses, points and lenses adjusted to the given tracks, where that pays"],
     )
 

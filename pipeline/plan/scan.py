@@ -25,7 +25,7 @@ from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
     GivenPoses,
     find_poses,
-    half_models,
+    incomplete_models,
     pose_files,
     transforms_photos,
     truth_folder,
@@ -142,7 +142,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     poses = None
     if config.poses != "ignore":
         poses = find_poses(folder, facts_cache)
-        warnings += half_models(folder)
+        warnings += incomplete_models(folder)
 
     chosen = _choose_folder(folder, config, poses, facts_cache, warnings)
     facts = _read_all(folder, chosen.path, chosen.names, facts_cache, warnings)

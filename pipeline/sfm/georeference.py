@@ -186,14 +186,14 @@ def from_gcp(
         triangulate: (3,) where photographs' pixels meet in the mapper's world, None where they
             do not.
     """
-    found = [(point, triangulate(point.seen)) for point in control.points]
+    found = [(point, triangulate(point.pixels)) for point in control.points]
     placed = [(point, at) for point, at in found if at is not None]
     if len(placed) < MIN_POSITIONS:
         return (
             f"only {len(placed)} of {len(control.points)} ground control points are seen by two "
             "photographs with a pose"
         )
-    places = np.array([point.place for point, _ in placed], np.float64)
+    places = np.array([point.position for point, _ in placed], np.float64)
     if control.geographic:
         origin = np.median(places, axis=0)[[1, 0, 2]]
         target = to_enu(places[:, [1, 0, 2]], origin)

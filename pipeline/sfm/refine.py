@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import pycolmap
 
-from pipeline.io.posefiles import SHARED_BY
+from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 
 # A freed parameter is kept where the robust cost falls by this share at least. On real sets with
 # known cameras the ones that are there gain 0.5% to 8%, the ones that are not 0.01% to 0.1%.
@@ -65,7 +65,10 @@ def refine(
         if principal_point == "yes":
             rich = set(model.cameras)
         else:
-            text = f"no camera has {SHARED_BY} photographs: distortion and principal points stay"
+            text = (
+                f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion and principal "
+                "points stay fixed"
+            )
             return Refined(best, False, set(), [text])
     if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in rich):
         freer = pycolmap.Reconstruction(best)
@@ -200,7 +203,7 @@ def _has_one_block_order(model: pycolmap.Reconstruction) -> bool:
 def _rich_cameras(model: pycolmap.Reconstruction) -> set[int]:
     """Ids of the cameras with enough registered images."""
     used = [model.image(i).camera_id for i in model.reg_image_ids()]
-    return {camera_id for camera_id in used if used.count(camera_id) >= SHARED_BY}
+    return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES_PER_CAMERA}
 
 
 def _make_radial(camera: pycolmap.Camera) -> None:

@@ -47,7 +47,7 @@ def opengl_camera(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return matrix, point, np.array([right, up, ahead])
 
 
-def test_a_known_point_lands_on_its_pixel(tmp_path):
+def test_a_known_point_projects_to_its_pixel(tmp_path):
     matrix, point, (right, up, ahead) = opengl_camera(0)
     write(tmp_path, {"fl_x": 120, "fl_y": 110, "cx": 101, "cy": 52, "frames": [frame(matrix)]})
     model = read_transforms(tmp_path, SIZES)
@@ -95,7 +95,7 @@ def test_applied_transform_and_scale_are_undone(tmp_path):
     np.testing.assert_allclose(image.rotation.T, matrix[:3, :3] @ np.diag([1, -1, -1]), atol=1e-12)
 
 
-def test_intrinsics_are_each_frames_own(tmp_path):
+def test_each_frame_has_its_own_intrinsics(tmp_path):
     frames = [
         frame(path="images/a.png"),
         frame(path="images/b.png", fl_x=150, w=200, h=100, cx=90, cy=40, k1=0.1),
@@ -168,7 +168,7 @@ NAN[0, 3] = np.nan
         ({"applied_scale": 0, "frames": [frame()]}, "applied_scale"),
     ],
 )
-def test_malformed_files_name_the_place(tmp_path, content, message):
+def test_messages_name_the_malformed_field(tmp_path, content, message):
     file = tmp_path / "transforms.json"
     if isinstance(content, dict):
         content = json.dumps(content)
@@ -198,7 +198,7 @@ def views(folder: Path, count: int, same: bool) -> list[View]:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_written_cameras_are_read_back_as_they_were(tmp_path, same):
+def test_written_cameras_are_read_back_unchanged(tmp_path, same):
     written = views(tmp_path, 3, same)
     file = tmp_path / "results" / "export" / "transforms.json"
     write_transforms(file, written, file.parent, points="points.ply")
@@ -233,7 +233,7 @@ def test_written_axes_split_and_points_are_nerfstudios(tmp_path):
     assert content["ply_file_path"] == "points.ply"
 
 
-def test_relative_names_hold_where_a_folder_is_a_link(tmp_path):
+def test_relative_names_are_valid_if_a_folder_is_a_symbolic_link(tmp_path):
     (tmp_path / "disk" / "deep" / "export").mkdir(parents=True)
     (tmp_path / "results").symlink_to(tmp_path / "disk" / "deep")
     (tmp_path / "data").mkdir()

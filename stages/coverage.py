@@ -1,4 +1,5 @@
-"""What the photographs did not see. Outputs: ``coverage.json`` with ``coverage/``."""
+"""Which parts of the scene the photographs do not cover. Outputs: ``coverage.json`` with
+``coverage/``."""
 
 from __future__ import annotations
 
@@ -15,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return StagePlan(run=True, reason="where the photographs leave gaps, and which views fill them")
+    return StagePlan(run=True, reason="parts that no photograph covers, and views that would")
 
 
 def work(job: Job) -> None:

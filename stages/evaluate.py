@@ -1,5 +1,5 @@
-"""Renders of the test views against their photographs, and estimated poses against true ones where
-``sparse_gt`` gives them. Outputs: ``evaluation.json`` with ``renders/``."""
+"""Compare renders of the test views with their photographs, and estimated poses with ground truth
+(``sparse_gt``) if there is any. Outputs: ``evaluation.json`` with ``renders/``."""
 
 from __future__ import annotations
 
@@ -17,16 +17,16 @@ if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
-# With refined cameras, those of test views are fitted to their photographs before the measurement.
+# With refined cameras, the poses of test views are fitted to their photographs before measuring.
 FIT_OPTIONS = ("train.refine_poses", "train.ssim_weight")
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     every = settled.config.split.holdout_every
-    truth = ["pose error against the truth in sparse_gt/"] if scan.truth is not None else []
-    reason = f"one view in {every}, sorted by name, is held out"
+    truth = ["pose errors with respect to sparse_gt/"] if scan.truth is not None else []
+    reason = f"one view in {every}, sorted by name, is a test view"
     if every == 0:
-        reason = "no view is held out: measured on the training views"
+        reason = "no test views: measured on the training views"
     return StagePlan(run=True, reason=reason, decisions=truth)
 
 
@@ -57,7 +57,7 @@ def work(job: Job) -> None:
     job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
     if not protocol.every:
-        job.warn("no view was held out: quality was measured on training views")
+        job.warn("there are no test views: quality was measured on training views")
 
 
 def facts(plan: Plan) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
+"""The initial Gaussians, from sparse points or random. Output: ``gaussians.npz``."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         return StagePlan(run=True, reason=f"Gaussians from the given {points}")
     return StagePlan(
         run=True,
-        reason="Gaussians from points triangulated at the given poses, which came without any",
-        decisions=["pairs of cameras that stand close and look alike"],
+        reason="Gaussians from points triangulated with the given poses, which have no points",
+        decisions=["pairs of cameras with near positions and similar directions"],
     )
 
 
@@ -41,12 +41,12 @@ def work(job: Job) -> None:
     training = [view for view in inputs.input_views(job) if not view.is_test]
     if not training:
         raise UserError(
-            "no photograph has a pose: there is nothing to train on",
-            fix="check that the poses name the photographs, or set poses: ignore",
+            "expected training views, found no photograph with a pose",
+            fix="check the photographs' names in the pose file, or set poses: ignore",
         )
     points = inputs.input_model(job).points
     if config.method != "random" and len(points) == 0:
-        job.decide("the given poses come without points: triangulating them")
+        job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
         report = triangulate(
             inputs.read_manifest(job, "views"),

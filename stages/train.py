@@ -1,5 +1,5 @@
-"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``; and
-where cameras or lenses were refined ``sparse/0``."""
+"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json``, ``exposure.json``; and
+``sparse/0`` if poses or intrinsics were refined."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def work(job: Job) -> None:
 
 
 def memory_mb(plan: Plan) -> int:
-    """The configured limit, or half more than the plan's rough estimate."""
+    """The configured limit, or 1.5 times the plan's estimate."""
     return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
 
 

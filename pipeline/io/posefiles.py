@@ -29,6 +29,9 @@ _LLFF_FILE = "poses_bounds.npy"
 MIN_IMAGES_PER_CAMERA = 5
 
 
+PoseKind = Literal["colmap", "transforms", "llff"]
+
+
 class GivenPoses(BaseModel):
     """Summary of the poses in a scene folder.
 
@@ -46,7 +49,7 @@ class GivenPoses(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Literal["colmap", "transforms", "llff"]
+    kind: PoseKind
     path: str
     names: tuple[str, ...]
     num_images: int

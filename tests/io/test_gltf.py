@@ -129,8 +129,8 @@ def _primitive(document: dict) -> dict:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda d: d["nodes"][0].update(scale=[2, 2, 2]), "nodes that move"),
-        (lambda d: d["nodes"][0].update(matrix=[2.0] * 16), "nodes that move"),
+        (lambda d: d["nodes"][0].update(scale=[2, 2, 2]), "with a transform"),
+        (lambda d: d["nodes"][0].update(matrix=[2.0] * 16), "with a transform"),
         (lambda d: _primitive(d).update(extensions={}), "found none"),
         (lambda d: _primitive(d)["attributes"].pop(f"{NAME}:SCALE"), "SCALE, found none"),
         (lambda d: _primitive(d)["attributes"].pop(f"{NAME}:SH_DEGREE_1_COEF_1"), "COEF_1"),

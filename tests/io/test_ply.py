@@ -78,8 +78,8 @@ def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
 
 
 def rewrite(path: Path, form: str, seed: int) -> None:
-    """The same Gaussians as another program might write them: shuffled, without normals, with
-    a comment and a property nobody knows, in another number format."""
+    """The same Gaussians with shuffled properties, without normals, with a comment and an unknown
+    property, in another number format."""
     column = columns_of(path)
     names = [n for n in column if n not in ("nx", "ny", "nz")]
     np.random.default_rng(seed).shuffle(names)

@@ -46,7 +46,7 @@ def work(job: Job) -> None:
         gains=inputs.read_json(job.inputs["train"] / "exposure.json"),
         threads=job.threads,
     )
-    job.tell([], evaluation.pop("warnings"))
+    job.add_messages([], evaluation.pop("warnings"))
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():

@@ -57,12 +57,12 @@ def work(job: Job) -> None:
             threads=job.threads,
             seed=job.seed,
         )
-        job.tell(report.decisions, report.warnings)
+        job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
         job.counters["triangulated_points"] = len(points)
     first = first_gaussians(points, training, config, job.seed)
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
-    job.tell(first.decisions, first.warnings)
+    job.add_messages(first.decisions, first.warnings)
     job.counters |= first.counters
 
 

@@ -41,7 +41,7 @@ def work(job: Job) -> None:
     manifest, warnings = verify_photos(
         found.manifest, threads=job.threads, min_photos=config.inspect.min_images
     )
-    job.tell([], [*found.warnings, *warnings])
+    job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
     job.counters = {
         "photos": len(manifest.photos),
@@ -55,7 +55,7 @@ def work(job: Job) -> None:
             listed=found.listed,
             base_folder=found.base_folder,
         )
-        job.tell(given.write(job.out), [])
+        job.add_messages(given.write(job.out), [])
         job.counters["given_poses"] = len(given.model.images)
         job.counters["given_points"] = len(given.model.points)
     if found.ground_control is not None and found.poses is None:

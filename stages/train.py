@@ -58,7 +58,7 @@ def work(job: Job) -> None:
         write_model(job.out / "sparse" / "0", trained.model)
     write_json(job.out / "curve.json", trained.result.curve)
     write_json(job.out / "exposure.json", trained.gains)
-    job.tell(trained.decisions, trained.warnings)
+    job.add_messages(trained.decisions, trained.warnings)
     job.counters, job.timings = trained.counters, trained.timings
 
 

@@ -154,7 +154,7 @@ def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
         differ = [f"{key} {row[key]} and {other[key]}" for key in QUALITY if row[key] != other[key]]
         cells = [", ".join(differ) or "the same"]
         for key, found in ratios.items():
-            # What was taken over from another run has that run's time.
+            # Results reused from another run have that run's time.
             found.append(other[key] / row[key])
             cells.append(f"{row[key]:.0f}, {other[key]:.0f}")
         lines.append(f"| {name} | {' | '.join(cells)} |")

@@ -25,7 +25,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     if poses is None:
         return StagePlan(run=False, reason="no poses are given; sfm adjusts the poses it finds")
     if settled.config.poses == "keep":
-        return StagePlan(run=False, reason="given poses are not adjusted, as configured")
+        return StagePlan(
+            run=False, reason="given poses are not adjusted, as configured (poses: keep)"
+        )
     if freed == "no":
         return StagePlan(run=False, reason="principal points are fixed, as configured")
     if poses.tracked < MIN_TRACKED:

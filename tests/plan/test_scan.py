@@ -268,7 +268,7 @@ def test_nerf_synthetic(tmp_path):
     expected = ["test/r_0.png", "test/r_1.png", "train/r_0.png", "train/r_1.png"]
     assert names(result) == expected == sorted(given_model(result).model.by_name())
     assert (result.num_alpha, result.poses.kind, result.poses.pinhole) == (4, "transforms", True)
-    assert any("2 of 6 cameras have no photograph" in line for line in result.warnings)
+    assert any("2 of 6 poses have no photograph" in line for line in result.warnings)
     assert names(look(tmp_path, config(poses="ignore"))) == expected
 
 
@@ -294,7 +294,7 @@ def test_transforms_with_absolute_paths_and_photographs_elsewhere(tmp_path):
     write(folder, {"fl_x": 50, "frames": frames})
     result = look(folder)
     assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(given_model(result).model.by_name())
-    assert any("2 of 4 cameras have no photograph" in line for line in result.warnings)
+    assert any("2 of 4 poses have no photograph" in line for line in result.warnings)
 
 
 def test_llff_order_includes_unreadable_photographs(tmp_path):

@@ -1,8 +1,9 @@
-"""``python -m benchmarks.coverage``: views taken away from the demo scene, and found again.
+"""``python -m benchmarks.coverage``: do the proposed viewpoints replace removed photographs?
 
-Trains the demo scene from true poses without some of its views, asks what the rest did not see, and
-compares with the views that were taken away: how near the proposals come to them, and what
-photographing the proposals is worth, each against viewpoints drawn at random from those considered.
+For each case, removes views of the demo scene, trains on the others with true poses, proposes
+viewpoints, and reports the distance from the proposals to the removed views, the rank correlation
+of trust and error, and the gain in PSNR from one photograph at the first proposal. Distance and
+gain are compared with those of random candidates. Prints JSON.
 """
 
 from __future__ import annotations
@@ -22,11 +23,12 @@ from PIL import Image
 from scipy.stats import spearmanr
 
 from pipeline.config.schema import Density, Init, Train
-from pipeline.coverage.probe_views import Draw, open_eye
-from pipeline.coverage.trust import trust_picture
-from pipeline.coverage.viewpoints import COUNT, Viewpoint, propose
+from pipeline.coverage.probe_views import Renderer, render_probe
+from pipeline.coverage.trust import trust_map
+from pipeline.coverage.viewpoints import MAX_PROPOSALS, Viewpoint, propose_viewpoints
 from pipeline.demo.cameras import lens, look_at, orbit
-from pipeline.demo.render import Rays, rays, render
+from pipeline.demo.render import Rays, rays
+from pipeline.demo.render import render as render_demo
 from pipeline.demo.scene import OBJECTS, shadow_maps
 from pipeline.demo.sensor import srgb, to_bytes
 from pipeline.geometry.cameras import Camera
@@ -43,7 +45,7 @@ from pipeline.training.loop.trainer import train
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
-POINTS_A_VIEW = 300
+POINTS_PER_VIEW = 300
 BLOCK = 8
 RING, HIGH = 32, 16
 MAX_GAUSSIANS = 8000
@@ -51,8 +53,10 @@ MAX_GAUSSIANS = 8000
 
 @dataclass(frozen=True)
 class Case:
-    """Which views are taken away, of the ring (``range(RING)``) and, if ``above``, of the smaller
-    ring above it."""
+    """The views to remove, as indices into ``cameras()``.
+
+    Without ``above``, only the lower ring is photographed.
+    """
 
     name: str
     removed: range
@@ -68,7 +72,7 @@ CASES = (
 
 
 class Studio:
-    """Takes photographs of the demo scene, once each."""
+    """Renders photographs of the demo scene, with points of the surface that each shows."""
 
     def __init__(self, folder: Path, width: int, height: int):
         self.folder, self.camera = folder, lens("none", width, height)
@@ -76,10 +80,10 @@ class Studio:
         self.points: dict[str, tuple[Array, NDArray[np.uint8]]] = {}
         shadow_maps()
 
-    def take(self, posed: PosedImage) -> View:
+    def photograph(self, posed: PosedImage) -> View:
         camera: Camera = self.camera
         path = self.folder / posed.name
-        seen = render(posed, camera, self.through, OBJECTS)
+        seen = render_demo(posed, camera, self.through, OBJECTS)
         colour = to_bytes(srgb(seen.light))
         Image.fromarray(colour).save(path)
         fx, fy, cx, cy = camera.pinhole
@@ -89,8 +93,8 @@ class Studio:
             False,
         )
         rng = np.random.default_rng(len(self.points))
-        column = rng.integers(0, camera.width, POINTS_A_VIEW)
-        row = rng.integers(0, camera.height, POINTS_A_VIEW)
+        column = rng.integers(0, camera.width, POINTS_PER_VIEW)
+        row = rng.integers(0, camera.height, POINTS_PER_VIEW)
         x, y = (column + 0.5 - cx) / fx, (row + 0.5 - cy) / fy
         local = np.stack([x, y, np.ones_like(x)], axis=1) * seen.depth[row, column, None]
         self.points[posed.name] = (
@@ -100,7 +104,7 @@ class Studio:
         return view
 
     def sparse(self, views: Sequence[View]) -> Points:
-        """What a reconstruction from these views would start from: true points that they show."""
+        """Points of the true surface that the views show, for the initialisation of training."""
         xyz, rgb = (np.concatenate([self.points[v.name][i] for v in views]) for i in (0, 1))
         return replace(Points.empty(), xyz=xyz, rgb=rgb)
 
@@ -116,7 +120,7 @@ def cameras() -> list[PosedImage]:
     return posed
 
 
-def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> Gaussians:
+def train_scene(studio: Studio, views: Sequence[View], steps: int, extent: float) -> Gaussians:
     config = Train(
         steps=steps,
         background="black",
@@ -136,73 +140,81 @@ def learn(studio: Studio, views: Sequence[View], steps: int, extent: float) -> G
         ).gaussians
 
 
-def drawer(gaussians: Gaussians, near: float) -> Draw:
-    def draw(view: View) -> Render:
+def renderer(gaussians: Gaussians, near: float) -> Renderer:
+    def render(view: View) -> Render:
         return render_view(gaussians, view, RasterOptions(near=near, threads=2))
 
-    return draw
+    return render
 
 
-def quality(draw: Draw, views: Sequence[View]) -> float:
+def quality(render: Renderer, views: Sequence[View]) -> float:
     """Mean PSNR, dB."""
-    return float(np.mean([psnr(draw(view).rgb, load_rgb(view.image) / 255.0) for view in views]))
+    return float(np.mean([psnr(render(view).rgb, load_rgb(view.image) / 255.0) for view in views]))
 
 
 def run_case(
     case: Case, studio: Studio, views: list[View], steps: int, draws: int
 ) -> dict[str, Any]:
-    """One case: train without the removed views, propose, compare, add, train again."""
-    there = range(RING + HIGH if case.above else RING)
+    """Train without the removed views, propose viewpoints, add the first one and train again."""
+    used = range(RING + HIGH if case.above else RING)
     removed = [views[i] for i in case.removed]
-    kept = [views[i] for i in there if i not in case.removed]
-    held_out, training = kept[::8], [v for i, v in enumerate(kept) if i % 8]
+    remaining = [views[i] for i in used if i not in case.removed]
+    test, training = remaining[::8], [v for i, v in enumerate(remaining) if i % 8]
     extent = scene_extent(training)
     near = near_plane(extent)
-    draw = drawer(learn(studio, training, steps, extent), near)
-    eyes = [open_eye(view, draw) for view in training]
-    beyond = float(np.percentile(np.concatenate([e.depth[~e.open] for e in eyes]), 95))
-    outlook = propose(training, eyes, draw, UP, beyond)
-    trusted, errors = {}, {}
-    for name, group in (("held_out", held_out), ("removed", removed)):
-        maps = [squares(view, draw, eyes, beyond) for view in group]
-        trusted[name], errors[name] = (np.concatenate([m[i] for m in maps]) for i in (0, 1))
-    both = [np.concatenate(list(values.values())) for values in (trusted, errors)]
+    render = renderer(train_scene(studio, training, steps, extent), near)
+    probes = [render_probe(view, render) for view in training]
+    background_depth = float(np.percentile(np.concatenate([p.depth[~p.empty] for p in probes]), 95))
+    best = propose_viewpoints(training, probes, render, UP, background_depth)
+    trust, errors = {}, {}
+    for name, group in (("test", test), ("removed", removed)):
+        maps = [block_means(view, render, probes, background_depth) for view in group]
+        trust[name], errors[name] = (np.concatenate([m[i] for m in maps]) for i in (0, 1))
+    both = [np.concatenate(list(values.values())) for values in (trust, errors)]
     rng = np.random.default_rng(0)
-    proposed = [proposal.viewpoint for proposal in outlook.proposals]
-    chances = [pick(outlook.judged, rng) for _ in range(1000)]
-    before = {"held_out": quality(draw, held_out), "removed": quality(draw, removed)}
+    proposed = [proposal.viewpoint for proposal in best.proposals]
+    random_draws = [draw_random(best.candidates, rng) for _ in range(1000)]
+    before = {"test": quality(render, test), "removed": quality(render, removed)}
 
-    def worth(viewpoint: Viewpoint, name: str) -> dict[str, float]:
-        """What one more photograph adds, dB."""
+    def gain_from(viewpoint: Viewpoint, name: str) -> dict[str, float]:
+        """Gain of one more photograph in mean PSNR, dB, over the test and the removed views."""
         added = photograph(studio, viewpoint, name)
-        better = drawer(learn(studio, [*training, added], steps, extent), near)
+        better = renderer(train_scene(studio, [*training, added], steps, extent), near)
         return {
-            "held_out": quality(better, held_out) - before["held_out"],
+            "test": quality(better, test) - before["test"],
             "removed": quality(better, removed) - before["removed"],
         }
 
     return {
         "case": case.name,
         "training_views": len(training),
-        "trust": {name: float(values.mean()) for name, values in trusted.items()},
+        "trust": {name: float(values.mean()) for name, values in trust.items()},
         "psnr": before,
         "rank_correlation": float(spearmanr(*both).statistic),
         "first": nearest(proposed[:1], removed),
         "best_of_five": nearest(proposed, removed),
-        "random_first": median([nearest(found[:1], removed) for found in chances]),
-        "random_best_of_five": median([nearest(found, removed) for found in chances]),
-        "better_than_random": share_beaten(proposed, chances, removed),
-        "added_first": worth(proposed[0], "first.png"),
-        "added_random": [worth(c[0], f"random_{i}.png") for i, c in enumerate(chances[:draws])],
-        "surroundings": [outlook.before, outlook.after, len(outlook.judged)],
+        "random_first": median([nearest(found[:1], removed) for found in random_draws]),
+        "random_best_of_five": median([nearest(found, removed) for found in random_draws]),
+        "better_than_random": share_farther(proposed, random_draws, removed),
+        "added_first": gain_from(proposed[0], "first.png"),
+        "added_random": [
+            gain_from(c[0], f"random_{i}.png") for i, c in enumerate(random_draws[:draws])
+        ],
+        "surroundings": [
+            best.trust_before,
+            best.trust_after,
+            len(best.candidates),
+        ],
     }
 
 
-def squares(view: View, draw: Draw, eyes: list, beyond: float) -> tuple[Array, Array]:
-    """Mean trust and squared error of squares of a view's map."""
-    eye = open_eye(view, draw)
-    found, _ = trust_picture(eye, eyes, beyond)
-    error = ((draw(view).rgb - load_rgb(view.image) / 255.0) ** 2).mean(axis=2)
+def block_means(
+    view: View, render: Renderer, probes: list, background_depth: float
+) -> tuple[Array, Array]:
+    """Mean trust and mean squared error of blocks of ``BLOCK`` x ``BLOCK`` pixels of a view."""
+    probe = render_probe(view, render)
+    found, _ = trust_map(probe, probes, background_depth)
+    error = ((render(view).rgb - load_rgb(view.image) / 255.0) ** 2).mean(axis=2)
     height, width = (side // BLOCK for side in found.shape)
     return tuple(  # type: ignore[return-value]
         resize_area(np.asarray(values, np.float32), width, height).ravel()
@@ -210,17 +222,18 @@ def squares(view: View, draw: Draw, eyes: list, beyond: float) -> tuple[Array, A
     )
 
 
-def pick(viewpoints: Sequence[Viewpoint], rng: np.random.Generator) -> list[Viewpoint]:
-    return [viewpoints[i] for i in rng.choice(len(viewpoints), COUNT, replace=False)]
+def draw_random(viewpoints: Sequence[Viewpoint], rng: np.random.Generator) -> list[Viewpoint]:
+    return [viewpoints[i] for i in rng.choice(len(viewpoints), MAX_PROPOSALS, replace=False)]
 
 
 def photograph(studio: Studio, viewpoint: Viewpoint, name: str) -> View:
     pose = viewpoint.view.world_to_camera
-    return studio.take(PosedImage(name, 1, pose[:3, :3], pose[:3, 3]))
+    return studio.photograph(PosedImage(name, 1, pose[:3, :3], pose[:3, 3]))
 
 
 def nearest(viewpoints: Sequence[Viewpoint], removed: Sequence[View]) -> list[float]:
-    """Metres and degrees from the nearest removed camera, of the viewpoint that is nearest."""
+    """Smallest distance (metres) between a viewpoint and a removed camera, and the angle between
+    their viewing directions (degrees)."""
     pairs = [
         (
             float(np.linalg.norm(v.view.centre - r.centre)),
@@ -240,19 +253,19 @@ def median(pairs: list[list[float]]) -> list[float]:
     return [float(v) for v in np.median(pairs, axis=0)]
 
 
-def share_beaten(
-    proposed: list[Viewpoint], chances: list[list[Viewpoint]], removed: list[View]
+def share_farther(
+    proposed: list[Viewpoint], random_draws: list[list[Viewpoint]], removed: list[View]
 ) -> float:
     """Share of the random draws whose first viewpoint is farther from every removed camera."""
     own = nearest(proposed[:1], removed)[0]
-    return float(np.mean([nearest(found[:1], removed)[0] > own for found in chances]))
+    return float(np.mean([nearest(found[:1], removed)[0] > own for found in random_draws]))
 
 
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.coverage", description=__doc__)
-    parser.add_argument("--size", default="200x150", help="of the photographs, pixels")
+    parser.add_argument("--size", default="200x150", help="of the photographs, pixels, WxH")
     parser.add_argument("--steps", type=int, default=400)
-    parser.add_argument("--draws", type=int, default=3, help="random draws that are trained, too")
+    parser.add_argument("--draws", type=int, default=3, help="number of random draws to train with")
     parser.add_argument("--cases", type=int, nargs="*", default=[*range(len(CASES))])
     parser.add_argument("--out", type=Path, help="JSON of the results")
     options = parser.parse_args()
@@ -260,7 +273,7 @@ def main() -> int:
     results: list[Any] = []
     with TemporaryDirectory() as folder:
         studio = Studio(Path(folder), width, height)
-        views = [studio.take(posed) for posed in cameras()]
+        views = [studio.photograph(posed) for posed in cameras()]
         for i in options.cases:
             results.append(run_case(CASES[i], studio, views, options.steps, options.draws))
             print(json.dumps(results[-1], indent=1), flush=True)

@@ -1,4 +1,4 @@
-"""``python -m benchmarks.mesh``: the mesh of the finished demo scene against its exact surface.
+"""``python -m benchmarks.mesh``: accuracy of the mesh of the demo scene against its true surface.
 
 make demo && python -m benchmarks.mesh results/demo data/demo
 """
@@ -21,7 +21,7 @@ from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
 from pipeline.splats.gaussians import Gaussians
-from pipeline.surface.depth import DepthMaps, Pictures
+from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.mesh import build_mesh
 
 
@@ -44,15 +44,15 @@ def main() -> int:
         split,
     )
     gaussians = Gaussians.load(options.results / "train" / "gaussians.npz")
-    drawn = choose_protocol(views, split, train).options(train, options.threads)
+    raster = choose_protocol(views, split, train).options(train, options.threads)
     start, cpu = time.monotonic(), time.process_time()
     with TemporaryDirectory() as folder:
-        pictures = Pictures(gaussians, views, drawn, Path(folder))
-        mesh, grid = build_mesh(DepthMaps(pictures), options.voxel, options.threads)
+        renders = RenderCache(gaussians, views, raster, Path(folder))
+        mesh, grid = build_mesh(DepthMaps(renders), options.voxel, options.threads)
     seconds = {"wall": time.monotonic() - start, "cpu": time.process_time() - cpu}
     peak = peak_memory_mb()
     if mesh is None or grid is None:
-        print("no mesh: the views' depths agree on no surface", file=sys.stderr)
+        print("no mesh: the depth maps of the views contain no common surface", file=sys.stderr)
         return 1
     frame = align(views, read_model(options.data / "sparse_gt"))
     found = measure(mesh.vertices, mesh.faces, true_points(views, frame), frame)

@@ -1,4 +1,4 @@
-"""How far a mesh is from the demo scene's exact surface."""
+"""Accuracy and completeness of a mesh against the true surface of the demo scene."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
 
-#: What the demo's cameras look at: the middle of the ball below, metres.
+#: Focus of the demo cameras and centre of the foreground, metres.
 FOCUS = np.array([0.0, 0.0, 0.45])
-#: The foreground is the ball of this diameter: all objects and the floor they stand on.
+#: Diameter of the foreground, a ball with all objects and the floor below them, metres.
 FOREGROUND = 2.4
-#: Points of the surface count that so many training views see.
+#: Least number of training views that see an evaluated point of the true surface.
 MIN_VIEWS = 3
 SAMPLES = 400_000
 # Points of the true surface: one in each cube of this side, metres.
@@ -61,15 +61,15 @@ class Accuracy:
 
 
 def align(views: list[View], truth: Reconstruction) -> Similarity:
-    """The similarity that lays the views' centres on the true ones, by name without suffix."""
+    """The similarity that aligns the centres of views to the true ones, by name without suffix."""
     true = {PurePosixPath(name).stem: posed.centre for name, posed in truth.by_name().items()}
     found = np.stack([view.centre for view in views])
-    wanted = np.stack([true[PurePosixPath(view.name).stem] for view in views])
-    return Similarity(*umeyama(found, wanted))
+    target = np.stack([true[PurePosixPath(view.name).stem] for view in views])
+    return Similarity(*umeyama(found, target))
 
 
 def true_points(views: list[View], frame: Similarity) -> Array:
-    """(P, 3) points of the exact surface, evenly spread, that enough training views see."""
+    """(P, 3) points of the true surface, evenly spread, that ``MIN_VIEWS`` training views see."""
     training = [view for view in views if not view.is_test]
     depths, found = [], []
     for view in training:

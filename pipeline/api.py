@@ -16,7 +16,13 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Evaluate, Train
 from pipeline.io import splat_files
 from pipeline.io.camera_files import choose_views
-from pipeline.metrics.evaluate import NO_GAINS, Protocol, choose_protocol, evaluate_views, reference
+from pipeline.metrics.evaluate import (
+    NO_GAINS,
+    Protocol,
+    choose_protocol,
+    evaluate_views,
+    photo_over_background,
+)
 from pipeline.metrics.image import psnr, ssim
 from pipeline.photos.load import load_view
 from pipeline.plan.posed_scene import PosedScene, posed_scene
@@ -80,7 +86,7 @@ class Scene:
 
     @property
     def test_views(self) -> list[View]:
-        """The views that were held out of training; empty where none was."""
+        """The test views, which are not used for training; may be empty."""
         return [view for view in self.views if view.is_test]
 
     def view(self, name: str) -> View:
@@ -103,18 +109,22 @@ class Scene:
             UserError: its file is missing or cannot be read.
         """
         pixels = load_view(view)
-        return reference(pixels, self._protocol.background).astype(np.float32) / np.float32(255)
+        return photo_over_background(pixels, self._protocol.background).astype(
+            np.float32
+        ) / np.float32(255)
 
     def measure(self, views: Sequence[View] = ()) -> Quality:
         """Render views and compare them with their photographs, by the protocol of metrics.json.
 
         Args:
-            views: those to measure; empty: the test views, or all views where none was held out.
+            views: those to measure; empty: the test views, or all views if there are no test views.
 
         Raises:
             UserError: a photograph that cannot be read, or masks that leave no pixel.
         """
-        protocol = replace(self._protocol, views=list(views) or self._protocol.views, seen=[])
+        protocol = replace(
+            self._protocol, views=list(views) or self._protocol.views, training_views=[]
+        )
         with tempfile.TemporaryDirectory() as renders:
             found = evaluate_views(
                 self.gaussians,

@@ -1,5 +1,4 @@
-"""Which parts of the scene the photographs do not cover. Outputs: ``coverage.json`` with
-``coverage/``."""
+"""Coverage of the scene by its photographs. Outputs: ``coverage.json`` with ``coverage/``."""
 
 from __future__ import annotations
 
@@ -16,11 +15,11 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return StagePlan(run=True, reason="parts that no photograph covers, and views that would")
+    return StagePlan(run=True, reason="finds gaps in the coverage and viewpoints that fill them")
 
 
 def work(job: Job) -> None:
-    from pipeline.coverage.measure import measure_coverage, world_of
+    from pipeline.coverage.measure import measure_coverage, world_frame
     from pipeline.metrics.evaluate import choose_protocol
 
     views, train = inputs.trained_views(job), job.section(Train)
@@ -32,7 +31,7 @@ def work(job: Job) -> None:
         train,
         inputs.read_json(job.inputs["evaluate"] / "evaluation.json"),
         job.inputs["evaluate"] / "renders",
-        world_of(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
+        world_frame(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
         threads=job.threads,
     )
 

@@ -41,7 +41,7 @@ def work(job: Job) -> None:
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),
-        drawn=inputs.trained_views(job),
+        training_size_views=inputs.trained_views(job),
         georeference=inputs.georeference(job),
         folder=job.inputs["train"].parent / job.stage,
     )

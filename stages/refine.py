@@ -49,10 +49,12 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.sfm.refine_given import refine_given
+    from pipeline.sfm.known_poses import refine_known_poses
 
     given = job.inputs["model"]
-    job.record(refine_given(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0"))
+    job.record(
+        refine_known_poses(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0")
+    )
     inputs.copy_georeference(job, "model")
 
 

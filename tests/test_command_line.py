@@ -246,7 +246,7 @@ def test_wrong_surroundings_are_one_clear_error(folder, capsys):
     bent = Camera("SIMPLE_RADIAL", SIZE, SIZE, np.array([50.0, 24, 24, 0.1]))
     for arguments, message in [
         (["convert", model, folder / "a.obj"], r"found the suffix '.obj'"),
-        (["convert", model, folder / "a.ply", "--min-opacity", "1"], "fainter than 1.0"),
+        (["convert", model, folder / "a.ply", "--min-opacity", "1"], "opacity below 1.0"),
         (["render", model, "--cameras", folder, "-o", folder / "o"], "COLMAP model"),
         (["render", model, "--cameras", scene, "-o", folder / "o", "--view", "x"], "named 'x'"),
         (["evaluate", model, "--scene", folder / "none"], "no such scene"),

@@ -1,4 +1,4 @@
-"""The export stage: every format it offers, and a frame that is true of them."""
+"""The export stage: every format, and ``frame.json``."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
-from pipeline.surface.outputs import DRAWN
+from pipeline.surface.outputs import RENDERED_FORMATS
 from stages.export import work
 from tests.splats.samples import sample
 
@@ -31,8 +31,8 @@ FORMATS = get_args(ExportFormat)
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """results/NAME with what the export reads: pictures of 90x60 whose camera stands for 180x120,
-    as poses of larger photographs are given."""
+    """results/NAME with the inputs of the export: images of 90x60 with a camera of 180x120, as if
+    the poses were given for larger photographs."""
     scene = tmp_path / "results" / "NAME"
     camera = Camera("PINHOLE", 180, 120, np.array([100.0, 100, 90, 60]))
     images = {
@@ -86,7 +86,7 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
 
 
 def test_every_format_the_schema_offers_is_written(scene):
-    assert set(WRITERS) | DRAWN == set(FORMATS)
+    assert set(WRITERS) | RENDERED_FORMATS == set(FORMATS)
     out, job = export(
         scene, formats=list(WRITERS), sh_degree=1, min_opacity=0.3, morton_order=False
     )
@@ -103,7 +103,7 @@ def test_every_format_the_schema_offers_is_written(scene):
     assert b"element vertex 1\n" in (out / "points.ply").read_bytes()[:100]
 
 
-def test_what_is_drawn_is_drawn_on_demand(scene):
+def test_rendered_formats_are_written_on_demand(scene):
     out, job = export(scene, formats=["renders", "depths", "mesh", "video"])
     assert len(list((out / "renders").glob("*.png"))) == 9
     assert len(list((out / "depths" / "median").iterdir())) == 9
@@ -113,14 +113,14 @@ def test_what_is_drawn_is_drawn_on_demand(scene):
     assert any("mesh" in text for text in (*job.decisions, *job.warnings))
 
 
-def test_files_that_cannot_say_how_they_want_to_be_drawn_are_named(scene):
-    """Drawn without the compensation that they were trained with, lego lost 10 dB."""
+def test_formats_without_an_antialias_flag_are_named_in_a_warning(scene):
+    """A viewer without opacity compensation renders such files much worse."""
     out, job = export(scene, antialias=True, formats=["ply", "spz"])
     assert [text.split()[0] for text in job.warnings] == ["point_cloud.ply"]
     assert json.loads((out / "frame.json").read_text())["render"]["antialias"]
 
 
-def test_transforms_name_the_pictures_from_where_they_end_up(scene):
+def test_transforms_paths_are_relative_to_the_final_folder(scene):
     out, _ = export(scene, formats=["transforms", "points"])
     frames = read_frames(out)
     assert [(out / frame.path).resolve().is_file() for frame in frames] == [True] * 9
@@ -132,15 +132,15 @@ def test_transforms_name_the_pictures_from_where_they_end_up(scene):
     assert len(content["test_filenames"]) == 2 and content["ply_file_path"] == "points.ply"
 
 
-def test_transforms_start_from_no_empty_cloud(scene):
-    """Given poses may come without points."""
+def test_transforms_omit_an_empty_point_cloud(scene):
+    """Given poses may have no points."""
     folder = scene / "undistort" / "sparse" / "0"
     write_model(folder, replace(read_model(folder), points=Points.empty()))
     out, _ = export(scene, formats=["transforms", "points"])
     assert "ply_file_path" not in json.loads((out / "transforms.json").read_text())
 
 
-def test_frame_says_what_the_files_leave_open(scene):
+def test_frame_json_describes_the_coordinate_frame(scene):
     out, _ = export(scene, formats=["ply", "gltf"])
     found = json.loads((out / "frame.json").read_text())
     assert found["up"] == [0, -1, 0]
@@ -151,7 +151,7 @@ def test_frame_says_what_the_files_leave_open(scene):
     assert list(found["axes_of"]) == ["point_cloud.glb"]
 
 
-def test_the_default_is_what_viewers_and_tools_take(scene):
+def test_default_formats(scene):
     out, _ = export(scene)
     written = {p.relative_to(out).as_posix() for p in out.rglob("*") if p.is_file()}
     assert written == {
@@ -161,5 +161,5 @@ def test_the_default_is_what_viewers_and_tools_take(scene):
 
 
 def test_pruning_everything_is_an_error(scene):
-    with pytest.raises(UserError, match="fainter"):
+    with pytest.raises(UserError, match="have an opacity below"):
         export(scene, min_opacity=1.0)

@@ -21,7 +21,7 @@ from benchmarks.judge.truth import Grade, Truth, grade
 from benchmarks.judge.world import write
 from pipeline.config.schema import Sfm
 from pipeline.io.colmap import read_model
-from pipeline.sfm.escalation import Attempt, map_until_good
+from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.models import write_model
@@ -32,7 +32,7 @@ GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
 SHOWN = (
     ("explained_matches", "expl", "{:.2f}"),
     ("agreeing_pairs", "agree", "{:.2f}"),
-    ("strangers", "stra", "{:.2f}"),
+    ("missing_covisibility", "miss", "{:.2f}"),
     ("observations_per_image", "obs", "{:.0f}"),
     ("parallax", "parlx", "{:.4f}"),
     ("median_angle_deg", "angle", "{:.1f}"),

@@ -14,7 +14,7 @@ from pathlib import Path
 from benchmarks.sfm.measure import STEPS, Run, Summary, as_data, run_once, summarise
 from benchmarks.sfm.plot import pareto_svg
 from benchmarks.sfm.scenes import REFERENCE, configurations, load_scene
-from pipeline.reporting.charts import Dot, pareto_front
+from pipeline.reporting.charts import ChartPoint, pareto_front
 from pipeline.runtime.atomic import write_json, write_text
 from pipeline.runtime.errors import UserError
 
@@ -85,7 +85,7 @@ def plot(summaries: Sequence[Summary]) -> str:
     for scene in dict.fromkeys(s.scene for s in summaries):
         shown = [s for s in summaries if s.scene == scene and s.centre_permille]
         dots = [
-            Dot(s.total_s, s.centre_permille or 0.0, _label(s), _tip(s), colour=_colour(s))
+            ChartPoint(s.total_s, s.centre_permille or 0.0, _label(s), _tip(s), colour=_colour(s))
             for s in shown
         ]
         front = pareto_front(dots)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Mapping, Sequence
 
-from pipeline.reporting.charts import Dot, trade_off_chart
+from pipeline.reporting.charts import ChartPoint, trade_off_chart
 from pipeline.reporting.text import escape
 
 _WIDTH, _HEIGHT, _HEAD = 440, 250, 26
@@ -20,7 +20,7 @@ _STYLE = (
 )
 
 
-def pareto_svg(charts: Mapping[str, Sequence[Dot]]) -> str:
+def pareto_svg(charts: Mapping[str, Sequence[ChartPoint]]) -> str:
     """Charts under one another, by their titles. Error labels are plain numbers."""
     parts = []
     for index, (title, dots) in enumerate(charts.items()):

@@ -1,1 +1,1 @@
-"""What the photographs of a scene did not see."""
+"""Coverage of a scene by its photographs: trust, defects, and viewpoints to add."""

@@ -1,4 +1,4 @@
-"""What is wrong where few photographs look: rays without a surface, and floaters."""
+"""Defects in regions that few photographs see: holes and floaters."""
 
 from __future__ import annotations
 
@@ -8,29 +8,28 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.coverage.probe_views import Bools, Eye, look_for
-from pipeline.coverage.trust import Evidence
+from pipeline.coverage.probe_views import Bools, ProbeView, find_visible
+from pipeline.coverage.trust import Observations
 from pipeline.splats.gaussians import Gaussians
 
-#: Photographs that must agree on anything; fewer are few.
-AGREE = 2
-#: Gaussians less opaque are not counted as floaters.
+#: Number of photographs that must agree for a surface, or its absence, to be certain.
+MIN_AGREEING = 2
+#: Gaussians of less opacity are not counted as floaters.
 MIN_OPACITY = 0.5
-#: Floaters are sought up to this share of the distance of the nearest surfaces.
+#: Floaters are searched up to this share of the distance of the nearest certain surfaces.
 NEAR_SHARE = 0.5
-#: Cameras named that have most of them.
-NAMED = 5
+#: Largest number of cameras that are named.
+MAX_NAMED = 5
 
 
 @dataclass(frozen=True)
 class Floaters:
-    """Opaque Gaussians that stand before cameras, nearer than any surface.
+    """Opaque Gaussians in front of cameras, nearer than any certain surface.
 
     Attributes:
-        count: how many.
-        within: distance from a camera up to which they were sought, world unit; 0 where
-            photographs agree on no surface.
-        cameras: names of the cameras that show them, those with most first, with their number.
+        count: number of floaters.
+        within: search distance from a camera, world units; 0 if no surface is certain.
+        cameras: number of floaters that a camera shows, by name of the camera, largest first.
     """
 
     count: int
@@ -38,55 +37,59 @@ class Floaters:
     cameras: dict[str, int]
 
 
-def holes(eye: Eye, evidence: Evidence, opaque: Bools | None) -> Bools:
-    """(H, W) pixels whose rays meet no surface, though there is one, or though fewer than ``AGREE``
-    photographs say that there is none.
+def holes(probe: ProbeView, observed: Observations, opaque: Bools | None) -> Bools:
+    """(H, W) pixels whose ray meets no surface although one is there.
 
     Args:
-        opaque: (H, W) where the photograph from here is, if it has alpha, else None.
+        observed: of the points of the probe view.
+        opaque: (H, W) opaque pixels of the photograph, if it has an alpha channel: these show a
+            surface. Without (None), pixels are holes unless ``MIN_AGREEING`` photographs show
+            background there as well.
     """
-    few = (evidence.count < AGREE).reshape(eye.open.shape)
-    return eye.counts & eye.open & (few if opaque is None else opaque)
+    few = (observed.count < MIN_AGREEING).reshape(probe.empty.shape)
+    return probe.valid & probe.empty & (few if opaque is None else opaque)
 
 
-def floating(eye: Eye, evidence: Evidence, nearest: float) -> Bools:
-    """(H, W) pixels that show what fewer than ``AGREE`` photographs see, and what as many see past
-    or what is nearer than any surface.
+def floating(probe: ProbeView, observed: Observations, nearest: float) -> Bools:
+    """(H, W) pixels that show floaters: surface that fewer than ``MIN_AGREEING`` photographs see,
+    and that as many see past or that is nearer than any certain surface.
 
     Args:
-        nearest: distance of the nearest surfaces that photographs agree on, world unit.
+        observed: of the points of the probe view.
+        nearest: distance of the nearest certain surfaces, world units.
     """
-    shape = eye.open.shape
-    few, passed = (evidence.count < AGREE).reshape(shape), evidence.passed.reshape(shape) >= AGREE
-    return eye.counts & ~eye.open & few & (passed | (eye.depth < NEAR_SHARE * nearest))
+    shape = probe.empty.shape
+    few = (observed.count < MIN_AGREEING).reshape(shape)
+    seen_past = observed.seen_past.reshape(shape) >= MIN_AGREEING
+    return probe.valid & ~probe.empty & few & (seen_past | (probe.depth < NEAR_SHARE * nearest))
 
 
 def near_floaters(
-    gaussians: Gaussians, training: Sequence[Eye], others: Sequence[Eye], nearest: float
+    gaussians: Gaussians, training: Sequence[ProbeView], test: Sequence[ProbeView], nearest: float
 ) -> Floaters:
-    """Opaque Gaussians that a camera shows nearer than any surface, and of the training views fewer
-    than ``AGREE``.
+    """Opaque Gaussians that a view shows nearer than any certain surface, and that fewer than
+    ``MIN_AGREEING`` training views show.
 
     Args:
-        others: of held-out views.
         nearest: as for ``floating``.
     """
     from scipy.spatial import cKDTree
 
     within = NEAR_SHARE * nearest
-    eyes = [*training, *others]
+    probes = [*training, *test]
     means = gaussians.means.numpy().astype(np.float64)
     logit = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
     opaque = means[gaussians.opacity_logits.numpy() >= logit]
-    centres = np.stack([eye.view.centre for eye in eyes])
-    reached, _ = cKDTree(centres).query(opaque, distance_upper_bound=within)
-    xyz = opaque[np.isfinite(reached)]
-    seen, shown = np.zeros(len(xyz), int), np.full(len(xyz), -1)
-    for i, eye in enumerate(eyes):
-        found = look_for(eye, xyz, np.zeros(len(xyz), bool)).seen
-        seen[found] += i < len(training)
-        close = np.linalg.norm(xyz[found] - eye.view.centre, axis=1) <= within
-        shown[found[close]] = i
-    named = Counter(eyes[i].view.name for i in shown[(seen < AGREE) & (shown >= 0)])
-    ranked = sorted(named.items(), key=lambda item: (-item[1], item[0]))
-    return Floaters(named.total(), within, dict(ranked[:NAMED]))
+    centres = np.stack([probe.view.centre for probe in probes])
+    distance, _ = cKDTree(centres).query(opaque, distance_upper_bound=within)
+    xyz = opaque[np.isfinite(distance)]
+    training_count, shown_by = np.zeros(len(xyz), int), np.full(len(xyz), -1)
+    for i, probe in enumerate(probes):
+        visible = find_visible(probe, xyz, np.zeros(len(xyz), bool)).visible
+        training_count[visible] += i < len(training)
+        close = np.linalg.norm(xyz[visible] - probe.view.centre, axis=1) <= within
+        shown_by[visible[close]] = i
+    floaters = (training_count < MIN_AGREEING) & (shown_by >= 0)
+    counts = Counter(probes[i].view.name for i in shown_by[floaters])
+    ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
+    return Floaters(counts.total(), within, dict(ranked[:MAX_NAMED]))

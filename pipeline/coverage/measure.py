@@ -1,4 +1,4 @@
-"""What the photographs of a scene did not see: ``coverage.json`` and its pictures."""
+"""Coverage of a trained scene by its photographs: ``coverage.json`` and its images."""
 
 from __future__ import annotations
 
@@ -15,11 +15,19 @@ from PIL import Image
 
 from pipeline.config.schema import Train
 from pipeline.coverage.defects import floating, holes, near_floaters
-from pipeline.coverage.probe_views import Bools, Doubles, Draw, Eye, Floats, open_eyes, points_of
+from pipeline.coverage.probe_views import (
+    Bools,
+    Doubles,
+    Floats,
+    ProbeView,
+    Renderer,
+    backproject,
+    render_probes,
+)
 from pipeline.coverage.summary import describe
-from pipeline.coverage.trust import LITTLE, gather, trust_pictures
-from pipeline.coverage.viewpoints import Outlook, propose
-from pipeline.metrics.evaluate import Protocol, reference
+from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
+from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
+from pipeline.metrics.evaluate import Protocol, photo_over_background
 from pipeline.photos.load import load_view, resize_area
 from pipeline.render.views import Render, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes, write_json
@@ -30,16 +38,18 @@ from pipeline.splats.gaussians import Gaussians
 
 T = TypeVar("T")
 
-#: Of more views, so many are looked at, evenly spread.
-MAX_PHOTOGRAPHS, MAX_HELD_OUT, MAX_SAMPLED = 200, 12, 12
-#: Pictures kept: the held-out views of least trust.
+#: Largest numbers of training views, of test views, and of training views whose surface points are
+#: counted. Larger sets are sampled evenly.
+MAX_TRAINING_VIEWS, MAX_TEST_VIEWS, MAX_SAMPLED = 200, 12, 12
+#: Number of test views, those of least trust, whose images are written.
 SHOWN = 2
-#: Error and trust are compared as means over squares of so many pixels of the maps.
+#: Error and trust are averaged over square blocks of the maps; side in pixels.
 BLOCK = 8
-#: Fewer squares tell nothing of a correlation.
+#: The rank correlation is not computed for fewer blocks.
 MIN_BLOCKS = 50
-#: Classes of trust, for the error in each.
+#: Bounds of the classes of trust whose errors are reported.
 CLASSES = (0.0, 0.25, 0.5, 0.75, 1.0)
+#: Part of ``coverage.json``.
 FORMULA = (
     "precision (how far a point may be off in this view, by triangulation from the photographs "
     "that see it) times support (how near in direction, and how sharp, the nearest is); 0 to 1"
@@ -47,42 +57,43 @@ FORMULA = (
 
 
 @dataclass(frozen=True)
-class Asked:
-    """A held-out view: what it shows, how far that is to be trusted, and how wrong it is.
+class MeasuredView:
+    """A test view with its trust and its error.
 
     Attributes:
-        trust, squared_error: (H, W); the error is the mean over channels, of a range of 1.
-        counts: (H, W) pixels that are measured.
-        record: what ``coverage.json`` says of it.
+        trust: (H, W), in [0, 1].
+        squared_error: (H, W) mean over the channels, for colours in [0, 1].
+        measured: (H, W) True in the pixels that are measured.
+        record: its entry in ``coverage.json``.
     """
 
-    eye: Eye
+    probe: ProbeView
     trust: Floats
     squared_error: Floats
-    counts: Bools
+    measured: Bools
     record: dict[str, Any]
 
 
 @dataclass(frozen=True)
-class World:
-    """The frame of the views.
+class WorldFrame:
+    """The world frame of the views.
 
     Attributes:
         up: (3,) unit vector.
-        unit: name of the unit of its lengths, None where it has none.
+        unit: name of the unit of length; None if the scale is arbitrary.
     """
 
     up: Doubles
     unit: str | None
 
 
-def world_of(
+def world_frame(
     views: Sequence[View], manifest: Manifest, georeference: Mapping[str, Any] | None
-) -> World:
-    """The frame of the views: up as their photographs were held, and metres where the model's
-    ``georeference.json`` says so."""
+) -> WorldFrame:
+    """The world frame: ``up`` from the orientation of the photographs, ``unit`` from the content of
+    ``georeference.json``."""
     unit = str((georeference or {}).get("unit", ""))
-    return World(scene_up(views, manifest), "m" if unit.startswith("metres") else None)
+    return WorldFrame(scene_up(views, manifest), "m" if unit.startswith("metres") else None)
 
 
 def measure_coverage(
@@ -93,16 +104,16 @@ def measure_coverage(
     train: Train,
     evaluation: Mapping[str, Any],
     renders: Path,
-    world: World,
+    world: WorldFrame,
     threads: int,
 ) -> dict[str, Any]:
     """Write ``coverage.json`` and ``coverage/*.png`` into the folder ``out``.
 
     Args:
-        views: all with a pose.
-        evaluation: what ``evaluate_views`` returned.
-        renders: folder of the renders that it names.
-        threads: views rendered or judged at a time.
+        views: all views with a pose.
+        evaluation: the result of ``evaluate_views``.
+        renders: folder of the renders that ``evaluation`` names.
+        threads: number of views processed at a time.
 
     Returns:
         The content of ``coverage.json``.
@@ -110,51 +121,53 @@ def measure_coverage(
 
     options = protocol.options(train, threads=1)
 
-    def draw(view: View) -> Render:
+    def render(view: View) -> Render:
         return render_view(gaussians, view, options)
 
-    training = _evenly([view for view in views if not view.is_test], MAX_PHOTOGRAPHS)
-    opened = open_eyes(training, draw, threads)
-    eyes = list(track(opened, "looking at what was seen", len(training), unit="views"))
-    depths = np.concatenate([eye.depth[~eye.open] for eye in eyes])
+    training = _evenly([view for view in views if not view.is_test], MAX_TRAINING_VIEWS)
+    rendered = render_probes(training, render, threads)
+    probes = list(track(rendered, "rendering training views", len(training), unit="views"))
+    depths = np.concatenate([probe.depth[~probe.empty] for probe in probes])
     result: dict[str, Any] = {
         "photographs": sum(not view.is_test for view in views),
-        "looked_at": len(eyes),
+        "looked_at": len(probes),
         "trust": FORMULA,
     }
     if not len(depths):
         return _written(out, result | {"reason": "the scene shows no surface"})
-    beyond = float(np.percentile(depths, 95))
-    surface, nearest = _surface(_evenly(eyes, MAX_SAMPLED), eyes, beyond)
-    asked = _held_out(evaluation, renders, protocol, eyes, draw, beyond, nearest, threads)
-    # All photographs that there are: nobody need take a held-out one again.
-    known = [*eyes, *(item.eye for item in asked)]
-    cameras = [*training, *(_named(views, item.eye.view.name) for item in asked)]
-    outlook = propose(cameras, known, draw, world.up, beyond, threads)
-    floaters = near_floaters(gaussians, eyes, known[len(eyes) :], nearest)
+    background_depth = float(np.percentile(depths, 95))
+    surface, nearest = _surface(_evenly(probes, MAX_SAMPLED), probes, background_depth)
+    tested = _measure_test_views(
+        evaluation, renders, protocol, probes, render, background_depth, nearest, threads
+    )
+    # Photographs of test views exist as well: proposals must not repeat them.
+    all_probes = [*probes, *(item.probe for item in tested)]
+    cameras = [*training, *(_named(views, item.probe.view.name) for item in tested)]
+    best = propose_viewpoints(cameras, all_probes, render, world.up, background_depth, threads)
+    floaters = near_floaters(gaussians, probes, all_probes[len(probes) :], nearest)
     result |= {
         "surface": surface,
-        "views": [item.record for item in asked],
-        "error": _agreement(asked),
+        "views": [item.record for item in tested],
+        "error": _error_by_trust(tested),
         "floaters": {
             "gaussians": floaters.count,
             "within": floaters.within,
             "cameras": floaters.cameras,
         },
         "surroundings": {
-            "viewpoints": len(outlook.judged),
-            "trust": outlook.before,
-            "trust_with_proposals": outlook.after,
+            "viewpoints": len(best.candidates),
+            "trust": best.trust_before,
+            "trust_with_proposals": best.trust_after,
         },
-        "viewpoints": _proposals(outlook, known, world),
+        "viewpoints": _proposals(best, all_probes, world),
     }
-    shown = [item for item in asked if item.record["trust"] is not None]
+    shown = [item for item in tested if item.record["trust"] is not None]
     shown = sorted(shown, key=lambda item: item.record["trust"])[:SHOWN]
     for i, item in enumerate(shown):
-        item.record.update(_pictures(out, f"view_{i + 1}", item.eye, item.trust))
-    proposed = [proposal.eye for proposal in outlook.proposals]
-    for i, (picture, _) in enumerate(trust_pictures(proposed, known, beyond, threads)):
-        result["viewpoints"][i] |= _pictures(out, f"next_{i + 1}", proposed[i], picture)
+        item.record.update(_write_images(out, f"view_{i + 1}", item.probe, item.trust))
+    proposed = [proposal.probe for proposal in best.proposals]
+    for i, (trust, _) in enumerate(trust_maps(proposed, all_probes, background_depth, threads)):
+        result["viewpoints"][i] |= _write_images(out, f"next_{i + 1}", proposed[i], trust)
     return _written(out, result)
 
 
@@ -173,21 +186,23 @@ def _named(views: Sequence[View], name: str) -> View:
 
 
 def _surface(
-    asking: Sequence[Eye], eyes: Sequence[Eye], beyond: float
+    sampled: Sequence[ProbeView], probes: Sequence[ProbeView], background_depth: float
 ) -> tuple[dict[str, Any], float]:
-    """How well what training views show is covered, and how near the nearest of it is."""
+    """Statistics of how the training views ``probes`` observe the surface that ``sampled`` show,
+    and the distance of the nearest surface (2nd percentile) that at least 3 of them see; 0 if there
+    is none."""
     counts, parallax, depth = [], [], []
-    for eye in track(asking, "counting who sees what", len(asking), unit="views"):
-        points = points_of(eye, beyond, 4)
-        evidence = gather(eyes, points)
-        met = ~points.open & (evidence.count > 0)
-        counts.append(evidence.count[met])
-        parallax.append(evidence.parallax[met])
-        depth.append(eye.focal / points.sharpness[met])
+    for probe in track(sampled, "counting observations", len(sampled), unit="views"):
+        points = backproject(probe, background_depth, 4)
+        observed = collect_observations(probes, points)
+        on_surface = ~points.empty & (observed.count > 0)
+        counts.append(observed.count[on_surface])
+        parallax.append(observed.parallax[on_surface])
+        depth.append(probe.focal / points.resolution[on_surface])
     count, angle, z = (np.concatenate(values) for values in (counts, parallax, depth))
     if not len(count):
         return {}, 0.0
-    agreed = z[count > 2]
+    certain = z[count > 2]
     seen_by = {
         "1": _share(count == 1),
         "2": _share(count == 2),
@@ -197,65 +212,66 @@ def _surface(
         "seen_by": seen_by,
         "median_photographs": float(np.median(count)),
         "median_parallax_deg": _rounded(np.median(angle)),
-    }, float(np.percentile(agreed, 2)) if len(agreed) else 0.0
+    }, float(np.percentile(certain, 2)) if len(certain) else 0.0
 
 
-def _held_out(
+def _measure_test_views(
     evaluation: Mapping[str, Any],
     renders: Path,
     protocol: Protocol,
-    eyes: Sequence[Eye],
-    draw: Draw,
-    beyond: float,
+    probes: Sequence[ProbeView],
+    render: Renderer,
+    background_depth: float,
     nearest: float,
     threads: int,
-) -> list[Asked]:
+) -> list[MeasuredView]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
-    measured = [item for item in evaluation["per_view"] if item["name"] in by_name]
-    measured = _evenly(measured, MAX_HELD_OUT)
-    views = [by_name[item["name"]] for item in measured]
-    asking = list(open_eyes(views, draw, threads))
-    mapped = trust_pictures(asking, eyes, beyond, threads)
-    mapped = track(mapped, "mapping trust", len(measured), unit="views")
+    items = [item for item in evaluation["per_view"] if item["name"] in by_name]
+    items = _evenly(items, MAX_TEST_VIEWS)
+    views = [by_name[item["name"]] for item in items]
+    test_probes = list(render_probes(views, render, threads))
+    maps = trust_maps(test_probes, probes, background_depth, threads)
+    maps = track(maps, "mapping trust", len(items), unit="views")
     result = []
-    for item, view, eye, (picture, evidence) in zip(measured, views, asking, mapped, strict=True):
+    for item, view, probe, (trust, observed) in zip(items, views, test_probes, maps, strict=True):
         pixels = load_view(view)
-        photo = reference(pixels, protocol.background)
-        with Image.open(renders / item["render"]) as render:
-            error = ((np.asarray(render) / 255.0 - photo / 255.0) ** 2).mean(axis=2)
-        height, width = eye.depth.shape
-        opaque, counts = None, eye.counts
+        photo = photo_over_background(pixels, protocol.background)
+        with Image.open(renders / item["render"]) as image:
+            error = ((np.asarray(image) / 255.0 - photo / 255.0) ** 2).mean(axis=2)
+        height, width = probe.depth.shape
+        opaque, measured = None, probe.valid
         if pixels.alpha is not None:
             opaque = resize_area(pixels.alpha, width, height) > 127
-            counts = counts & (opaque | ~eye.open)
+            measured = measured & (opaque | ~probe.empty)
         record = {
             "name": view.name,
             "psnr": item["psnr"],
-            "trust": _rounded(picture[counts].mean()) if counts.any() else None,
-            "little_trust": _share(picture[counts] < LITTLE),
-            "holes": _share(holes(eye, evidence, opaque)[counts]),
-            "floating": _share(floating(eye, evidence, nearest)[counts]),
-            "median_photographs": float(np.median(evidence.count)),
+            "trust": _rounded(trust[measured].mean()) if measured.any() else None,
+            "little_trust": _share(trust[measured] < LOW_TRUST),
+            "holes": _share(holes(probe, observed, opaque)[measured]),
+            "floating": _share(floating(probe, observed, nearest)[measured]),
+            "median_photographs": float(np.median(observed.count)),
         }
         small = resize_area(error.astype(np.float32), width, height)
-        result.append(Asked(eye, picture, small, counts, record))
+        result.append(MeasuredView(probe, trust, small, measured, record))
     return result
 
 
-def _agreement(asked: Sequence[Asked]) -> dict[str, Any]:
-    """Whether trust tells the error of held-out views."""
+def _error_by_trust(tested: Sequence[MeasuredView]) -> dict[str, Any]:
+    """How the error of test views depends on trust: Spearman's rank correlation over blocks, and
+    the RMS error in classes of trust."""
     from scipy.stats import spearmanr
 
-    pairs = [_blocks(item) for item in asked]
-    trusted, error = (
+    pairs = [_blocks(item) for item in tested]
+    trust, error = (
         np.concatenate([pair[i] for pair in pairs]) if pairs else np.zeros(0) for i in (0, 1)
     )
-    classes = np.digitize(trusted, CLASSES[1:-1])
-    constant = len(trusted) < MIN_BLOCKS or np.ptp(trusted) == 0 or np.ptp(error) == 0
+    classes = np.digitize(trust, CLASSES[1:-1])
+    undefined = len(trust) < MIN_BLOCKS or np.ptp(trust) == 0 or np.ptp(error) == 0
     return {
-        "squares": len(trusted),
+        "squares": len(trust),
         "square_px": BLOCK,
-        "rank_correlation": None if constant else _rounded(spearmanr(trusted, error).statistic),
+        "rank_correlation": None if undefined else _rounded(spearmanr(trust, error).statistic),
         "by_trust": [
             {
                 "trust": [low, high],
@@ -268,27 +284,29 @@ def _agreement(asked: Sequence[Asked]) -> dict[str, Any]:
     }
 
 
-def _blocks(item: Asked) -> tuple[NDArray[Any], NDArray[Any]]:
-    """Mean trust and mean squared error of the squares of which half the pixels count."""
-    height, width = (side // BLOCK * BLOCK for side in item.counts.shape)
+def _blocks(item: MeasuredView) -> tuple[NDArray[Any], NDArray[Any]]:
+    """Mean trust and mean squared error of the blocks with at least half of the pixels measured."""
+    height, width = (side // BLOCK * BLOCK for side in item.measured.shape)
 
     def total(values: NDArray[Any]) -> Doubles:
-        squares = values[:height, :width].astype(np.float64)
-        return squares.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).sum(axis=(1, 3))
+        blocks = values[:height, :width].astype(np.float64)
+        return blocks.reshape(height // BLOCK, BLOCK, width // BLOCK, BLOCK).sum(axis=(1, 3))
 
-    number = total(item.counts)
+    number = total(item.measured)
     enough = number >= BLOCK * BLOCK / 2
     return tuple(  # type: ignore[return-value]
-        total(values * item.counts)[enough] / number[enough]
+        total(values * item.measured)[enough] / number[enough]
         for values in (item.trust, item.squared_error)
     )
 
 
-def _proposals(outlook: Outlook, known: Sequence[Eye], world: World) -> list[dict[str, Any]]:
-    missing = max(1 - outlook.before, 1e-9)
+def _proposals(
+    best: NextBestViews, probes: Sequence[ProbeView], world: WorldFrame
+) -> list[dict[str, Any]]:
+    missing = max(1 - best.trust_before, 1e-9)
     return [
         {
-            "where": describe(proposal.viewpoint, known, world.up, world.unit),
+            "where": describe(proposal.viewpoint, probes, world.up, world.unit),
             "position": _rounded(proposal.viewpoint.view.centre, 6),
             "direction": _rounded(proposal.viewpoint.view.world_to_camera[2, :3], 6),
             "look_at": _rounded(proposal.viewpoint.subject, 6),
@@ -296,22 +314,22 @@ def _proposals(outlook: Outlook, known: Sequence[Eye], world: World) -> list[dic
             "unknown_percent": _rounded(100 * proposal.unknown, 1),
             "gain_percent": _rounded(100 * proposal.gain / missing, 1),
         }
-        for proposal in outlook.proposals
+        for proposal in best.proposals
     ]
 
 
-def _pictures(out: Path, name: str, eye: Eye, picture: Floats) -> dict[str, str]:
-    """Write what a camera shows and how far to trust it (grey, white is 1)."""
+def _write_images(out: Path, name: str, probe: ProbeView, trust: Floats) -> dict[str, str]:
+    """Write the render and the trust map (grey, white is 1) of a probe view; their paths."""
     files = {"render": f"coverage/{name}_render.png", "trust_map": f"coverage/{name}_trust.png"}
-    for file, values in zip(files.values(), (eye.rgb, picture), strict=True):
+    for file, values in zip(files.values(), (probe.rgb, trust), strict=True):
         buffer = io.BytesIO()
         Image.fromarray(to_bytes(values)).save(buffer, "PNG")
         write_bytes(out / file, buffer.getvalue())
     return files
 
 
-def _share(where: NDArray[Any]) -> float:
-    return round(float(where.mean()), 4) if where.size else 0.0
+def _share(condition: NDArray[Any]) -> float:
+    return round(float(condition.mean()), 4) if condition.size else 0.0
 
 
 def _rounded(values: Any, digits: int = 3) -> Any:

@@ -1,4 +1,4 @@
-"""What cameras see of a trained scene: small renders of it, and points looked for in them."""
+"""Probe views: reduced renders of a trained scene with depth, and which points they show."""
 
 from __future__ import annotations
 
@@ -17,84 +17,85 @@ from pipeline.scene.views import View, view_size
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
 Bools = NDArray[np.bool_]
-Draw = Callable[[View], Render]
+Renderer = Callable[[View], Render]
 
-#: Renders are reduced to this, pixels on the longer side.
+#: Longer side of a probe view, pixels.
 SIDE = 128
-#: Rays that less opacity stops meet no surface.
+#: A ray meets a surface if it accumulates at least this much opacity.
 MIN_ALPHA = 0.5
-#: Depths of one surface, rendered from two sides, agree to this share.
-AGREEMENT = 0.03
+#: Relative difference up to which a point's depth and a rendered depth are the same surface.
+DEPTH_TOLERANCE = 0.03
 
 
 @dataclass(frozen=True)
-class Eye:
-    """A camera and the surface it has in front.
+class ProbeView:
+    """A camera at reduced size with a render of the trained scene.
 
     Attributes:
-        view: reduced to ``SIDE``.
-        focal: pixels at the view's own size; the geometric mean of fx and fy.
+        view: the camera, reduced to ``SIDE``.
+        focal: focal length in pixels at the full size: the geometric mean of fx and fy.
         rgb: (H, W, 3) float32 render in [0, 1].
-        depth: (H, W) camera z of the surface, world unit; inf where there is none.
-        near, far: (H, W) least and largest depth within a pixel around; inf where there is none.
-        counts: (H, W) False where the photograph is masked.
+        depth: (H, W) median depth (camera z, world units); inf if the ray meets no surface.
+        min_depth, max_depth: (H, W) range of the finite depths in the 3 x 3 neighbourhood; inf if
+            there is none.
+        valid: (H, W) False in the masked pixels of the photograph.
     """
 
     view: View
     focal: float
     rgb: Floats
     depth: Floats
-    near: Floats
-    far: Floats
-    counts: Bools
+    min_depth: Floats
+    max_depth: Floats
+    valid: Bools
 
     @property
-    def open(self) -> Bools:
-        """(H, W) True where the ray meets no surface."""
+    def empty(self) -> Bools:
+        """(H, W) True in pixels whose ray meets no surface."""
         return ~np.isfinite(self.depth)
 
 
 @dataclass(frozen=True)
-class Points:
-    """Points of the surface, each with the camera that asks for it.
+class QueryPoints:
+    """Points that a query camera shows, for which the photographs' coverage is computed.
 
     Attributes:
-        xyz: (N, 3) world; where a ray met no surface, a point far out on it.
-        open: (N,) True for those.
-        towards: (N, 3) unit vectors from the points to their asking camera.
-        sharpness: (N,) pixels of the asking camera in a world unit at the point.
+        xyz: (N, 3) world; if the ray meets no surface, a point at the background depth.
+        empty: (N,) True for points whose ray meets no surface.
+        to_camera: (N, 3) unit vectors from the points to their query camera.
+        resolution: (N,) pixels of the query camera per world unit at the point.
     """
 
     xyz: Doubles
-    open: Bools
-    towards: Floats
-    sharpness: Floats
+    empty: Bools
+    to_camera: Floats
+    resolution: Floats
 
     def __len__(self) -> int:
         return len(self.xyz)
 
 
 @dataclass(frozen=True)
-class Sighting:
-    """What one camera sees of points.
+class Visibility:
+    """Which of N points a camera sees.
 
     Attributes:
-        seen: (M,) indices of the points that lie on the surface which the camera has in front.
-        passed: (N,) the camera sees past the point, to something behind.
-        hidden: (N,) the surface in front hides the point.
-        towards: (M, 3) unit vectors from the seen points to the camera.
-        sharpness: (M,) pixels of the camera's own size in a world unit at the seen points.
+        visible: (M,) indices of the visible points: those on the surface that the camera renders.
+        seen_past: (N,) True if the camera renders a surface, or none, behind the point.
+        occluded: (N,) True if the camera renders a surface in front of the point.
+        to_camera: (M, 3) unit vectors from the visible points to the camera.
+        resolution: (M,) pixels of the camera at full size per world unit at the visible points.
     """
 
-    seen: NDArray[np.intp]
-    passed: Bools
-    hidden: Bools
-    towards: Floats
-    sharpness: Floats
+    visible: NDArray[np.intp]
+    seen_past: Bools
+    occluded: Bools
+    to_camera: Floats
+    resolution: Floats
 
 
 def reduced(view: View, side: int = SIDE) -> View:
-    """The view with no side longer than ``side`` pixels."""
+    """The view scaled down so that no side is longer than ``side`` pixels."""
     width, height = view_size(view.width, view.height, side)
     sx, sy = width / view.width, height / view.height
     return replace(
@@ -108,71 +109,74 @@ def reduced(view: View, side: int = SIDE) -> View:
     )
 
 
-def open_eye(view: View, draw: Draw) -> Eye:
+def render_probe(view: View, render: Renderer) -> ProbeView:
     """Render a view at reduced size."""
     small = reduced(view)
-    drawn = draw(small)
-    met = (drawn.alpha >= MIN_ALPHA) & (drawn.median_depth > 0)
-    depth = np.where(met, drawn.median_depth, np.float32(np.inf))
-    counts = np.ones(depth.shape, bool)
+    rendered = render(small)
+    on_surface = (rendered.alpha >= MIN_ALPHA) & (rendered.median_depth > 0)
+    depth = np.where(on_surface, rendered.median_depth, np.float32(np.inf))
+    valid = np.ones(depth.shape, bool)
     if view.mask is not None:
-        counts = resize_mask(load_mask(view.mask, view.mask_digest), small.width, small.height)
-    near, far = _windows(depth)
+        valid = resize_mask(load_mask(view.mask, view.mask_digest), small.width, small.height)
+    min_depth, max_depth = _neighbourhood_range(depth)
     focal = float(np.sqrt(view.fx * view.fy))
-    return Eye(small, focal, drawn.rgb, depth, near, far, counts)
+    return ProbeView(small, focal, rendered.rgb, depth, min_depth, max_depth, valid)
 
 
-def open_eyes(views: Sequence[View], draw: Draw, threads: int) -> Iterator[Eye]:
-    """``open_eye`` of each view in order, ``threads`` at a time: renders so small leave the
-    rasterizer's own threads little to share."""
+def render_probes(views: Sequence[View], render: Renderer, threads: int) -> Iterator[ProbeView]:
+    """``render_probe`` of each view, in order, ``threads`` views at a time.
+
+    Views run in parallel because renders of this size are too small for the rasterizer's own
+    threads.
+    """
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        yield from pool.map(lambda view: open_eye(view, draw), views)
+        yield from pool.map(lambda view: render_probe(view, render), views)
 
 
-def _windows(depth: Floats) -> tuple[Floats, Floats]:
-    """Least and largest depth of 3 by 3 pixels, of those where there is any."""
+def _neighbourhood_range(depth: Floats) -> tuple[Floats, Floats]:
+    """Minimum and maximum of the finite depths in each 3 x 3 neighbourhood; inf without any."""
     height, width = depth.shape
-    around = np.pad(depth, 1, mode="edge")
-    parts = [around[y : y + height, x : x + width] for y in range(3) for x in range(3)]
-    near = np.minimum.reduce(parts)
-    far = np.maximum.reduce([np.where(np.isfinite(part), part, 0) for part in parts])
-    return near, np.where(far > 0, far, np.float32(np.inf))
+    padded = np.pad(depth, 1, mode="edge")
+    shifted = [padded[y : y + height, x : x + width] for y in range(3) for x in range(3)]
+    minimum = np.minimum.reduce(shifted)
+    maximum = np.maximum.reduce([np.where(np.isfinite(part), part, 0) for part in shifted])
+    return minimum, np.where(maximum > 0, maximum, np.float32(np.inf))
 
 
-def points_of(eye: Eye, beyond: float, step: int = 1) -> Points:
-    """A point for each pixel, row by row.
+def backproject(probe: ProbeView, background_depth: float, step: int = 1) -> QueryPoints:
+    """The world points that the pixels show, in row-major order.
 
     Args:
-        beyond: depth to take where the ray meets no surface, world unit.
-        step: each this-many-th pixel of each this-many-th row, from the middle of the first.
+        background_depth: depth of pixels whose ray meets no surface, world units.
+        step: stride in pixels, in both directions.
     """
-    view, pick = eye.view, slice(step // 2, None, step)
-    depth = eye.depth[pick, pick]
-    x = ((np.arange(view.width) + 0.5 - view.cx) / view.fx)[pick]
-    y = ((np.arange(view.height) + 0.5 - view.cy) / view.fy)[pick]
+    view, sampled = probe.view, slice(step // 2, None, step)
+    depth = probe.depth[sampled, sampled]
+    x = ((np.arange(view.width) + 0.5 - view.cx) / view.fx)[sampled]
+    y = ((np.arange(view.height) + 0.5 - view.cy) / view.fy)[sampled]
     local = np.stack([*np.meshgrid(x, y), np.ones(depth.shape)], axis=-1).reshape(-1, 3)
-    rays = turned(local, view.world_to_camera[:3, :3].T)
-    met = np.isfinite(depth).ravel()
-    z = np.where(met, depth.ravel(), beyond)
-    towards = -rays / np.sqrt((rays**2).sum(axis=1, keepdims=True))
-    return Points(
+    rays = rotate(local, view.world_to_camera[:3, :3].T)
+    on_surface = np.isfinite(depth).ravel()
+    z = np.where(on_surface, depth.ravel(), background_depth)
+    to_camera = -rays / np.sqrt((rays**2).sum(axis=1, keepdims=True))
+    return QueryPoints(
         view.centre + z[:, None] * rays,
-        ~met,
-        towards.astype(np.float32),
-        (eye.focal / z).astype(np.float32),
+        ~on_surface,
+        to_camera.astype(np.float32),
+        (probe.focal / z).astype(np.float32),
     )
 
 
-def look_for(eye: Eye, xyz: Doubles, open_: Bools) -> Sighting:
-    """Look for points in a camera's depth map.
+def find_visible(probe: ProbeView, xyz: Doubles, empty: Bools) -> Visibility:
+    """Compare points with the depth map of a probe view.
 
     Args:
         xyz: (N, 3) world.
-        open_: (N,) points that stand for no surface: they are seen where the camera has none,
-            either.
+        empty: (N,) True for background points, which lie on no surface: they are visible in pixels
+            whose ray meets no surface.
     """
-    view = eye.view
-    # Relative to the camera in double precision: worlds may lie far from their origin.
+    view = probe.view
+    # Subtracted in double precision: scenes may lie far from the origin.
     offset = (xyz - view.centre).astype(np.float32)
     x, y, z = _columns(offset, view.world_to_camera[:3, :3].astype(np.float32))
     inverse = 1 / np.where(z > 0, z, np.float32(np.inf))
@@ -181,28 +185,32 @@ def look_for(eye: Eye, xyz: Doubles, open_: Bools) -> Sighting:
     inside = np.flatnonzero(
         (z > 0) & (column >= 0) & (row >= 0) & (column < view.width) & (row < view.height)
     )
-    place = row[inside].astype(np.intp) * view.width + column[inside].astype(np.intp)
-    counts = eye.counts.ravel()[place]
-    inside, place = inside[counts], place[counts]
-    depth, near = z[inside], eye.near.ravel()[place]
-    before = depth < near * (1 - AGREEMENT)
-    met = ~before & (depth <= eye.far.ravel()[place] * (1 + AGREEMENT)) & np.isfinite(near)
-    nothing = eye.open.ravel()[place]
-    found = np.where(open_[inside], nothing, met)
-    passed, hidden = np.zeros((2, len(xyz)), bool)
-    passed[inside], hidden[inside] = before & ~found, ~before & ~found
-    seen = inside[found]
-    back = -offset[seen]
-    length = np.sqrt((back**2).sum(axis=1, keepdims=True))
-    return Sighting(seen, passed, hidden, back / length, (eye.focal / z[seen]).astype(np.float32))
+    pixel = row[inside].astype(np.intp) * view.width + column[inside].astype(np.intp)
+    valid = probe.valid.ravel()[pixel]
+    inside, pixel = inside[valid], pixel[valid]
+    depth, nearest = z[inside], probe.min_depth.ravel()[pixel]
+    farthest = probe.max_depth.ravel()[pixel]
+    in_front = depth < nearest * (1 - DEPTH_TOLERANCE)
+    on_surface = ~in_front & (depth <= farthest * (1 + DEPTH_TOLERANCE)) & np.isfinite(nearest)
+    found = np.where(empty[inside], probe.empty.ravel()[pixel], on_surface)
+    seen_past, occluded = np.zeros((2, len(xyz)), bool)
+    seen_past[inside], occluded[inside] = in_front & ~found, ~in_front & ~found
+    visible = inside[found]
+    to_camera = -offset[visible]
+    to_camera = to_camera / np.sqrt((to_camera**2).sum(axis=1, keepdims=True))
+    resolution = (probe.focal / z[visible]).astype(np.float32)
+    return Visibility(visible, seen_past, occluded, to_camera, resolution)
 
 
-def turned(vectors: NDArray[Any], rotation: NDArray[Any]) -> NDArray[Any]:
-    """(N, 3) vectors turned by a (3, 3) matrix."""
+def rotate(vectors: NDArray[Any], rotation: NDArray[Any]) -> NDArray[Any]:
+    """(N, 3) vectors, each multiplied by a (3, 3) matrix."""
     return np.stack(_columns(vectors, rotation), axis=1)
 
 
 def _columns(vectors: NDArray[Any], rotation: NDArray[Any]) -> list[NDArray[Any]]:
-    """Written out: a matrix product may round differently with other threads."""
+    """The columns of ``vectors @ rotation.T``.
+
+    Written out, because a matrix product may round differently with the number of threads.
+    """
     x, y, z = vectors.T
     return [x * row[0] + y * row[1] + z * row[2] for row in rotation]

@@ -1,4 +1,4 @@
-"""Viewpoints as sentences for the person with the camera."""
+"""Descriptions of viewpoints for the photographer, relative to existing photographs."""
 
 from __future__ import annotations
 
@@ -7,101 +7,105 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.coverage.probe_views import Doubles, Eye, look_for
-from pipeline.coverage.viewpoints import STEEP, Viewpoint
+from pipeline.coverage.probe_views import Doubles, ProbeView, find_visible
+from pipeline.coverage.viewpoints import STEEP_COSINE, Viewpoint
 
-#: Steps shorter than this share of the distance to the subject are not worth words.
-_SMALL = 0.08
-#: Cameras on two sides of a place stand at least so many degrees apart, seen from above it...
-_BETWEEN = 120.0
-#: ...and no farther away than this many times the nearer one.
-_FARTHER = 4.0
+#: Offsets below this share of the subject distance are not described.
+_MIN_OFFSET = 0.08
+#: A viewpoint is "between" two cameras if their directions from it, seen from above, differ by at
+#: least this angle in degrees...
+_MIN_BETWEEN_DEG = 120.0
+#: ...and the farther one is at most this many times as far away as the nearer one.
+_MAX_DISTANCE_RATIO = 4.0
 
 
-def describe(viewpoint: Viewpoint, eyes: Sequence[Eye], up: Doubles, unit: str | None) -> str:
-    """Where to stand and what to look at, told by photographs that there are.
+def describe(
+    viewpoint: Viewpoint, probes: Sequence[ProbeView], up: Doubles, unit: str | None
+) -> str:
+    """The position of a viewpoint as steps from existing photographs, and its viewing target.
 
     Args:
-        eyes: of the photographs.
-        up: (3,) the world's.
-        unit: of the world's lengths, None where it has none: then lengths are told as shares of the
-            distance to the subject.
+        probes: probe views of the photographs.
+        up: (3,) up vector of the world.
+        unit: name of the unit of length. None: lengths are given as percentages of the distance to
+            the subject.
     """
     place = viewpoint.view.centre
-    centres = np.stack([eye.view.centre for eye in eyes])
+    centres = np.stack([probe.view.centre for probe in probes])
     distance = np.linalg.norm(centres - place, axis=1)
     order = np.argsort(distance, kind="stable")
     first = int(order[0])
-    second = _opposite(_level(centres - place, up), order)
-    name = eyes[first].view.name
+    second = _opposite(_horizontal(centres - place, up), order)
+    name = probes[first].view.name
     start = centres[first]
     if second is None:
         text = f"from {name}"
     else:
-        text = f"between {name} and {eyes[second].view.name}"
+        text = f"between {name} and {probes[second].view.name}"
         along = centres[second] - start
-        level = _level(along, up)
+        level = _horizontal(along, up)
         start = start + along * float((place - start) @ level / (level @ level))
-    right, ahead = _heading(eyes[first], up)
+    right, ahead = _heading(probes[first], up)
     step = place - start
     steps = [
         _step(float(step @ up), "higher", "lower", viewpoint.distance, unit),
         _step(float(step @ right), "to the right", "to the left", viewpoint.distance, unit),
         _step(float(step @ ahead), "ahead", "back", viewpoint.distance, unit),
     ]
-    moves = ", ".join(words for words in steps if words)
+    moves = ", ".join(part for part in steps if part)
     if moves and unit is None:
         moves += " (of the distance to the subject)"
-    shown = _shows(viewpoint.subject, eyes)
-    looking = f", looking at what {shown} shows in its middle" if shown else ""
+    target = _most_central(viewpoint.subject, probes)
+    looking = f", looking at what {target} shows in its middle" if target else ""
     return f"{text}{', ' + moves if moves else ''}{looking}"
 
 
 def _opposite(offsets: Doubles, order: NDArray[np.intp]) -> int | None:
-    """The nearest camera on the other side of a place than the nearest one.
+    """Index of the nearest camera on the side of a place opposite to the nearest camera.
 
     Args:
-        offsets: (N, 3) level, from the place to the cameras. order: the cameras, nearest first.
+        offsets: (N, 3) horizontal vectors from the place to the cameras.
+        order: indices of the cameras, nearest first.
     """
     first = offsets[order[0]]
     distance = np.linalg.norm(offsets, axis=1)
     for i in map(int, order[1:]):
         both = distance[order[0]] * distance[i]
-        if distance[i] > _FARTHER * distance[order[0]] or both == 0:
+        if distance[i] > _MAX_DISTANCE_RATIO * distance[order[0]] or both == 0:
             continue
-        if first @ offsets[i] / both < np.cos(np.radians(_BETWEEN)):
+        if first @ offsets[i] / both < np.cos(np.radians(_MIN_BETWEEN_DEG)):
             return i
     return None
 
 
-def _level(vectors: Doubles, up: Doubles) -> Doubles:
+def _horizontal(vectors: Doubles, up: Doubles) -> Doubles:
     return np.asarray(vectors - (vectors @ up)[..., None] * up)
 
 
-def _heading(eye: Eye, up: Doubles) -> tuple[Doubles, Doubles]:
-    """Level unit vectors to the right and ahead of a camera."""
-    rotation = eye.view.world_to_camera[:3, :3]
-    ahead = rotation[2] if abs(float(rotation[2] @ up)) < STEEP else -rotation[1]
-    ahead = _level(ahead, up)
+def _heading(probe: ProbeView, up: Doubles) -> tuple[Doubles, Doubles]:
+    """Horizontal unit vectors to the right of and ahead of a camera."""
+    rotation = probe.view.world_to_camera[:3, :3]
+    ahead = rotation[2] if abs(float(rotation[2] @ up)) < STEEP_COSINE else -rotation[1]
+    ahead = _horizontal(ahead, up)
     ahead = ahead / np.linalg.norm(ahead)
     return np.cross(ahead, up), ahead
 
 
 def _step(length: float, more: str, less: str, distance: float, unit: str | None) -> str:
-    if abs(length) < _SMALL * distance:
+    if abs(length) < _MIN_OFFSET * distance:
         return ""
-    words = more if length > 0 else less
+    direction = more if length > 0 else less
     if unit is None:
-        return f"{abs(length) / distance:.0%} {words}"
-    return f"{abs(length):.2g} {unit} {words}"
+        return f"{abs(length) / distance:.0%} {direction}"
+    return f"{abs(length):.2g} {unit} {direction}"
 
 
-def _shows(subject: Doubles, eyes: Sequence[Eye]) -> str | None:
-    """The photograph that has a point nearest to its middle; None where none sees it."""
+def _most_central(subject: Doubles, probes: Sequence[ProbeView]) -> str | None:
+    """Name of the photograph that shows a point nearest to its centre; None if none shows it."""
     best, name = np.inf, None
-    for eye in eyes:
-        view = eye.view
-        if not len(look_for(eye, subject[None], np.zeros(1, bool)).seen):
+    for probe in probes:
+        view = probe.view
+        if not len(find_visible(probe, subject[None], np.zeros(1, bool)).visible):
             continue
         x, y, z = view.world_to_camera[:3, :3] @ (subject - view.centre)
         off = np.hypot(

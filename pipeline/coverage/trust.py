@@ -1,4 +1,22 @@
-"""How far a view of the trained scene is to be trusted, point by point."""
+"""Trust: a number in [0, 1] for each pixel of a view, from how the photographs observe the pixel's
+surface point. It does not use the photograph of the view itself.
+
+trust = precision * support, with
+
+precision = 1 / (1 + e^2 / HALF_TRUST_ERROR_SQUARED). e is the standard deviation, in pixels of the
+query camera and across its ray, of the point triangulated from the photographs that see it with an
+error of one pixel each. The covariance C of the point is the inverse of the information matrix:
+each photograph adds s^2 (I - d d^T), with d the unit vector to the photograph and s its resolution
+at the point over the query camera's, and the prior adds I / PRIOR_SIGMA_PX^2. With d_q the unit
+vector to the query camera, e^2 = tr C - d_q^T C d_q. An uncertain depth hence lowers the trust of
+views from the side, not of views from the photographs' own direction.
+(Hartley and Zisserman, Multiple View Geometry, chapter 5.)
+
+support = max over the photographs that see the point of
+min(1, s) / (1 + (1 - cos b) / HALF_SUPPORT_TURN), with b the angle between the photograph and the
+query camera at the point: the colour was observed from a similar direction, at sufficient
+resolution.
+"""
 
 from __future__ import annotations
 
@@ -8,136 +26,139 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from pipeline.coverage.probe_views import Eye, Floats, Points, Sighting, look_for, points_of
+from pipeline.coverage.probe_views import (
+    Floats,
+    ProbeView,
+    QueryPoints,
+    Visibility,
+    backproject,
+    find_visible,
+)
 
-#: Pixels of the asking camera by which a point that nothing has measured may be off.
-UNKNOWN_PIXELS = 50.0
-#: The displacement, squared, that halves the trust; pixels. A point that one photograph shows, from
-#: the very place that asks, is off by as much.
-HALF_SQUARED = 2.0
-#: 1 minus the cosine of the angle to the nearest photograph that halves the trust: of 30 degrees.
-HALF_TURN = 0.134
-#: What is trusted less is little trusted.
-LITTLE = 0.5
+#: Prior standard deviation of a point's position, pixels of the query camera.
+PRIOR_SIGMA_PX = 50.0
+#: e^2 at which precision is 1/2, pixels squared: that of a point seen by one photograph, from the
+#: direction of the query camera and at its resolution.
+HALF_TRUST_ERROR_SQUARED = 2.0
+#: 1 - cos b at which support is 1/2; b is 30 degrees.
+HALF_SUPPORT_TURN = 0.134
+#: Pixels below this are counted as ``little_trust``.
+LOW_TRUST = 0.5
 
 
 @dataclass
-class Evidence:
-    """What photographs say of points, summed up.
+class Observations:
+    """How photographs observe points, accumulated photograph by photograph.
 
     Attributes:
-        count: (N,) photographs that see the point.
-        passed: (N,) photographs that see past it, to something behind.
-        first: (N, 3) unit vectors to the first photograph that sees it; 0 without one.
-        aside: (N,) least cosine of the angle between there and another one that sees it.
-        information: (6, N) xx, yy, zz, xy, xz, yz of the sum over those that see it of
-            s^2 (1 - d d^T), with d the direction to the photograph and s its sharpness over the
-            asking camera's.
-        support: (N,) largest of min(1, s) / (1 + (1 - cos b) / HALF_TURN), with b the angle between
-            the photograph and the asking camera.
+        count: (N,) number of photographs that see the point.
+        seen_past: (N,) number of photographs that see a surface, or none, behind the point.
+        first_direction: (N, 3) unit vectors to the first photograph that sees the point; 0 if there
+            is none.
+        min_cosine: (N,) least cosine of the angle between ``first_direction`` and the direction to
+            another photograph that sees the point.
+        information: (6, N) xx, yy, zz, xy, xz, yz of the information matrix, without the prior.
+        support: (N,) support, as defined above.
     """
 
     count: Floats
-    passed: Floats
-    first: Floats
-    aside: Floats
+    seen_past: Floats
+    first_direction: Floats
+    min_cosine: Floats
     information: Floats
     support: Floats
 
     @staticmethod
-    def none(number: int) -> Evidence:
-        count, passed, support = np.zeros((3, number), np.float32)
+    def none(number: int) -> Observations:
+        """Of ``number`` points, by no photograph."""
+        count, seen_past, support = np.zeros((3, number), np.float32)
         first, information = np.zeros((number, 3), np.float32), np.zeros((6, number), np.float32)
-        return Evidence(count, passed, first, np.ones_like(count), information, support)
+        return Observations(count, seen_past, first, np.ones_like(count), information, support)
 
     @property
     def parallax(self) -> Floats:
-        """(N,) degrees between the first photograph that sees the point and the one farthest from
-        that: at least half of the widest angle between two."""
-        return np.asarray(np.degrees(np.arccos(self.aside)))
+        """(N,) largest angle, in degrees, between the first photograph that sees the point and
+        another one: at least half of the largest angle between any two."""
+        return np.asarray(np.degrees(np.arccos(self.min_cosine)))
 
-    def add(self, sighting: Sighting, points: Points) -> None:
-        """One more photograph."""
-        seen, d = sighting.seen, sighting.towards
-        self.passed += sighting.passed
-        self.information[:, seen], self.support[seen] = self.gained(sighting, points)
-        new = self.count[seen] == 0
-        self.first[seen[new]] = d[new]
-        self.aside[seen] = np.minimum(self.aside[seen], _cosine(d, self.first[seen]))
-        self.count[seen] += 1
+    def add(self, visibility: Visibility, points: QueryPoints) -> None:
+        """Add a photograph."""
+        visible, d = visibility.visible, visibility.to_camera
+        self.seen_past += visibility.seen_past
+        self.information[:, visible], self.support[visible] = self.updated(visibility, points)
+        new = self.count[visible] == 0
+        self.first_direction[visible[new]] = d[new]
+        cosine = _cosine(d, self.first_direction[visible])
+        self.min_cosine[visible] = np.minimum(self.min_cosine[visible], cosine)
+        self.count[visible] += 1
 
-    def gained(self, sighting: Sighting, points: Points) -> tuple[Floats, Floats]:
-        """``information`` and ``support`` of the points that a photograph sees, with it."""
-        seen, d = sighting.seen, sighting.towards
-        s = sighting.sharpness / points.sharpness[seen]
+    def updated(self, visibility: Visibility, points: QueryPoints) -> tuple[Floats, Floats]:
+        """``information`` and ``support`` of the visible points as ``add`` would set them."""
+        visible, d = visibility.visible, visibility.to_camera
+        s = visibility.resolution / points.resolution[visible]
         x, y, z = d.T
-        grown = np.stack([1 - x * x, 1 - y * y, 1 - z * z, -x * y, -x * z, -y * z]) * (s * s)
-        turn = (1 - _cosine(d, points.towards[seen])) / np.float32(HALF_TURN)
+        added = np.stack([1 - x * x, 1 - y * y, 1 - z * z, -x * y, -x * z, -y * z]) * (s * s)
+        turn = (1 - _cosine(d, points.to_camera[visible])) / np.float32(HALF_SUPPORT_TURN)
         support = np.minimum(s, 1) / (1 + turn)
-        return self.information[:, seen] + grown, np.maximum(self.support[seen], support)
+        return self.information[:, visible] + added, np.maximum(self.support[visible], support)
 
 
-def gather(eyes: Iterable[Eye], points: Points) -> Evidence:
-    """All that photographs say of points."""
-    evidence = Evidence.none(len(points))
-    for eye in eyes:
-        evidence.add(look_for(eye, points.xyz, points.open), points)
-    return evidence
+def collect_observations(photographs: Iterable[ProbeView], points: QueryPoints) -> Observations:
+    """Observations of points by all given photographs."""
+    observed = Observations.none(len(points))
+    for photograph in photographs:
+        observed.add(find_visible(photograph, points.xyz, points.empty), points)
+    return observed
 
 
-def trust(information: Floats, support: Floats, towards: Floats) -> Floats:
-    """(N,) in [0, 1]: precision * support.
-
-    precision = 1 / (1 + e^2 / HALF_SQUARED): e, in pixels of the asking camera, is how far the
-    point may be off across its ray, if each photograph finds it with an error of one pixel. It
-    comes of the covariance C of a triangulated point, the inverse of the information (each
-    photograph weighs by its pixels in a world unit and knows nothing along its ray) plus a prior
-    of UNKNOWN_PIXELS: e^2 = tr C - d^T C d, d being the direction to the asking camera. So an
-    unknown depth costs nothing seen from where the photographs stand, and much from the side.
-    Source of the covariance: Hartley and Zisserman, Multiple View Geometry, chapter 5.
-
-    support = max over the photographs that see the point of
-    min(1, s) / (1 + (1 - cos b) / HALF_TURN): its colour was seen from a direction near enough (b:
-    the angle to the asking camera), and sharply enough (s: the photograph's pixels in a world unit
-    over the asking camera's).
+def trust(information: Floats, support: Floats, to_camera: Floats) -> Floats:
+    """(N,) trust, in [0, 1], as defined above.
 
     Args:
-        information, support: of ``Evidence``. towards: (N, 3) unit vectors to the asking cameras.
+        information: (6, N), see ``Observations``.
+        support: (N,), see ``Observations``.
+        to_camera: (N, 3) unit vectors from the points to the query cameras.
     """
-    prior = np.float32(UNKNOWN_PIXELS**-2)
+    prior = np.float32(PRIOR_SIGMA_PX**-2)
     xx, yy, zz = information[:3] + prior
     xy, xz, yz = information[3:]
     # The adjugate: the inverse times the determinant.
     a, b, c = yy * zz - yz * yz, xx * zz - xz * xz, xx * yy - xy * xy
     d, e, f = xz * yz - xy * zz, xy * yz - xz * yy, xy * xz - xx * yz
     determinant = xx * a + xy * d + xz * e
-    x, y, z = towards.T
+    x, y, z = to_camera.T
     along = a * x * x + b * y * y + c * z * z + 2 * (d * x * y + e * x * z + f * y * z)
     squared = np.maximum(a + b + c - along, 0) / np.maximum(determinant, np.float32(1e-30))
-    return np.asarray(support / (1 + squared / np.float32(HALF_SQUARED)))
+    return np.asarray(support / (1 + squared / np.float32(HALF_TRUST_ERROR_SQUARED)))
 
 
-def trust_picture(eye: Eye, photographs: Iterable[Eye], beyond: float) -> tuple[Floats, Evidence]:
-    """(H, W) trust of each pixel of what a camera shows, and what it rests on, row by row.
+def trust_map(
+    probe: ProbeView, photographs: Iterable[ProbeView], background_depth: float
+) -> tuple[Floats, Observations]:
+    """(H, W) trust of each pixel of a probe view, and the observations of its points, in row-major
+    order.
 
     Args:
-        beyond: depth to take where a ray meets no surface, world unit.
+        background_depth: depth of pixels whose ray meets no surface, world units.
     """
-    points = points_of(eye, beyond)
-    evidence = gather(photographs, points)
-    found = trust(evidence.information, evidence.support, points.towards)
-    return found.reshape(eye.depth.shape), evidence
+    points = backproject(probe, background_depth)
+    observed = collect_observations(photographs, points)
+    values = trust(observed.information, observed.support, points.to_camera)
+    return values.reshape(probe.depth.shape), observed
 
 
-def trust_pictures(
-    eyes: Sequence[Eye], photographs: Sequence[Eye], beyond: float, threads: int
-) -> Iterator[tuple[Floats, Evidence]]:
-    """``trust_picture`` of each camera in order, ``threads`` at a time."""
+def trust_maps(
+    probes: Sequence[ProbeView],
+    photographs: Sequence[ProbeView],
+    background_depth: float,
+    threads: int,
+) -> Iterator[tuple[Floats, Observations]]:
+    """``trust_map`` of each probe view, in order, ``threads`` views at a time."""
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        yield from pool.map(lambda eye: trust_picture(eye, photographs, beyond), eyes)
+        yield from pool.map(lambda probe: trust_map(probe, photographs, background_depth), probes)
 
 
 def _cosine(a: Floats, b: Floats) -> Floats:
-    """(N,) of the angles between unit vectors."""
+    """(N,) cosines of the angles between unit vectors."""
     product = a[:, 0] * b[:, 0] + a[:, 1] * b[:, 1] + a[:, 2] * b[:, 2]
     return np.asarray(product.clip(-1, 1))

@@ -1,4 +1,4 @@
-"""Viewpoints to photograph next."""
+"""Next best views: viewpoints from which further photographs raise the trust most."""
 
 from __future__ import annotations
 
@@ -11,50 +11,53 @@ from numpy.typing import NDArray
 from pipeline.coverage.probe_views import (
     Bools,
     Doubles,
-    Draw,
-    Eye,
-    Points,
-    look_for,
-    open_eyes,
-    points_of,
+    ProbeView,
+    QueryPoints,
+    Renderer,
+    backproject,
+    find_visible,
+    render_probes,
 )
-from pipeline.coverage.trust import gather, trust
+from pipeline.coverage.trust import collect_observations, trust
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 
-COUNT = 5
-#: A viewpoint that would raise the mean trust of its surroundings by less is not worth the way.
+#: Largest number of proposals.
+MAX_PROPOSALS = 5
+#: A proposal raises the mean trust of all candidates by at least this.
 MIN_GAIN = 0.002
-#: So many cameras are moved about, and so many of the viewpoints that this gives are judged.
+#: Largest numbers of cameras that are moved to make candidates, and of candidates.
 MAX_BASES, MAX_CANDIDATES = 40, 64
-#: How, in degrees: around what the camera shows, and above.
-MOVES = tuple((a, e) for a in (-40, -20, 0, 20, 40) for e in (-20, -10, 0, 10, 20) if a or e)
-#: Cameras that look steeper up or down than this are moved about their picture's column.
-STEEP = 0.8
-#: Viewpoints go so far above and below the cameras as these spread in height, or this share of
-#: their usual distance to what they show: who photographed on foot has no ladder.
+#: Moves of a camera around its subject: azimuth and elevation, degrees.
+ORBIT_MOVES = tuple((a, e) for a in (-40, -20, 0, 20, 40) for e in (-20, -10, 0, 10, 20) if a or e)
+#: A camera whose viewing direction is within acos(this) of vertical orbits about its image's
+#: vertical axis, not about the world's.
+STEEP_COSINE = 0.8
+#: Candidates may exceed the cameras' range of heights by that range, or by this share of the
+#: median subject distance if that is more.
 HEIGHT_MARGIN = 0.1
-#: Where no photograph shows whether there is room, a viewpoint stays this near to a camera, as a
-#: share of its distance to what it shows.
+#: Candidates at places that no photograph shows to be free lie within this share of their subject
+#: distance from a camera.
 BLIND_REACH = 0.4
-#: Surfaces nearer than this share of that distance, in a tenth of the picture, leave no room.
-MIN_ROOM = 0.25
-#: Viewpoints where more of the rays meet no surface show nothing that can be judged.
-MAX_OPEN = 0.7
-#: Nearer to a photograph than this it would be the same photograph; see ``_features``.
-SAME = 0.15
-#: Each this-many-th pixel of each this-many-th row is judged.
-STEP = 6
+#: A candidate is dropped if a tenth of its pixels show surfaces nearer than this share of its
+#: subject distance...
+MIN_CLEARANCE = 0.25
+#: ...or if more than this share of its rays meets no surface.
+MAX_EMPTY = 0.7
+#: Least distance between two candidates, or a candidate and a photograph, in ``_features``.
+MIN_SEPARATION = 0.15
+#: Stride of the evaluated pixels of a candidate.
+PIXEL_STEP = 6
 
 
 @dataclass(frozen=True)
 class Viewpoint:
-    """Where a photograph could be taken.
+    """A camera pose from which a photograph could be taken.
 
     Attributes:
-        view: its camera, at the size of the photographs.
-        subject: (3,) the point of the world that it looks at.
-        distance: from there, world unit.
+        view: the camera, at the size of the photographs.
+        subject: (3,) world point on its optical axis.
+        distance: from the camera to the subject, world units.
     """
 
     view: View
@@ -67,137 +70,144 @@ class Proposal:
     """A viewpoint to photograph.
 
     Attributes:
-        viewpoint: where.
-        eye: what the trained scene shows there.
-        unknown: 1 minus the mean trust of that, given the proposals before it.
-        gain: rise of the mean trust of all judged viewpoints, given the proposals before it.
+        viewpoint: the camera.
+        probe: render of the trained scene from there.
+        unknown: 1 - mean trust of the render, with the photographs and the earlier proposals.
+        gain: by how much this proposal raises the mean trust of all candidates.
     """
 
     viewpoint: Viewpoint
-    eye: Eye
+    probe: ProbeView
     unknown: float
     gain: float
 
 
 @dataclass(frozen=True)
-class Outlook:
-    """What is known of the surroundings of the photographs, and what would add to it.
+class NextBestViews:
+    """Proposals and what they were chosen from.
 
     Attributes:
-        proposals: what adds most, first.
-        judged: all viewpoints around the photographs that were thought of.
-        before, after: mean trust of what these show, now and with the proposals.
+        proposals: in the order in which they were chosen.
+        candidates: all viewpoints that were evaluated.
+        trust_before, trust_after: mean trust over the candidates without and with the proposals.
     """
 
     proposals: list[Proposal]
-    judged: list[Viewpoint]
-    before: float
-    after: float
+    candidates: list[Viewpoint]
+    trust_before: float
+    trust_after: float
 
 
-def propose(
+def propose_viewpoints(
     views: Sequence[View],
-    eyes: Sequence[Eye],
-    draw: Draw,
+    probes: Sequence[ProbeView],
+    render: Renderer,
     up: Doubles,
-    beyond: float,
+    background_depth: float,
     threads: int = 1,
-) -> Outlook:
-    """Viewpoints that together raise the trust most, each after those before it.
+) -> NextBestViews:
+    """Choose the viewpoints that together raise the mean trust of the scene's surroundings most.
 
-    Cameras are moved around what they show, by up to 40 degrees, and above and below by up to 20.
-    Of the viewpoints that this gives, those where there is room are thinned evenly; what they show
-    of surfaces is judged. One after the other, the one is proposed that adds most to the mean trust
-    of all of it, if the surface is where the scene has it now. (Greedy, as for coverage in general:
-    Nemhauser et al. 1978, "An analysis of approximations for maximizing submodular set functions".)
+    Candidates are the photographs' cameras moved on a sphere around their subjects, by up to 40
+    degrees of azimuth and 20 of elevation, if the place is free, thinned to an even spread. The
+    mean trust over the surfaces that all candidates show is maximised greedily: each proposal is
+    the candidate that raises it most, given the proposals before it and the surface as it is now
+    (Nemhauser et al. 1978, "An analysis of approximations for maximizing submodular set
+    functions").
 
     Args:
-        views: the photographs' cameras, at their own size. eyes: the same, in the same order.
-        up: (3,) the world's.
-        beyond: depth to take where a ray meets no surface, world unit.
-        threads: viewpoints rendered at a time.
+        views: cameras of the photographs, at full size.
+        probes: probe views of the same cameras, in the same order.
+        up: (3,) up vector of the world.
+        background_depth: depth of pixels whose ray meets no surface, world units.
+        threads: number of candidates rendered at a time.
     """
-    viewpoints, opened = _with_sight(_around(views, eyes, up), draw, threads)
-    if not viewpoints:
-        return Outlook([], [], 0.0, 0.0)
-    points, owner = _surfaces(opened, beyond)
-    evidence = gather(track(eyes, "judging viewpoints", len(eyes), unit="views"), points)
-    sightings = [look_for(eye, points.xyz, points.open) for eye in opened]
-    # Each viewpoint counts the same, however much of its picture is surface.
-    weight = 1 / np.bincount(owner, minlength=len(opened))[owner] / len(opened)
-    known = trust(evidence.information, evidence.support, points.towards)
-    # Sums, not products of vectors: BLAS sums by the number of threads.
-    before = float((weight * known).sum())
-    left, proposals = set(range(len(opened))), list[Proposal]()
-    while left and len(proposals) < COUNT:
-        gains = np.full(len(opened), -np.inf)
-        for i in left:
-            seen = sightings[i].seen
-            grown = trust(*evidence.gained(sightings[i], points), points.towards[seen])
-            gains[i] = (weight[seen] * (grown - known[seen])).sum()
+    candidates, shown = _render_candidates(_candidates(views, probes, up), render, threads)
+    if not candidates:
+        return NextBestViews([], [], 0.0, 0.0)
+    points, owner = _surfaces(shown, background_depth)
+    tracked = track(probes, "evaluating viewpoints", len(probes), unit="views")
+    observed = collect_observations(tracked, points)
+    visibilities = [find_visible(probe, points.xyz, points.empty) for probe in shown]
+    # Each candidate has the same weight, however many of its pixels show a surface.
+    weight = 1 / np.bincount(owner, minlength=len(shown))[owner] / len(shown)
+    current = trust(observed.information, observed.support, points.to_camera)
+    # Sums, not dot products: BLAS splits those by the number of threads, which changes rounding.
+    before = float((weight * current).sum())
+    remaining, proposals = set(range(len(shown))), list[Proposal]()
+    while remaining and len(proposals) < MAX_PROPOSALS:
+        gains = np.full(len(shown), -np.inf)
+        for i in remaining:
+            visible = visibilities[i].visible
+            raised = trust(*observed.updated(visibilities[i], points), points.to_camera[visible])
+            gains[i] = (weight[visible] * (raised - current[visible])).sum()
         best = int(gains.argmax())
         if gains[best] < MIN_GAIN:
             break
-        unknown = 1 - float(known[owner == best].mean())
-        proposals.append(Proposal(viewpoints[best], opened[best], unknown, float(gains[best])))
-        left.remove(best)
-        evidence.add(sightings[best], points)
-        known = trust(evidence.information, evidence.support, points.towards)
-    return Outlook(proposals, viewpoints, before, float((weight * known).sum()))
+        unknown = 1 - float(current[owner == best].mean())
+        proposals.append(Proposal(candidates[best], shown[best], unknown, float(gains[best])))
+        remaining.remove(best)
+        observed.add(visibilities[best], points)
+        current = trust(observed.information, observed.support, points.to_camera)
+    return NextBestViews(proposals, candidates, before, float((weight * current).sum()))
 
 
-def _surfaces(eyes: Sequence[Eye], beyond: float) -> tuple[Points, NDArray[np.intp]]:
-    """Points of the surfaces that cameras show, and the index of the camera of each."""
-    parts = [points_of(eye, beyond, STEP) for eye in eyes]
-    joined = [np.concatenate([getattr(part, name) for part in parts]) for name in _FIELDS]
+def _surfaces(
+    probes: Sequence[ProbeView], background_depth: float
+) -> tuple[QueryPoints, NDArray[np.intp]]:
+    """Surface points that probe views show, and for each the index of its probe view."""
+    parts = [backproject(probe, background_depth, PIXEL_STEP) for probe in probes]
+    joined = [
+        np.concatenate([getattr(part, name) for part in parts])
+        for name in ("xyz", "empty", "to_camera", "resolution")
+    ]
     owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
-    met = ~joined[1]
-    return Points(*(values[met] for values in joined)), owner[met]
+    on_surface = ~joined[1]
+    return QueryPoints(*(values[on_surface] for values in joined)), owner[on_surface]
 
 
-_FIELDS = ("xyz", "open", "towards", "sharpness")
-
-
-def _around(views: Sequence[View], eyes: Sequence[Eye], up: Doubles) -> list[Viewpoint]:
-    """Viewpoints near cameras where there is room, evenly spread and not too many."""
-    distances = np.array([subject_distance(eye) for eye in eyes])
-    usual = float(np.median(distances[distances > 0])) if (distances > 0).any() else 0.0
-    if usual == 0:
+def _candidates(views: Sequence[View], probes: Sequence[ProbeView], up: Doubles) -> list[Viewpoint]:
+    """Up to ``MAX_CANDIDATES`` viewpoints around the cameras, at free places, evenly spread."""
+    distances = np.array([subject_distance(probe) for probe in probes])
+    scale = float(np.median(distances[distances > 0])) if (distances > 0).any() else 0.0
+    if scale == 0:
         return []
-    taken = np.stack([_features(view, usual) for view in views])
-    bases = _spread(taken, MAX_BASES, np.full(len(taken), np.inf))
+    photographed = np.stack([_features(view, scale) for view in views])
+    bases = _farthest_points(photographed, MAX_BASES, np.full(len(photographed), np.inf))
     moved = [
-        _moved(views[i], float(distances[i]), up, *move)
+        _orbit(views[i], float(distances[i]), up, *move)
         for i in sorted(bases)
         if distances[i] > 0
-        for move in MOVES
+        for move in ORBIT_MOVES
     ]
     height = np.stack([view.centre for view in views]) @ up
-    margin = max(float(np.ptp(height)), HEIGHT_MARGIN * usual)
+    margin = max(float(np.ptp(height)), HEIGHT_MARGIN * scale)
     low, high = height.min() - margin, height.max() + margin
     moved = [item for item in moved if low <= item.view.centre @ up <= high]
-    moved = [item for item, room in zip(moved, _room(moved, eyes, up), strict=True) if room]
+    free = _free_places(moved, probes, up)
+    moved = [item for item, is_free in zip(moved, free, strict=True) if is_free]
     if not moved:
         return []
-    features = np.stack([_features(viewpoint.view, usual) for viewpoint in moved])
-    apart = np.min([np.linalg.norm(features - other, axis=1) for other in taken], axis=0)
-    return [moved[i] for i in _spread(features, MAX_CANDIDATES, apart)]
+    features = np.stack([_features(viewpoint.view, scale) for viewpoint in moved])
+    apart = np.min([np.linalg.norm(features - other, axis=1) for other in photographed], axis=0)
+    return [moved[i] for i in _farthest_points(features, MAX_CANDIDATES, apart)]
 
 
-def subject_distance(eye: Eye) -> float:
-    """Median depth of the middle of a camera's picture; 0 where there is no surface."""
-    height, width = eye.depth.shape
-    middle = eye.depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
-    met = middle[np.isfinite(middle)]
-    return float(np.median(met)) if len(met) else 0.0
+def subject_distance(probe: ProbeView) -> float:
+    """Median depth of the central ninth of a probe view; 0 if it shows no surface."""
+    height, width = probe.depth.shape
+    centre = probe.depth[height // 3 : height - height // 3, width // 3 : width - width // 3]
+    finite = centre[np.isfinite(centre)]
+    return float(np.median(finite)) if len(finite) else 0.0
 
 
-def _moved(view: View, distance: float, up: Doubles, around: float, above: float) -> Viewpoint:
+def _orbit(view: View, distance: float, up: Doubles, azimuth: float, elevation: float) -> Viewpoint:
+    """A camera moved around its subject by two angles in degrees."""
     rotation = view.world_to_camera[:3, :3]
-    axis = up if abs(float(rotation[2] @ up)) < STEEP else -rotation[1]
+    axis = up if abs(float(rotation[2] @ up)) < STEEP_COSINE else -rotation[1]
     subject = view.centre + distance * rotation[2]
     offset = view.centre - subject
-    turn = _rotation(axis, around) @ _rotation(np.cross(offset, axis), above)
+    turn = _rotation(axis, azimuth) @ _rotation(np.cross(offset, axis), elevation)
     centre = subject + turn @ offset
     pose = np.eye(4)
     pose[:3, :3] = rotation @ turn.T
@@ -214,54 +224,57 @@ def _rotation(axis: Doubles, degrees: float) -> Doubles:
     return np.asarray(np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross)
 
 
-def _features(view: View, usual: float) -> Doubles:
-    """(6,) place, in the photographs' usual distances to what they show, and direction."""
-    return np.concatenate([view.centre / usual, view.world_to_camera[2, :3]])
+def _features(view: View, scale: float) -> Doubles:
+    """(6,) position, in units of the median subject distance, and viewing direction."""
+    return np.concatenate([view.centre / scale, view.world_to_camera[2, :3]])
 
 
-def _spread(features: Doubles, count: int, apart: Doubles) -> list[int]:
-    """Indices of up to ``count`` rows, each the farthest from those before it.
+def _farthest_points(features: Doubles, count: int, apart: Doubles) -> list[int]:
+    """Farthest point sampling: indices of up to ``count`` rows.
 
     Args:
-        apart: (N,) distances from what is there already; rows nearer than ``SAME`` are left out.
+        apart: (N,) distances to what is there already; rows nearer than ``MIN_SEPARATION`` to that
+            or to a chosen row are not chosen.
     """
     chosen: list[int] = []
     while len(chosen) < min(count, len(features)):
         best = int(apart.argmax())
-        if apart[best] < SAME:
+        if apart[best] < MIN_SEPARATION:
             break
         chosen.append(best)
         apart = np.minimum(apart, np.linalg.norm(features - features[best], axis=1))
     return chosen
 
 
-def _room(viewpoints: Sequence[Viewpoint], eyes: Sequence[Eye], up: Doubles) -> Bools:
-    """(N,) True where a photograph sees past the place; where none looks there, if a camera is near
-    and not all are higher: people do not stand below ground."""
+def _free_places(
+    viewpoints: Sequence[Viewpoint], probes: Sequence[ProbeView], up: Doubles
+) -> Bools:
+    """(N,) True where a photograph sees a surface behind the place; also, if no photograph shows
+    the place, near a camera and not below the lowest one (which excludes places under ground)."""
     xyz = np.array([viewpoint.view.centre for viewpoint in viewpoints]).reshape(-1, 3)
     reach = BLIND_REACH * np.array([viewpoint.distance for viewpoint in viewpoints])
-    free, hidden, near = np.zeros((3, len(xyz)), bool)
-    for eye in eyes:
-        sighting = look_for(eye, xyz, np.zeros(len(xyz), bool))
-        free |= sighting.passed
-        hidden |= sighting.hidden
-        hidden[sighting.seen] = True
-        near |= np.linalg.norm(xyz - eye.view.centre, axis=1) <= reach
-    lowest = min(float(eye.view.centre @ up) for eye in eyes)
-    return np.asarray(free | (near & ~hidden & (xyz @ up >= lowest)))
+    free, occluded, near = np.zeros((3, len(xyz)), bool)
+    for probe in probes:
+        visibility = find_visible(probe, xyz, np.zeros(len(xyz), bool))
+        free |= visibility.seen_past
+        occluded |= visibility.occluded
+        occluded[visibility.visible] = True
+        near |= np.linalg.norm(xyz - probe.view.centre, axis=1) <= reach
+    lowest = min(float(probe.view.centre @ up) for probe in probes)
+    return np.asarray(free | (near & ~occluded & (xyz @ up >= lowest)))
 
 
-def _with_sight(
-    viewpoints: list[Viewpoint], draw: Draw, threads: int
-) -> tuple[list[Viewpoint], list[Eye]]:
-    """Those that have sight of something, and what they see."""
-    kept: list[Viewpoint] = []
-    eyes: list[Eye] = []
-    opened = open_eyes([viewpoint.view for viewpoint in viewpoints], draw, threads)
-    opened = track(opened, "looking around", len(viewpoints), unit="viewpoints")
-    for viewpoint, eye in zip(viewpoints, opened, strict=True):
-        nearest = np.percentile(np.where(eye.open, 1e30, eye.depth), 10)
-        if eye.open.mean() <= MAX_OPEN and nearest >= MIN_ROOM * viewpoint.distance:
-            kept.append(viewpoint)
-            eyes.append(eye)
-    return kept, eyes
+def _render_candidates(
+    viewpoints: list[Viewpoint], render: Renderer, threads: int
+) -> tuple[list[Viewpoint], list[ProbeView]]:
+    """Render viewpoints; those that show too little, or too near a surface, are dropped."""
+    chosen: list[Viewpoint] = []
+    shown: list[ProbeView] = []
+    probes = render_probes([viewpoint.view for viewpoint in viewpoints], render, threads)
+    probes = track(probes, "rendering viewpoints", len(viewpoints), unit="viewpoints")
+    for viewpoint, probe in zip(viewpoints, probes, strict=True):
+        nearest = np.percentile(np.where(probe.empty, 1e30, probe.depth), 10)
+        if probe.empty.mean() <= MAX_EMPTY and nearest >= MIN_CLEARANCE * viewpoint.distance:
+            chosen.append(viewpoint)
+            shown.append(probe)
+    return chosen, shown

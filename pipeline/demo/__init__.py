@@ -1,1 +1,1 @@
-"""A ray-traced scene with exact truth."""
+"""The demo scene: ray-traced photographs with exact ground truth."""

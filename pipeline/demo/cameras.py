@@ -1,4 +1,4 @@
-"""Where the demo's photographs are taken from, and through what lens."""
+"""Camera poses and lenses of the demo scene."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ Array = NDArray[np.float64]
 
 FOCAL_MM = 28
 SENSOR_WIDTH_MM = 36.0
-# Neighbours farther apart than this share too little for SIFT: fewer views make a shorter arc.
+# Largest angle between neighbours at which SIFT still matches: fewer views give a shorter arc.
 MAX_STEP_DEGREES = 12.0
 
 LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
@@ -32,7 +32,7 @@ def lens(distortion: str, width: int, height: int) -> Camera:
 
 
 def focal_35mm(width: int, height: int) -> int:
-    """EXIF's FocalLengthIn35mmFilm: by the diagonal, 43.27 mm on film (CIPA DCG-001)."""
+    """EXIF's FocalLengthIn35mmFilm: from the diagonal, 43.27 mm on film (CIPA DCG-001)."""
     sensor_diagonal = SENSOR_WIDTH_MM * float(np.hypot(1.0, height / width))
     return round(FOCAL_MM * float(np.hypot(36.0, 24.0)) / sensor_diagonal)
 

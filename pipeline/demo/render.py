@@ -8,29 +8,29 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.scene import BACKGROUND, Thing, shade, trace
+from pipeline.demo.scene import BACKGROUND, SceneObject, shade, trace
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
 from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
 
-SAMPLES = 2  # rays a pixel and axis
-# The lens's blur, in pixels: what keeps a real photograph free of aliasing, and a mosaic legible.
+SAMPLES = 2  # rays per pixel and axis
+# Sigma of the lens blur, pixels: avoids aliasing, also in the Bayer mosaic.
 LENS_SIGMA = 0.65
-MARGIN = 3  # pixels rendered around the picture for that blur
-# The texture filter's sigma in pixels; the lens's blur does the rest.
+MARGIN = 3  # pixels rendered around the image for the lens blur
+# Sigma of the texture filter, pixels; the lens blur is applied in addition.
 TEXTURE_SIGMA = 0.35
-RAYS_AT_ONCE = 32_768
+RAYS_PER_BATCH = 32_768
 
 
 @dataclass(frozen=True)
 class Rays:
-    """A camera's rays, alike for all of its photographs: (2, rows, columns) normalised points.
+    """Rays of a camera as (2, rows, columns) normalised points, the same for all its photographs.
 
     Attributes:
-        fine: SAMPLES a pixel and axis, MARGIN pixels around.
-        centres: one a pixel, through its centre.
+        fine: SAMPLES per pixel and axis, with a margin of MARGIN pixels.
+        centres: one per pixel, through its centre.
     """
 
     fine: Array
@@ -39,14 +39,14 @@ class Rays:
 
 @dataclass(frozen=True)
 class Rendered:
-    """What a view shows.
+    """Exact image and depth of a view.
 
     Attributes:
-        light: (H, W, 3) float64 linear RGB; multiplied by ``alpha`` where there is one.
-        coverage: (H, W) float64, share of the pixel's light that the last thing of the scene
-            gives (``visitor``) or that any object gives (``transparent``); else 1.
-        depth: (H, W) float32, z of the scene's surface at the pixel's centre, behind a visitor;
-            0 where there is none.
+        light: (H, W, 3) float64 linear RGB; multiplied by alpha if ``transparent``.
+        coverage: (H, W) float64, share of the pixel covered by the visitor, the last object of
+            the scene (``visitor``), or by any object (``transparent``); else 1.
+        depth: (H, W) float32, z of the scene's surface at the pixel centre, ignoring the
+            visitor; 0 if there is no surface.
     """
 
     light: Array
@@ -63,7 +63,7 @@ def render(
     posed: PosedImage,
     camera: Camera,
     through: Rays,
-    things: tuple[Thing, ...],
+    objects: tuple[SceneObject, ...],
     *,
     transparent: bool = False,
     visitor: bool = False,
@@ -79,16 +79,16 @@ def render(
     flat = through.fine.reshape(2, -1)
     layers = np.empty((4, flat.shape[1]))
     pixel = TEXTURE_SIGMA / camera.pinhole[0]
-    for start in range(0, flat.shape[1], RAYS_AT_ONCE):
-        part = slice(start, start + RAYS_AT_ONCE)
+    for start in range(0, flat.shape[1], RAYS_PER_BATCH):
+        part = slice(start, start + RAYS_PER_BATCH)
         origin, direction = _world(posed, flat[:, part])
-        t, index = trace(origin, direction, things)
-        light = shade(origin, direction, t, index, pixel * t, things)
+        t, index = trace(origin, direction, objects)
+        light = shade(origin, direction, t, index, pixel * t, objects)
         if transparent:
             inside = index != BACKGROUND
             light *= inside
         else:
-            inside = index == len(things) - 1 if visitor else np.ones(index.shape, bool)
+            inside = index == len(objects) - 1 if visitor else np.ones(index.shape, bool)
         layers[:3, part], layers[3, part] = light, inside
     picture = np.ascontiguousarray(layers.reshape(4, rows, columns).transpose(1, 2, 0))
     picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), LENS_SIGMA * SAMPLES), np.float64)
@@ -97,7 +97,7 @@ def render(
     picture = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
 
     origin, direction = _world(posed, through.centres.reshape(2, -1))
-    t, index = trace(origin, direction, things[:-1] if visitor else things)
+    t, index = trace(origin, direction, objects[:-1] if visitor else objects)
     depth = np.where((index == BACKGROUND) & transparent, 0.0, t).astype(np.float32)
     return Rendered(picture[..., :3], picture[..., 3], depth.reshape(camera.height, camera.width))
 

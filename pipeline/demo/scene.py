@@ -1,4 +1,4 @@
-"""The demo scene: a papered room with a few objects in the middle, and the light in it.
+"""The demo scene: a textured room with a few objects in the middle, and its lighting.
 
 World frame: z up, the floor at 0, metres. All light is linear, sRGB primaries.
 """
@@ -19,85 +19,87 @@ Array = NDArray[np.float64]
 ROOM = Box((0, 0, 1.5), (3.5, 3.5, 1.5), inside=True)
 LAMPS = np.array([[1.2, -0.9, 2.8], [-1.6, 1.2, 2.6]])
 LAMP_POWER = (0.75, 0.35)
-LAMP_SIZE = 0.5  # half the side of each lamp's panel: how soft the shadows are
+LAMP_SIZE = 0.5  # half the side of each lamp's panel; larger panels give softer shadows
 AMBIENT = 0.5
-LAMP_SAMPLES = 6  # a side of the grid over a panel
+LAMP_SAMPLES = 6  # per side of the grid over a panel
 SKY_SAMPLES = 48
-# Shadows are looked up in a map of the floor's middle; beyond it the floor is open.
+# Shadows come from a precomputed map of the middle of the floor; outside it there are none.
 SHADOW_REACH = 2.0
 SHADOW_CELLS = 134
 
-# Floor, walls and ceiling are coarser than the objects: they are seen from farther away.
+# Floor, walls and ceiling have coarser textures than the objects: they are farther away.
 FLOOR = Material((0.42, 0.33, 0.24), (0.25, 0.17, 0.10), (-0.07, 0.03, 0.10), 0.08, 0.9, 1)
 WALLS = Material((0.40, 0.44, 0.42), (0.16, 0.22, 0.25), (0.20, 0.02, -0.12), 0.14, 1.4, 2)
 CEILING = Material((0.55, 0.55, 0.58), (0.18, 0.18, 0.20), (0.06, -0.04, 0.06), 0.18, 1.6, 3)
 
 
 @dataclass(frozen=True)
-class Thing:
-    """One object: where it is and what it looks like."""
+class SceneObject:
+    """An object of the scene."""
 
     shape: Shape
     material: Material
 
 
-OBJECTS: tuple[Thing, ...] = (
-    Thing(
+OBJECTS: tuple[SceneObject, ...] = (
+    SceneObject(
         Cylinder((0.0, 0.0), 0.42, 0.0, 0.38),
         Material((0.36, 0.37, 0.42), (0.26, 0.25, 0.22), (0.12, -0.04, -0.12), 0.04, 0.4, 11),
     ),
-    Thing(
+    SceneObject(
         Sphere((0.0, 0.0, 0.68), 0.30),
         Material((0.34, 0.07, 0.06), (0.22, 0.10, 0.03), (0.08, 0.07, 0.10), 0.05, 0.4, 12, 0.05),
     ),
-    Thing(
+    SceneObject(
         Box((0.95, 0.25, 0.28), (0.22, 0.30, 0.28), 0.4),
         Material((0.16, 0.30, 0.42), (0.14, 0.24, 0.26), (0.20, 0.12, -0.10), 0.04, 0.4, 13),
     ),
-    Thing(
+    SceneObject(
         Box((0.95, 0.25, 0.68), (0.13, 0.11, 0.12), 0.9),
         Material((0.48, 0.36, 0.10), (0.32, 0.20, 0.06), (-0.10, 0.08, 0.14), 0.04, 0.3, 14),
     ),
-    Thing(
+    SceneObject(
         Box((-0.55, 0.85, 0.42), (0.30, 0.18, 0.42), -0.5),
         Material((0.22, 0.36, 0.16), (0.18, 0.28, 0.12), (0.20, 0.06, 0.14), 0.04, 0.4, 15),
     ),
-    Thing(
+    SceneObject(
         Cylinder((-0.90, -0.45), 0.20, 0.0, 0.75),
         Material((0.44, 0.28, 0.36), (0.32, 0.18, 0.22), (-0.12, 0.12, 0.14), 0.04, 0.4, 16),
     ),
-    Thing(
+    SceneObject(
         Sphere((0.15, -0.95, 0.27), 0.27),
         Material((0.42, 0.42, 0.38), (0.36, 0.34, 0.26), (-0.08, 0.04, 0.18), 0.04, 0.4, 17),
     ),
-    Thing(
+    SceneObject(
         Sphere((-0.40, -0.85, 0.13), 0.13),
         Material((0.48, 0.22, 0.08), (0.30, 0.18, 0.06), (-0.06, 0.08, 0.16), 0.04, 0.3, 18),
     ),
 )
-# What walks through the pictures when a scene with masks is asked for: elsewhere in each.
+# Material of the moving object in scenes with masks; its position differs in each image.
 VISITOR = Material((0.30, 0.08, 0.40), (0.10, 0.06, 0.14), (0.20, 0.14, -0.10), 0.04, 0.3, 19)
 
 UP = np.array([[0.0], [0.0], [1.0]])
 BACKGROUND = -1
 
 
-def trace(origin: Array, direction: Array, things: tuple[Thing, ...]) -> tuple[Array, NDArray]:
-    """First hits of rays from (3, 1) or (3, N) origins: (N,) t and (N,) index of the thing, or
+def trace(
+    origin: Array, direction: Array, objects: tuple[SceneObject, ...]
+) -> tuple[Array, NDArray]:
+    """First hits of rays from (3, 1) or (3, N) origins: (N,) t and (N,) index of the object, or
     BACKGROUND for the room."""
     best = ROOM.hit(origin, direction)
     index = np.full(best.shape, BACKGROUND)
-    for i, thing in enumerate(things):
-        t = thing.shape.hit(origin, direction)
+    for i, item in enumerate(objects):
+        t = item.shape.hit(origin, direction)
         nearer = t < best
         best, index = np.where(nearer, t, best), np.where(nearer, i, index)
     return best, index
 
 
 def distance(point: Array) -> Array:
-    """(N,) signed distances of (3, N) points from the scene's surface; the empty part of the room
-    is positive."""
-    shapes = (ROOM, *(thing.shape for thing in OBJECTS))
+    """(N,) signed distances of (3, N) points from the scene's surface; positive in
+    the empty part of the room."""
+    shapes = (ROOM, *(item.shape for item in OBJECTS))
     return np.asarray(np.min([shape.distance(point) for shape in shapes], axis=0))
 
 
@@ -107,16 +109,16 @@ def shade(
     t: Array,
     index: NDArray,
     blur: Array,
-    things: tuple[Thing, ...],
+    objects: tuple[SceneObject, ...],
 ) -> Array:
-    """(3, N) linear light that comes back along rays that hit at ``t``.
+    """(3, N) linear radiance along rays with hits at ``t``.
 
     Args:
         blur: (N,) sigma of the texture filter at the hits, metres.
     """
     light = np.zeros(direction.shape)
     point = origin + t * direction
-    for i in range(BACKGROUND, len(things)):
+    for i in range(BACKGROUND, len(objects)):
         here = np.flatnonzero(index == i)
         if len(here) == 0:
             continue
@@ -124,9 +126,9 @@ def shade(
         if i == BACKGROUND:
             light[:, here] = _room_light(p, s)
             continue
-        normal = things[i].shape.normal(p)
-        material = things[i].material
-        # Close to the floor the open half of the light is hidden.
+        normal = objects[i].shape.normal(p)
+        material = objects[i].material
+        # Near the floor part of the ambient light is occluded.
         open_share = 0.72 + 0.28 * np.clip(p[2] / 0.25, 0, 1)
         colour = _albedo(material, p, s) * _irradiance(p, normal) * open_share
         if material.gloss > 0:
@@ -204,8 +206,8 @@ def _floor_irradiance(point: Array) -> Array:
 
 @cache
 def shadow_maps() -> Array:
-    """(1 + lamps, SHADOW_CELLS, SHADOW_CELLS): shares of the sky and of each lamp that points of
-    the floor see past the objects. Computed once per process (a second)."""
+    """(1 + lamps, SHADOW_CELLS, SHADOW_CELLS): shares of the sky and of each lamp that are
+    visible from points on the floor. Computed once per process."""
     side = np.linspace(-SHADOW_REACH, SHADOW_REACH, SHADOW_CELLS)
     x, y = (v.ravel() for v in np.meshgrid(side, side))
     point = np.stack([x, y, np.zeros_like(x)])

@@ -1,4 +1,4 @@
-"""From linear light to files: sRGB pictures with EXIF, or a Bayer sensor's DNG."""
+"""Converts linear light to files: sRGB images with EXIF, or the DNG of a Bayer sensor."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ Array = NDArray[np.float64]
 MAKE, MODEL = "Splatmake", "Demo 1"
 JPEG_QUALITY = 95
 
-# XYZ (D65) to the sensor's colours: the ColorMatrix a Canon EOS 6D's DNG files carry.
+# XYZ (D65) to sensor colours: the ColorMatrix in DNG files of the Canon EOS 6D.
 COLOR_MATRIX = np.array(
     [[0.7034, -0.0804, -0.1014], [-0.4420, 1.2564, 0.2058], [-0.0851, 0.1994, 0.5758]]
 )
@@ -29,7 +29,7 @@ RGGB = ((0, 1), (1, 2))
 
 
 def srgb(light: Array) -> Array:
-    """Linear light to sRGB's curve, both 0 to 1 (IEC 61966-2-1); clipped."""
+    """Linear light in [0, 1] to sRGB values in [0, 1] (IEC 61966-2-1); clipped."""
     light = np.clip(light, 0.0, 1.0)
     return np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
 
@@ -50,15 +50,15 @@ def write_picture(path: Path, pixels: NDArray[np.uint8], taken: str) -> None:
     photo[36867] = taken
     photo[37386] = float(FOCAL_MM)
     photo[41486] = photo[41487] = pixels.shape[1] / SENSOR_WIDTH_MM * 10
-    photo[41488] = 3  # pixels a centimetre
+    photo[41488] = 3  # pixels per centimetre
     photo[41989] = focal_35mm(pixels.shape[1], pixels.shape[0])
     exif[0x8769] = photo
-    # Other formats pass over JPEG's two options.
+    # Other formats ignore the two options of JPEG.
     Image.fromarray(pixels).save(path, exif=exif, quality=JPEG_QUALITY, subsampling=0)
 
 
 def white_balance() -> Array:
-    """(3,) the sensor's answer to white, the strongest channel 1: DNG's AsShotNeutral."""
+    """(3,) sensor response to white, scaled to a maximum of 1: AsShotNeutral of DNG."""
     answer = (COLOR_MATRIX @ SRGB_TO_XYZ).sum(axis=1)
     return np.asarray(answer / answer.max())
 
@@ -75,7 +75,7 @@ def expose(light: Array, noise: float, seed: tuple[int, int]) -> NDArray[np.uint
     mosaic = np.empty((height, width))
     for dy, row in enumerate(RGGB):
         for dx, channel in enumerate(row):
-            # Summed by hand: the same bits at any number of BLAS threads.
+            # Written out: BLAS rounds differently with the number of threads.
             r, g, b = np.moveaxis(light[dy::2, dx::2], -1, 0)
             m = matrix[channel]
             mosaic[dy::2, dx::2] = m[0] * r + m[1] * g + m[2] * b

@@ -1,4 +1,4 @@
-"""Things a ray can hit. Points and directions are (3, N) float64, world frame, z up."""
+"""Shapes for ray tracing. Points and directions are (3, N) float64, world frame, z up."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Hits nearer than this are the surface the ray starts from.
+# Nearer hits are self-intersections with the surface at the origin of the ray.
 NEAR = 1e-4
 
 
@@ -27,7 +27,7 @@ class Shape(Protocol):
         ...
 
     def distance(self, point: Array) -> Array:
-        """(N,) exact signed distances, negative inside what is solid."""
+        """(N,) exact signed distances, negative inside solids."""
         ...
 
 
@@ -54,7 +54,7 @@ class Sphere:
 
 @dataclass(frozen=True)
 class Cylinder:
-    """Upright, with both caps."""
+    """A vertical cylinder with both caps."""
 
     centre: tuple[float, float]
     radius: float
@@ -91,7 +91,7 @@ class Cylinder:
 
 @dataclass(frozen=True)
 class Box:
-    """Turned by ``yaw`` radians about the vertical; ``inside`` makes it a room around the rays."""
+    """A box, rotated by ``yaw`` radians about the vertical; ``inside``: a room seen from inside."""
 
     centre: tuple[float, float, float]
     half: tuple[float, float, float]
@@ -128,7 +128,7 @@ class Box:
 
 
 def _outside(excess: Array) -> Array:
-    """Signed distance from how far (K, N) points are past each of K perpendicular bounds."""
+    """Signed distance from the (K, N) signed distances to K perpendicular bounds."""
     beyond = np.sqrt((np.maximum(excess, 0) ** 2).sum(0))
     return np.asarray(beyond + np.minimum(excess.max(0), 0))
 

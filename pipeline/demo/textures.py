@@ -1,7 +1,7 @@
-"""Solid textures made of plane waves: detail at every scale, and none finer than was asked for.
+"""Solid textures from sums of plane waves, with detail in a given range of wavelengths.
 
-A sum of waves of random direction and phase is a Gaussian random field with an exactly known
-band: full of blobs for SIFT, and free of the aliasing that noise on a lattice brings.
+A sum of waves of random direction and phase is a band-limited Gaussian random field: it has blobs
+at all scales for SIFT, and no aliasing.
 """
 
 from __future__ import annotations
@@ -16,19 +16,19 @@ Floats = NDArray[np.float32]
 
 BANDS = 6
 WAVES_PER_BAND = 8
-# The share of its colour range a texture spends: steeper makes patches with softer insides.
+# Contrast: larger values saturate more of the texture at the ends of its colour range.
 STEEPNESS = 1.3
 
 
 @dataclass(frozen=True)
 class Material:
-    """A surface's colours, linear light.
+    """Colours of a surface, linear light.
 
     Attributes:
         base, tint_a, tint_b: RGB; the colour is base + a tint_a + b tint_b with a and b in (-1, 1).
-        finest, coarsest: wavelengths of the texture, in the world's unit.
-        seed: another seed, another pattern.
-        gloss: share of mirror reflection seen head on; 0 is a matte surface.
+        finest, coarsest: shortest and longest wavelength of the texture, world units.
+        seed: of the pattern.
+        gloss: reflectance at normal incidence; 0 is a matte surface.
     """
 
     base: tuple[float, float, float]
@@ -52,7 +52,7 @@ class Material:
         total = np.zeros(point.shape[1], np.float32)
         variance = 0.0
         for wavelength, directions, phases in _waves(self, which):
-            # Amplitudes grow slowly with the wavelength, as in natural pictures.
+            # Amplitudes grow slowly with the wavelength, as in natural images.
             amplitude = (wavelength / self.coarsest) ** 0.3
             variance += amplitude**2 * WAVES_PER_BAND / 2
             waves = directions[0] * point[0]

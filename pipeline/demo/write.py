@@ -1,4 +1,4 @@
-"""The demo scene as a folder of photographs, with its exact truth beside it."""
+"""Writes the demo scene: a folder of photographs with exact ground truth."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from PIL import Image
 
 from pipeline.demo.cameras import LENSES, lens, orbit
 from pipeline.demo.render import Rays, rays, render
-from pipeline.demo.scene import OBJECTS, VISITOR, Thing
+from pipeline.demo.scene import OBJECTS, VISITOR, SceneObject
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
 from pipeline.demo.shapes import Sphere
 from pipeline.geometry.cameras import Camera
@@ -36,13 +36,13 @@ Poses = Literal["none", "colmap", "transforms"]
 Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # a view's depth and colours
 
 POINTS_PER_VIEW = 200
-# A point is seen where its depth agrees with the truth to this share: surfaces slope in a pixel.
+# Relative tolerance of depths for the visibility of a point: depth varies within a pixel.
 DEPTH_AGREEMENT = 0.01
 
 
 @dataclass(frozen=True)
 class DemoSpec:
-    """What the demo scene is written as.
+    """Options of the demo scene.
 
     Attributes:
         views: photographs, in order around the objects.
@@ -70,7 +70,7 @@ class DemoSpec:
     seed: int = 0
 
     def check(self) -> None:
-        """Raises UserError where the options do not go together."""
+        """Raises UserError if options are incompatible."""
         if self.views < 1 or self.width < 16 or self.height < 16:
             raise UserError("the demo needs at least one view of at least 16x16 pixels")
         if self.format not in get_args(Format) or self.poses not in get_args(Poses):
@@ -165,11 +165,11 @@ def _rays(spec: DemoSpec) -> Rays:
 
 def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
     """Render and write one view. Its depth and colours are returned for the points; depth is 0
-    where they show nothing of the scene."""
+    in pixels of the visitor or without a surface."""
     camera, posed = _camera(spec), _views(spec)[number]
-    things = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
+    objects = (*OBJECTS, _visitor(spec.seed, number, posed)) if spec.masks else OBJECTS
     options = {"transparent": spec.alpha, "visitor": spec.masks}
-    seen = render(posed, camera, _rays(spec), things, **options)
+    seen = render(posed, camera, _rays(spec), objects, **options)
     stem = Path(posed.name).stem
     path = folder / "images" / posed.name
     taken = f"2026:01:01 12:{number // 60 % 60:02d}:{number % 60:02d}"
@@ -194,11 +194,13 @@ def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
     return depth, colour
 
 
-def _visitor(seed: int, number: int, posed: PosedImage) -> Thing:
-    """A ball somewhere in front of the camera, near the middle of the picture."""
+def _visitor(seed: int, number: int, posed: PosedImage) -> SceneObject:
+    """A ball at a random position in front of the camera, near the image centre."""
     x, y, z = np.random.default_rng([seed, 2, number]).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 1.3))
     centre = posed.centre + posed.rotation.T @ np.array([x * z, y * z, z])
-    return Thing(Sphere((float(centre[0]), float(centre[1]), float(centre[2])), 0.14), VISITOR)
+    return SceneObject(
+        Sphere((float(centre[0]), float(centre[1]), float(centre[2])), 0.14), VISITOR
+    )
 
 
 def _points(
@@ -207,7 +209,7 @@ def _points(
     colours: list[NDArray[np.uint8]],
     seed: int,
 ) -> Points:
-    """Points on the surfaces with exact positions, and the views that truly see them."""
+    """Points on the surfaces with exact positions, and the views in which they are visible."""
     camera = truth.cameras[1]
     rng = np.random.default_rng([seed, 3])
     xyz, rgb = [], []

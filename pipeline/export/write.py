@@ -1,4 +1,4 @@
-"""A finished scene as files for other programs."""
+"""Export of a finished scene to the file formats of other programs."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import prepare
 
-# Share of the Gaussians that may not fit into a format without a warning: some specks always fail.
+# A warning is given if a larger share of the Gaussians cannot be represented in a format.
 TOLERATED_SHARE = 0.05
 # Formats that cannot record that the Gaussians were trained with opacity compensation.
 WITHOUT_ANTIALIAS = ("ply", "splat", "gltf")
@@ -31,30 +31,30 @@ WITHOUT_ANTIALIAS = ("ply", "splat", "gltf")
 
 @dataclass(frozen=True)
 class ExportScene:
-    """What is exported.
+    """A finished scene.
 
     Attributes:
-        trained: the Gaussians as training left them.
+        trained: the Gaussians after training.
         model: cameras and sparse points.
         manifest: the photographs of the views.
-        views: at the photographs' own size.
-        drawn: the same views at the size of training.
-        georeference: the model's frame (``georeference.json``), None without one.
-        folder: where the files will be in the end.
+        views: all views, at the size of the photographs.
+        training_size_views: the same views at the size used in training.
+        georeference: content of ``georeference.json``; None without one.
+        folder: final folder of the exported files.
     """
 
     trained: Gaussians
     model: Reconstruction
     manifest: Manifest
     views: list[View]
-    drawn: list[View]
+    training_size_views: list[View]
     georeference: dict[str, Any] | None
     folder: Path
 
 
 @dataclass
 class ExportReport:
-    """What was exported, and what is said of it."""
+    """What was exported, and messages to the user."""
 
     exported_gaussians: int
     decisions: list[str] = field(default_factory=list)
@@ -69,7 +69,7 @@ class _Files:
     points: str | None
 
 
-# format -> the file or folder, and its writer.
+# Format -> name of the file or folder, and its writer.
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
     "spz": ("point_cloud.spz", lambda path, f: write_spz(path, f.gaussians, antialias=f.antialias)),
@@ -103,7 +103,7 @@ def export_scene(
     report = ExportReport(len(gaussians), warnings=_warnings(files, config))
     _write_frame(out, files, written, train, split)
     if not set(config.formats) <= WRITERS.keys():
-        _draw(out, scene, config, train, split, threads, report)
+        _write_rendered_formats(out, scene, config, train, split, threads, report)
     return report
 
 
@@ -113,15 +113,16 @@ def _warnings(files: _Files, config: Export) -> list[str]:
     if lost > TOLERATED_SHARE * len(files.gaussians):
         warnings.append(
             f"point_cloud.spz: {lost} of {len(files.gaussians)} Gaussians are too small or too "
-            "large for SPZ's numbers in the unit of the poses; take point_cloud.ply, or give the "
-            "poses in a unit in which the scene measures about 1 to 100"
+            "large for the number format of SPZ in the unit of the poses. Use point_cloud.ply, or "
+            "give the poses in a unit in which the size of the scene is about 1 to 100"
         )
-    silent = [WRITERS[name][0] for name in WITHOUT_ANTIALIAS if name in config.formats]
-    if files.antialias and silent:
+    unmarked = [WRITERS[name][0] for name in WITHOUT_ANTIALIAS if name in config.formats]
+    if files.antialias and unmarked:
         warnings.append(
-            f"{' and '.join(silent)} cannot say that the Gaussians were trained with "
-            "train.antialias, and a viewer without Mip-Splatting's compensation draws them far too "
-            "thick: switch it on there, take point_cloud.spz, which says so, or train without"
+            f"{' and '.join(unmarked)} cannot record that the Gaussians were trained with "
+            "train.antialias, and viewers without Mip-Splatting's opacity compensation render them "
+            "too thick. Enable it in the viewer, use point_cloud.spz, which records it, or train "
+            "with train.antialias: false"
         )
     return warnings
 
@@ -139,7 +140,7 @@ def _write_frame(out: Path, files: _Files, written: list[str], train: Train, spl
     write_json(out / "frame.json", frame)
 
 
-def _draw(
+def _write_rendered_formats(
     out: Path,
     scene: ExportScene,
     config: Export,
@@ -148,18 +149,18 @@ def _draw(
     threads: int,
     report: ExportReport,
 ) -> None:
-    """The formats that draw the Gaussians, as they were trained, from the views of training."""
-    # Rarely asked for, and heavy: marching cubes, video encoders.
-    from pipeline.surface.outputs import write_drawn
+    """Write the formats that need renders of the trained Gaussians."""
+    # Imported here because it is slow to import and rarely used.
+    from pipeline.surface.outputs import write_rendered
 
-    told = write_drawn(
+    messages = write_rendered(
         out,
         config.formats,
         scene.trained,
-        scene.drawn,
-        choose_protocol(scene.drawn, split, train).options(train, threads),
+        scene.training_size_views,
+        choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),
         mesh_voxel=config.mesh_voxel,
     )
-    report.decisions += told.decisions
-    report.warnings += told.warnings
+    report.decisions += messages.decisions
+    report.warnings += messages.warnings

@@ -1,4 +1,4 @@
-"""Held-out views against their photographs."""
+"""Evaluation of a scene: renders of the test views compared with their photographs."""
 
 from __future__ import annotations
 
@@ -26,25 +26,24 @@ from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.fit_pose import fit_pose
 
-#: Training views that are rendered, too: what the model makes of pictures that it has seen.
-NUM_SEEN = 8
-#: Below this many dB on seen views the photographs contradict each other or the poses: scenes that
-#: train well reach 25 to 40 dB.
-LOW_SEEN_PSNR = 22.0
-#: This many dB between seen and held-out views, where these are bad, is overfitting: well-covered
-#: scenes show 0 to 4.
+#: Number of training views that are rendered for ``train_psnr``.
+NUM_TRAINING_VIEWS = 8
+#: A mean PSNR of training views below this, in dB, indicates inconsistent photographs or poses.
+LOW_TRAIN_PSNR = 22.0
+#: Overfitting: the PSNR of training views exceeds that of test views by more than ``LARGE_GAP`` dB,
+#: and the latter is below ``LOW_PSNR`` dB.
 LARGE_GAP, LOW_PSNR = 6.0, 25.0
 
-#: Of zlib, for the renders: higher ones take several times as long for a tenth of the size.
+#: zlib level of the renders: higher levels are much slower and save little.
 PNG_LEVEL = 1
 
 NO_GAINS: Mapping[str, Sequence[float]] = MappingProxyType({})
 EXPOSURE_PROTOCOL = (
-    "renders multiplied by each photograph's gains (one a channel), which were measured at the "
-    "sparse points, in held-out photographs too; psnr_without_gains is as rendered"
+    "renders multiplied by each photograph's gains (one per channel), which are measured at the "
+    "sparse points, in test photographs as well; psnr_without_gains is without this"
 )
 POSES_PROTOCOL = (
-    "each held-out camera moved to where the scene, which stays as it is, fits its photograph best"
+    "the pose of each test camera is optimised on its photograph, with the scene held fixed"
 )
 Mask = NDArray[np.bool_]
 
@@ -53,26 +52,26 @@ BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True)
 class Protocol:
-    """How quality was measured; the same for every view of a scene.
+    """How the quality of a scene is measured.
 
     Attributes:
-        views: those measured on.
-        seen: training views measured beside them, evenly spread; empty where ``every`` is 0.
-        every: each this-many-th view was held out of training; 0: none was, these were seen.
+        views: the evaluated views: the test views, or all views if there are none.
+        training_views: an even sample of the training views; empty without test views.
+        every: every n-th view, sorted by name, is a test view; 0: there are none.
         background: RGB in [0, 1] behind renders and transparent photographs.
-        near: near plane of the renders, as in training; world unit.
-        extent: the scene's size, world unit.
+        near: near plane of the renders, as in training; world units.
+        extent: radius of the scene, world units (``scene_extent``).
     """
 
     views: list[View]
-    seen: list[View]
+    training_views: list[View]
     every: int
     background: tuple[float, float, float]
     near: float
     extent: float
 
     def options(self, train: Train, threads: int) -> RasterOptions:
-        """How its renders are drawn: as in training, over ``background``."""
+        """Options of the rasterizer: as in training, over ``background``."""
         return RasterOptions(
             sh_degree=train.sh_degree,
             background=self.background,
@@ -83,20 +82,24 @@ class Protocol:
 
 
 def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protocol:
-    """The views to evaluate on (the held-out ones, else all) and the background.
+    """The views to evaluate on (the test views; without any, all) and the background.
 
-    The background is the one trained on; where that was random (images with alpha), white, as
-    the field does for NeRF-synthetic scenes.
+    The background is that of training. If that is random (images with alpha), it is white, as is
+    usual for NeRF-synthetic scenes.
     """
-    held_out = [view for view in views if view.is_test]
+    test = [view for view in views if view.is_test]
     training = [view for view in views if not view.is_test]
-    picks = np.linspace(0, len(training) - 1, min(NUM_SEEN, len(training))).round().astype(int)
+    picks = (
+        np.linspace(0, len(training) - 1, min(NUM_TRAINING_VIEWS, len(training)))
+        .round()
+        .astype(int)
+    )
     white = train.background in ("white", "random")
     extent = scene_extent(list(views))
     return Protocol(
-        held_out or list(views),
-        [training[i] for i in picks] if held_out else [],
-        split.holdout_every if held_out else 0,
+        test or list(views),
+        [training[i] for i in picks] if test else [],
+        split.holdout_every if test else 0,
         WHITE if white else BLACK,
         near_plane(extent),
         extent,
@@ -113,18 +116,21 @@ def evaluate_views(
     gains: Mapping[str, Sequence[float]] = NO_GAINS,
     threads: int,
 ) -> dict[str, Any]:
-    """Render each view, save it as 8-bit PNG, and measure that picture.
+    """Render each view, write it as 8-bit PNG, and compare that image with the photograph.
 
     Args:
-        gains: by view's name, each channel's factor from the scene's typical exposure to the
-            view's; empty where views are exposed alike.
+        gains: factor of each channel from the scene's typical exposure to the view's, by name of
+            the view; empty if exposure is not modelled.
         out: folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:
-        ``psnr``, ``ssim``, ``lpips`` (means of the views' values; lpips null where its weights are
-        missing, with ``lpips_reason``), ``train_psnr`` (mean over the seen views, null without
-        any), ``psnr_without_gains`` (null where there are none), ``per_view``, ``warnings`` and
-        ``protocol``.
+        ``psnr`` (dB), ``ssim`` and ``lpips`` (means over the views; lpips is None, with
+        ``lpips_reason``, if its weights are missing), ``train_psnr`` (mean over a sample of the
+        training views, None without test views), ``psnr_without_gains`` (None without gains),
+        ``per_view``, ``warnings`` and ``protocol``.
+
+    Raises:
+        UserError: the masks hide all views.
     """
     lpips, reason = lpips_available(config.lpips_net)
     smallest = min(min(view.width, view.height) for view in protocol.views)
@@ -132,14 +138,14 @@ def evaluate_views(
         lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
     per_view: list[dict[str, Any]] = []
-    progress = Progress("evaluating", len(protocol.views) + len(protocol.seen), "views")
+    progress = Progress("evaluating", len(protocol.views) + len(protocol.training_views), "views")
     warnings: list[str] = []
-    without: list[float] = []
+    unadjusted: list[float] = []
     options = protocol.options(train, threads)
 
-    def compare(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
+    def render_and_load(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view)
-        photo = reference(pixels, protocol.background)
+        photo = photo_over_background(pixels, protocol.background)
         if train.refine_poses and view.is_test:
             gain, weight = gains.get(view.name), train.ssim_weight
             view = fit_pose(
@@ -147,63 +153,63 @@ def evaluate_views(
             )
         return render_rgb(gaussians, view, options), photo, pixels.mask
 
-    def exposed(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
+    def with_exposure(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
         return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)
 
     def measure(
         index: int, rgb: NDArray[np.float32], photo: NDArray[np.uint8], mask: Mask | None
     ) -> tuple[dict[str, Any], float | None]:
         view = protocol.views[index]
-        picture = exposed(rgb, view)
+        image = with_exposure(rgb, view)
         name = f"{index:04d}.png"
-        Image.fromarray(picture).save(out / name, compress_level=PNG_LEVEL)
-        a, b = picture / 255.0, photo / 255.0
+        Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
+        a, b = image / 255.0, photo / 255.0
         record = {"name": view.name, "psnr": psnr(a, b, mask), "ssim": ssim(a, b, mask)}
         record |= {"lpips": None, "render": name}
         return record, psnr(to_bytes(rgb) / 255.0, b, mask) if gains else None
 
-    def collect(found: Future[tuple[dict[str, Any], float | None]]) -> None:
-        record, plain = found.result()
+    def collect(future: Future[tuple[dict[str, Any], float | None]]) -> None:
+        record, psnr_without_gains = future.result()
         per_view.append(record)
-        if plain is not None:
-            without.append(plain)
+        if psnr_without_gains is not None:
+            unadjusted.append(psnr_without_gains)
         progress.advance(note=f"PSNR {record['psnr']:.2f} dB")
 
-    # Views are measured beside the rendering of the next ones; few, as each holds its pictures.
+    # Views are measured while the next ones are rendered. The queue is short: it holds the images.
     pending: deque[Future[tuple[dict[str, Any], float | None]]] = deque()
     distances: list[float] = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for index, view in enumerate(protocol.views):
-            rgb, photo, mask = compare(view)
-            if _hidden(mask):
+            rgb, photo, mask = render_and_load(view)
+            if _hides_all(mask):
                 warnings.append(f"{view.name}: its mask leaves no pixel to measure")
                 progress.advance()
                 continue
             pending.append(pool.submit(measure, index, rgb, photo, mask))
             if lpips is not None:
-                distances.append(lpips(exposed(rgb, view) / 255.0, photo / 255.0, mask))
+                distances.append(lpips(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
             if len(pending) > threads:
                 collect(pending.popleft())
         while pending:
             collect(pending.popleft())
     for record, distance in zip(per_view, distances, strict=lpips is not None):
         record["lpips"] = distance
-    seen: list[float] = []
-    for view in protocol.seen:
-        rgb, photo, mask = compare(view)
-        if not _hidden(mask):
-            seen.append(psnr(exposed(rgb, view) / 255.0, photo / 255.0, mask))
+    training: list[float] = []
+    for view in protocol.training_views:
+        rgb, photo, mask = render_and_load(view)
+        if not _hides_all(mask):
+            training.append(psnr(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
     mean_psnr = float(np.mean([v["psnr"] for v in per_view]))
-    train_psnr = float(np.mean(seen)) if seen else None
+    train_psnr = float(np.mean(training)) if training else None
     if train_psnr is not None:
         warnings += diagnose(mean_psnr, train_psnr)
     return {
         "psnr": mean_psnr,
         "train_psnr": train_psnr,
-        "psnr_without_gains": float(np.mean(without)) if gains else None,
+        "psnr_without_gains": float(np.mean(unadjusted)) if gains else None,
         "ssim": float(np.mean([v["ssim"] for v in per_view])),
         "lpips": None if lpips is None else float(np.mean([v["lpips"] for v in per_view])),
         "lpips_reason": reason,
@@ -215,28 +221,30 @@ def evaluate_views(
     }
 
 
-def diagnose(held_out: float, seen: float) -> list[str]:
-    """Warnings for what mean PSNR (dB) on held-out and on seen views says of a bad scene."""
-    if seen < LOW_SEEN_PSNR:
+def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
+    """Warnings about inconsistent photographs or overfitting, from mean PSNR in dB."""
+    if train_psnr < LOW_TRAIN_PSNR:
         return [
-            f"the scene reproduces the photographs it was trained on badly ({seen:.1f} dB): "
-            "look at the report's views; photographs that differ in exposure or season, things "
-            "that move, unmasked backgrounds, wrong poses and very short training do this"
+            f"the scene reproduces its training photographs badly ({train_psnr:.1f} dB). Possible "
+            "causes: exposure or season changes between photographs, moving objects, unmasked "
+            "backgrounds, wrong poses, very short training. Compare the views in the report"
         ]
-    if held_out < LOW_PSNR and seen - held_out > LARGE_GAP:
+    if test_psnr < LOW_PSNR and train_psnr - test_psnr > LARGE_GAP:
         return [
-            f"views held out are much worse than views trained on ({held_out:.1f} against "
-            f"{seen:.1f} dB): too few photographs, too far apart, see some places only once"
+            f"test views are much worse than training views ({test_psnr:.1f} against "
+            f"{train_psnr:.1f} dB): there are too few photographs, or they are too far apart"
         ]
     return []
 
 
-def _hidden(mask: Mask | None) -> bool:
+def _hides_all(mask: Mask | None) -> bool:
     return mask is not None and not mask.any()
 
 
-def reference(pixels: ViewPixels, background: tuple[float, float, float]) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 photograph, over the background where it has alpha."""
+def photo_over_background(
+    pixels: ViewPixels, background: tuple[float, float, float]
+) -> NDArray[np.uint8]:
+    """(H, W, 3) uint8 photograph, composited over the background if it has an alpha channel."""
     if pixels.alpha is None:
         return pixels.rgb
     alpha = pixels.alpha[..., None] / 255.0
@@ -250,15 +258,15 @@ def _describe(
     return {
         "resolution": [f"{w}x{h}" for w, h in sizes],
         "split": (
-            f"held out: one view in {protocol.every}, sorted by name, from the first"
+            f"test views: one view in {protocol.every}, sorted by name, from the first"
             if protocol.every
-            else "no view was held out: measured on the TRAINING views"
+            else "no test views: measured on the TRAINING views"
         ),
-        "poses_and_points": "from all photographs, the held-out ones included (the field's habit)",
+        "poses_and_points": "from all photographs, test views included (as usual in the field)",
         "num_views": num_views,
-        "psnr": "mean of the views' PSNR in dB, 8-bit renders, peak 1",
+        "psnr": "mean over the views of PSNR in dB, 8-bit renders, peak 1",
         "ssim": SSIM_VARIANT,
         "lpips": no_lpips or LPIPS_VARIANTS[config.lpips_net],
-        "masks": "masked pixels count for nothing" if any(v.mask for v in protocol.views) else None,
+        "masks": "masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
         "background": list(protocol.background),
     }

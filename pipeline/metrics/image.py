@@ -1,12 +1,12 @@
-"""How alike two pictures are: PSNR, and SSIM with the window of the 3DGS literature.
+"""Image quality: PSNR, and SSIM with the window and padding of 3DGS.
 
-SSIM is written from the formula of Wang, Bovik, Sheikh and Simoncelli, "Image quality
-assessment: from error visibility to structural similarity" (2004), equation 13, with their
-constants K1 = 0.01, K2 = 0.03 and their 11 x 11 Gaussian window of sigma 1.5. Implementations
-differ at the border and so in the second digit; ``SSIM_VARIANT`` names which one the headline is.
+SSIM is equation 13 of Wang, Bovik, Sheikh and Simoncelli, "Image quality assessment: from error
+visibility to structural similarity" (2004), with their constants K1 = 0.01, K2 = 0.03 and their
+11 x 11 Gaussian window of sigma 1.5. Implementations differ in the treatment of the border, which
+changes the second digit; ``SSIM_VARIANT`` describes the reported one.
 
-Pictures are (H, W, 3) in [0, 1]; everything is computed in float64. A mask is (H, W); its
-non-zero pixels count.
+Images are (H, W, 3) in [0, 1]. All computations are in float64. A mask is (H, W); its non-zero
+pixels are measured.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from pipeline.runtime.errors import UserError
 
 PSNR_CAP = 100.0
-"""dB, reported for identical pictures: JSON has no infinity."""
+"""PSNR of identical images, dB: JSON has no infinity."""
 
 SSIM_VARIANT = "3DGS: 11x11 Gaussian, sigma 1.5, zero padding, mean over channels"
 
@@ -35,7 +35,7 @@ def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
 
     Args:
         image, reference: (H, W, 3), [0, 1].
-        mask: (H, W) or None; zero pixels count for nothing.
+        mask: (H, W) or None; zero pixels are excluded.
 
     Returns:
         ``min(-10 log10(mean squared error), PSNR_CAP)``.
@@ -61,9 +61,9 @@ def ssim(
     Args:
         image, reference: (H, W, 3), [0, 1].
         mask: (H, W) or None. Masked pixels of the image are replaced by the reference's, so that
-            what was rendered there reaches no window, and the map is averaged over the others.
-        padding: "zero" continues both pictures with black, as the 3DGS literature does
-            (``SSIM_VARIANT``); "valid" averages only where the window lies inside the picture.
+            they do not affect neighbouring windows, and are excluded from the mean.
+        padding: "zero" pads both images with black, as 3DGS does (``SSIM_VARIANT``); "valid"
+            averages only the pixels whose window lies inside the image.
 
     Raises:
         UserError: no pixel is left to average, or a side is under 11 pixels with "valid".
@@ -76,9 +76,9 @@ def ssim(
         height, width = values.shape[:2]
         if min(height, width) <= 2 * _RADIUS:
             raise UserError(
-                f"SSIM without padding needs pictures of at least 11 x 11 pixels, "
+                f"SSIM without padding needs images of at least 11 x 11 pixels, "
                 f"found {width} x {height}",
-                fix="use larger pictures, or zero padding",
+                fix="use larger images, or zero padding",
             )
         inner = np.s_[_RADIUS:-_RADIUS, _RADIUS:-_RADIUS]
         values = values[inner]
@@ -87,7 +87,7 @@ def ssim(
 
 
 def _ssim_map(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.float64]:
-    """SSIM(x, y) of every pixel and channel, both pictures continued with zeros."""
+    """SSIM(x, y) of every pixel and channel, with zero padding."""
     mean_x, mean_y = _blur(x), _blur(y)
     variance_x = _blur(x * x) - mean_x**2
     variance_y = _blur(y * y) - mean_y**2
@@ -98,7 +98,7 @@ def _ssim_map(x: NDArray[np.float64], y: NDArray[np.float64]) -> NDArray[np.floa
 
 
 def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Each channel weighted by the (separable) Gaussian window around every pixel."""
+    """Convolution of each channel with the (separable) Gaussian window."""
     offsets = np.arange(-_RADIUS, _RADIUS + 1)
     window = np.exp(-0.5 * (offsets / _SIGMA) ** 2)
     window /= window.sum()
@@ -111,11 +111,11 @@ def _checked(
     image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_] | None]:
     if image.shape != reference.shape or image.ndim != 3:
-        raise ValueError(f"pictures of shapes {image.shape} and {reference.shape}")
+        raise ValueError(f"images of shapes {image.shape} and {reference.shape}")
     keep = None
     if mask is not None:
         if mask.shape != image.shape[:2]:
-            raise ValueError(f"mask of shape {mask.shape} for pictures of shape {image.shape}")
+            raise ValueError(f"mask of shape {mask.shape} for images of shape {image.shape}")
         keep = _not_empty(mask != 0)
     return image.astype(np.float64), reference.astype(np.float64), keep
 
@@ -124,6 +124,6 @@ def _not_empty(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:
     if not keep.any():
         raise UserError(
             "the mask leaves no pixel to measure",
-            fix="leave this view out of the evaluation, or mend its mask (non-zero counts)",
+            fix="leave this view out, or correct its mask (non-zero pixels are measured)",
         )
     return keep

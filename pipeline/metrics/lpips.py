@@ -1,15 +1,16 @@
 """LPIPS v0.1 (Zhang et al., "The Unreasonable Effectiveness of Deep Features as a Perceptual
-Metric", 2018), where its trained weights are found on this machine. Nothing is downloaded, and
-nothing ever stands in for missing weights: the metric is then not available, with the reason.
+Metric", 2018), computed if its trained weights are on this machine; nothing is downloaded.
+Without the weights, or with wrong ones, the metric is unavailable and the reason is reported.
 
 Two files are needed, both in ``$TORCH_HOME/hub/checkpoints`` (``~/.cache/torch`` by default):
 
 - the backbone, torchvision's ImageNet weights: ``vgg16-397923af.pth`` or
   ``alexnet-owt-7be5be79.pth``;
 - the linear heads of the LPIPS authors' release v0.1: ``lpips_vgg.pth`` or ``lpips_alex.pth``
-  (also found as ``vgg.pth`` or ``alex.pth``, as other programs leave them there).
+  (or ``vgg.pth``, ``alex.pth``, the names under which other programs store them).
 
-The published 3DGS numbers feed [0, 1] where the network was trained on [-1, 1]; so does this.
+Inputs are in [0, 1], as for the published figures of 3DGS, although the network was trained on
+[-1, 1].
 """
 
 from __future__ import annotations
@@ -39,12 +40,12 @@ LPIPS_VARIANTS: dict[str, str] = {
 }
 
 MIN_SIDE = 32
-"""Pixels; a smaller picture shrinks to nothing inside the networks."""
+"""Least side of an image in pixels: the networks reduce smaller images to nothing."""
 
-# The authors' input normalisation: ImageNet's mean and deviation seen from [-1, 1].
+# The authors' input normalisation: ImageNet's mean and standard deviation, for inputs in [-1, 1].
 _SHIFT = (-0.030, -0.088, -0.188)
 _SCALE = (0.458, 0.448, 0.450)
-# Keeps an all-zero feature vector from dividing by zero, as in the authors' release.
+# Avoids division by zero for all-zero feature vectors, as in the authors' release.
 _EPSILON = 1e-10
 
 
@@ -104,7 +105,7 @@ _NETWORKS = {
 
 
 def _weight_files(network: _Network) -> tuple[Path, Path]:
-    """The backbone and the linear heads, where they are or else should be: torch.hub's folder."""
+    """Paths of the backbone and of the linear heads in torch.hub's folder; they may not exist."""
     cache = os.environ.get("XDG_CACHE_HOME", "~/.cache")
     home = os.environ.get("TORCH_HOME", os.path.join(cache, "torch"))
     folder = Path(home).expanduser() / "hub" / "checkpoints"
@@ -113,7 +114,7 @@ def _weight_files(network: _Network) -> tuple[Path, Path]:
 
 
 def weights_found(net: Net) -> dict[str, int]:
-    """Names and sizes in bytes of the weight files at hand; cheap, without torch."""
+    """Names and sizes in bytes of the weight files that exist. Does not import torch."""
     files = () if net == "none" else _weight_files(_NETWORKS[net])
     return {file.name: file.stat().st_size for file in files if file.is_file()}
 
@@ -212,9 +213,9 @@ def _distance(
     height, width = image.shape[:2]
     if min(height, width) < MIN_SIDE:
         raise UserError(
-            f"LPIPS needs pictures of at least {MIN_SIDE} x {MIN_SIDE} pixels, "
+            f"LPIPS needs images of at least {MIN_SIDE} x {MIN_SIDE} pixels, "
             f"found {width} x {height}",
-            fix="use larger pictures, or evaluate without it (lpips_net: none)",
+            fix="use larger images, or evaluate without it (lpips_net: none)",
         )
     keep = np.ones((height, width), bool) if mask is None else mask != 0
     if not keep.any():
@@ -222,8 +223,8 @@ def _distance(
     image = np.where(keep[..., None], image, reference)
 
     unmasked = torch.from_numpy(keep.astype(np.float32))[None, None]
-    # Torch's convolutions round differently with the number of threads; a metric must not. So
-    # each picture has one thread of its own.
+    # torch's convolutions round differently with the number of threads, so each image is
+    # processed by a single thread.
     each = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
     with _one_thread(), each as pool:
         x, y = pool.map(lambda v: _taps(network, weights, v), (image, reference))
@@ -239,7 +240,7 @@ def _distance(
 def _taps(
     network: _Network, weights: list[tuple[torch.Tensor, torch.Tensor]], picture: NDArray[Any]
 ) -> list[torch.Tensor]:
-    """The layers that LPIPS reads, (1, C, h, w) each, feature vectors at length one."""
+    """Outputs of the layers that LPIPS compares, (1, C, h, w) each, normalised over channels."""
     import torch
     import torch.nn.functional as F
 

@@ -1,4 +1,4 @@
-"""How far estimated camera poses are from the truth."""
+"""Errors of estimated camera poses against ground truth."""
 
 from __future__ import annotations
 
@@ -18,19 +18,19 @@ AUC_DEGREES = (1.0, 5.0, 10.0)
 
 @dataclass(frozen=True)
 class PoseError:
-    """Pose errors after the similarity that best lays the estimated centres on the true ones.
+    """Pose errors after aligning the estimated centres to the true ones by a similarity.
 
     Attributes:
-        rotation_median_deg, rotation_mean_deg: degrees over the common images; None where there
-            is no common image.
-        centre_median, centre_mean: distances of the centres in the truth's unit; None below
-            three common images (a similarity of two centres leaves no residual).
+        rotation_median_deg, rotation_mean_deg: over the common images, degrees; None if there
+            is none.
+        centre_median, centre_mean: distances of the centres in units of the truth; None for
+            fewer than three common images (two centres align exactly).
         centre_relative_median: ``centre_median`` over ``radius``.
         radius: root mean square distance of the true common centres from their mean.
-        scale: truth units in one unit of the estimate.
-        auc: degrees -> area under the recall curve of relative pose errors of all pairs of the
-            truth's images, up to that many degrees, in 0..1; None below two true images.
-        num_common, num_truth: images in both, images in the truth.
+        scale: length of one unit of the estimate in units of the truth.
+        auc: threshold in degrees -> area under the recall curve of the relative pose errors of all
+            pairs of true images, up to the threshold, in [0, 1]; None for fewer than two images.
+        num_common, num_truth: number of images in both, and in the truth.
     """
 
     rotation_median_deg: float | None
@@ -46,14 +46,14 @@ class PoseError:
 
 
 def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
-    """Compare poses of the images that both know by name, or by name without suffix (developed
-    RAW files have another).
+    """Compare the poses of images with equal names, or equal names without suffix (which changes
+    when RAW files are developed).
 
     Images of the truth that the estimate lacks count as failures in the AUC, and in
     ``num_common`` against ``num_truth``; the other figures are over the common ones.
 
-    The rotation between the two worlds comes from the centres when they determine it, else (two
-    common images, or centres on a line) from the rotations themselves.
+    The rotation of the alignment is computed from the centres if they determine it, else (two
+    common images, or collinear centres) from the camera rotations.
     """
     posed, true = estimated.by_name(), truth.by_name()
     names = sorted(true)
@@ -97,8 +97,8 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
 def auc_of_errors(errors: Array, limit: float) -> float:
     """Area under the cumulative recall of ``errors`` from 0 to ``limit``, over ``limit``.
 
-    The trapezoid rule of SuperGlue's evaluation, as the Image Matching Challenge uses it;
-    failures have an infinite error.
+    By the trapezoid rule, as in the evaluation of SuperGlue and the Image Matching Challenge.
+    Failures have an infinite error.
     """
     errors = np.sort(np.asarray(errors, np.float64))
     if len(errors) == 0:
@@ -137,7 +137,8 @@ def _relative(poses: dict, first: str, rest: list[str]) -> tuple[Array, Array]:
 
 
 def _angle(first: Array, second: Array) -> Array:
-    """Degrees between two stacks of rotations. By atan2, exact for tiny angles too."""
+    """Angles in degrees between two stacks of rotations. By atan2, which is accurate for small
+    angles."""
     delta = first @ np.swapaxes(second, -1, -2)
     axis = np.stack(
         [
@@ -152,8 +153,8 @@ def _angle(first: Array, second: Array) -> Array:
 
 
 def _direction_angle(first: Array, second: Array) -> Array:
-    """Degrees between directions. A true translation of zero length has none: no error then;
-    an estimated one against a true direction is a failure."""
+    """Angles in degrees between estimated and true directions. A true translation of length zero
+    has no direction and hence no error; an estimated one of length zero is a failure (180)."""
     lengths = np.linalg.norm(first, axis=1), np.linalg.norm(second, axis=1)
     sine = np.linalg.norm(np.cross(first, second), axis=1)
     angle = np.degrees(np.arctan2(sine, (first * second).sum(1)))
@@ -162,6 +163,6 @@ def _direction_angle(first: Array, second: Array) -> Array:
 
 
 def _spread_dimensions(centres: Array) -> int:
-    """Dimensions that points spread over: 0 a point, 1 a line, 2 a plane, 3."""
+    """Dimension of the affine hull of points: 0 a point, 1 a line, 2 a plane, 3."""
     values = np.linalg.svd(centres - centres.mean(0), compute_uv=False)
     return int((values > 1e-6 * max(float(values[0]), 1e-300)).sum()) if values[0] > 0 else 0

@@ -1,10 +1,9 @@
-"""How bright photographs are against one another, from what they show at the sparse points.
+"""Relative exposure and white balance of photographs, from their colours at the sparse points.
 
-A point of the scene that several photographs see has one colour; what they record of it differs
-by each photograph's exposure and white balance. In display values, which go with light by a power
-law, both are a factor a channel. With y_op the logarithm of the value that observation o of point
-p has in view v, the model is y = c_p + g_v, solved by alternating robust means; the factors'
-geometric mean over the views is 1.
+The colours that different photographs record of one point differ by exposure and white balance. In
+display values, which follow a power law of light, both are one factor per channel. With y_pv the
+logarithm of the value of point p in view v, the model is y_pv = c_p + g_v. It is solved by
+alternating means over points and medians over views; the geometric mean of the gains is 1.
 """
 
 from __future__ import annotations
@@ -19,14 +18,15 @@ from pipeline.photos.load import load_view
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-#: Stops a unit of log2 in display values: sRGB's curve is near a power of 1 / 2.2.
+#: Stops per unit of log2 in display values: the sRGB curve is close to a power of 1 / 2.2.
 GAMMA = 2.2
-#: Display values nearer to black or white than this say nothing about exposure.
+#: Range of usable display values: darker and brighter ones are clipped or noisy.
 DARK, BRIGHT = 0.04, 0.96
 #: Views with fewer usable observations keep a gain of 1.
 MIN_OBSERVATIONS = 20
-#: Enough views to tell whether photographs differ.
+#: Number of views that are measured.
 SAMPLE = 64
+#: Number of alternations of the solver.
 ROUNDS = 20
 
 Array = NDArray[np.float64]
@@ -34,13 +34,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Exposures:
-    """Gains by view.
+    """Gains of views.
 
     Attributes:
-        gains: (V, 3) float64: what display values of the typical photograph are multiplied by to
-            give this view's, for red, green and blue.
-        spread: standard deviation over the views in stops, of the channel that varies most.
-        measured: views with observations enough.
+        gains: (V, 3) float64 RGB factors of a view's display values relative to the average view.
+        spread: standard deviation of the gains over the views, in stops; the largest of the
+            channels.
+        measured: number of views with at least ``MIN_OBSERVATIONS`` usable observations.
     """
 
     gains: Array
@@ -49,39 +49,42 @@ class Exposures:
 
 
 def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures:
-    """Gains of ``views`` from the colours at the points of ``model`` that they see.
+    """Estimate the gains of ``views`` from their colours at the observations of ``model``.
 
     Args:
-        views: with images of ``model`` by name; the model's observations in pixels of its cameras.
+        views: views of images of ``model``, matched by name. They may have another resolution than
+            the model's cameras.
     """
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
     numbers = {image.name: number for number, image in model.images.items()}
-    rows, levels, view_of = [], [], []
+    point_of, view_of, colours = [], [], []
     for index, view in enumerate(views):
         number = numbers[view.name]
-        here = np.flatnonzero(points.track_image_id == number)
-        if not len(here):
+        observations = np.flatnonzero(points.track_image_id == number)
+        if not len(observations):
             continue
         camera = model.cameras[model.images[number].camera_id]
         scale = np.array([view.width / camera.width, view.height / camera.height])
-        found, level = _log_colours(view, points.track_xy[here] * scale)
-        rows.append(owner[here[found]])
-        levels.append(level)
-        view_of.append(np.full(len(level), index))
-    if not rows:
+        usable, log_colours = _log_colours(view, points.track_xy[observations] * scale)
+        point_of.append(owner[observations[usable]])
+        view_of.append(np.full(len(log_colours), index))
+        colours.append(log_colours)
+    if not point_of:
         return Exposures(np.ones((len(views), 3)), 0.0, 0)
-    return _solve(np.concatenate(rows), np.concatenate(view_of), np.concatenate(levels), len(views))
+    point, view_index = np.concatenate(point_of), np.concatenate(view_of)
+    return _solve(point, view_index, np.concatenate(colours), len(views))
 
 
 def sample_views(views: Sequence[View]) -> list[View]:
-    """Up to ``SAMPLE`` of the views, evenly spread."""
+    """Up to ``SAMPLE`` views, evenly spaced."""
     picks = np.linspace(0, len(views) - 1, min(SAMPLE, len(views))).round().astype(int)
     return [views[i] for i in picks]
 
 
 def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
-    """Which of the pixels ``xy`` (M, 2) are usable, and log2 of their display values (K, 3)."""
+    """(M,) True for the usable ones of the pixels ``xy`` (M, 2), and (K, 3) log2 of their display
+    values."""
     pixels = load_view(view)
     usable = np.isfinite(xy).all(axis=1)
     column, row = np.nan_to_num(xy).astype(int).T
@@ -94,20 +97,27 @@ def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
 
 
 def _solve(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> Exposures:
-    """``point``, ``view`` (M,) and ``y`` (M, 3) of every observation."""
+    """Solve for the gains.
+
+    Args:
+        point, view: (M,) indices of the point and the view of each observation.
+        y: (M, 3) log2 display values.
+        count: number of views.
+    """
     _, point = np.unique(point, return_inverse=True)
-    seen = np.bincount(point)
-    several = seen[point] >= 2
+    observed = np.bincount(point)
+    several = observed[point] >= 2
     point, view, y = point[several], view[several], y[several]
     members = [np.flatnonzero(view == v) for v in range(count)]
-    weight = np.maximum(np.bincount(point, minlength=len(seen)), 1)
+    weight = np.maximum(np.bincount(point, minlength=len(observed)), 1)
     measured = np.array([len(m) >= MIN_OBSERVATIONS for m in members])
     gains = np.zeros((count, 3))
     if not measured.any():
         return Exposures(np.ones((count, 3)), 0.0, 0)
     for _ in range(ROUNDS):
-        own = y - gains[view]
-        colour = np.stack([np.bincount(point, own[:, c], len(seen)) for c in range(3)], axis=1)
+        normalized = y - gains[view]
+        sums = [np.bincount(point, normalized[:, c], len(observed)) for c in range(3)]
+        colour = np.stack(sums, axis=1)
         residual = y - (colour / weight[:, None])[point]
         for v in np.flatnonzero(measured):
             gains[v] = np.median(residual[members[v]], axis=0)

@@ -1,4 +1,4 @@
-"""Names of pictures that are written anew in another format."""
+"""File names of images that are converted to another format."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from pathlib import PurePosixPath
 
 
 def rename(suffixes: Mapping[str, str]) -> dict[str, str]:
-    """New names, one each: the suffix is replaced, or appended where two would become the same.
+    """New, distinct names: the suffix is replaced, or appended if two names would become equal.
 
     Args:
-        suffixes: new suffix (".png") of every name; "" leaves a name as it is.
+        suffixes: name -> new suffix (".png"); "" for a name that does not change.
     """
-    short = {
+    replaced = {
         name: str(PurePosixPath(name).with_suffix(suffix)) if suffix else name
         for name, suffix in suffixes.items()
     }
-    count = Counter(short.values())
+    count = Counter(replaced.values())
     return {
-        name: short[name] if count[short[name]] == 1 or not suffix else name + suffix
+        name: replaced[name] if count[replaced[name]] == 1 or not suffix else name + suffix
         for name, suffix in suffixes.items()
     }

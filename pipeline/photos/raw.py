@@ -1,7 +1,8 @@
-"""RAW files to pictures, all views of a scene developed alike.
+"""Development of RAW files with the same settings for all photographs of a scene.
 
-LibRaw's defaults brighten every picture by its own histogram and balance it by its own guess:
-fine for one picture, poison for a scene. Here nothing is chosen per picture.
+LibRaw's defaults choose brightness and white balance for each image, which makes the photographs of
+a scene inconsistent. Here all photographs share the exposure, and photographs of one camera body
+share the white balance.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ DEMOSAIC = {
     "ahd": rawpy.DemosaicAlgorithm.AHD,
     "aahd": rawpy.DemosaicAlgorithm.AAHD,
 }
-SRGB_GAMMA = (2.4, 12.92)  # LibRaw's default is BT.709's
+SRGB_GAMMA = (2.4, 12.92)  # LibRaw's default is the curve of BT.709.
 FIX = "Copy the file from the camera again, or remove it from the folder."
 
 
 @dataclass(frozen=True)
 class DecodeReport:
-    """What became of the RAW files: the new manifest, and a warning for each left out."""
+    """The manifest with developed photographs, and a warning for each RAW file left out."""
 
     manifest: Manifest
     warnings: tuple[str, ...]
@@ -42,7 +43,13 @@ class DecodeReport:
 
 @dataclass(frozen=True)
 class _Balance:
-    """A body's identity (its colour matrix) and its white balances, green 1: (4,) float64."""
+    """White balances of a RAW file.
+
+    Attributes:
+        body: identifies the camera body (its colour matrix).
+        as_shot, daylight: (4,) float64 factors relative to green; ``as_shot`` is None if the file
+            has none.
+    """
 
     body: bytes
     as_shot: NDArray[np.float64] | None
@@ -52,41 +59,41 @@ class _Balance:
 def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> DecodeReport:
     """Develop the RAW files of ``manifest`` to ``out/images/<stem>.png`` and ``out/images.json``.
 
-    8-bit sRGB, or 16-bit linear light with sRGB's primaries. One exposure for all; one white
-    balance for all photographs of one body. The stored pixel grid is kept; sizes and focal
-    lengths in the new manifest are those of the PNGs. Photographs that are not RAW stay as
-    they are.
+    The PNGs are 8-bit sRGB, or 16-bit linear light with sRGB primaries (``config.linear``). All
+    photographs have the same exposure; photographs of one camera body have the same white balance.
+    EXIF orientation is not applied. The new manifest has the sizes and focal lengths of the PNGs.
+    Other photographs are unchanged.
 
     Raises:
-        UserError: not one RAW file could be read.
+        UserError: none of the RAW files could be read.
     """
     raws = [photo for photo in manifest.photos if photo.raw]
     names = rename({photo.name: ".png" if photo.raw else "" for photo in manifest.photos})
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         balances = dict(zip(raws, pool.map(_balance, raws), strict=True))
         warnings = [balance for balance in balances.values() if isinstance(balance, str)]
-        whole = {photo: b for photo, b in balances.items() if isinstance(b, _Balance)}
-        common = _common_balance(list(whole.values()), config)
+        readable = {photo: b for photo, b in balances.items() if isinstance(b, _Balance)}
+        common = _common_balance(list(readable.values()), config)
 
         def work(photo: Photo) -> Photo | str:
-            return _develop_one(photo, names[photo.name], common[whole[photo].body], config, out)
+            return _develop_one(photo, names[photo.name], common[readable[photo].body], config, out)
 
-        jobs = pool.map(work, whole)
+        jobs = pool.map(work, readable)
         results = dict(
-            zip(whole, track(jobs, "developing RAW", len(whole), "photographs"), strict=True)
+            zip(readable, track(jobs, "developing RAW", len(readable), "photographs"), strict=True)
         )
     warnings += [result for result in results.values() if isinstance(result, str)]
-    kept = {photo.name: result for photo, result in results.items() if isinstance(result, Photo)}
-    if raws and not kept:
+    new = {photo.name: result for photo, result in results.items() if isinstance(result, Photo)}
+    if raws and not new:
         raise UserError(
             f"none of the {len(raws)} RAW files could be read",
             file=Path(raws[0].path).parent,
             fix=FIX,
         )
     photos = [
-        kept[photo.name] if photo.raw else photo
+        new[photo.name] if photo.raw else photo
         for photo in manifest.photos
-        if not photo.raw or photo.name in kept
+        if not photo.raw or photo.name in new
     ]
     developed = Manifest(
         scene=manifest.scene,
@@ -98,7 +105,7 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
 
 
 def _balance(photo: Photo) -> _Balance | str:
-    """White balances of a RAW file, or the warning that says why there are none."""
+    """White balances of a RAW file, or a warning if it cannot be read."""
     try:
         with rawpy.imread(_bytes_of(photo)) as raw:
             body = np.asarray(raw.rgb_xyz_matrix).tobytes()
@@ -113,7 +120,8 @@ def _balance(photo: Photo) -> _Balance | str:
 
 
 def _common_balance(balances: list[_Balance], config: Decode) -> dict[bytes, list[float]]:
-    """One white balance for every body: the median as-shot one; daylight where none is told."""
+    """One white balance for each camera body: the median as-shot balance, or daylight if the files
+    have none or ``config`` selects it."""
     result = {}
     for body in {balance.body for balance in balances}:
         same = [balance for balance in balances if balance.body == body]
@@ -127,7 +135,7 @@ def _common_balance(balances: list[_Balance], config: Decode) -> dict[bytes, lis
 def _develop_one(
     photo: Photo, name: str, balance: list[float], config: Decode, out: Path
 ) -> Photo | str:
-    """The developed photograph, or the warning that says why there is none."""
+    """The developed photograph, or a warning if it cannot be read."""
     try:
         with rawpy.imread(_bytes_of(photo)) as raw:
             rgb = raw.postprocess(
@@ -145,7 +153,7 @@ def _develop_one(
         return _left_out(photo, error)
     path = out / "images" / name
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Encoded and written apart: cv2.imwrite is silent about a full disk.
+    # Encoded and written separately: cv2.imwrite does not report a full disk.
     _, data = cv2.imencode(".png", rgb[..., ::-1])
     path.write_bytes(data.tobytes())
     height, width = rgb.shape[:2]

@@ -1,4 +1,4 @@
-"""Pictures, masks and depth maps as pinhole cameras would have seen them."""
+"""Undistort images, masks and depth maps to pinhole cameras."""
 
 from __future__ import annotations
 
@@ -33,17 +33,19 @@ from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import view_size
 
-ROWS_AT_ONCE = 256
-# Sizes reached by rounding still have nearly the same shape.
+# Number of rows of the undistortion map that are computed at a time.
+BATCH_ROWS = 256
+# Largest relative difference of the aspect ratio between a photograph and its camera, which
+# differ by rounding.
 SHAPE_TOLERANCE = 0.02
-# A wide lens's border may lie at infinity: never see less than a fifth nor more than twice of
-# what a lens of the same focal length without distortion would. COLMAP's limits.
+# COLMAP's limits of the undistorted size relative to the size without distortion: the border of a
+# wide lens may be at infinity.
 MIN_SCALE, MAX_SCALE = 0.2, 2.0
 
 
 @dataclass(frozen=True)
 class UndistortReport:
-    """The new manifest, and what the user should know."""
+    """The manifest of the undistorted photographs, and warnings."""
 
     manifest: Manifest
     warnings: tuple[str, ...]
@@ -51,13 +53,14 @@ class UndistortReport:
 
 @dataclass(frozen=True)
 class _Lens:
-    """How pictures of one camera become pinhole pictures.
+    """Undistortion map of one camera.
 
     Attributes:
         target: the pinhole camera at the size that is written.
-        x, y: (height, width) float32 positions in the photograph, cv2's pixel coordinates;
-            None where nothing is to be moved.
-        valid: (height, width) bool, False where the photograph shows nothing; None if all do.
+        x, y: (height, width) float32 positions in the distorted image, in cv2's pixel coordinates;
+            None for a camera without distortion.
+        valid: (height, width) bool, False for pixels outside the distorted image; None if all are
+            inside.
     """
 
     target: Camera
@@ -65,7 +68,8 @@ class _Lens:
     y: NDArray[np.float32] | None
     valid: NDArray[np.bool_] | None
 
-    def move(self, picture: Picture, interpolation: int, border: int) -> Picture:
+    def remap(self, picture: Picture, interpolation: int, border: int) -> Picture:
+        """Undistort an image at full resolution."""
         if self.x is None or self.y is None:
             return picture
         return np.asarray(cv2.remap(picture, self.x, self.y, interpolation, borderMode=border))
@@ -80,15 +84,15 @@ def undistort(
     *,
     threads: int,
 ) -> UndistortReport:
-    """Undistort every registered photograph at full resolution, then reduce it by area.
+    """Undistort every registered photograph at full resolution, then downscale it by area.
 
-    Writes ``out/images/<stem>.png`` (or .jpg, without alpha and where ``jpeg_quality`` asks for
-    it), ``out/masks/`` where there are masks or blank pixels, ``out/depths/``, ``out/sparse/0``
-    (poses and points unchanged, observations moved; those outside the picture become NaN) and
-    ``out/images.json``.
+    Writes ``out/images/<stem>.png`` (.jpg for photographs without alpha if ``jpeg_quality`` is
+    set), ``out/masks/`` for masks and blank pixels, ``out/depths/``, ``out/images.json`` and
+    ``out/sparse/0``: poses and points are unchanged, observations are undistorted, and those
+    outside the image become NaN.
 
     Raises:
-        UserError: a photograph cannot be read, or is not of its camera's shape.
+        UserError: a photograph cannot be read, or its aspect ratio differs from its camera's.
     """
     registered = model.by_name()
     photos = [photo for photo in manifest.photos if photo.name in registered]
@@ -105,7 +109,7 @@ def undistort(
     done: list[Photo] = []
     warnings: list[str] = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        # One camera after the other: its maps are as large as a picture.
+        # One camera at a time: its maps are as large as an image.
         for number, (key, group) in enumerate(sorted(groups.items()), start=1):
             source = _camera_of_size(model.cameras[key[0]], group[0])
             lens = _lens(source, config.blank_pixels, views.max_long_side_px)
@@ -113,8 +117,8 @@ def undistort(
             if lens.valid is not None:
                 share = 100 * (1 - float(lens.valid.mean()))
                 warnings.append(
-                    f"camera {key[0]} ({source.model}): {share:.1f}% of the undistorted pictures "
-                    f"is blank and masked out"
+                    f"camera {key[0]} ({source.model}): {share:.1f}% of the undistorted images "
+                    f"is blank and masked"
                 )
 
             def work(photo: Photo, lens: _Lens = lens) -> Photo:
@@ -125,7 +129,7 @@ def undistort(
                 done.append(new)
                 progress.advance()
 
-    write_model(out / "sparse" / "0", _moved(model, cameras, camera_of, names))
+    write_model(out / "sparse" / "0", _undistorted_model(model, cameras, camera_of, names))
     undistorted = Manifest(
         scene=manifest.scene,
         photos=tuple(sorted(done, key=lambda photo: photo.name)),
@@ -136,12 +140,12 @@ def undistort(
 
 
 def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
-    """The PINHOLE camera that sees what ``camera`` sees, with its focal lengths.
+    """The PINHOLE camera of the undistorted images of ``camera``, with its focal lengths.
 
-    With ``blank_pixels`` 0 it is cropped to the rectangle inside the undistorted border, with 1
-    it holds the whole border; between them, between the two. As COLMAP's undistorter does, but
-    the principal point stays where it is, so that both sides of an off-centre lens are cropped
-    by what they need.
+    Args:
+        blank_pixels: 0 crops to the rectangle inside the undistorted image border, 1 contains the
+            whole border; values between interpolate. As COLMAP's undistorter, except that each side
+            is cropped by itself around the principal point.
     """
     fx, fy, cx, cy = camera.pinhole
     width, height = float(camera.width), float(camera.height)
@@ -152,15 +156,15 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
         (np.stack([x, np.zeros_like(x)], -1), 1, -fy, cy),
         (np.stack([x, np.full_like(x, height)], -1), 1, fy, height - cy),
     )
-    reaches = []  # pixels from the principal point to the left, right, top and bottom
-    for border, axis, focal, room in sides:
-        reach = unproject(camera, border)[:, axis] * focal
-        finite = reach[np.isfinite(reach)]
+    extents = []  # pixels from the principal point to the left, right, top and bottom
+    for border, axis, focal, distorted in sides:
+        undistorted = unproject(camera, border)[:, axis] * focal
+        finite = undistorted[np.isfinite(undistorted)]
         inner = finite.min(initial=np.inf)
-        outer = finite.max(initial=-np.inf) if len(finite) == len(reach) else np.inf
-        inner, outer = np.clip((inner, outer), MIN_SCALE * room, MAX_SCALE * room)
-        reaches.append(outer * blank_pixels + inner * (1 - blank_pixels))
-    left, right, top, bottom = reaches
+        outer = finite.max(initial=-np.inf) if len(finite) == len(undistorted) else np.inf
+        inner, outer = np.clip((inner, outer), MIN_SCALE * distorted, MAX_SCALE * distorted)
+        extents.append(outer * blank_pixels + inner * (1 - blank_pixels))
+    left, right, top, bottom = extents
     x0, x1 = int(np.ceil(cx - left - 1e-6)), int(np.floor(cx + right + 1e-6))
     y0, y1 = int(np.ceil(cy - top - 1e-6)), int(np.floor(cy + bottom + 1e-6))
     params = np.array([fx, fy, cx - x0, cy - y0])
@@ -168,13 +172,13 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
 
 
 def _camera_of_size(camera: Camera, photo: Photo) -> Camera:
-    """The camera at the photograph's size; given poses may refer to larger pictures."""
+    """The camera rescaled to the photograph's size: known poses may refer to larger images."""
     ratio = photo.width * camera.height / (photo.height * camera.width)
     if abs(ratio - 1) > SHAPE_TOLERANCE:
         raise UserError(
             f"is {photo.width}x{photo.height} pixels, its camera {camera.width}x{camera.height}",
             file=photo.path,
-            fix="Use the photographs the poses were made for, neither turned nor cropped.",
+            fix="Use the photographs that the poses belong to, neither rotated nor cropped.",
         )
     if (photo.width, photo.height) == (camera.width, camera.height):
         return camera
@@ -182,11 +186,12 @@ def _camera_of_size(camera: Camera, photo: Photo) -> Camera:
 
 
 def _lens(source: Camera, blank_pixels: float, max_long_side: int) -> _Lens:
+    """Undistortion map of ``source``, to an image of at most ``max_long_side`` pixels."""
     if source.is_pinhole:
         size = (source.width, source.height)
         fx, fy, cx, cy = source.pinhole
-        plain = Camera("PINHOLE", *size, np.array([fx, fy, cx, cy]))
-        return _Lens(plain.resized(*view_size(*size, max_long_side)), None, None, None)
+        same = Camera("PINHOLE", *size, np.array([fx, fy, cx, cy]))
+        return _Lens(same.resized(*view_size(*size, max_long_side)), None, None, None)
     pinhole = pinhole_camera(source, blank_pixels)
     size = (pinhole.width, pinhole.height)
     fx, fy, cx, cy = pinhole.pinhole
@@ -194,8 +199,8 @@ def _lens(source: Camera, blank_pixels: float, max_long_side: int) -> _Lens:
     valid = np.empty((size[1], size[0]), bool)
     fold = fold_radius(source)
     columns = (np.arange(size[0]) + 0.5 - cx) / fx
-    for start in range(0, size[1], ROWS_AT_ONCE):
-        part = slice(start, min(start + ROWS_AT_ONCE, size[1]))
+    for start in range(0, size[1], BATCH_ROWS):
+        part = slice(start, min(start + BATCH_ROWS, size[1]))
         rows = (np.arange(part.start, part.stop) + 0.5 - cy) / fy
         points = np.stack(np.meshgrid(columns, rows), axis=-1)
         xy = project(source, points)
@@ -214,7 +219,7 @@ def _write(
     views: schema.Views,
     out: Path,
 ) -> Photo:
-    """Write one photograph and what belongs to it; its new entry in the manifest."""
+    """Write one photograph with its mask and depth map; returns its new entry in the manifest."""
     width, height = lens.target.width, lens.target.height
     picture, alpha = _picture(photo, lens)
     path = out / "images" / name
@@ -253,7 +258,7 @@ def _write(
 
 
 def _picture(photo: Photo, lens: _Lens) -> tuple[Picture, NDArray[np.uint8] | None]:
-    """Undistorted and reduced: (H, W, 3) colours (16 bits stay) and (H, W) alpha."""
+    """Undistorted and downscaled (H, W, 3) colours, uint8 or uint16, and (H, W) alpha."""
     size = (lens.target.width, lens.target.height)
     alpha: NDArray[np.uint8] | None = None
     if photo.alpha:
@@ -262,46 +267,47 @@ def _picture(photo: Photo, lens: _Lens) -> tuple[Picture, NDArray[np.uint8] | No
         picture = load_rgb(photo.path, photo.digest)
     _check_size(picture, photo, photo.path)
     if lens.x is None or alpha is None:
-        moved = lens.move(picture, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
-        moved_alpha = alpha
+        new = lens.remap(picture, cv2.INTER_CUBIC, cv2.BORDER_REPLICATE)
+        new_alpha = alpha
     else:
-        # Weighted by alpha, so that hidden colours never bleed in.
+        # Colours are weighted by alpha: transparent pixels have no influence.
         weight = alpha.astype(np.float32)
-        moved_weight = lens.move(weight, cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
-        light = lens.move(picture * weight[..., None], cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
-        colour = light / np.maximum(moved_weight, 1e-6)[..., None]
-        moved = np.rint(colour.clip(0, 255)).astype(np.uint8)
-        moved_alpha = np.rint(moved_weight).astype(np.uint8)
+        new_weight = lens.remap(weight, cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
+        weighted = lens.remap(picture * weight[..., None], cv2.INTER_LINEAR, cv2.BORDER_CONSTANT)
+        colour = weighted / np.maximum(new_weight, 1e-6)[..., None]
+        new = np.rint(colour.clip(0, 255)).astype(np.uint8)
+        new_alpha = np.rint(new_weight).astype(np.uint8)
     if lens.valid is not None:
-        moved = moved * lens.valid[..., None]
-        moved_alpha = None if moved_alpha is None else moved_alpha * lens.valid
-    if moved_alpha is None:
-        return resize_area(moved, *size), None
-    return resize_rgba(moved, moved_alpha, *size)
+        new = new * lens.valid[..., None]
+        new_alpha = None if new_alpha is None else new_alpha * lens.valid
+    if new_alpha is None:
+        return resize_area(new, *size), None
+    return resize_rgba(new, new_alpha, *size)
 
 
 def _mask(photo: Photo, lens: _Lens, views: schema.Views) -> NDArray[np.bool_] | None:
-    """What counts in the undistorted picture; None where everything does."""
+    """(H, W) mask of the undistorted image, True for valid pixels; None if all are valid."""
     size = (lens.target.width, lens.target.height)
     mask = None
     if photo.mask is not None and views.masks == "auto":
         full = load_mask(photo.mask, photo.mask_digest).astype(np.uint8)
         full = _nearest(full, photo.width, photo.height)
-        moved = lens.move(full, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
-        mask = resize_mask(moved > 0, *size)
+        new = lens.remap(full, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+        mask = resize_mask(new > 0, *size)
     if lens.valid is not None:
-        # A pixel that is blank in part shows a colour that is not the scene's.
-        seen = resize_area(lens.valid.astype(np.float32), *size) > 0.999
-        mask = seen if mask is None else mask & seen
+        # Partly blank pixels have a wrong colour.
+        valid = resize_area(lens.valid.astype(np.float32), *size) > 0.999
+        mask = valid if mask is None else mask & valid
     return None if mask is None else np.asarray(mask)
 
 
 def _write_depth(photo: Photo, lens: _Lens, path: Path) -> None:
-    """Depth along z is the pinhole camera's too; values are moved, never mixed."""
+    """Write the undistorted depth map, by nearest neighbour. Undistortion does not change depth
+    along z."""
     assert photo.depth is not None
     depth = read_depth(photo.depth, photo.depth_digest)
     depth = _nearest(depth, photo.width, photo.height)
-    depth = lens.move(depth, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
+    depth = lens.remap(depth, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)
     depth = _nearest(depth, lens.target.width, lens.target.height)
     if path.suffix != ".npy":
         return _encode(path, depth)
@@ -316,12 +322,12 @@ def _nearest(picture: Picture, width: int, height: int) -> Picture:
 
 
 def _bgr(rgb: Picture) -> Picture:
-    """By cv2: its encoders take several times as long to read a reversed view of an array."""
+    """Convert by cv2: its encoders are several times slower for a reversed view of an array."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 
 def _encode(path: Path, picture: Picture, options: list[int] | None = None) -> None:
-    """Encoded and written apart: cv2.imwrite is silent about a full disk."""
+    """Encode and write separately: cv2.imwrite does not report a full disk."""
     path.parent.mkdir(parents=True, exist_ok=True)
     _, data = cv2.imencode(path.suffix, picture, options or [])
     path.write_bytes(data.tobytes())
@@ -331,36 +337,36 @@ def _check_size(picture: Picture, photo: Photo, path: str) -> None:
     if picture.shape[1::-1] != (photo.width, photo.height):
         raise UserError(
             f"is {picture.shape[1]}x{picture.shape[0]} pixels, "
-            f"was {photo.width}x{photo.height} when the scene was looked at",
+            f"was {photo.width}x{photo.height} when the scene was inspected",
             file=path,
-            fix="Let the photographs alone while the program runs, and start it again.",
+            fix="Do not change photographs while the program runs; start it again.",
         )
 
 
-def _moved(
+def _undistorted_model(
     model: Reconstruction,
     cameras: dict[int, Camera],
     camera_of: dict[str, int],
     names: dict[str, str],
 ) -> Reconstruction:
-    """The model with pinhole cameras, new names, and observations where they are now."""
+    """The model with pinhole cameras, new names and undistorted observations."""
     images = {
         number: PosedImage(names[i.name], camera_of[i.name], i.rotation, i.translation)
         for number, i in model.images.items()
         if i.name in names
     }
     points = model.points
-    kept = np.isin(points.track_image_id, list(images))
-    owner = np.repeat(np.arange(len(points)), points.track_length)[kept]
-    ids, xy = points.track_image_id[kept], points.track_xy[kept].copy()
+    registered = np.isin(points.track_image_id, list(images))
+    owner = np.repeat(np.arange(len(points)), points.track_length)[registered]
+    ids, xy = points.track_image_id[registered], points.track_xy[registered].copy()
     order = np.argsort(ids, kind="stable")
     for number, image in images.items():
-        here = order[slice(*np.searchsorted(ids, [number, number + 1], sorter=order))]
+        own = order[slice(*np.searchsorted(ids, [number, number + 1], sorter=order))]
         target = cameras[image.camera_id]
-        new = project(target, unproject(model.cameras[model.images[number].camera_id], xy[here]))
+        new = project(target, unproject(model.cameras[model.images[number].camera_id], xy[own]))
         outside = np.any(~((new >= 0) & (new <= (target.width, target.height))), axis=1)
         new[outside] = np.nan
-        xy[here] = new
+        xy[own] = new
     starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=len(points)))])
-    moved = Points(points.xyz, points.rgb, points.error, starts.astype(np.int64), ids, xy)
-    return Reconstruction(cameras, images, moved)
+    undistorted = Points(points.xyz, points.rgb, points.error, starts.astype(np.int64), ids, xy)
+    return Reconstruction(cameras, images, undistorted)

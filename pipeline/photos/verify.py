@@ -1,4 +1,4 @@
-"""The thorough look: every photograph decoded once, before anything is built on it."""
+"""Check that every photograph can be decoded."""
 
 from __future__ import annotations
 
@@ -20,20 +20,20 @@ from pipeline.scene.manifest import Manifest, Photo
 def verify_photos(
     manifest: Manifest, *, threads: int, min_photos: int = 1
 ) -> tuple[Manifest, list[str]]:
-    """Decode all photographs and leave the broken ones out.
+    """Decode all photographs and remove the damaged ones from the manifest.
 
     Args:
-        manifest: the photographs to look at.
-        threads: how many at once; does not change the result.
-        min_photos: fewer good ones than this is an error.
+        manifest: the photographs to decode.
+        threads: number of threads; does not change the result.
+        min_photos: smallest number of photographs that can be decoded.
 
     Returns:
-        The manifest without them (its warnings extended), and one warning each, one more where
-        photographs are copies of others.
+        The manifest without the damaged photographs and with the new warnings, and these warnings:
+        one for each damaged photograph, and one if photographs are copies of others.
 
     Raises:
-        UserError: fewer than ``min_photos`` are whole; every broken one is named. Or one has
-            changed since it was scanned.
+        UserError: fewer than ``min_photos`` can be decoded (the message names the damaged ones), or
+            a photograph has changed since it was scanned.
     """
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         results = pool.map(_fault_of, manifest.photos)
@@ -51,7 +51,7 @@ def verify_photos(
             f"only {len(good)} of {len(faults)} photographs can be decoded, at least "
             f"{min_photos} are needed" + "".join(f"\n  {line}" for line in warnings),
             file=Path(manifest.photos[0].path).parent if manifest.photos else None,
-            fix="replace the broken files by whole ones, or lower inspect.min_images",
+            fix="replace the damaged files, or lower inspect.min_images",
         )
     warnings += _copies(good)
     update = {"photos": good, "warnings": (*manifest.warnings, *warnings)}
@@ -59,7 +59,7 @@ def verify_photos(
 
 
 def _copies(photos: Sequence[Photo]) -> list[str]:
-    """A warning where files are the same to the byte."""
+    """A warning if files are identical."""
     first: dict[str, str] = {}
     pairs = [
         f"{photo.name} = {first[photo.digest]}"
@@ -70,20 +70,20 @@ def _copies(photos: Sequence[Photo]) -> list[str]:
         return []
     some = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
     return [
-        f"copies of other photographs: {len(pairs)} ({some}): one that is held out while "
-        "training sees its copy makes the measures too good; remove the copies"
+        f"copies of other photographs: {len(pairs)} ({some}): a test view with a copy among the "
+        "training views makes the metrics too good; remove the copies"
     ]
 
 
 def _fault_of(photo: Photo) -> str | None:
-    """What keeps the photograph from being decoded; None if nothing does."""
+    """Why the photograph cannot be decoded; None if it can."""
     decode: Callable[[Photo], None] = _decode_raw if photo.raw else _decode
     try:
         decode(photo)
     except (MemoryError, ChangedFileError):
         raise
-    # PIL's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error, ...; LibRaw
-    # its own. Whatever it is, the file does not decode.
+    # PIL's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and others;
+    # LibRaw has its own exceptions.
     except Exception as error:
         text = str(error).strip() or type(error).__name__
         return f"cannot be decoded ({text})"
@@ -98,7 +98,7 @@ def _decode(photo: Photo) -> None:
 
 
 def _decode_raw(photo: Photo) -> None:
-    import rawpy  # Only scenes with RAW files pay for it.
+    import rawpy  # Imported only if the scene has RAW files.
 
     with rawpy.imread(io.BytesIO(read_recorded(photo.path, photo.digest))) as raw:
         raw.unpack()

@@ -1,4 +1,4 @@
-"""What a batch of runs gave, as rows, as means, and beside what others published."""
+"""Results of a batch of runs: rows, means over seeds and scenes, and published figures."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from pipeline.plan.protocols import benchmark_scene
 
 PUBLISHED = Path(__file__).with_name("published.json")
 
-# Facts of a run that a mean over seeds and scenes makes sense of.
+# Fields of a run that are averaged over seeds and scenes.
 MEASURES = (
     "psnr",
     "ssim",
@@ -31,22 +31,22 @@ MEASURES = (
     "peak_rss_mb",
 )
 _TIMES = ("wall_s", "cpu_s", "peak_rss_mb")
-# What a time means nothing without (``run.json``).
+# Fields of ``run.json`` that describe the machine and code of a timing.
 MACHINE = ("host", "processor", "cores", "threads", "load_average", "commit")
 
 
 @dataclass(frozen=True)
 class Result:
-    """How one run of a batch ended.
+    """Outcome of one run of a batch.
 
     Attributes:
-        run: which.
-        status: "left out" is a folder that is no scene; "not run" was never reached.
-        stage: which one failed; empty otherwise.
-        message: why, for whatever is not ok.
-        metrics: the content of its ``metrics.json`` where status is ok, else empty.
-        size_mb: size of the exported Gaussians (PLY) in MB (10^6 bytes); None where there are none.
-        machine: of its training: ``MACHINE``.
+        run: the run.
+        status: "left out": the folder is no scene; "not run": the run was not started.
+        stage: name of the failed stage; empty otherwise.
+        message: reason, if status is not "ok".
+        metrics: content of ``metrics.json`` if status is "ok", else empty.
+        size_mb: size of the exported Gaussians (PLY) in MB (10^6 bytes); None if there are none.
+        machine: fields ``MACHINE`` of its training.
     """
 
     run: Run
@@ -64,7 +64,7 @@ class Result:
 
 @dataclass(frozen=True)
 class Spread:
-    """A measure over seeds, or over scenes: mean, smallest, largest, and how many."""
+    """Mean, minimum, maximum and number of values of a measure over seeds or scenes."""
 
     mean: float
     low: float
@@ -73,8 +73,8 @@ class Spread:
 
 
 def row(result: Result, stages: Sequence[str] = ()) -> dict[str, Any]:
-    """One line of ``benchmark.csv``: the run, how it ended, quality, and the time and memory of
-    each of ``stages`` (empty where it was skipped). Units stand in the names."""
+    """One line of ``benchmark.csv``: the run, its status, quality, and the time and memory of
+    each of ``stages`` (empty if skipped). Names contain the units."""
     m = result.metrics
     protocol = m.get("protocol") or {}
     pose = m.get("pose_error") or {}
@@ -116,7 +116,7 @@ def _sum(values: Iterable[float]) -> float | None:
 
 
 def as_csv(results: Sequence[Result], stages: Sequence[str] = ()) -> str:
-    """``benchmark.csv``: a header and a line a run, with columns for these stages."""
+    """``benchmark.csv``: a header and one line per run, with columns for these stages."""
     text = io.StringIO()
     writer = csv.DictWriter(text, list(row(results[0], stages)), lineterminator="\n")
     writer.writeheader()
@@ -126,7 +126,7 @@ def as_csv(results: Sequence[Result], stages: Sequence[str] = ()) -> str:
 
 def as_json(results: Sequence[Result], stages: Sequence[str] = ()) -> dict[str, Any]:
     """``benchmark.json``: the rows, the means over seeds by scene and configuration, the means
-    over the scenes that every configuration finished, and what others published."""
+    over the scenes that every configuration finished, and published figures."""
     means = {
         scene: {config: _plain(spreads) for config, spreads in by_config.items()}
         for scene, by_config in by_scene(results).items()
@@ -163,8 +163,8 @@ def by_scene(results: Sequence[Result]) -> dict[str, dict[str, dict[str, Spread]
 
 
 def by_config(results: Sequence[Result]) -> tuple[list[str], dict[str, dict[str, Spread]]]:
-    """The scenes that every configuration finished (one that finished none is not asked), and
-    configuration -> measure -> its spread over these scenes: means over others would not compare.
+    """The scenes that every configuration finished (configurations without a finished scene are
+    ignored), and configuration -> measure -> its spread over these scenes.
     """
     configs = list(dict.fromkeys(result.run.config for result in results if result.ok))
     means = by_scene(results)
@@ -180,7 +180,7 @@ def by_config(results: Sequence[Result]) -> tuple[list[str], dict[str, dict[str,
 
 
 def _spreads(rows: Sequence[Mapping[str, Any]]) -> dict[str, Spread]:
-    """Of each measure that all rows know."""
+    """The spread of each measure that all rows contain."""
     spreads = {}
     for name in MEASURES:
         values = [line[name] for line in rows if line.get(name) is not None]
@@ -190,15 +190,15 @@ def _spreads(rows: Sequence[Mapping[str, Any]]) -> dict[str, Spread]:
 
 
 def photographs(results: Sequence[Result], scene: str) -> int | None:
-    """How many photographs the scene has."""
+    """The number of photographs of a scene; None without a finished run."""
     return next((r.metrics["total_images"] for r in results if r.ok and r.run.scene == scene), None)
 
 
 def published_for(scene: str, count: int | None) -> list[dict[str, Any]]:
-    """What others published for the scene, by its folder's name and number of photographs.
+    """Published figures for a scene, by the name of its folder and its number of photographs.
 
     Returns:
-        A dict each: ``method``, ``dataset``, ``source``, ``protocol`` and the measures given.
+        One dict per method: ``method``, ``dataset``, ``source``, ``protocol`` and its measures.
     """
     data = json.loads(PUBLISHED.read_text())
     name = benchmark_scene(scene)

@@ -1,5 +1,7 @@
-"""Line charts and histograms as SVG inside HTML: they take their colours from the page, so that
-they follow its light and dark dress, and the same data gives the same bytes."""
+"""Line charts and histograms as SVG elements for HTML pages.
+
+Colours are CSS variables of the page (light and dark theme). The same data gives the same bytes.
+"""
 
 from __future__ import annotations
 
@@ -20,7 +22,7 @@ Label = Callable[[float], str]
 
 
 def short(value: float) -> str:
-    """A tick's label: 1500 -> 1.5k, 0.25 -> 0.25."""
+    """Label of a tick: 1500 -> 1.5k, 0.25 -> 0.25."""
     for limit, unit in ((1e6, "M"), (1e3, "k")):
         if abs(value) >= limit:
             return f"{value / limit:.4g}{unit}"
@@ -28,7 +30,7 @@ def short(value: float) -> str:
 
 
 def clock(seconds: float) -> str:
-    """A tick's label for a time: 90 -> 1:30, 5400 -> 1:30:00."""
+    """Label of a tick on a time axis: 90 -> 1:30, 5400 -> 1:30:00."""
     whole = round(seconds)
     if whole >= 3600:
         return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
@@ -56,7 +58,7 @@ def time_ticks(low: float, high: float, most: int = 6) -> list[float]:
 
 
 def log_ticks(low: float, high: float) -> list[float]:
-    """1, 2 and 5 of every decade (only the decades over more than three of them)."""
+    """1, 2 and 5 of every decade; only powers of ten over more than three decades."""
     first, last = math.floor(math.log10(low)), math.ceil(math.log10(high))
     digits = (1, 2, 5) if last - first <= 3 else (1,)
     ticks = [d * 10.0**e for e in range(first, last + 1) for d in digits]
@@ -77,13 +79,13 @@ def line_chart(
     timed: bool = False,
     log: bool = False,
 ) -> str:
-    """A line through the points, each with its values as a tooltip.
+    """A line chart, with the values of each point as a tooltip.
 
     Args:
         xs, ys: finite, at least one point.
-        y_label: how a y value reads in a tooltip.
-        timed: x is seconds.
-        log: logarithmic y axis, where all values are positive.
+        y_label: formats a y value for a tooltip.
+        timed: x is a time in seconds.
+        log: logarithmic y axis; ignored unless all values are positive.
     """
     log = log and min(ys) > 0
     x_low, x_high = _range(min(xs), max(xs), pad=0.0)
@@ -101,7 +103,7 @@ def line_chart(
     path = " ".join(f"{x:.1f},{y:.1f}" for x, y in spots)
     base = _HEIGHT - _BOTTOM
     area = f"{spots[0][0]:.1f},{base} {path} {spots[-1][0]:.1f},{base}"
-    dots = "".join(
+    points = "".join(
         f'<circle class="dot" cx="{sx:.1f}" cy="{sy:.1f}" r="5"><title>'
         f"{escape(x_title)} {escape(clock(x) if timed else f'{x:,.0f}')}: {escape(y_label(y))}"
         "</title></circle>"
@@ -109,18 +111,18 @@ def line_chart(
     )
     marks = f'<polygon class="area" points="{area}"/><polyline class="line" points="{path}"/>'
     axes = _axes([(across(t), x_label(t)) for t in x_ticks], [(up(t), short(t)) for t in y_ticks])
-    return _svg(title, x_title, axes + marks + dots)
+    return _svg(title, x_title, axes + marks + points)
 
 
 @dataclass(frozen=True)
-class Dot:
-    """A point of a trade-off chart: what it cost, what it left wrong, and what it is.
+class ChartPoint:
+    """A point of a trade-off chart.
 
     Attributes:
         seconds, error: finite and positive.
-        name: written beside it; empty for a small dot that only has its tooltip.
-        tip: the tooltip.
-        colour: which of the page's colours; the same number, the same colour.
+        name: label; empty for a small point without a label.
+        tip: tooltip.
+        colour: index of a colour of the page.
     """
 
     seconds: float
@@ -133,15 +135,17 @@ class Dot:
 _COLOURS = ("--accent", "--test", "--train", "--bad", "--good")
 
 
-def trade_off_chart(dots: Sequence[Dot], *, title: str, x_title: str, y_label: Label) -> str:
-    """Time against error, both logarithmic, and the Pareto front of the named dots: a line through
-    those that no other one beats in both.
+def trade_off_chart(
+    points: Sequence[ChartPoint], *, title: str, x_title: str, y_label: Label
+) -> str:
+    """Error against time, both logarithmic, with a line through the Pareto front of the named
+    points.
 
     Args:
-        dots: at least one.
-        y_label: how an error reads at the axis.
+        points: at least one.
+        y_label: formats an error for the axis.
     """
-    xs, ys = [d.seconds for d in dots], [d.error for d in dots]
+    xs, ys = [d.seconds for d in points], [d.error for d in points]
     x_low, x_high, y_low, y_high = min(xs) / 1.3, max(xs) * 1.3, min(ys) / 1.12, max(ys) * 1.12
     across = _scale(x_low, x_high, _LEFT, _WIDTH - _RIGHT, log=True)
     up = _scale(y_low, y_high, _HEIGHT - _BOTTOM, _TOP, log=True)
@@ -156,11 +160,11 @@ def trade_off_chart(dots: Sequence[Dot], *, title: str, x_title: str, y_label: L
     axes = _axes(
         [(across(t), clock(t)) for t in x_ticks[::step]], [(up(t), y_label(t)) for t in y_ticks]
     )
-    front = pareto_front([d for d in dots if d.name])
+    front = pareto_front([d for d in points if d.name])
     line = " ".join(f"{across(d.seconds):.1f},{up(d.error):.1f}" for d in front)
     marks = f'<polyline class="front" points="{line}"/>'
     taken: list[tuple[float, float]] = []
-    for dot in sorted(dots, key=lambda d: (bool(d.name), d.error)):
+    for dot in sorted(points, key=lambda d: (bool(d.name), d.error)):
         x, y = across(dot.seconds), up(dot.error)
         paint = f'style="fill: var({_COLOURS[dot.colour % len(_COLOURS)]})"'
         size, faint = (5.5, "") if dot.name else (3, ' opacity=".45"')
@@ -185,10 +189,10 @@ def _free(x: float, y: float, taken: Sequence[tuple[float, float]]) -> bool:
     return all(abs(x - other) > 90 or abs(y - height) > 11 for other, height in taken)
 
 
-def pareto_front(dots: Sequence[Dot]) -> list[Dot]:
-    """The dots that no other one beats in time and error, the quickest first."""
-    front: list[Dot] = []
-    for dot in sorted(dots, key=lambda d: (d.seconds, d.error)):
+def pareto_front(points: Sequence[ChartPoint]) -> list[ChartPoint]:
+    """The points that no other one beats in time and error, the quickest first."""
+    front: list[ChartPoint] = []
+    for dot in sorted(points, key=lambda d: (d.seconds, d.error)):
         if not front or dot.error < front[-1].error:
             front.append(dot)
     return front
@@ -230,7 +234,9 @@ def histogram(
             f'height="{_HEIGHT - _BOTTOM - up(n):.1f}"><title>{name}: {n:,}</title></rect>'
         )
     ticks = linear_ticks(float(edges[0]), float(edges[-1]))
-    half = 0.5 if whole and edges[1] - edges[0] == 1 else 0.0  # a number names its bar's middle
+    half = (
+        0.5 if whole and edges[1] - edges[0] == 1 else 0.0
+    )  # the label of an integer is at the middle of its bar
     ticks = [t for t in ticks if t == round(t) and t < edges[-1]] if whole else ticks
     median = float(np.median(values))
     at = across(min(median + half, float(edges[-1])))
@@ -245,7 +251,7 @@ def histogram(
 
 
 def _range(low: float, high: float, pad: float) -> tuple[float, float]:
-    """With some room; never empty."""
+    """The range extended by ``pad`` on both sides; never empty."""
     span = high - low
     if span <= 1e-9 * max(abs(low), abs(high), 1e-9):
         span = max(abs(high), 1.0)

@@ -1,4 +1,4 @@
-"""``metrics.json``: what a scene's stages recorded, put together."""
+"""Collects ``metrics.json`` from the records of a scene's stages."""
 
 from __future__ import annotations
 
@@ -22,12 +22,12 @@ def collect_metrics(
     """Gather a scene's metrics.
 
     Args:
-        scene: its name.
+        scene: name of the scene.
         plan: ``plan.json``.
-        folder: ``results/<scene>``, with the stages' folders.
+        folder: ``results/<scene>``, which contains the folders of the stages.
         evaluation: ``evaluate/evaluation.json``.
-        seed: the run's.
-        versions: of the packages whose results count.
+        seed: of the run.
+        versions: of the packages that affect results.
 
     Raises:
         UserError: a stage's record is missing or damaged.

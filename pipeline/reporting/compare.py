@@ -1,11 +1,11 @@
-"""The runs of a batch, what its configurations are worth, or how well a second batch repeats it.
+"""Tables of the runs of a batch, of differences between its configurations, or between two batches.
 
     splatmake compare results/benchmark.json --each
     splatmake compare results/benchmark.json --base balanced
     splatmake compare first/benchmark.json results/benchmark.json
 
-prints the table as Markdown. ``config/ablations.yaml`` and ``config/skipping.yaml`` make batches
-that are worth comparing.
+prints the table as Markdown. ``config/ablations.yaml`` and ``config/skipping.yaml`` define batches
+for such comparisons.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pipeline.config.runs import Run
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
 
-# The same run on the same machine gives these to the bit.
+# Identical, to the bit, for repeated runs on the same machine.
 QUALITY = (
     "psnr",
     "ssim",
@@ -31,7 +31,7 @@ QUALITY = (
     "rotation_error_deg",
     "centre_error_share",
 )
-# Stages in which a choice of the plan shows; the others' time goes with them.
+# Stages whose times are compared.
 POSES = ("decode", "features", "matches", "sfm", "refine", "undistort")
 WORK = (*POSES, "train")
 
@@ -39,10 +39,10 @@ Row = dict[str, Any]
 
 
 def each_run(rows: Sequence[Row]) -> list[str]:
-    """Each run for itself: quality, and wall seconds by stage."""
+    """One row per run: quality, and wall time in seconds of groups of stages."""
     lines = [
         "| run | PSNR | on training views | SSIM | Gaussians | posed | rotation, centres | poses s "
-        "| training s | in all s | most MB | |",
+        "| training s | total s | peak MB | |",
         "|---" * 12 + "|",
     ]
     seeded = len({row["seed"] for row in rows}) > 1
@@ -72,9 +72,9 @@ def each_run(rows: Sequence[Row]) -> list[str]:
 
 
 def against(rows: Sequence[Row], base: str) -> list[str]:
-    """Each configuration beside ``base``, scene by scene and in the mean: the difference of PSNR
-    (dB), of SSIM and of CPU seconds for poses and training together; then these seconds apart, and
-    Gaussians. Of several seeds, compared seed by seed: the median, and half the range.
+    """Differences of each configuration from ``base``, by scene and in the mean: PSNR (dB), SSIM
+    and CPU seconds of poses and training; then these seconds separately, and Gaussians.
+    Several seeds are compared seed by seed: median and half the range.
     """
     by_run = {(row["scene"], row["config"], row["seed"]): row for row in rows}
     configs, scenes, seeds = (
@@ -85,7 +85,7 @@ def against(rows: Sequence[Row], base: str) -> list[str]:
     for config in configs:
         cells: list[str] = []
         gains: list[float] = []
-        kept: list[list[Row]] = []
+        finished: list[list[Row]] = []
         for scene in scenes:
             found = [by_run[key] for seed in seeds if (key := (scene, config, seed)) in by_run]
             done = [row for row in found if row["status"] == "ok"]
@@ -93,7 +93,7 @@ def against(rows: Sequence[Row], base: str) -> list[str]:
                 states = [f"{row['status']}: {row['message']}" for row in found]
                 cells.append(states[0] if states else "no run")
                 continue
-            kept.append(done)
+            finished.append(done)
             pairs = [
                 (row, other)
                 for row in done
@@ -114,9 +114,9 @@ def against(rows: Sequence[Row], base: str) -> list[str]:
             cells.append(f"{_spread(more, '{:+.2f}')}, {ssim}, {seconds} s")
         mean = f"{statistics.fmean(gains):+.2f} dB" if gains else ""
         cost = gaussians = ""
-        if kept:
+        if finished:
             poses, training, number = (
-                statistics.fmean(statistics.median(of(row) for row in done) for done in kept)
+                statistics.fmean(statistics.median(of(row) for row in done) for done in finished)
                 for of in (
                     lambda row: _cpu(row, POSES),
                     lambda row: _cpu(row, ("train",)),
@@ -131,7 +131,7 @@ def against(rows: Sequence[Row], base: str) -> list[str]:
 
 
 def _spread(values: Sequence[float], form: str) -> str:
-    """The median, and of several values half their range."""
+    """The median and, for several values, half their range."""
     middle = form.format(statistics.median(values))
     if len(values) == 1:
         return middle
@@ -140,7 +140,7 @@ def _spread(values: Sequence[float], form: str) -> str:
 
 
 def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
-    """What two batches of the same runs agree in: quality to the bit, and the ratio of times."""
+    """Comparison of two batches of the same runs: differences in quality, and ratios of times."""
     again = {(row["scene"], row["config"], row["seed"]): row for row in second}
     lines = ["| run | quality | wall s | CPU s |", "|---|---|---|---|"]
     ratios: dict[str, list[float]] = {"wall_s": [], "cpu_s": []}
@@ -154,7 +154,7 @@ def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
         differ = [f"{key} {row[key]} and {other[key]}" for key in QUALITY if row[key] != other[key]]
         cells = [", ".join(differ) or "the same"]
         for key, found in ratios.items():
-            # Results reused from another run have that run's time.
+            # Stages reused from another run are counted with that run's time.
             found.append(other[key] / row[key])
             cells.append(f"{row[key]:.0f}, {other[key]:.0f}")
         lines.append(f"| {name} | {' | '.join(cells)} |")
@@ -180,19 +180,21 @@ def _short(value: float, sign: str = "") -> str:
 
 
 def compare(batches: Sequence[Path], base: str | None = None, each: bool = False) -> list[str]:
-    """A table of one batch, or of how well a second repeats the first, as lines of Markdown.
+    """A table of one batch, or of the differences between two, as lines of Markdown.
 
     Args:
         batches: one or two ``benchmark.json``.
         base: the configuration that others are compared with; None: the default preset.
-        each: each run of one batch, without comparing.
+        each: list the runs of one batch, without comparison.
 
     Raises:
-        UserError: more than two files, one that is no batch's, or no such configuration.
+        UserError: more than two files, a file that is no ``benchmark.json``, or an unknown
+            configuration.
     """
     if len(batches) > 2:
         raise UserError(
-            f"expected one or two batches, found {len(batches)}", fix="compare them in pairs"
+            f"expected one or two benchmark.json files, found {len(batches)}",
+            fix="compare them in pairs",
         )
     runs = [_read(path) for path in batches]
     if len(runs) == 2:
@@ -215,7 +217,7 @@ def _read(path: Path) -> list[Row]:
         return list(json.loads(path.read_text())["runs"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
-            f"expected a batch's benchmark.json: {error}",
+            f"expected a benchmark.json: {error}",
             file=path,
-            fix="make one: snakemake results/benchmark.csv",
+            fix="create one: snakemake results/benchmark.csv",
         ) from None

@@ -1,4 +1,4 @@
-"""The section of the page that shows what the photographs did not see."""
+"""The coverage section of a report page."""
 
 from __future__ import annotations
 
@@ -13,24 +13,24 @@ from pipeline.reporting.pictures import data_uri, trust_colours, trust_gradient,
 from pipeline.reporting.space import upright_frame
 from pipeline.reporting.text import count, escape, fixed
 
-_ABOVE = 440  # side of the plan, pixels
+_ABOVE = 440  # side of the map, pixels
 _MARGIN = 28
-_TICK = 17  # length of a direction, pixels
+_TICK = 17  # length of the line that shows a viewing direction, pixels
 
 
 def coverage_section(data: ReportData) -> str:
     """HTML of the section."""
     shown = data.coverage
     if shown is None or "surface" not in shown.record:
-        return '<p class="hint">Nothing is known of what the photographs saw.</p>'
+        return '<p class="hint">No coverage was recorded.</p>'
     record = shown.record
     orientations = data.trained.orientations if data.trained else {}
     worst = [view for view in record["views"] if "trust_map" in view]
     return (
-        '<p class="hint">Trust says of each pixel how well the photographs determine it: how many '
-        "of them see the place, from how different directions, how sharply, and how near to the "
-        "direction of this view. It knows nothing of the photograph that the view is compared "
-        "with.</p>"
+        '<p class="hint">Trust is a number from 0 to 1 for each pixel: how well the photographs '
+        "determine the surface point that it shows, from their number, the angles between them, "
+        "their resolution and the angle to this view. The photograph that the view is compared "
+        "with is not used.</p>"
         f'<div class="scale">trust 0<i style="background: {trust_gradient()}"></i>1</div>'
         f'<div class="unseen"><div>{_views(shown, worst, orientations)}{_facts(record)}'
         f"{_above(record['viewpoints'], data.trained)}</div><div>{_viewpoints(shown)}</div></div>"
@@ -48,7 +48,7 @@ def _views(
         "</li>"
         for view in sorted(views, key=lambda view: float(view["trust"]))
     )
-    return f"<h3>Held-out views of least trust</h3><ol>{items}</ol>"
+    return f"<h3>Test views of least trust</h3><ol>{items}</ol>"
 
 
 def _facts(record: Mapping[str, Any]) -> str:
@@ -63,8 +63,8 @@ def _facts(record: Mapping[str, Any]) -> str:
     views = record["views"]
     if views:
         rows += [
-            ("holes in held-out views", f"{np.mean([v['holes'] for v in views]):.2%} of pixels"),
-            ("floaters in them", f"{np.mean([v['floating'] for v in views]):.2%} of pixels"),
+            ("holes in test views", f"{np.mean([v['holes'] for v in views]):.2%} of pixels"),
+            ("floaters in test views", f"{np.mean([v['floating'] for v in views]):.2%} of pixels"),
         ]
     near = ", ".join(f"{name} ({number})" for name, number in floaters["cameras"].items())
     rows.append(
@@ -78,8 +78,8 @@ def _facts(record: Mapping[str, Any]) -> str:
             (
                 "trust and squared error",
                 f"rank correlation {_signed(error['rank_correlation'])} over "
-                f"{count(error['squares'])} squares of held-out views (\u22121: trust tells the "
-                "error; 0: it tells nothing)",
+                f"{count(error['squares'])} blocks of test views (\u22121: low trust always "
+                "means high error; 0: no relation)",
             )
         )
     for row in error["by_trust"]:
@@ -87,7 +87,7 @@ def _facts(record: Mapping[str, Any]) -> str:
         rows.append(
             (
                 f"RMS error where trust is {low:g} to {high:g}",
-                f"{fixed(row['rmse'], 3)} ({row['share']:.1%} of squares)",
+                f"{fixed(row['rmse'], 3)} ({row['share']:.1%} of blocks)",
             )
         )
     inside = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in rows)
@@ -97,16 +97,16 @@ def _facts(record: Mapping[str, Any]) -> str:
 def _viewpoints(shown: Coverage) -> str:
     viewpoints = shown.record["viewpoints"]
     if not viewpoints:
-        return "<h3>To photograph next</h3><p>No viewpoint nearby would add much.</p>"
+        return "<h3>To photograph next</h3><p>No nearby viewpoint would add much trust.</p>"
     items = "".join(
         f"<li><p><b>{i + 1}.</b> {escape(_sentence(view['where']))} {view['unknown_percent']:.0f} "
-        f"% of this picture is unknown; it would fill {view['gain_percent']:.0f} % of what is "
-        f"missing around the photographs.</p>{_pair(shown, view, 1)}</li>"
+        f"% of this view is unknown; a photograph would add {view['gain_percent']:.0f} % of the "
+        f"trust that is missing around the photographs.</p>{_pair(shown, view, 1)}</li>"
         for i, view in enumerate(viewpoints)
     )
     return (
-        '<h3>To photograph next</h3><p class="hint">Each adds to those before it. The pictures '
-        "are what the trained scene shows there now, and how far to trust it.</p>"
+        '<h3>To photograph next</h3><p class="hint">Each gain is in addition to the proposals '
+        "before it. The images are the current render from there, and its trust.</p>"
         f"<ol>{items}</ol>"
     )
 
@@ -127,7 +127,7 @@ def _pair(shown: Coverage, entry: Mapping[str, Any], orientation: int) -> str:
 
 
 def _above(viewpoints: Sequence[Mapping[str, Any]], scene: TrainedScene | None) -> str:
-    """Cameras and viewpoints from above, as SVG."""
+    """Map of the cameras and proposed viewpoints, as SVG."""
     if scene is None or not scene.views or not viewpoints:
         return ""
     frame = upright_frame(np.stack([view.world_to_camera[:3, :3] for view in scene.views]))

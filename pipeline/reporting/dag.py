@@ -1,4 +1,4 @@
-"""A picture of a scene's plan: what runs, what feeds it, what was skipped and why."""
+"""Diagram of the plan of a scene: stages that run with their inputs, and skipped stages."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ _BOX_W, _BOX_H = 92, 34
 _GAP_X, _GAP_Y = 26, 16
 _MARGIN = 8
 _REASON_CHARS, _REASON_LINES, _LINE_H = 20, 5, 12
-# Colours come from the page where there is one, so that the picture follows its dress.
+# Colours are CSS variables of the page, if there are any, so that the theme applies.
 _STYLE = (
     ".plan text{font:600 13px system-ui,sans-serif;fill:var(--ink,#16191d);text-anchor:middle}"
     ".plan .why{font-size:10px;font-weight:400;fill:var(--soft,#5d6673)}"
@@ -25,16 +25,16 @@ _STYLE = (
 
 
 def plan_svg(plan: Mapping[str, Any]) -> str:
-    """The plan as one ``<svg>`` element, usable inside a page and as a file of its own.
+    """The plan as an ``<svg>`` element, for a page or as a separate file.
 
     Args:
         plan: the content of ``plan.json``: ``stages`` maps a name to ``run``, ``reason``,
             ``decisions`` and ``inputs`` (the stages whose output it reads).
 
     Returns:
-        Running stages from left to right with the arrows of what they read (those that another
-        way implies left out); below them, dashed, the skipped ones with the reason. Each box has
-        its reason and decisions as a tooltip.
+        Running stages from left to right, with arrows from their inputs (without those implied by
+        a longer path); below them, dashed, the skipped stages with the reason. The tooltip of
+        each box has its reason and decisions.
     """
     stages: dict[str, Mapping[str, Any]] = {
         name: plan["stages"][name] for name in plan.get("order", plan["stages"])
@@ -64,7 +64,7 @@ def plan_svg(plan: Mapping[str, Any]) -> str:
 
 
 def _edges(stages: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
-    """What feeds what, without the edges that a longer way implies."""
+    """Edges from inputs to stages, without those implied by a longer path."""
     inputs = {name: list(stage.get("inputs") or []) for name, stage in stages.items()}
 
     def reaches(target: str) -> set[str]:
@@ -89,19 +89,19 @@ def _edges(stages: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
 def _places(
     stages: Mapping[str, Mapping[str, Any]], edges: list[tuple[str, str]]
 ) -> tuple[dict[str, tuple[int, int]], int, int]:
-    """Column and lane of each stage, and how many there are of both. A running stage that does
-    not wait for the one before it stands under it, in the same column."""
+    """Column and lane of each stage, and the numbers of columns and lanes. A running stage that
+    does not depend on the one before it is placed below that, in the same column."""
     places: dict[str, tuple[int, int]] = {}
     column, lane, lanes = -1, 0, 1
-    together: set[str] = set()
+    in_column: set[str] = set()
     for name, stage in stages.items():
-        waits = any(target == name and source in together for source, target in edges)
-        if stage["run"] and together and not waits and any(t == name for _, t in edges):
+        depends = any(target == name and source in in_column for source, target in edges)
+        if stage["run"] and in_column and not depends and any(t == name for _, t in edges):
             lane += 1
         else:
-            column, lane, together = column + 1, 0, set()
+            column, lane, in_column = column + 1, 0, set()
         if stage["run"]:
-            together.add(name)
+            in_column.add(name)
         lanes = max(lanes, lane + 1)
         places[name] = (column, lane)
     return places, column + 1, lanes
@@ -129,7 +129,7 @@ def _reason(text: str, x: float, y: float) -> str:
 def _arrow(source: tuple[float, float], target: tuple[float, float]) -> str:
     x0, y0 = source[0] + _BOX_W, source[1] + _BOX_H / 2
     x1, y1 = target[0], target[1] + _BOX_H / 2
-    # Bend beside the boxes: between them there may be others in the same lane.
+    # Bends lie next to the boxes: other boxes may be in between.
     bend = _GAP_X / 2
     middle = (
         f"L{x0} {y0}" if y0 == y1 else f"C{x0 + bend} {y0} {x0 + bend} {y1} {x0 + 2 * bend} {y1}"

@@ -1,4 +1,4 @@
-"""What the report page shows."""
+"""The content of the report page."""
 
 from __future__ import annotations
 
@@ -15,15 +15,15 @@ from pipeline.splats.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class Comparison:
-    """A held-out view beside its photograph, both on the stored pixel grid.
+    """A test view with its photograph, both on the stored pixel grid.
 
     Attributes:
-        label: which of the views it is.
+        label: its rank by PSNR.
         name: the photograph's name.
         photograph, render: (H, W, 3) uint8.
-        mask: (H, W), zero pixels counted for nothing; or None.
+        mask: (H, W), zero pixels are excluded; or None.
         psnr, ssim: of this view.
-        orientation: EXIF orientation, 1 to 8; turns the pictures for display only.
+        orientation: EXIF orientation, 1 to 8; rotates the images for display only.
     """
 
     label: Literal["worst", "low", "median", "high", "best"]
@@ -38,12 +38,12 @@ class Comparison:
 
 @dataclass(frozen=True)
 class TrainedScene:
-    """What was trained and what is needed to look at it.
+    """The trained scene with what is needed to display it.
 
     Attributes:
-        gaussians: in the world of the views.
-        views: training and held-out ones.
-        orientations: name of a view -> EXIF orientation of its photograph; 1 where there is none.
+        gaussians: in the world frame of the views.
+        views: training and test views.
+        orientations: name of a view -> EXIF orientation of its photograph; 1 if there is none.
         background: RGB in [0, 1] behind the Gaussians. antialias, near: as in training.
     """
 
@@ -57,11 +57,11 @@ class TrainedScene:
 
 @dataclass(frozen=True)
 class Coverage:
-    """What the photographs did not see.
+    """Coverage of the scene by its photographs.
 
     Attributes:
         record: the content of ``coverage.json``.
-        pictures: its pictures by the names it has for them; (H, W, 3) renders and (H, W) trust,
+        pictures: images by the names in ``record``: (H, W, 3) renders and (H, W) trust maps,
             uint8.
     """
 
@@ -75,20 +75,21 @@ def _empty(*shape: int) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class ReportData:
-    """One scene. What is empty is left out of the page, which says so.
+    """Content of the page of one scene. For empty values the page states that they are missing.
 
     Attributes:
         scene: its name.
         metrics: the content of ``metrics.json``.
         plan: the content of ``plan.json``; ``stages`` maps a name to ``run`` and ``reason``.
-        decisions: stage -> what it decided, as recorded in its ``stage.json``.
-        curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, where it
-            is known, ``seconds`` since the start of training; a missing or null value is a gap.
-        comparisons: pictures to show, worst first.
+        decisions: stage -> its decisions, as recorded in ``stage.json``.
+        curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, if
+            known, ``seconds`` since the start of training; a missing or null value is a gap.
+        comparisons: views to show, worst first.
         trained: the Gaussians and their views.
-        coverage: what the photographs did not see.
+        coverage: None without a record.
         points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
-        reprojection_errors: pixels, one a sparse point. track_lengths: images, one a point.
+        reprojection_errors: pixels, one per sparse point.
+        track_lengths: number of images, one per sparse point.
     """
 
     scene: str
@@ -108,8 +109,8 @@ class ReportData:
 def ranked(
     per_view: Sequence[Mapping[str, Any]], count: int
 ) -> list[tuple[Literal["worst", "low", "median", "high", "best"], Mapping[str, Any]]]:
-    """``count`` of the views' measurements from the worst PSNR to the best, evenly over the ranks,
-    each with its label; fewer where there are fewer views."""
+    """``count`` views from the worst PSNR to the best, evenly spaced by rank, each with its label;
+    fewer if there are fewer views."""
     ordered = sorted(per_view, key=lambda view: (view["psnr"], view["name"]))
     count = min(count, len(ordered))
     if count == 1:

@@ -1,4 +1,4 @@
-"""``python -m pipeline.reporting.headline results/<scene>``: the result in a line."""
+"""``python -m pipeline.reporting.headline results/<scene>``: print the result in one line."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 
 def headline(metrics: Metrics) -> str:
-    """One line for people: quality, size, poses."""
+    """One line: quality, number of Gaussians, poses, warnings."""
     lpips = "n/a" if metrics.lpips is None else f"{metrics.lpips:.3f}"
     pose = metrics.pose_error
     known = pose is not None and pose.rotation_median_deg is not None

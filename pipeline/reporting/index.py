@@ -25,7 +25,7 @@ from pipeline.reporting.batch import (
     published_for,
     row,
 )
-from pipeline.reporting.charts import Dot, trade_off_chart
+from pipeline.reporting.charts import ChartPoint, trade_off_chart
 from pipeline.reporting.dag import plan_svg
 from pipeline.reporting.pictures import shrunk, upright
 from pipeline.reporting.style import CSS
@@ -72,7 +72,7 @@ class Thumbnail:
 
 
 def thumbnail(picture: NDArray[np.uint8], orientation: int, view: str) -> Thumbnail:
-    """A small JPEG of an (H, W, 3) picture, turned as EXIF says it is to be looked at."""
+    """A small JPEG of an (H, W, 3) picture, rotated by its EXIF orientation."""
     small = shrunk(upright(picture, orientation), _THUMBNAIL_PX)
     buffer = io.BytesIO()
     Image.fromarray(small).save(buffer, "JPEG", quality=84, optimize=True)
@@ -82,11 +82,11 @@ def thumbnail(picture: NDArray[np.uint8], orientation: int, view: str) -> Thumbn
 
 @dataclass(frozen=True)
 class Batch:
-    """What the page shows.
+    """Content of the page of a batch.
 
     Attributes:
-        results: one a run, scene by scene; at least one.
-        renders: run's name -> a held-out view of it.
+        results: one per run, ordered by scene; at least one.
+        renders: run's name -> render of a test view.
         photos: scene -> the photograph of that view.
         plans: scene -> ``plan.json`` of its first run.
         stages: names in the order of the DAG.
@@ -124,7 +124,7 @@ def index_html(batch: Batch) -> str:
         f'<div class="top"><h1>{count(len(scenes))} {"scene" if len(scenes) == 1 else "scenes"}'
         f'</h1><p class="lead">{_lead(results)}</p><nav>{links}</nav></div>\n'
         f"<main>{_failures(results)}{body}</main>"
-        '<div class="foot">Made by splatmake. The same numbers stand in benchmark.csv and '
+        '<div class="foot">Made by splatmake. The numbers are also in benchmark.csv and '
         "benchmark.json.</div></body></html>\n"
     )
 
@@ -173,9 +173,9 @@ def _failures(results: Sequence[Result]) -> str:
 def _configs(results: Sequence[Result]) -> str:
     scenes, over = by_config(results)
     if not scenes:
-        hint = "No scene has finished under every configuration: there is nothing to compare yet."
+        hint = "No scene was finished with every configuration, so there is no comparison yet."
         return f'<p class="hint">{hint}</p>' if any(r.ok for r in results) else ""
-    # The range over scenes says more of the scenes than of the configuration.
+    # No ranges: over scenes, they describe the scenes rather than the configuration.
     means = {
         config: {name: Spread(s.mean, s.mean, s.mean, 1) for name, s in spreads.items()}
         for config, spreads in over.items()
@@ -184,16 +184,16 @@ def _configs(results: Sequence[Result]) -> str:
     names = ", ".join(scenes)
     return (
         f'<p class="hint">Means over the {count(len(scenes))} scenes that every configuration '
-        f"finished: {escape(names)}. Error of a pixel is the root mean square error that the mean "
-        "PSNR stands for, in percent of full range. The dashed line joins the configurations that "
-        f"no other one beats in time and error.{_sizes_differ(results, scenes)}</p>"
+        f"finished: {escape(names)}. Pixel error is the root mean square error that corresponds to "
+        "the mean PSNR, in percent of full range. The dashed line is the Pareto front of time and "
+        f"error.{_sizes_differ(results, scenes)}</p>"
         + table
         + f'<div class="charts">{_means_charts(results, over)}</div>'
     )
 
 
 def _sizes_differ(results: Sequence[Result], scenes: Sequence[str]) -> str:
-    """A warning where a scene's configurations were measured on pictures of different sizes."""
+    """A warning if the configurations of a scene were measured on images of different sizes."""
     sizes: dict[str, set[str]] = {}
     for r in results:
         if r.ok and r.run.scene in scenes:
@@ -201,9 +201,9 @@ def _sizes_differ(results: Sequence[Result], scenes: Sequence[str]) -> str:
     if all(len(found) < 2 for found in sizes.values()):
         return ""
     return (
-        " <strong>Configurations were measured on pictures of different sizes</strong> (each on "
-        "what it trains on): errors are smaller in smaller pictures, and such numbers do not say "
-        "which configuration is the better one."
+        " <strong>Configurations were measured on images of different sizes</strong> (each at its "
+        "training resolution). Errors are smaller in smaller images, so these numbers do not show "
+        "which configuration is better."
     )
 
 
@@ -212,19 +212,19 @@ def _means_charts(results: Sequence[Result], over: Mapping[str, Mapping[str, Spr
     single = len(over) == 1
     parts = []
     for measure, title, label in _ERRORS:
-        dots = []
+        points = []
         for r in results:
             line = row(r)
             if r.ok and line[measure] is not None:
                 name = r.run.scene if single else ""
-                dots.append(_dot(line, measure, name, r.run.name, colours[r.run.config]))
+                points.append(_chart_point(line, measure, name, r.run.name, colours[r.run.config]))
         if not single:
             for config, spreads in over.items():
                 if measure in spreads:
                     values = {name: s.mean for name, s in spreads.items()}
-                    dots.append(_dot(values, measure, config, config, colours[config]))
-        if dots:
-            parts.append(trade_off_chart(dots, title=title, x_title="time", y_label=label))
+                    points.append(_chart_point(values, measure, config, config, colours[config]))
+        if points:
+            parts.append(trade_off_chart(points, title=title, x_title="time", y_label=label))
     return "".join(parts)
 
 
@@ -233,22 +233,26 @@ def _percent(value: float) -> str:
 
 
 _ERRORS = (
-    ("psnr", "Error of a pixel against time", _percent),
+    ("psnr", "Pixel error against time", _percent),
     ("ssim", "1 - SSIM against time", lambda value: f"{value:.2g}"),
     ("lpips", "LPIPS against time", lambda value: f"{value:.2g}"),
 )
 
 
 def _error(measure: str, value: float) -> float:
-    """Of a measure, what is lost; never quite 0, for a logarithmic axis."""
+    """The error that a measure corresponds to; positive, for a logarithmic axis."""
     if measure == "psnr":
         return 100 * 10 ** (-value / 20)
     return max(1 - value if measure == "ssim" else value, 1e-6)
 
 
-def _dot(values: Mapping[str, Any], measure: str, name: str, tip: str, colour: int) -> Dot:
+def _chart_point(
+    values: Mapping[str, Any], measure: str, name: str, tip: str, colour: int
+) -> ChartPoint:
     shown = f"{tip}: {fixed(values[measure], 3)} {measure.upper()}, {duration(values['wall_s'])}"
-    return Dot(max(values["wall_s"], 1e-3), _error(measure, values[measure]), name, shown, colour)
+    return ChartPoint(
+        max(values["wall_s"], 1e-3), _error(measure, values[measure]), name, shown, colour
+    )
 
 
 # --- one scene ----------------------------------------------------------------------------
@@ -280,16 +284,16 @@ def _scene(batch: Batch, scene: str) -> str:
     table = _table(rows, [(f"{p['method']} (published)", p) for p in published])
     chart = ""
     if len(means) > 1:
-        dots = [
-            _dot({n: s.mean for n, s in spreads.items()}, "psnr", _label(config), config, i)
+        points = [
+            _chart_point({n: s.mean for n, s in spreads.items()}, "psnr", _label(config), config, i)
             for i, (config, spreads) in enumerate(means.items())
         ]
         title, label = _ERRORS[0][1:]
-        chart = trade_off_chart(dots, title=title, x_title="time", y_label=label)
+        chart = trade_off_chart(points, title=title, x_title="time", y_label=label)
         chart = f'<div class="charts single">{chart}</div>'
     plan = batch.plans.get(scene)
     picture = (
-        f"<details><summary>What ran, and what was skipped</summary>{plan_svg(plan)}</details>"
+        f"<details><summary>Stages that ran or were skipped</summary>{plan_svg(plan)}</details>"
         if plan
         else ""
     )
@@ -321,7 +325,7 @@ def _figure(picture: Thumbnail, caption: str, run: str) -> str:
 
 
 def _cells(spreads: Mapping[str, Spread]) -> dict[str, str]:
-    """A cell a measure: its mean and, over several seeds or scenes, half of its range."""
+    """One cell per measure: its mean and, over several seeds or scenes, half of its range."""
     cells = {}
     for name, (_, digits) in _COLUMNS.items():
         if name in spreads:
@@ -382,9 +386,8 @@ def _stages(results: Sequence[Result], order: Sequence[str]) -> str:
                 body += f'<td class="number" title="{tip}">{duration(s["wall_s"])}</td>'
         body += "</tr>"
     return (
-        '<p class="hint">Wall time; CPU time and peak memory are tooltips. A dash is a stage that '
-        "the scene did not need. Work that two configurations share was done once and counts for "
-        "both.</p>"
+        '<p class="hint">Wall time; CPU time and peak memory are tooltips. A dash is a skipped '
+        "stage. Stages that configurations share ran once; their time is counted for each.</p>"
         f'<div class="table"><table><thead><tr><th scope="col">Run</th>{heads}</tr></thead>'
         f"<tbody>{body}</tbody></table></div>"
     )
@@ -405,5 +408,5 @@ def _sources(results: Sequence[Result], scenes: Sequence[str]) -> str:
         f"{escape(p['protocol'])}.</dd>"
         for (method, dataset), p in shown.items()
     )
-    hint = "They compare with the runs' numbers only where resolution, split and pictures agree."
+    hint = "Comparable with the runs only if resolution, split and photographs are the same."
     return f'<p class="hint">{hint}</p><dl>{items}</dl>' if shown else ""

@@ -1,7 +1,7 @@
-"""The report: one HTML file a scene that opens anywhere, without a network.
+"""The report page of a scene: one HTML file that needs no network.
 
-Everything is inside it: style, script, pictures. A content security policy forbids the browser
-to ask for anything else. The same data gives the same bytes.
+Style, scripts and images are embedded. A content security policy forbids any other request. The
+same data gives the same bytes.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ _POLICY = (
     "script-src 'unsafe-inline' 'wasm-unsafe-eval'; worker-src blob:"
 )
 
-# Of the whole page. Mail and chat programs, which pages travel by, take 15 MB and more.
+# Of the page, so that it can be sent by mail: common limits are 15 MB or more.
 _MAX_BYTES = 14_500_000
 
 
 def write_report(data: ReportData, path: Path) -> None:
-    """Write the page to ``path``, whole or not at all."""
+    """Write the page to ``path`` atomically."""
     write_text(path, report_html(data))
 
 
@@ -49,15 +49,15 @@ def report_html(data: ReportData) -> str:
     viewer = "" if data.trained is None else f"<script>{viewer_script()}</script>"
     sections = [
         ("pictures", "Photograph and render", _pictures(data.comparisons)),
-        ("coverage", "What the photographs did not see", coverage_section(data)),
+        ("coverage", "Coverage by the photographs", coverage_section(data)),
         ("training", "Training", _curves(data)),
         ("reconstruction", "Reconstruction", _reconstruction(data)),
-        ("views", "Every view", per_view_table(data.metrics.get("per_view") or [])),
+        ("views", "All views", per_view_table(data.metrics.get("per_view") or [])),
         ("stages", "Stages", stages_table(data.metrics.get("stages") or {})),
         ("how", "Decisions and protocol", _how(data)),
     ]
-    room = _MAX_BYTES - len(viewer) - sum(len(inside) for _, _, inside in sections)
-    sections.insert(0, ("scene", "Scene", space_section(data, room)))
+    max_bytes = _MAX_BYTES - len(viewer) - sum(len(inside) for _, _, inside in sections)
+    sections.insert(0, ("scene", "Scene", space_section(data, max_bytes)))
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in sections)
     body = "".join(
         f'<section id="{key}"><h2>{title}</h2>{inside}</section>' for key, title, inside in sections
@@ -95,10 +95,10 @@ def _cards(data: ReportData) -> str:
     lpips = m.get("lpips")
     protocol = m.get("protocol") or {}
     registered, total = m.get("registered_images"), m.get("total_images")
-    seen = m.get("train_psnr")
-    beside = "" if seen is None else f"; training views: {fixed(seen, 2)} dB"
+    train_psnr = m.get("train_psnr")
+    note = "" if train_psnr is None else f"; training views: {fixed(train_psnr, 2)} dB"
     plain = m.get("psnr_without_gains")
-    beside += "" if plain is None else f"; without exposure gains: {fixed(plain, 2)} dB"
+    note += "" if plain is None else f"; without exposure gains: {fixed(plain, 2)} dB"
     whole = f'<span class="unit"> / {count(total)}</span>' if total is not None else ""
     ran = [s for s in stages if not s.get("skipped")]
     cpu, rss = sum(s["cpu_s"] for s in ran), max((s["peak_rss_mb"] for s in ran), default=0.0)
@@ -107,7 +107,7 @@ def _cards(data: ReportData) -> str:
             "first",
             "PSNR",
             f'{fixed(m.get("psnr"), 2)}<span class="unit"> dB</span>',
-            f"mean of the views{beside}",
+            f"mean of the views{note}",
         ),
         ("first", "SSIM", fixed(m.get("ssim"), 4), protocol.get("ssim", "")),
         (
@@ -161,7 +161,7 @@ def _nothing(what: str) -> str:
 
 
 def _choice(target: str, toggle: str, off: str, on: str) -> str:
-    """Two radio buttons that put the class ``toggle`` on the element ``target``, or take it."""
+    """Two radio buttons that add the class ``toggle`` to the element ``target``, or remove it."""
     buttons = "".join(
         f'<label><input type="radio" name="{toggle}" value="{value}" data-toggle="{toggle}" '
         f'data-target="{target}"{" checked" if value == "off" else ""}>{text}</label>'
@@ -173,7 +173,7 @@ def _choice(target: str, toggle: str, off: str, on: str) -> str:
 def _pictures(views: Iterable[Comparison]) -> str:
     views = list(views)
     if not views:
-        return _nothing("No picture was kept for comparison.")
+        return _nothing("No view was recorded for comparison.")
     grey = "<b></b>masked" if any(v.mask is not None for v in views) else ""
     parts = [
         '<div class="bar-top">'
@@ -253,11 +253,11 @@ def _reconstruction(data: ReportData) -> str:
     out = f'<div class="charts">{"".join(parts)}</div>' if parts else ""
     pose = data.metrics.get("pose_error")
     if pose:
-        out += "<h3>Poses against the truth</h3>" + definitions(pose)
+        out += "<h3>Pose errors against ground truth</h3>" + definitions(pose)
     placed = data.metrics.get("georeference")
     if placed and placed.get("origin"):
-        out += f"<h3>Place on the ground</h3>{georeference(placed)}"
-    return out or _nothing("Nothing is known of points and tracks, and there is no true pose.")
+        out += f"<h3>Georeferencing</h3>{georeference(placed)}"
+    return out or _nothing("No points or tracks were recorded, and there are no true poses.")
 
 
 def _how(data: ReportData) -> str:

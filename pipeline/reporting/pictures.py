@@ -1,4 +1,4 @@
-"""Pictures for pages: error maps, display orientation, JPEG inside HTML."""
+"""Images for pages: error maps, display orientation, JPEG in HTML."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from pipeline.reporting.data import Comparison
 Picture = NDArray[np.uint8]
 
 ERROR_SCALE = 0.2
-"""Absolute error, of a range of 1, shown in the brightest colour; larger ones look the same.
-The scale is fixed, so that maps of different views and scenes can be compared."""
+"""Absolute error, for colours in [0, 1], of the brightest colour; larger errors are clipped.
+The scale is fixed, so that maps of different views and scenes are comparable."""
 
 MASKED_GREY = 128
 
 _ERROR_COLOURS, _TRUST_COLOURS = "inferno", "viridis"
 _PAGE_SIDE = 900
 _JPEG_QUALITY = 86
-# Bytes of JPEG in one page; base64 makes a third more of them.
+# Bytes of JPEG in one page; base64 adds a third.
 _PAGE_BUDGET = 3_300_000
 
 
@@ -34,7 +34,7 @@ def error_map(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] |
 
     Args:
         image, reference: (H, W, 3), both uint8 or both floats in [0, 1].
-        mask: (H, W), zero pixels are painted grey; or None.
+        mask: (H, W), zero pixels are grey; or None.
 
     Returns:
         (H, W, 3) uint8; black is no error, the brightest yellow ``ERROR_SCALE`` or more.
@@ -51,7 +51,7 @@ def error_map(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] |
 
 def trust_colours(trust: Picture) -> Picture:
     """(H, W) uint8 trust, 255 is 1, as (H, W, 3) in a perceptually uniform colour map; yellow is
-    trusted."""
+    high."""
     return _colours(_TRUST_COLOURS)[trust]
 
 
@@ -68,7 +68,7 @@ def scale_gradient() -> str:
 
 
 def trust_gradient() -> str:
-    """The trust map's colours likewise."""
+    """The colours of the trust map as a CSS gradient, left to right."""
     return _gradient(_TRUST_COLOURS)
 
 
@@ -78,9 +78,9 @@ def _gradient(name: str) -> str:
 
 
 def upright(picture: Picture, orientation: int) -> Picture:
-    """The picture as EXIF says it is to be looked at; unknown values leave it as it is."""
+    """The image rotated and flipped by its EXIF orientation; unknown values have no effect."""
     if orientation >= 5:
-        picture = picture.swapaxes(0, 1)  # 5: transposed; 6, 7, 8: that, and then flipped
+        picture = picture.swapaxes(0, 1)  # 5: transposed; 6, 7, 8: transposed, then flipped
     flip_vertically, flip_horizontally = {
         2: (False, True),
         3: (True, True),
@@ -95,7 +95,7 @@ def upright(picture: Picture, orientation: int) -> Picture:
 
 
 def triple(view: Comparison) -> tuple[Picture, Picture, Picture]:
-    """Photograph, render and error map, turned for display."""
+    """Photograph, render and error map in display orientation."""
     error = error_map(view.render, view.photograph, view.mask)
     photograph, render, error = (
         upright(p, view.orientation) for p in (view.photograph, view.render, error)
@@ -104,7 +104,7 @@ def triple(view: Comparison) -> tuple[Picture, Picture, Picture]:
 
 
 def shrunk(picture: Picture, max_side: int) -> Picture:
-    """Reduced, by area, so that no side is longer than ``max_side`` pixels."""
+    """The image reduced by area averaging so that no side is longer than ``max_side`` pixels."""
     height, width = picture.shape[:2]
     scale = max_side / max(height, width)
     if scale >= 1:
@@ -114,7 +114,7 @@ def shrunk(picture: Picture, max_side: int) -> Picture:
 
 
 def page_pictures(views: Sequence[Comparison]) -> list[list[tuple[str, int, int]]]:
-    """The triples of all views for one page, within a budget of bytes.
+    """The triples of all views for one page, reduced to fit a total size in bytes.
 
     Returns:
         For each view its photograph, render and error map as (data URI, width, height).
@@ -137,7 +137,7 @@ def page_pictures(views: Sequence[Comparison]) -> list[list[tuple[str, int, int]
 
 
 def data_uri(picture: Picture) -> str:
-    """The picture as JPEG, for an ``img``."""
+    """The image as a JPEG data URI."""
     return _data_uri(_jpeg(picture))
 
 

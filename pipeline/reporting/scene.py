@@ -1,4 +1,4 @@
-"""The content of a scene's page, read from what its stages recorded."""
+"""Reads the content of a scene's page from the outputs of its stages."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from pipeline.metrics.evaluate import Protocol, reference
+from pipeline.metrics.evaluate import Protocol, photo_over_background
 from pipeline.photos.load import load_view
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
 from pipeline.runtime.record import read_run, read_stage
@@ -23,14 +23,14 @@ from pipeline.splats.gaussians import Gaussians
 
 @dataclass(frozen=True)
 class SceneResults:
-    """What the stages of a scene made.
+    """Outputs of the stages of a scene.
 
     Attributes:
         metrics: the content of ``metrics.json`` with the times of the stages.
         plan: the content of ``plan.json``.
         folders: role -> the stage's folder: inspect, train, evaluate and coverage.
         manifest: photographs of the views.
-        model: cameras as training refined them, and sparse points.
+        model: cameras (refined, if training refines them) and sparse points.
         protocol: of the evaluation. antialias: as in training.
     """
 
@@ -51,7 +51,7 @@ def report_data(results: SceneResults, evaluation: Mapping[str, Any], shown: int
 
     Args:
         evaluation: the content of ``evaluation.json``.
-        shown: number of test views beside their photographs.
+        shown: number of views shown with their photographs.
     """
     points = results.model.points
     return ReportData(
@@ -92,7 +92,7 @@ def _comparisons(
                 Comparison(
                     label=label,
                     name=view.name,
-                    photograph=reference(pixels, results.protocol.background),
+                    photograph=photo_over_background(pixels, results.protocol.background),
                     render=np.asarray(render),
                     mask=pixels.mask,
                     psnr=measured["psnr"],
@@ -114,14 +114,14 @@ def _coverage(folder: Path) -> Coverage:
 
 
 def _curve(train: Path) -> list[dict[str, Any]]:
-    """The training curve with the seconds of the run that made it."""
+    """The training curve with the times of the run that recorded it."""
     seconds = read_run(train).curve_seconds or []
     records = read_json(train / "curve.json")
     return [r | {"seconds": s} for r, s in zip(records, seconds, strict=True)]
 
 
 def _decisions(plan: Mapping[str, Any], results: Path) -> dict[str, list[str]]:
-    """The decisions of each stage that has run, after those that the plan made for it."""
+    """The decisions of each stage that ran: those of the plan, then those of the stage."""
     return {
         name: step["decisions"]
         + (list(read_stage(results / name).decisions) if name != "report" else [])

@@ -1,4 +1,4 @@
-"""The report page's behaviour: sliders and sorting. Without it the page still shows everything."""
+"""JavaScript of the report page: sliders and sorting. The page is complete without it."""
 
 JS = """
 "use strict";

@@ -25,43 +25,43 @@ Array = NDArray[np.float64]
 _VIEWER = Path(__file__).with_name("viewer") / "viewer.min.js"
 
 _MAX_POINTS = 25_000
-# The view's box is [-1, 1]; points out to this many boxes are kept, in 16-bit integers.
+# The scene's box is [-1, 1]; points within this multiple of it are stored as 16-bit integers.
 _REACH = 4.0
 _STEP = _REACH / 32767
-# Radii of scenes that SPZ holds well: its sizes reach from e^-10 to e^5.9, its steps are 2^-20.
+# Radii of scenes that SPZ represents well: scales from e^-10 to e^5.9, position steps of 2^-20.
 _SPZ_RADII = (0.1, 100.0)
 
 
 def viewer_script() -> str:
-    """The viewer's JavaScript; it runs once the section's elements are there."""
+    """JavaScript of the viewer, to be placed after the elements of the section."""
     return _VIEWER.read_text("utf-8")
 
 
-def space_section(data: ReportData, room: int) -> str:
+def space_section(data: ReportData, max_bytes: int) -> str:
     """HTML of the section.
 
     Args:
-        room: bytes that the Gaussians may take in the page.
+        max_bytes: size limit of the Gaussians in the page.
     """
     data = sized_for_spz(data)
     scene = data.trained
     if scene is None:
         return '<p class="hint">There is no trained scene.</p>'
     centres = np.array([view.centre for view in scene.views]).reshape(-1, 3)
-    packed = fit(scene.gaussians, centres, room * 3 // 4)  # base64 makes 4 bytes of 3
+    packed = fit(scene.gaussians, centres, max_bytes * 3 // 4)  # base64 makes 4 bytes of 3
     names = "".join(
-        f'<option value="{i}">{escape(view.name)}{" (held out)" if view.is_test else ""}</option>'
+        f'<option value="{i}">{escape(view.name)}{" (test view)" if view.is_test else ""}</option>'
         for i, view in enumerate(scene.views)
     )
     test = sum(view.is_test for view in scene.views)
     return (
-        '<p class="hint">Drag to turn; drag with the right button, or two fingers, to move; click '
-        "the scene once to zoom with the wheel. A click on a camera looks through it. Keys: "
-        "arrows, with Shift to move, + and \u2212.</p>"
+        '<p class="hint">Drag to rotate; drag with the right button or two fingers to pan; click '
+        "the scene once to zoom with the wheel. Click a camera to look through it. Keys: "
+        "arrows, with Shift to pan, + and \u2212.</p>"
         '<div id="space"><canvas tabindex="0" aria-label="the trained scene"></canvas>'
         '<output></output><p role="status">Loading the scene\u2026</p></div>'
         '<form id="space-tools"><fieldset disabled>'
-        f'<label>View <select name="view"><option value="">from afar</option>{names}</select>'
+        f'<label>View <select name="view"><option value="">overview</option>{names}</select>'
         '</label><button type="button" name="previous" aria-label="previous view">\u2039</button>'
         '<button type="button" name="next" aria-label="next view">\u203a</button>'
         '<label><input type="checkbox" name="cameras" checked> Cameras</label>'
@@ -70,7 +70,7 @@ def space_section(data: ReportData, room: int) -> str:
         '</label></span><button type="button" name="full">Full screen</button></fieldset></form>'
         f'<div class="keys"><span>{_shown(scene, packed)}</span>'
         f'<span><i style="background: var(--train)"></i>{count(len(scene.views) - test)} training '
-        f'cameras</span><span><i style="background: var(--test)"></i>{count(test)} held-out '
+        f'cameras</span><span><i style="background: var(--test)"></i>{count(test)} test '
         f"cameras</span><span>{count(len(data.points_xyz))} sparse points</span></div>"
         f'<script type="application/json" id="space-data">{_json(viewer_data(data, scene))}'
         f'</script><script type="text/plain" id="splats">{_base64(packed.spz)}</script>'
@@ -78,7 +78,7 @@ def space_section(data: ReportData, room: int) -> str:
 
 
 def sized_for_spz(data: ReportData) -> ReportData:
-    """The same scene, of radius 1 where its own is none for SPZ."""
+    """The same scene, scaled to radius 1 if SPZ cannot represent its radius."""
     scene = data.trained
     if scene is None:
         return data
@@ -101,7 +101,7 @@ def sized_for_spz(data: ReportData) -> ReportData:
 
 
 def _shown(scene: TrainedScene, packed: Packed) -> str:
-    """How many Gaussians there are, and what of them is in the page."""
+    """Text: the number of Gaussians, and the part of them in the page."""
     whole = scene.gaussians
     text = f"{count(len(whole))} Gaussians"
     left_out = []
@@ -110,20 +110,20 @@ def _shown(scene: TrainedScene, packed: Packed) -> str:
     if packed.sh_degree < whole.sh_degree:
         left_out.append(f"SH of degree {packed.sh_degree} instead of {whole.sh_degree}")
     if left_out:
-        text += f" (this page, to stay small, has {' with '.join(left_out)}; the exports are whole)"
+        text += f" (to limit its size, this page has {' with '.join(left_out)})"
     return text
 
 
 def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
-    """What the viewer draws beside the Gaussians.
+    """Input of the viewer besides the Gaussians.
 
-    The page's frame has y up, and its unit box holds the scene.
+    The frame of the page has y up; its unit box contains the scene.
 
     Returns:
         ``frame``: 16 numbers, world to the page's frame, column by column; ``near`` (world unit),
         ``background`` (RGB in [0, 1]), ``antialias``: as in training; ``cameras``: pinholes in
-        pixels, turned upright, with ``world_to_camera`` (3, 4) row by row; ``start``: index of
-        the camera to start from, or null; ``points``: base64 of int16 (P, 3), little-endian, in
+        pixels, in display orientation, with ``world_to_camera`` (3, 4) row by row; ``start``: index
+        of the initial camera, or null; ``points``: base64 of int16 (P, 3), little-endian, in
         the page's frame in units of ``step``; ``colours``: base64 of uint8 (P, 3); ``size`` of a
         camera.
     """
@@ -159,8 +159,8 @@ def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
 
 
 def upright_camera(view: View, orientation: int) -> dict[str, Any]:
-    """The view's pinhole, turned as EXIF says the photograph is to be looked at (a mirroring is
-    left out), as the viewer reads it."""
+    """The pinhole camera of a view, rotated by the EXIF orientation of its photograph (without
+    mirroring), in the format of the viewer."""
     w, h, fx, fy, cx, cy = view.width, view.height, view.fx, view.fy, view.cx, view.cy
     pose = view.world_to_camera[:3]
     right, down, forward = pose
@@ -168,7 +168,7 @@ def upright_camera(view: View, orientation: int) -> dict[str, Any]:
         case 3 | 4:
             cx, cy = w - cx, h - cy
             pose = np.stack([-right, -down, forward])
-        case 5 | 6:  # what is left is shown on top
+        case 5 | 6:  # the left side is displayed on top
             w, h, fx, fy, cx, cy = h, w, fy, fx, h - cy, cx
             pose = np.stack([-down, right, forward])
         case 7 | 8:
@@ -184,7 +184,7 @@ def upright_camera(view: View, orientation: int) -> dict[str, Any]:
 
 
 def _start(data: ReportData, scene: TrainedScene) -> int | None:
-    """The view of median quality, else the middle one."""
+    """Index of the view of median PSNR, else of the middle view; None without views."""
     names = [view.name for view in scene.views]
     for comparison in data.comparisons:
         if comparison.label == "median" and comparison.name in names:
@@ -193,7 +193,7 @@ def _start(data: ReportData, scene: TrainedScene) -> int | None:
 
 
 def _robust_box(xyz: Array, centres: Array) -> tuple[Array, float]:
-    """Middle and radius that hold most cameras and half the points, wherever the rest may be."""
+    """Centre and radius of a ball with most cameras and half the points, robust to outliers."""
     groups = [(values, share) for values, share in ((xyz, 50), (centres, 96)) if len(values)]
     if not groups:
         return np.zeros(3), 1.0
@@ -204,8 +204,8 @@ def _robust_box(xyz: Array, centres: Array) -> tuple[Array, float]:
 
 
 def upright_frame(rotations: Array) -> Array:
-    """(3, 3) world to a frame whose y is up: what the cameras agree to be so, or, where they do
-    not, as from the air, what is behind them."""
+    """(3, 3) rotation from the world to a frame with y up: the mean up direction of the cameras or,
+    if these cancel (aerial images), the mean direction opposite to their viewing direction."""
     up = np.array([0.0, -1.0, 0.0])
     for row in (1, 2):
         mean = -rotations[:, row].mean(axis=0) if len(rotations) else np.zeros(3)
@@ -220,7 +220,7 @@ def upright_frame(rotations: Array) -> Array:
 
 
 def _camera_size(centres: Array) -> float:
-    """So that neighbours do not hide one another."""
+    """Size of a camera symbol that avoids overlaps."""
     if len(centres) < 2:
         return 0.06
     from scipy.spatial import cKDTree
@@ -234,5 +234,5 @@ def _base64(data: bytes) -> str:
 
 
 def _json(value: Any) -> str:
-    """JSON that cannot end the script element it stands in."""
+    """JSON that is safe inside a script element."""
     return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

@@ -18,7 +18,7 @@ _NAMES = {
     "centre_mean": "centre error, mean, truth's unit",
     "centre_relative_median": "centre error, median, share of the radius",
     "radius": "radius of the cameras, truth's unit",
-    "scale": "truth's units in one unit of the model",
+    "scale": "truth's units per unit of the model",
     "auc": "AUC of relative poses (degrees: share)",
     "num_common": "cameras compared",
     "num_truth": "true cameras",
@@ -37,15 +37,15 @@ def definitions(values: Mapping[str, Any]) -> str:
 
 
 def georeference(placed: Mapping[str, Any]) -> str:
-    """What the model's frame rests on, where its zero is, and how far off the rest is."""
+    """Method, origin and residuals of the georeferencing."""
     left = placed.get("residuals_m") or {}
     values = {
-        "rests on": {"gps": "GPS", "gcp": "ground control points"}.get(placed["method"]),
+        "method": {"gps": "GPS", "gcp": "ground control points"}.get(placed["method"]),
         **(placed.get("origin") or {}),
         "positions used": left.get("used"),
-        "left out as wrong": left.get("left_out"),
-        "residual on the ground, median and largest, m": _pair(left, "horizontal"),
-        "residual in height, median and largest, m": _pair(left, "vertical"),
+        "rejected as outliers": left.get("left_out"),
+        "horizontal residual, median and largest, m": _pair(left, "horizontal"),
+        "vertical residual, median and largest, m": _pair(left, "vertical"),
     }
     return definitions({name: value for name, value in values.items() if value is not None})
 
@@ -57,7 +57,7 @@ def _pair(left: Mapping[str, Any], axis: str) -> str | None:
 
 
 def per_view_table(per_view: Sequence[Mapping[str, Any]]) -> str:
-    """Sortable; a measure that no view has is left out."""
+    """A sortable table of the views; measures that no view has are omitted."""
     if not per_view:
         return '<p class="hint">No view was measured.</p>'
     known = [key for key in _MEASURES if any(view.get(key) is not None for view in per_view)]
@@ -85,7 +85,7 @@ def per_view_table(per_view: Sequence[Mapping[str, Any]]) -> str:
 
 
 def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
-    """Time and memory of what ran, the reason of what did not."""
+    """Time and memory of the stages that ran, and the reason why others did not."""
     if not stages:
         return '<p class="hint">No stage was recorded.</p>'
     longest = max((s["wall_s"] for s in stages.values()), default=0.0)
@@ -106,7 +106,7 @@ def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
         f'<th class="number" scope="col">{name}</th>' for name in ("Wall time", "CPU", "Memory")
     )
     return (
-        f'<div class="table"><table><thead><tr>{heads}<th scope="col">Why</th></tr></thead>'
+        f'<div class="table"><table><thead><tr>{heads}<th scope="col">Reason</th></tr></thead>'
         f"<tbody>{''.join(rows)}</tbody></table></div>"
     )
 
@@ -114,7 +114,7 @@ def stages_table(stages: Mapping[str, Mapping[str, Any]]) -> str:
 def _span(values: Sequence[float | None]) -> tuple[float, float]:
     found = [v for v in values if v is not None and math.isfinite(v)]
     low, high = min(found, default=0.0), max(found, default=1.0)
-    return low - 0.12 * (high - low), high  # the smallest keeps a visible bar
+    return low - 0.12 * (high - low), high  # the smallest value has a visible bar
 
 
 def _bar(value: float, low: float, high: float) -> str:

@@ -1,4 +1,4 @@
-"""Values as a person reads them, safe inside HTML."""
+"""Formats values for display, escaped for HTML."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ def escape(text: object) -> str:
 
 
 def fixed(value: float | None, digits: int) -> str:
-    """``digits`` decimals, or n/a for nothing and for what is not finite."""
+    """``digits`` decimals, or n/a for None and values that are not finite."""
     if value is None or not math.isfinite(value):
         return MISSING
     return f"{value:,.{digits}f}"

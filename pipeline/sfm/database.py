@@ -1,4 +1,7 @@
-"""COLMAP's database of a scene: filled from keypoint files, matched, and put in a fixed order."""
+"""COLMAP database of a scene: cameras, images, keypoints, matches and two-view geometries.
+
+Matching and verification are cached pair by pair.
+"""
 
 from __future__ import annotations
 
@@ -26,27 +29,32 @@ from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pairs import Pair
 
-# COLMAP's guess where there is no prior: a 45 degree view, about.
+# COLMAP's default focal length over the longer side without a prior (about 45 degrees).
 DEFAULT_FOCAL_FACTOR = 1.2
 
-# Part of a pair's key in the cache: raise it whenever the same two photographs would match
-# differently.
+# Part of a pair's cache key: increase it when a change of the code changes matches.
 ALGORITHM_VERSION = 1
 
-# Two-view geometries are drawn from random samples. At most so many: enough for a fundamental
-# matrix where 40% of the matches are right, and pairs that share nothing cost a fifth of COLMAP's.
+# Maximum number of RANSAC trials of two-view geometry: enough for a fundamental matrix at an inlier
+# ratio of 40%. COLMAP's default of 10000 costs five times as much for pairs without overlap.
 MAX_TRIALS = 2000
 
-# Photographs whose keypoints are held at a time, some 700 KB each.
-KEYPOINTS_HELD = 200
-# Pairs that go into the cache together; a run that is stopped loses no more than these.
+# Number of photographs whose keypoints are in memory at a time, about 700 KB each.
+CACHED_KEYPOINT_FILES = 200
+# Number of pairs written to the cache at a time; an interrupted run loses at most these.
 BATCH_PAIRS = 256
 _PAIR_TABLES = ("matches", "two_view_geometries")
 
 
 @dataclass(frozen=True)
 class MatchingSettings:
-    """What one run of matching and verification needs to know."""
+    """Settings of matching and two-view verification.
+
+    Attributes:
+        max_ratio: of Lowe's ratio test.
+        min_inliers: smallest number of inliers of a verified pair.
+        seed: of RANSAC.
+    """
 
     max_ratio: float
     min_inliers: int
@@ -56,10 +64,14 @@ class MatchingSettings:
 def plan_cameras(
     manifest: Manifest, sfm: schema.Sfm
 ) -> tuple[list[pycolmap.Camera], dict[str, int]]:
-    """Cameras (ids from 1, in order of their first photograph) and photograph's name -> id.
+    """Group the photographs into cameras.
 
-    Photographs share a camera as ``sfm.share_cameras`` says, and only ever with photographs of
-    the same size. The focal prior of a camera is the median of its photographs' EXIF priors.
+    ``sfm.share_cameras`` decides which photographs share a camera; photographs of different sizes
+    never do. The focal length prior of a camera is the median of its photographs' EXIF priors.
+
+    Returns:
+        The cameras (ids from 1, in order of their first photograph) and photograph name -> camera
+        id.
     """
     members: dict[tuple[str, int, int], list[Photo]] = defaultdict(list)
     for photo in manifest.photos:
@@ -91,39 +103,39 @@ def build_database(
     cache: Path | None = None,
     threads: int = 1,
 ) -> int:
-    """Write a database of matched and verified pairs to ``path``.
+    """Match and verify pairs and write the database to ``path``.
 
-    The file's bytes depend neither on ``threads`` nor on what the cache holds: each pair is
-    computed by itself, and all go into the file in their order.
+    The file depends neither on ``threads`` nor on the content of the cache: pairs are computed
+    independently and written in order.
 
     Args:
-        images: (image id, name, camera id) in order of their ids.
+        images: (image id, name, camera id), sorted by id.
         features: folder of keypoint files.
         pairs: indices into ``images``, the smaller one first.
-        cache: folder for pairs' results that outlives the call.
+        cache: folder for results of pairs that outlives the call; None for a temporary one.
 
     Returns:
-        How many pairs the cache had.
+        The number of pairs found in the cache.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     with tempfile.TemporaryDirectory(prefix="matching-", dir=path.parent) as folder:
         store = Path(folder) if cache is None else cache
         store.mkdir(parents=True, exist_ok=True)
-        found = _Photographs(cameras, images, features)
-        wanted = [(images[i][0], images[j][0]) for i, j in pairs]
-        keys = {pair: found.key(pair, settings) for pair in wanted}
-        with closing(_PairCache(store)) as kept:
-            missing = [pair for pair in wanted if not kept.has(keys[pair])]
-            _match_missing(found, missing, keys, settings, kept, Path(folder), threads)
+        inputs = _MatchingInputs(cameras, images, features)
+        id_pairs = [(images[i][0], images[j][0]) for i, j in pairs]
+        keys = {pair: inputs.key(pair, settings) for pair in id_pairs}
+        with closing(_PairCache(store)) as results:
+            missing = [pair for pair in id_pairs if not results.has(keys[pair])]
+            _match_missing(inputs, missing, keys, settings, results, Path(folder), threads)
             path.unlink(missing_ok=True)
-            found.write(path)
-            kept.copy_to(path, keys)
-            kept.prune(set(keys.values()))
-    return len(wanted) - len(missing)
+            inputs.write(path)
+            results.copy_to(path, keys)
+            results.prune(set(keys.values()))
+    return len(id_pairs) - len(missing)
 
 
 def verified_inliers(path: Path) -> dict[tuple[str, str], int]:
-    """Names of the two images -> number of verified matches, of the pairs that have any."""
+    """Names of two images -> number of verified matches, for the pairs that have any."""
     with pycolmap.Database.open(path) as database:
         names = {image.image_id: image.name for image in database.read_all_images()}
         ids, counts = database.read_two_view_geometry_num_inliers()
@@ -136,21 +148,24 @@ def verified_inliers(path: Path) -> dict[tuple[str, str], int]:
 
 
 def share_cameras_by_size(source: Path, target: Path) -> bool:
-    """Copy a database, giving photographs of one size one camera, without a focal prior;
-    False, and no copy, where they have one already."""
+    """Copy a database so that photographs of the same size share a camera without a focal prior.
+
+    Returns:
+        False, without writing a copy, if they share their cameras already.
+    """
     with pycolmap.Database.open(source) as database:
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         used = {image.camera_id for image in database.read_all_images()}
-    kept: dict[tuple[int, int], int] = {}
+    shared_ids: dict[tuple[int, int], int] = {}
     merged = {}
     for camera_id in sorted(used):
         camera = cameras[camera_id]
-        merged[camera_id] = kept.setdefault((camera.width, camera.height), camera_id)
-    if len(kept) == len(used):
+        merged[camera_id] = shared_ids.setdefault((camera.width, camera.height), camera_id)
+    if len(shared_ids) == len(used):
         return False
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
-        for camera_id in kept.values():
+        for camera_id in shared_ids.values():
             camera = cameras[camera_id]
             side = max(camera.width, camera.height)
             shared = pycolmap.Camera.create_from_model_name(
@@ -161,7 +176,7 @@ def share_cameras_by_size(source: Path, target: Path) -> bool:
                 camera.height,
             )
             database.update_camera(shared)
-    # A rig has its camera's id, and a frame is one image.
+    # Every rig has one camera, with the same id; every frame has one image.
     moves = [(new, old) for old, new in merged.items() if new != old]
     connection = sqlite3.connect(target)
     try:
@@ -169,17 +184,17 @@ def share_cameras_by_size(source: Path, target: Path) -> bool:
             statement = f"UPDATE {table} SET {column} = ? WHERE {column} = ?"
             connection.executemany(statement, moves)
         connection.executemany("UPDATE frame_data SET sensor_id = ? WHERE sensor_id = ?", moves)
-        gone = [(old,) for _, old in moves]
-        connection.executemany("DELETE FROM rigs WHERE rig_id = ?", gone)
-        connection.executemany("DELETE FROM cameras WHERE camera_id = ?", gone)
+        unused = [(old,) for _, old in moves]
+        connection.executemany("DELETE FROM rigs WHERE rig_id = ?", unused)
+        connection.executemany("DELETE FROM cameras WHERE camera_id = ?", unused)
         connection.commit()
     finally:
         connection.close()
     return True
 
 
-class _Photographs:
-    """What matching needs to know of each photograph; keypoints are read as they are needed."""
+class _MatchingInputs:
+    """Cameras, images and keypoints to match; keypoints are read on demand."""
 
     def __init__(
         self,
@@ -192,19 +207,19 @@ class _Photographs:
         self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
         self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
         self._digest = {image_id: file_digest(file) for image_id, file in self._file.items()}
-        # Two for each thread are in use at a time; the rest spares reading.
-        self.keypoints = lru_cache(maxsize=KEYPOINTS_HELD)(self._read)
+        self.keypoints = lru_cache(maxsize=CACHED_KEYPOINT_FILES)(self._read)
 
     def camera(self, image_id: int) -> pycolmap.Camera:
         return self._camera[self._camera_of[image_id]]
 
     def _read(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """(F, 2) places and (F, 128) descriptors."""
+        """(F, 2) positions and (F, 128) descriptors."""
         found = Keypoints.read(self._file[image_id])
         return found.xy.astype(np.float64), found.descriptors
 
     def key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
-        """Names the pair's result by all that it depends on: 63 bits, as SQLite's keys have."""
+        """Cache key of a pair: a hash of everything the result depends on, 63 bits (a positive
+        SQLite integer)."""
         facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, asdict(settings)]
         for image_id in pair:
             c = self.camera(image_id)
@@ -214,7 +229,7 @@ class _Photographs:
         return int.from_bytes(digest[:8], "big") >> 1
 
     def write(self, path: Path) -> None:
-        """A database of the cameras, images and keypoints."""
+        """Write a database of the cameras, images and keypoints."""
         with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
             for camera in self._cameras:
                 database.write_camera(camera, use_camera_id=True)
@@ -233,48 +248,48 @@ class _Photographs:
 
 
 def _match_missing(
-    found: _Photographs,
+    inputs: _MatchingInputs,
     missing: Sequence[tuple[int, int]],
     keys: Mapping[tuple[int, int], int],
     settings: MatchingSettings,
-    kept: _PairCache,
+    cache: _PairCache,
     folder: Path,
     threads: int,
 ) -> None:
-    """Match and verify those pairs, and keep what comes of them."""
+    """Match and verify pairs and add the results to the cache."""
     if not missing:
         return
     progress = Progress("matching", len(missing), "pairs")
-    # Threads suffice: matching and pycolmap's verification both let go of the interpreter.
+    # Threads suffice: matching and verification release the GIL.
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
         for start in range(0, len(missing), BATCH_PAIRS):
             batch = missing[start : start + BATCH_PAIRS]
             path = folder / "batch.db"
             path.unlink(missing_ok=True)
             with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-                results = pool.map(lambda pair: _match_pair(found, pair, settings), batch)
+                results = pool.map(lambda pair: _match_pair(inputs, pair, settings), batch)
                 for (first, second), (matches, geometry) in zip(batch, results, strict=True):
                     database.write_matches(first, second, matches)
                     database.write_two_view_geometry(first, second, geometry)
                     progress.advance()
-            kept.take(path, {pair: keys[pair] for pair in batch})
+            cache.add(path, {pair: keys[pair] for pair in batch})
 
 
 def _match_pair(
-    found: _Photographs, pair: tuple[int, int], settings: MatchingSettings
+    inputs: _MatchingInputs, pair: tuple[int, int], settings: MatchingSettings
 ) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
-    """(M, 2) matches, and the geometry that verifies some of them, empty where none does."""
-    (xy_a, descriptors_a), (xy_b, descriptors_b) = (found.keypoints(i) for i in pair)
+    """(M, 2) matches, and their two-view geometry, which is empty if the pair is not verified."""
+    (xy_a, descriptors_a), (xy_b, descriptors_b) = (inputs.keypoints(i) for i in pair)
     matches = match_descriptors(descriptors_a, descriptors_b, settings.max_ratio)
     if len(matches) < settings.min_inliers:
         return matches, pycolmap.TwoViewGeometry()
     options = pycolmap.TwoViewGeometryOptions(min_num_inliers=settings.min_inliers)
     options.ransac.random_seed = settings.seed
     options.ransac.max_num_trials = MAX_TRIALS
-    # A geometry with fewer inliers is dropped anyway, so none with a smaller share is looked for.
+    # A geometry with fewer inliers would be rejected below.
     options.ransac.min_inlier_ratio = settings.min_inliers / len(matches)
     geometry = pycolmap.estimate_two_view_geometry(
-        found.camera(pair[0]), xy_a, found.camera(pair[1]), xy_b, matches, options
+        inputs.camera(pair[0]), xy_a, inputs.camera(pair[1]), xy_b, matches, options
     )
     if len(geometry.inlier_matches) < settings.min_inliers:
         return matches, pycolmap.TwoViewGeometry()
@@ -282,10 +297,11 @@ def _match_pair(
 
 
 class _PairCache:
-    """Results of pairs by their keys, as COLMAP's rows with the key in the place of the pair."""
+    """Cache of matches and two-view geometries: a COLMAP database whose ``pair_id`` is the cache
+    key of the pair."""
 
     def __init__(self, folder: Path):
-        # COLMAP's tables may change with its version.
+        # The database schema may change with COLMAP's version.
         path = folder / f"pairs-{pycolmap.__version__}.db"
         for file in folder.glob("pairs-*.db"):
             if file != path:
@@ -293,7 +309,7 @@ class _PairCache:
         try:
             self._open(path)
         except sqlite3.DatabaseError:
-            # Damaged: it holds nothing that cannot be made again.
+            # Corrupt: the results can be computed again.
             self._connection.close()
             path.unlink()
             self._open(path)
@@ -316,22 +332,22 @@ class _PairCache:
     def has(self, key: int) -> bool:
         return key in self._keys
 
-    def take(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
-        """Keep the pairs of the database at ``path`` (image ids -> key)."""
+    def add(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
+        """Add the pairs of the database at ``path`` (image ids -> key)."""
         self._copy(path, [(pair_id, key) for pair_id, key in _by_pair_id(keys)], "other", "main")
         self._keys |= set(keys.values())
 
     def copy_to(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
-        """Add pairs to the database at ``path``, in their order (image ids -> key)."""
+        """Copy pairs (image ids -> key) to the database at ``path``, in order of pair ids."""
         self._copy(path, [(key, pair_id) for pair_id, key in _by_pair_id(keys)], "main", "other")
 
     def prune(self, used: set[int]) -> None:
-        """Drop what this run did not use, once that is more than what it did."""
-        others = self._keys - used
-        if len(others) > len(used):
+        """Remove the unused results if there are more of them than used ones."""
+        unused = self._keys - used
+        if len(unused) > len(used):
             for table in _PAIR_TABLES:
                 self._connection.executemany(
-                    f"DELETE FROM {table} WHERE pair_id = ?", [(key,) for key in others]
+                    f"DELETE FROM {table} WHERE pair_id = ?", [(key,) for key in unused]
                 )
             self._connection.commit()
             self._connection.execute("VACUUM")
@@ -340,10 +356,10 @@ class _PairCache:
         self._connection.close()
 
     def _copy(self, path: Path, ids: list[tuple[int, int]], source: str, target: str) -> None:
-        """Copy the rows of (id in the source, id in the target), in order of the target's."""
+        """Copy rows, ``ids`` being (id in the source, id in the target), in order of target ids."""
         run = self._connection.execute
         run("ATTACH DATABASE ? AS other", (str(path),))
-        # Copies of a photograph share their keys: neither column is unique.
+        # Identical photographs have equal keys: neither column is unique.
         run("CREATE TEMP TABLE renamed (old INTEGER, new INTEGER)")
         self._connection.executemany("INSERT INTO renamed VALUES (?, ?)", ids)
         for table in _PAIR_TABLES:

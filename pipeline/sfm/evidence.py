@@ -1,4 +1,5 @@
-"""Evidence on a model: what ``judge`` looks at, taken from pycolmap's model and database."""
+"""Statistics of a reconstruction for the quality check (``judge``), from a pycolmap model and its
+database."""
 
 from __future__ import annotations
 
@@ -11,23 +12,30 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.sfm.consistency import Pairs, check
+from pipeline.sfm.consistency import Pairs, measure_consistency
 from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
 
-# Enough pairs and matches to tell turning from moving, few enough to take no time.
+# Size of the sample of pairs, and of matches of each, that pure rotation is fitted to.
 PARALLAX_PAIRS = 40
 PARALLAX_MATCHES = 64
-# A camera that only turned can have any focal length (over the longer side) and any distortion.
+# Grid of focal lengths (over the longer side) and radial distortions: under pure rotation the
+# model's own estimates may be wrong.
 PARALLAX_FOCALS = tuple(float(v) for v in np.geomspace(0.35, 4.0, 14))
 PARALLAX_STEP = float(np.log(PARALLAX_FOCALS[1] / PARALLAX_FOCALS[0]))
 PARALLAX_RADIALS = (-0.3, -0.15, 0.0, 0.15)
 
-# How the focal length is tried: changed by this factor, on this many images, spread evenly.
+# Focal certainty: factor by which focal lengths are changed, number of images (evenly spread) and
+# of iterations of the bundle adjustments.
 FOCAL_STEP, FOCAL_IMAGES, FOCAL_ITERATIONS = 1.2, 30, 8
 
 
-def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Evidence:
-    """The evidence on ``model``, which was made from ``database``, of ``total`` photographs."""
+def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int) -> Evidence:
+    """Compute the statistics of ``model``.
+
+    Args:
+        database: the database that the model was mapped from.
+        total: number of photographs of the scene.
+    """
     registered = sorted(model.reg_image_ids())
     behind, observations, angles = _geometry(model)
     camera_of = {i: model.image(i).camera_id for i in registered}
@@ -37,11 +45,11 @@ def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Eviden
         for camera in opened.read_all_cameras():
             if camera.has_prior_focal_length and camera.camera_id in used:
                 priors[camera.camera_id] = float(camera.mean_focal_length())
-        every = _verified_pairs(opened)
-        geometries = {pair: m for pair, m in every.items() if set(pair) <= set(registered)}
-        explained = _explained_matches(model, opened, geometries)
-        parallax = _parallax(model, opened, geometries)
-        consistency = check(model, opened, geometries)
+        verified = _verified_pairs(opened)
+        pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(registered)}
+        explained = _explained_matches(model, opened, pairs)
+        parallax = _parallax(model, opened, pairs)
+        consistency = measure_consistency(model, opened, pairs)
     focal = {i: float(model.camera(i).mean_focal_length()) for i in used}
     side = {i: max(model.camera(i).width, model.camera(i).height) for i in used}
     off = {i: max(focal[i] / prior, prior / max(focal[i], 1e-9)) for i, prior in priors.items()}
@@ -50,7 +58,7 @@ def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Eviden
     return Evidence(
         registered=len(registered),
         total=total,
-        reachable=_largest_set(list(every)),
+        reachable=_largest_component(list(verified)),
         points=int(model.num_points3D()),
         observations_per_image=observations / max(len(registered), 1),
         mean_track_length=float(model.compute_mean_track_length()),
@@ -58,40 +66,39 @@ def gather(model: pycolmap.Reconstruction, database: Path, total: int) -> Eviden
         explained_matches=explained,
         agreeing_matches=consistency.agreeing_matches,
         agreeing_pairs=consistency.agreeing_pairs,
-        strangers=consistency.strangers,
+        missing_covisibility=consistency.missing_covisibility,
         behind_camera=behind,
         parallax=parallax,
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        # Where EXIF agrees nobody asks.
-        focal_certainty=None if _agrees(focal_off) else _focal_certainty(model),
+        focal_certainty=None if _agrees_with_exif(focal_off) else _focal_certainty(model),
         focal_relative=float(np.median([focal[c] / side[c] for c in camera_of.values()])),
         focal_prior_px=priors,
     )
 
 
 def _geometry(model: pycolmap.Reconstruction) -> tuple[float, int, NDArray[np.float64]]:
-    """Share of observations behind their camera, their number, and each point's angle (degrees)
-    between the rays of its first camera and of the one farthest from that."""
+    """Share of the observations behind their camera, number of observations, and (P,) angles in
+    degrees of each point: the largest between the first ray of its track and any other."""
     poses = {}
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
         poses[image_id] = (image.cam_from_world().matrix()[2], image.projection_center())
     behind, observations = 0, 0
     angles = np.zeros(model.num_points3D())
-    for place, point in enumerate(model.points3D.values()):
+    for index, point in enumerate(model.points3D.values()):
         seen = [poses[element.image_id] for element in point.track.elements]
         axes, centres = (np.array(column) for column in zip(*seen, strict=True))
         behind += int((axes[:, :3] @ point.xyz + axes[:, 3] <= 0).sum())
         observations += len(seen)
         rays = centres - point.xyz
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
-        angles[place] = np.degrees(np.arccos(np.clip((rays @ rays[0]).min(), -1, 1)))
+        angles[index] = np.degrees(np.arccos(np.clip((rays @ rays[0]).min(), -1, 1)))
     return behind / max(observations, 1), observations, angles
 
 
 def _verified_pairs(database: pycolmap.Database) -> Pairs:
-    """Image ids -> (M, 2) verified matches, of the pairs that have any, in order."""
+    """Image ids -> (M, 2) verified matches, for the pairs that have any, sorted by ids."""
     found = {}
     ids, geometries = database.read_two_view_geometries()
     for pair_id, geometry in zip(ids, geometries, strict=True):
@@ -100,8 +107,8 @@ def _verified_pairs(database: pycolmap.Database) -> Pairs:
     return dict(sorted(found.items()))
 
 
-def _largest_set(pairs: list[tuple[int, int]]) -> int:
-    """Images in the largest set that the pairs hold together."""
+def _largest_component(pairs: list[tuple[int, int]]) -> int:
+    """Number of images in the largest connected component of the view graph."""
     if not pairs:
         return 0
     ids, index = np.unique(np.array(pairs), return_inverse=True)
@@ -116,7 +123,7 @@ def _explained_matches(
     database: pycolmap.Database,
     pairs: Pairs,
 ) -> float:
-    """Share of verified matches between registered images that join keypoints of one point."""
+    """Share of the verified matches whose two keypoints are observations of one 3D point."""
     seen: dict[int, NDArray[np.int64]] = {}
     for image_id in model.reg_image_ids():
         points = np.full(database.num_keypoints_for_image(image_id), -1, np.int64)
@@ -133,11 +140,11 @@ def _explained_matches(
 
 
 def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs: Pairs) -> float:
-    """How far matches are from what a camera that only turns would see, over the longer side.
+    """Residual of the matches under pure rotation, as a share of the longer side.
 
-    For each pair the best rotation between the keypoints' rays is found (Kabsch) and the median
-    distance of what it predicts taken; of the pairs, the third quartile. The model's own focal
-    length and distortion may be wrong: the smallest value over many is returned.
+    For each pair the rotation that best aligns the keypoints' rays (Kabsch) gives a median
+    distance between predicted and matched keypoints; the value is the upper quartile over the
+    pairs, minimised over focal lengths and radial distortions on a grid.
     """
     if not pairs:
         return 0.0
@@ -145,23 +152,24 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
     found: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
     for pair in chosen:
         matches = pairs[pair]
-        # As many of each pair, so that all pairs make one array; of a small one some twice.
-        spread = np.linspace(0, len(matches) - 1, PARALLAX_MATCHES).round().astype(np.intp)
-        for image_id, column, side in zip(pair, matches[spread].T, found, strict=True):
+        # The same number for each pair, so that all pairs form one array; pairs with fewer matches
+        # repeat some.
+        sample = np.linspace(0, len(matches) - 1, PARALLAX_MATCHES).round().astype(np.intp)
+        for image_id, column, side in zip(pair, matches[sample].T, found, strict=True):
             camera = model.camera(model.image(image_id).camera_id)
             xy = database.read_keypoints(image_id)[column, :2].astype(np.float64)
             middle = np.array([camera.width, camera.height]) / 2
             side.append((xy - middle) / max(camera.width, camera.height))
     a, b = (np.stack(side) for side in found)
 
-    def missed(focal: float, radial: float) -> float:
-        plane_a, plane_b = (_undistorted(p / focal, radial) for p in (a, b))
-        misses = np.linalg.norm(_turn(plane_a, plane_b) - plane_b, axis=-1) * focal
-        medians = np.median(np.nan_to_num(misses, nan=1.0), axis=1)
+    def residual(focal: float, radial: float) -> float:
+        rays_a, rays_b = (_undistorted(p / focal, radial) for p in (a, b))
+        distances = np.linalg.norm(_best_rotated(rays_a, rays_b) - rays_b, axis=-1) * focal
+        medians = np.median(np.nan_to_num(distances, nan=1.0), axis=1)
         return float(np.percentile(medians, 75))
 
     best, focal, radial = min(
-        (missed(f, k), f, k) for f in PARALLAX_FOCALS for k in PARALLAX_RADIALS
+        (residual(f, k), f, k) for f in PARALLAX_FOCALS for k in PARALLAX_RADIALS
     )
     for finer in (0.5, 0.25):
         near = [
@@ -169,35 +177,36 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
             for sf in (-1, 0, 1)
             for sk in (-1, 0, 1)
         ]
-        best, focal, radial = min([(missed(f, k), f, k) for f, k in near])
+        best, focal, radial = min([(residual(f, k), f, k) for f, k in near])
     return best
 
 
-def _undistorted(plane: NDArray[np.float64], radial: float) -> NDArray[np.float64]:
-    """(..., 2) without a radial term, to first order: this is to be near, not exact."""
-    return plane * (1 - radial * (plane**2).sum(-1, keepdims=True))
+def _undistorted(points: NDArray[np.float64], radial: float) -> NDArray[np.float64]:
+    """(..., 2) normalized coordinates with one radial term removed, to first order."""
+    return points * (1 - radial * (points**2).sum(-1, keepdims=True))
 
 
-def _turn(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
-    """(P, M, 2) where points ``a`` of the plane z = 1 go by the rotation, one for each of P, that
-    best takes them to ``b``; NaN where that is behind."""
+def _best_rotated(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(P, M, 2) normalized coordinates ``a`` of P pairs, rotated by the rotation of each pair that
+    best aligns them with ``b``; NaN behind the camera."""
     rays_a, rays_b = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (a, b))
     rays_a /= np.linalg.norm(rays_a, axis=-1, keepdims=True)
     rays_b /= np.linalg.norm(rays_b, axis=-1, keepdims=True)
     u, _, vt = np.linalg.svd(np.swapaxes(rays_b, -1, -2) @ rays_a)
     vt[:, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    turned = rays_a @ np.swapaxes(u @ vt, -1, -2)
-    return np.asarray(turned[..., :2] / np.where(turned[..., 2:] > 1e-6, turned[..., 2:], np.nan))
+    rotated = rays_a @ np.swapaxes(u @ vt, -1, -2)
+    depth = np.where(rotated[..., 2:] > 1e-6, rotated[..., 2:], np.nan)
+    return np.asarray(rotated[..., :2] / depth)
 
 
-def _agrees(focal_off: float | None) -> bool:
+def _agrees_with_exif(focal_off: float | None) -> bool:
     return focal_off is not None and focal_off <= MAX_FOCAL_OFF
 
 
 def _focal_certainty(model: pycolmap.Reconstruction) -> float:
-    """By what share the robust cost rises, at least, when the focal lengths are 20% smaller or
-    larger and everything else may adapt: near 0, the photographs do not tell them (a plane seen
-    from the front, a camera that turns or goes straight ahead)."""
+    """Smallest relative increase of the robust cost if the focal lengths are held 20% smaller or
+    larger while all other parameters are adjusted. Near 0, the images do not determine the focal
+    length (fronto-parallel planes, pure rotation, forward motion)."""
     base = pycolmap.Reconstruction(model)
     best = _adjusted_cost(base, refine_focal=True)
     rises = []
@@ -212,7 +221,7 @@ def _focal_certainty(model: pycolmap.Reconstruction) -> float:
 
 
 def _adjusted_cost(model: pycolmap.Reconstruction, *, refine_focal: bool) -> float:
-    """Adjust ``model`` and return its robust cost; a few steps, for the order of magnitude."""
+    """Bundle adjust ``model`` for a few iterations, on a sample of images, and return the cost."""
     options = pycolmap.BundleAdjustmentOptions(
         refine_focal_length=refine_focal, print_summary=False
     )

@@ -1,7 +1,7 @@
-"""Run a function in a process of its own.
+"""Run a function in a separate process.
 
-pycolmap crashes beside torch, and where it was imported before cv2 (both bring a libpng and a
-zlib of their own), so libraries that must not meet are kept apart here.
+pycolmap crashes in a process that has loaded torch, or that imports cv2 after pycolmap (both bundle
+libpng and zlib). Functions that use incompatible libraries run in separate processes.
 """
 
 from __future__ import annotations
@@ -24,28 +24,29 @@ T = TypeVar("T")
 
 
 def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
-    """Call ``function(*args, **kwargs)`` in a fresh (spawned) process and return its value.
+    """Call ``function(*args, **kwargs)`` in a new (spawned) process and return its value.
 
-    The function, its arguments and its value must pickle; the function's module is imported in
-    the new process, nothing else of this one is. Progress goes to the same file. The process
-    ends when this one does, even by SIGKILL.
+    The function, its arguments and its value must be picklable; the new process imports the
+    function's module only. Progress is written to the same file. The process ends when the calling
+    process ends, even by SIGKILL.
 
     Raises:
-        UserError: the one the function raised.
-        RuntimeError: any other exception (with its traceback as text), or the process died.
+        UserError: raised by the function.
+        RuntimeError: the function raised another exception (the message has its traceback), or the
+            process died.
     """
     context = multiprocessing.get_context("spawn")
-    ours, theirs = context.Pipe(duplex=False)
-    # The pipe's other end: closed by the system when this process goes, whatever the way.
-    leash_child, leash_parent = context.Pipe(duplex=False)
+    receiver, sender = context.Pipe(duplex=False)
+    # The operating system closes the parent's end of this pipe when the parent ends.
+    parent_alive, held_by_parent = context.Pipe(duplex=False)
     process = context.Process(
-        target=_child, args=(theirs, leash_child, progress._file, function, args, kwargs)
+        target=_child, args=(sender, parent_alive, progress._file, function, args, kwargs)
     )
     process.start()
-    theirs.close()
-    leash_child.close()
+    sender.close()
+    parent_alive.close()
     try:
-        status, value = ours.recv()
+        status, value = receiver.recv()
     except EOFError:
         process.join()
         raise RuntimeError(f"{function.__qualname__} {_death(process.exitcode)}") from None
@@ -53,8 +54,8 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
         if sys.exc_info()[0] is KeyboardInterrupt:
             process.terminate()
         process.join()
-        leash_parent.close()
-        ours.close()
+        held_by_parent.close()
+        receiver.close()
     if status == "user error":
         raise UserError(value["what"], file=value["file"], fix=value["fix"])
     if status == "error":
@@ -65,13 +66,13 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
 
 def _child(
     results: Connection,
-    leash: Connection,
+    parent_alive: Connection,
     progress_file: Path | None,
     function: Callable[..., Any],
     args: tuple[Any, ...],
     kwargs: dict[str, Any],
 ) -> None:
-    threading.Thread(target=_die_with_parent, args=(leash,), daemon=True).start()
+    threading.Thread(target=_exit_with_parent, args=(parent_alive,), daemon=True).start()
     progress.write_progress_to(progress_file)
     if progress_file is not None:
         sys.stderr = progress.Console(sys.stderr, None)  # type: ignore[assignment]
@@ -83,14 +84,14 @@ def _child(
         results.send(("error", traceback.format_exc()))
     if isinstance(sys.stderr, progress.Console):
         sys.stderr.clear()
-    # Destructors of extension libraries have nothing left to do that is worth a crash here.
+    # Skip the destructors of extension libraries: they may crash.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
 
 
-def _die_with_parent(leash: Connection) -> None:
-    wait([leash])
+def _exit_with_parent(parent_alive: Connection) -> None:
+    wait([parent_alive])
     os._exit(1)
 
 

@@ -1,10 +1,10 @@
-"""Is a reconstruction to be believed?
+"""Quality check of a reconstruction: "good", "weak" or "failed", with reasons and remedies.
 
-A failed one can register every image at 0.3 px: a wrong focal length bends the scene and drops
-what does not fit, and where two sides of a building look alike it is folded onto itself, so the
-residual of what is left says little. Other things say more: what was dropped, whether the pairs of
-photographs agree, each for itself, whether neighbours see the same things, and whether the
-geometry could have told a wrong focal length at all.
+The reprojection error is not sufficient: a failed model can register every image at 0.3 px. A wrong
+focal length bends the scene and the mapper drops the observations that do not fit; repeated
+structure (doppelgangers) folds the model onto itself. The check therefore considers the matches
+that the model does not explain, two-view consistency, covisibility of neighbouring images, and
+whether the images determine the focal length at all.
 """
 
 from __future__ import annotations
@@ -14,70 +14,68 @@ from typing import Literal
 
 Grade = Literal["good", "weak", "failed"]
 
-# Bounds on the evidence, (failed, weak), from the corpus of ``benchmarks.judge`` (docs/judge.md):
-# each lies between what right models and what wrong ones show there, nearer to the wrong ones.
+# Thresholds (failed, weak), chosen on the corpus of ``python -m benchmarks.judge``: each lies
+# between the values of correct and of wrong models, closer to the wrong ones.
 MIN_EXPLAINED = (0.20, 0.40)
 MIN_OBSERVATIONS = (15, 60)
 MIN_AGREEING_PAIRS = (0.93, 0.98)
-MAX_STRANGERS = (0.35, 0.15)
-# Both signs of a folded model together, each of which alone would pass as weak.
-FOLDED_AGREEING, FOLDED_STRANGERS = 0.97, 0.15
-# Matches that a camera which only turns would see as well, but for noise (half a pixel).
+MAX_MISSING_COVISIBILITY = (0.35, 0.15)
+# A model that exceeds both is folded, although each alone would only be weak.
+FOLDED_AGREEING, FOLDED_MISSING_COVISIBILITY = 0.97, 0.15
+# Below this, pure rotation explains the matches up to noise (half a pixel).
 MIN_PARALLAX = (0.0018, 0.004)
 MAX_BEHIND = 0.01
-# A lens from 8 mm to 600 mm on 35 mm film: focal length over the longer side.
+# Focal length over the longer side: lenses from 8 mm to 600 mm on 35 mm film.
 FOCAL_RANGE = (0.22, 17.0)
-# EXIF is rounded by a few per cent; beyond this the picture was cropped, or the model is wrong.
+# EXIF focal lengths are rounded by a few per cent. A larger ratio means a cropped image or a wrong
+# model.
 MAX_FOCAL_OFF = 1.3
-# Less of a rise in cost for a focal length 20% off: the photographs do not tell it. Right models of
-# things with depth show 0.3 and more, planes and straight drives 0.06 and less.
+# If the cost rises by a smaller share for a focal length that is off by 20%, the images do not
+# determine the focal length (planar scenes, forward motion).
 MIN_FOCAL_CERTAINTY = 0.1
 MIN_SHARE_GOOD = 0.8
 MAX_REPROJECTION_WEAK_PX = 2.0
-# Half of the points seen under less than this: the camera hardly moved, depths are guesses.
+# Median triangulation angle below which the baseline is too short for reliable depths.
 MIN_ANGLE_WEAK_DEG = 2.0
-# As many of the photographs that pairs link have a pose: mapping them again gains none.
-REACHED = 0.9
+# If at least this share of the largest connected component is registered, another mapping attempt
+# cannot register many more images.
+REGISTERED_SHARE_OF_COMPONENT = 0.9
 
-_MORE = (
-    "take more photographs around the subject, each sharing at least two thirds with the one before"
-)
+_MORE = "take more photographs around the subject, each overlapping the previous one by two thirds"
 _OPTIONS = "raise features.max_features and matches.neighbours, or set matches.pairs: exhaustive"
 _MOVE = "move sideways around the subject between photographs instead of turning on the spot"
-_TEXTURE = "photograph something with texture, sharply and in unchanging light"
+_TEXTURE = "photograph textured surfaces, in focus and in constant light"
 _FOCAL = (
-    "keep the original files with their EXIF, use one lens and zoom, and add photographs from "
-    "higher, lower and closer that see depth"
+    "keep the original files with their EXIF data, use one lens at a fixed zoom, and add "
+    "photographs from higher, lower and closer viewpoints that show depth"
 )
-_ALIKE = (
+_REPEATED = (
     "add photographs that show the parts that look alike together with their surroundings, and "
-    "turn corners in small steps"
+    "take more photographs when you go around corners"
 )
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """What there is to see of a model.
+    """Statistics of a model from which ``judge`` derives its verdict.
 
     Attributes:
-        registered, total: images.
-        reachable: images in the largest set that verified pairs hold together.
-        points, observations_per_image, mean_track_length, reprojection_px: of the model.
-        explained_matches: share of verified matches between registered images whose two keypoints
-            are seen as one point.
-        agreeing_matches, agreeing_pairs: shares of the verified matches, and of the strong pairs,
-            that agree with the epipolar geometry which the model gives them.
-        strangers: share of neighbouring views that hardly see one another's points again.
-        behind_camera: share of observations behind the camera that made them.
-        parallax: how far matches are from what a camera that only turns would see, over the
-            longer side.
-        median_angle_deg: of the points, the largest angle between two of their rays, the median.
-        focal_off: ratio of the focal length to its EXIF prior, either way up, of the median image
-            with a prior; None without any (pictures cropped after they were taken have wrong ones).
-        focal_certainty: share by which the cost rises for a focal length 20% off; None, not asked,
-            where EXIF agrees.
-        focal_relative: focal length over the longer side, of the median image.
-        focal_prior_px: camera id -> EXIF prior.
+        registered, total: numbers of registered images and of all images.
+        reachable: number of images in the largest connected component of the view graph.
+        points, observations_per_image, mean_track_length, reprojection_px: of the model, as COLMAP
+            reports them.
+        explained_matches: share of the verified matches between registered images whose two
+            keypoints are observations of the same 3D point.
+        agreeing_matches, agreeing_pairs, missing_covisibility: see ``consistency.Consistency``.
+        behind_camera: share of observations whose point is behind the camera.
+        parallax: residual of the matches under pure rotation, as a share of the longer side.
+        median_angle_deg: median over the points of the triangulation angle.
+        focal_off: median over the images with an EXIF prior of max(f / prior, prior / f); None
+            without any prior. Images cropped after capture have wrong priors.
+        focal_certainty: smallest relative increase of the bundle adjustment cost for a focal length
+            that is off by 20%; None (not computed) if the focal length agrees with EXIF.
+        focal_relative: median over the images of the focal length over the longer side.
+        focal_prior_px: camera id -> EXIF prior, pixels.
     """
 
     registered: int
@@ -90,7 +88,7 @@ class Evidence:
     explained_matches: float
     agreeing_matches: float
     agreeing_pairs: float
-    strangers: float
+    missing_covisibility: float
     behind_camera: float
     parallax: float
     median_angle_deg: float
@@ -102,93 +100,108 @@ class Evidence:
 
 @dataclass(frozen=True)
 class Verdict:
-    """Attributes:
-    reasons: what speaks against the model.
-    remedies: what to photograph or change, one for each reason, each once.
-    curable: mapping again, another way, may give a better model.
+    """Result of the quality check.
+
+    Attributes:
+        grade: "good", "weak" (usable, with a warning) or "failed".
+        reasons: the defects found, empty for "good".
+        remedies: what to photograph or configure differently, without duplicates.
+        worth_retrying: whether another mapping attempt may give a better model.
     """
 
     grade: Grade
     reasons: list[str]
     remedies: list[str]
-    curable: bool
+    worth_retrying: bool
 
 
 @dataclass(frozen=True)
 class _Finding:
-    """One thing that speaks against a model, where ``hit``. ``curable``: mapping again may take it
-    away; ``final``: whatever else it takes away is not worth it."""
+    """A possible defect of a model.
 
-    hit: bool
+    Attributes:
+        found: whether the model has the defect.
+        worth_retrying: another mapping attempt may remove the defect.
+        prevents_retry: no other attempt is made, whatever the other findings are.
+    """
+
+    found: bool
     reason: str
     remedy: str
-    curable: bool = True
-    final: bool = False
+    worth_retrying: bool = True
+    prevents_retry: bool = False
 
 
 def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
-    """The verdict on a model, None being no model at all."""
+    """Grade a reconstruction.
+
+    Args:
+        evidence: statistics of the model; None if the mapper returned no model.
+        min_registered_share: share of registered images below which the model has failed.
+    """
     if evidence is None:
         return Verdict(
             "failed",
-            ["no photographs could be put in relation to each other"],
+            ["no relative pose between photographs could be estimated"],
             [_MORE, _MOVE, _TEXTURE],
             True,
         )
     for index, grade in enumerate(("failed", "weak")):
-        found = [f for f in _findings(evidence, index, min_registered_share) if f.hit]
+        found = [f for f in _findings(evidence, index, min_registered_share) if f.found]
         if found:
             return Verdict(
                 grade,  # type: ignore[arg-type]
                 [f.reason for f in found],
                 list(dict.fromkeys(f.remedy for f in found)),
-                any(f.curable for f in found) and not any(f.final for f in found),
+                any(f.worth_retrying for f in found) and not any(f.prevents_retry for f in found),
             )
     return Verdict("good", [], [], False)
 
 
-def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Finding]:
-    """What could speak against a model; ``which``: 0 asks for failure, 1 for weakness."""
-    failed = which == 0
+def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Finding]:
+    """The defects that are checked; ``level`` indexes the thresholds: 0 failed, 1 weak."""
+    failed = level == 0
     share = e.registered / e.total
-    folded = e.agreeing_pairs < FOLDED_AGREEING and e.strangers > FOLDED_STRANGERS
+    folded = (
+        e.agreeing_pairs < FOLDED_AGREEING and e.missing_covisibility > FOLDED_MISSING_COVISIBILITY
+    )
     off = e.focal_off or 1.0
-    told = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
+    focal_determined = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
     findings = [
         _Finding(
             share < (min_registered_share if failed else MIN_SHARE_GOOD),
             f"{e.registered} of {e.total} photographs got a pose",
-            _MORE + f"; leave out those that show something else; or {_OPTIONS}",
-            e.registered < REACHED * e.reachable,
+            _MORE + f"; remove those that show something else; or {_OPTIONS}",
+            e.registered < REGISTERED_SHARE_OF_COMPONENT * e.reachable,
         ),
         _Finding(
-            e.explained_matches < MIN_EXPLAINED[which],
+            e.explained_matches < MIN_EXPLAINED[level],
             f"only {e.explained_matches:.0%} of the verified matches fit the model",
             _FOCAL,
         ),
         _Finding(
-            e.observations_per_image < MIN_OBSERVATIONS[which],
-            f"a photograph sees only {e.observations_per_image:.0f} points",
+            e.observations_per_image < MIN_OBSERVATIONS[level],
+            f"a photograph observes only {e.observations_per_image:.0f} points on average",
             _TEXTURE + f"; or {_OPTIONS}",
         ),
         _Finding(
-            e.agreeing_pairs < MIN_AGREEING_PAIRS[which] or (failed and folded),
+            e.agreeing_pairs < MIN_AGREEING_PAIRS[level] or (failed and folded),
             f"{1 - e.agreeing_pairs:.0%} of the strongest pairs of photographs contradict the "
-            "model: parts that look alike may have been taken for one another",
-            _ALIKE,
+            "model: different parts that look alike may have been merged",
+            _REPEATED,
         ),
         _Finding(
-            e.strangers > MAX_STRANGERS[which] and not (failed and folded),
-            f"{e.strangers:.0%} of neighbouring photographs do not see the same things: parts that "
-            "look alike may have been taken for one another",
-            _ALIKE,
+            e.missing_covisibility > MAX_MISSING_COVISIBILITY[level] and not (failed and folded),
+            f"{e.missing_covisibility:.0%} of neighbouring photographs do not see the same points: "
+            "different parts that look alike may have been merged",
+            _REPEATED,
         ),
         _Finding(
-            e.parallax < MIN_PARALLAX[which],
-            "the camera only turned, or hardly moved: nothing shows how far away things are",
+            e.parallax < MIN_PARALLAX[level],
+            "the camera only turned, or hardly moved: without parallax, depth is unknown",
             _MOVE,
-            curable=False,
-            final=True,
+            worth_retrying=False,
+            prevents_retry=True,
         ),
     ]
     if failed:
@@ -196,7 +209,7 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
             *findings,
             _Finding(
                 not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
-                f"the focal length is {e.focal_relative:.2f} times the picture's longer side",
+                f"the focal length is {e.focal_relative:.2f} times the image's longer side",
                 _FOCAL,
             ),
             _Finding(
@@ -208,26 +221,26 @@ def _findings(e: Evidence, which: int, min_registered_share: float) -> list[_Fin
     return [
         *findings,
         _Finding(
-            off > MAX_FOCAL_OFF and not told,
-            f"the focal length is {off:.1f} times off the one in EXIF, and the photographs do not "
-            "tell which is right",
+            off > MAX_FOCAL_OFF and not focal_determined,
+            f"the focal length differs from EXIF by a factor of {off:.1f}, and the photographs do "
+            "not determine which one is correct",
             _FOCAL,
         ),
         _Finding(
-            e.focal_off is None and not told,
-            "the photographs hardly tell the focal length: they show a plane from the front, the "
-            "camera went straight ahead, or they are not sharp",
+            e.focal_off is None and not focal_determined,
+            "the photographs hardly determine the focal length: they show a plane from the front, "
+            "the camera moved straight ahead, or they are not sharp",
             _FOCAL,
             False,
         ),
         _Finding(
             e.reprojection_px > MAX_REPROJECTION_WEAK_PX,
-            f"the points miss their keypoints by {e.reprojection_px:.1f} px",
+            f"the mean reprojection error is {e.reprojection_px:.1f} px",
             _TEXTURE,
         ),
         _Finding(
             e.median_angle_deg < MIN_ANGLE_WEAK_DEG,
-            "the camera hardly moved: half of the points are seen within "
+            "the camera hardly moved: the median triangulation angle is "
             f"{e.median_angle_deg:.1f} degrees",
             _MOVE,
             False,

@@ -1,4 +1,4 @@
-"""Keypoints of one photograph and their file."""
+"""Keypoints of one photograph and their file format."""
 
 from __future__ import annotations
 
@@ -19,11 +19,12 @@ class Keypoints:
     """Keypoints of one photograph, largest scale first.
 
     Attributes:
-        xy: (F, 2) float32, stored pixels, pixel centres at .5.
-        scale: (F,) float32, sigma in stored pixels.
+        xy: (F, 2) float32, pixels of the stored image (before EXIF orientation), pixel centres at
+            .5.
+        scale: (F,) float32, sigma in pixels.
         orientation: (F,) float32, radians.
         descriptors: (F, 128) uint8, RootSIFT times 512.
-        rgb: (F, 3) uint8, the photograph's colour there.
+        rgb: (F, 3) uint8, colour of the photograph at the keypoint.
     """
 
     xy: NDArray[np.float32]
@@ -36,7 +37,7 @@ class Keypoints:
         return len(self.xy)
 
     def write(self, path: Path) -> None:
-        """Write as ``.npz``, atomically; the same keypoints give the same bytes."""
+        """Write as ``.npz``, atomically and deterministically."""
         buffer = io.BytesIO()
         np.savez(
             buffer,
@@ -50,20 +51,25 @@ class Keypoints:
 
     @staticmethod
     def read(path: Path) -> Keypoints:
+        """Read a file that ``write`` wrote."""
         with np.load(path, allow_pickle=False) as data:
             return Keypoints(**{name: data[name] for name in Keypoints.__dataclass_fields__})
 
 
 def keypoint_file(folder: Path, name: str) -> Path:
-    """The keypoint file of the photograph ``name``: no two names share one."""
-    plain = quote(name, safe="")
-    # File systems take 255 bytes a name.
-    if len(plain) > 200:
-        plain = hashlib.sha256(name.encode()).hexdigest()
-    return folder / f"{plain}.npz"
+    """Path of the keypoint file of the photograph ``name``; distinct for distinct names."""
+    stem = quote(name, safe="")
+    # File systems limit names to 255 bytes.
+    if len(stem) > 200:
+        stem = hashlib.sha256(name.encode()).hexdigest()
+    return folder / f"{stem}.npz"
 
 
 def root_sift(descriptors: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(F, 128) RootSIFT times 512 of (F, 128) SIFT descriptors of any scale."""
+    """RootSIFT (Arandjelovic and Zisserman 2012) times 512, as COLMAP stores it.
+
+    Args:
+        descriptors: (F, 128) SIFT descriptors of any scale.
+    """
     sums = np.maximum(np.abs(descriptors).sum(axis=1, keepdims=True), 1e-12)
     return np.clip(np.rint(512 * np.sqrt(descriptors / sums)), 0, 255).astype(np.uint8)

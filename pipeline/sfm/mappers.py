@@ -1,4 +1,4 @@
-"""pycolmap's two mappers, set up."""
+"""pycolmap's incremental and global mapper with this project's settings."""
 
 from __future__ import annotations
 
@@ -13,29 +13,30 @@ from pipeline.runtime.progress import Progress
 
 Mapper = Literal["incremental", "global"]
 
-# A smaller model is no reconstruction; of two photographs, two must do.
+# Smallest number of registered images of a model (2 for a scene of two photographs).
 MIN_MODEL_SIZE = 3
 
-# Global mapping on the longest tracks alone: three times as fast, as accurate.
+# Global mapping uses the longest tracks only: several times faster at the same accuracy.
 GLOBAL_TRACKS_PER_VIEW = 300
 
 
 def run_mapper(
     mapper: Mapper, database: Path, total: int, seed: int
 ) -> list[pycolmap.Reconstruction]:
-    """The models found, largest first; the database is not changed.
+    """Map the database and return the models found, largest first.
 
-    On one thread: the libraries sum in the order their threads finish.
+    The database is not changed. Runs on one thread: with more, the result depends on the order in
+    which threads finish.
 
     Args:
-        total: photographs in the database.
+        total: number of photographs in the database.
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         run = _map_incremental if mapper == "incremental" else _map_global
         models = run(database, Path(folder), total, seed)
     smallest = min(MIN_MODEL_SIZE, total)
     models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
-    # Ties go to the model with more points, then to the first found.
+    # Of models with equally many images, the one with more points comes first.
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     return models
 
@@ -48,20 +49,19 @@ def _map_incremental(
         random_seed=seed,
         min_model_size=min(MIN_MODEL_SIZE, total),
         extract_colors=False,
-        # Fewer global adjustments: a third faster, as accurate.
+        # Fewer bundle adjustments than COLMAP's default: faster at the same accuracy.
         ba_local_max_refinements=1,
         ba_global_frames_ratio=1.5,
         ba_global_points_ratio=1.5,
-        # The last adjustment, which frees the cameras (refine.py), goes on to the end; those on the
-        # way need not: a fifth of the time, as accurate.
+        # The final bundle adjustment (refine.py) converges further; intermediate ones need not.
         ba_global_function_tolerance=1e-5,
     )
-    # 1.8 times the points at the same accuracy, and points are what Gaussians start from.
+    # Two-view tracks nearly double the number of points, from which Gaussians are initialised.
     options.triangulation.ignore_two_view_tracks = False
     progress = Progress("mapping", total, "photographs")
 
     def registered() -> None:
-        # Photographs tried again, or in a second model, count once more: stop at the total.
+        # An image is counted again if it is registered again or in a second model.
         if progress.done < progress.total:
             progress.advance()
 
@@ -74,7 +74,7 @@ def _map_incremental(
 def _map_global(database: Path, out: Path, total: int, seed: int) -> list[pycolmap.Reconstruction]:
     calibrated = out / "calibrated.db"
     shutil.copyfile(database, calibrated)
-    # Global mapping trusts the focal lengths it is given: estimate those without a prior first.
+    # Global mapping relies on the initial focal lengths: estimate those without a prior first.
     pycolmap.calibrate_view_graph(
         calibrated, pycolmap.ViewGraphCalibrationOptions(random_seed=seed)
     )

@@ -1,6 +1,6 @@
-"""From verified matches to camera poses and sparse points.
+"""Sparse reconstruction: from verified matches to camera poses and points.
 
-Imports pycolmap: not to be imported beside torch (see ``isolate``).
+Imports pycolmap and must not be imported in a process that uses torch (see ``isolate``).
 """
 
 from __future__ import annotations
@@ -18,22 +18,23 @@ from pipeline.config import schema
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.escalation import Attempt, AttemptRecord, map_until_good
-from pipeline.sfm.evidence import gather
+from pipeline.sfm.alignment import align_model
+from pipeline.sfm.attempts import Attempt, AttemptRecord, map_until_good
+from pipeline.sfm.evidence import collect_evidence
 from pipeline.sfm.georeference import summary
 from pipeline.sfm.judge import Evidence
-from pipeline.sfm.matching import shown
+from pipeline.sfm.matching import list_names
 from pipeline.sfm.models import Colors, color_points, write_model
-from pipeline.sfm.placement import place
 from pipeline.sfm.quiet import quiet_colmap
 from pipeline.sfm.refine import refine
 
-GIVEN_POSES = "or give known poses (sparse/0, transforms.json)"
+KNOWN_POSES_HINT = "or give known poses (sparse/0, transforms.json)"
 
 
 @dataclass(frozen=True)
 class CameraSummary:
-    """One camera of the model: sizes and focal length in pixels, and where it came from."""
+    """One camera of the model: size, parameters (pixels, COLMAP's order), number of registered
+    images and EXIF focal length."""
 
     camera_id: int
     model: str
@@ -46,18 +47,20 @@ class CameraSummary:
 
 @dataclass(frozen=True)
 class SfmReport:
-    """Attributes:
-    mapper: the mapper whose model was taken.
-    registered, total: photographs with a pose, and all.
-    not_registered: names of the others.
-    mean_reprojection_error_px, num_points, mean_track_length: of the model.
-    other_models: numbers of images of the smaller models kept in ``other_models``.
-    cameras: their summaries.
-    verdict: "good" or "weak" (a failed one raises).
-    evidence: what the verdict stands on (see ``judge.Evidence``).
-    attempts: what was tried, in order (see ``escalation``).
-    georeference: the frame's method, origin and residuals (see ``georeference.Frame``).
-    decisions, warnings: for people.
+    """Result of the sfm stage.
+
+    Attributes:
+        mapper: the mapper that produced the model.
+        registered, total: numbers of registered photographs and of all photographs.
+        not_registered: names of the photographs without a pose.
+        mean_reprojection_error_px, num_points, mean_track_length: of the model.
+        other_models: numbers of images of the smaller models, written to ``other_models``.
+        cameras: the model's cameras.
+        verdict: "good" or "weak" (a failed reconstruction raises).
+        evidence: statistics behind the verdict (see ``judge.Evidence``).
+        attempts: the mapping attempts, in order (see ``attempts``).
+        georeference: method, origin and residuals (see ``georeference.WorldFrame``).
+        decisions, warnings: sentences for the log.
     """
 
     mapper: str
@@ -87,23 +90,23 @@ def reconstruct(
     seed: int,
     ground_control: Path | None = None,
 ) -> SfmReport:
-    """Write the largest model to ``out/sparse/0``, where its frame is to ``out/georeference.json``
-    and the other models to ``out/other_models/<n>``.
+    """Map a scene, check the model, refine its cameras and georeference it.
 
-    The same bytes for any number of ``threads``: the libraries sum in the order their threads
-    finish, so mapping runs on one (which on real scenes is no slower).
+    Writes the largest model to ``out/sparse/0``, its world frame to ``out/georeference.json`` and
+    the other models to ``out/other_models/<n>``. The files do not depend on ``threads``.
 
     Args:
-        database: what ``match_features`` wrote (``keypoint_colors.npz`` beside it colours the
-            points; it is not changed).
-        config: ``mapper`` is settled, not "auto".
+        database: database written by ``match_features``; not changed. ``keypoint_colors.npz``
+            beside it gives the points' colours.
+        config: options; ``mapper`` must not be "auto".
+        ground_control: the scene's ``gcp_list.txt``, None without one.
 
     Raises:
-        UserError: no mapper found a model that can be believed.
+        UserError: every attempt failed the quality check (see ``judge``).
     """
     quiet_colmap()
     if config.mapper == "auto":
-        raise ValueError("the mapper is not settled")
+        raise ValueError("the mapper must be chosen, found: auto")
     total = len(manifest.photos)
     with tempfile.TemporaryDirectory(prefix="splatmake-sfm-") as folder:
         # Opening a database can change its bytes: work on a copy.
@@ -118,7 +121,7 @@ def reconstruct(
             seed,
             config.max_attempts,
         )
-        decisions = [_told(record, total) for record in attempts]
+        decisions = [_describe(record, total) for record in attempts]
         if attempt.verdict.grade == "failed" or attempt.evidence is None:
             raise _failure(attempt, attempts)
         model, evidence = attempt.models[0], attempt.evidence
@@ -130,36 +133,38 @@ def reconstruct(
             )
             model = refined.model
             decisions += refined.decisions
-            # What the reader is told is of the model that is written.
-            evidence = gather(model, attempt.database, total)
+            # The report describes the refined model.
+            evidence = collect_evidence(model, attempt.database, total)
         else:
-            decisions.append("cameras not refined further: weak geometry bends to what is freed")
-    frame = place(model, manifest, config.georeference, ground_control)
+            decisions.append("cameras not refined further: the model is weak and would overfit")
+    frame = align_model(model, manifest, config.georeference, ground_control)
     decisions += frame.decisions
     warnings += frame.warnings
     others = attempt.models[1:]
     folders = [out / "sparse" / "0"]
     folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]
     colors = _read_colors(database.with_name("keypoint_colors.npz"))
-    for each, folder_of in zip([model, *others], folders, strict=True):
+    for written, model_folder in zip([model, *others], folders, strict=True):
         if colors is not None:
-            color_points(each, colors)
-        write_model(each, folder_of)
+            color_points(written, colors)
+        write_model(written, model_folder)
     write_json(out / "georeference.json", frame.sidecar())
 
     registered = {model.image(i).name for i in model.reg_image_ids()}
     missing = [photo.name for photo in manifest.photos if photo.name not in registered]
     if missing:
-        warnings.append(f"{len(missing)} of {total} photographs have no pose: {shown(missing)}")
+        warnings.append(
+            f"{len(missing)} of {total} photographs have no pose: {list_names(missing)}"
+        )
     if others:
         sizes = ", ".join(str(other.num_reg_images()) for other in others)
         warnings.append(
-            f"the photographs gave {len(attempt.models)} models that share no place: the largest "
+            f"the photographs gave {len(attempt.models)} unconnected models: the largest "
             f"({len(registered)} photographs) is used; the others ({sizes}) are in other_models"
         )
     if attempt.verdict.grade == "weak":
         warnings.append(
-            f"the reconstruction is weak: {'; '.join(attempt.verdict.reasons)} (what would help: "
+            f"the reconstruction is weak: {'; '.join(attempt.verdict.reasons)} (to improve it: "
             f"{'; '.join(attempt.verdict.remedies)})"
         )
     return SfmReport(
@@ -185,24 +190,28 @@ def reconstruct(
     )
 
 
-def _told(record: AttemptRecord, total: int) -> str:
-    how = f" ({record.change})" if record.change else ""
-    found = f"{record.registered} of {total} photographs" if record.registered else "no model"
-    why = f": {'; '.join(record.reasons)}" if record.reasons and record.registered else ""
-    taken = "; taken" if record.taken else ""
-    return f"{record.mapper} mapping{how}: {found}, {record.verdict}{why}{taken}"
+def _describe(record: AttemptRecord, total: int) -> str:
+    change = f" ({record.change})" if record.change else ""
+    size = f"{record.registered} of {total} photographs" if record.registered else "no model"
+    reasons = f": {'; '.join(record.reasons)}" if record.reasons and record.registered else ""
+    taken = "; used" if record.taken else ""
+    return f"{record.mapper} mapping{change}: {size}, {record.verdict}{reasons}{taken}"
 
 
 def _failure(attempt: Attempt, attempts: list[AttemptRecord]) -> UserError:
-    ways = f" ({len(attempts)} ways were tried)" if len(attempts) > 1 else ""
+    count = f" after {len(attempts)} attempts" if len(attempts) > 1 else ""
     return UserError(
-        f"no reconstruction{ways}: {'; '.join(attempt.verdict.reasons)}",
-        fix="; ".join([*attempt.verdict.remedies, GIVEN_POSES]),
+        f"no reconstruction{count}: {'; '.join(attempt.verdict.reasons)}",
+        fix="; ".join([*attempt.verdict.remedies, KNOWN_POSES_HINT]),
     )
 
 
 def _check_complete(manifest: Manifest, database: Path) -> list[str]:
-    """Every photograph is in the database, or the folder and it do not belong together."""
+    """Check that every photograph is in the database; returns warnings.
+
+    Raises:
+        UserError: photographs are missing from the database.
+    """
     with pycolmap.Database.open(database) as opened:
         known = {image.name for image in opened.read_all_images()}
         empty = [
@@ -213,11 +222,11 @@ def _check_complete(manifest: Manifest, database: Path) -> list[str]:
     missing = [photo.name for photo in manifest.photos if photo.name not in known]
     if missing:
         raise UserError(
-            f"{len(missing)} photographs are not in the database of matches: {shown(missing)}",
+            f"{len(missing)} photographs are not in the database of matches: {list_names(missing)}",
             file=database.name,
             fix="run the features and matches stages again",
         )
-    return [f"no features in {shown(sorted(empty))}"] if empty else []
+    return [f"no features in {list_names(sorted(empty))}"] if empty else []
 
 
 def _read_colors(path: Path) -> Colors | None:

@@ -1,6 +1,6 @@
 """Matching and two-view verification of a scene's photographs.
 
-Imports pycolmap: not to be imported beside torch (see ``isolate``).
+Imports pycolmap and must not be imported in a process that uses torch (see ``isolate``).
 """
 
 from __future__ import annotations
@@ -32,14 +32,16 @@ NAMES_SHOWN = 5
 
 @dataclass(frozen=True)
 class MatchReport:
-    """Attributes:
-    num_pairs, num_verified: pairs matched, and those that a two-view geometry explains.
-    median_inliers: verified matches of the median verified pair.
-    components: sizes of the sets of photographs that verified pairs hold together, largest first.
-    isolated: names of the photographs outside the largest set.
-    num_cameras: cameras shared out among the photographs.
-    num_cached: pairs whose result was found in the cache.
-    decisions, warnings: for people.
+    """Result of the matches stage.
+
+    Attributes:
+        num_pairs, num_verified: numbers of matched pairs and of pairs with a two-view geometry.
+        median_inliers: median number of inliers of the verified pairs.
+        components: sizes of the connected components of the view graph, largest first.
+        isolated: names of the photographs outside the largest component.
+        num_cameras: number of cameras.
+        num_cached: number of pairs found in the cache.
+        decisions, warnings: sentences for the log.
     """
 
     num_pairs: int
@@ -64,15 +66,17 @@ def match_features(
     cache: Path | None = None,
     threads: int = 1,
 ) -> MatchReport:
-    """Write ``out/database.db`` (COLMAP's: cameras with their priors, images with ids from 1 in
-    order of names, keypoints, matches, verified geometries) and ``out/keypoint_colors.npz``
-    (image id -> (F, 3) uint8). The bits depend neither on ``threads`` nor on the cache.
+    """Choose pairs, match them and verify their two-view geometry.
+
+    Writes ``out/database.db`` (COLMAP database: cameras with their priors, images with ids from 1
+    in order of names, keypoints, matches, two-view geometries) and ``out/keypoint_colors.npz``
+    (image id -> (F, 3) uint8). The files depend neither on ``threads`` nor on the cache.
 
     Args:
-        features: the folder ``extract_features`` wrote.
-        config: ``pairs`` is settled, not "auto".
-        sharing: its camera model and sharing.
-        cache: folder for pairs' results that outlives the call.
+        features: folder written by ``extract_features``.
+        config: options; ``pairs`` must not be "auto".
+        sharing: options of the sfm stage, of which the camera model and sharing are used.
+        cache: folder for results of pairs that outlives the call.
 
     Raises:
         UserError: no pair of photographs could be verified.
@@ -95,16 +99,16 @@ def match_features(
     components, isolated = _components(names, list(verified))
     if not verified:
         raise UserError(
-            f"no two of the {len(names)} photographs show the same thing: {len(pairs)} pairs were "
-            f"matched, and in none did {config.min_inliers} matches agree on how the camera moved",
-            fix="photograph one textured, unmoving thing from all sides, in light that stays, each "
-            "picture sharing at least two thirds with the one before",
+            f"no two of the {len(names)} photographs overlap: {len(pairs)} pairs were matched, and "
+            f"none has a two-view geometry with {config.min_inliers} inliers",
+            fix="photograph a static, textured scene from all sides in constant light, each "
+            "photograph overlapping the previous one by two thirds",
         )
     warnings = []
     if len(components) > 1:
         warnings.append(
-            f"the photographs fall into {len(components)} sets that no verified pair links: the "
-            f"largest has {components[0]} of {len(names)}; outside it: {shown(isolated)}"
+            f"verified pairs connect the photographs into {len(components)} separate groups: the "
+            f"largest has {components[0]} of {len(names)}; outside it: {list_names(isolated)}"
         )
     priors = sum(camera.has_prior_focal_length for camera in cameras)
     median = int(np.median(list(verified.values())))
@@ -118,7 +122,7 @@ def match_features(
         num_cached=num_cached,
         decisions=[
             decision,
-            f"{len(verified)} of {len(pairs)} pairs verified, {median} matches in the median one",
+            f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
             f"{len(cameras)} camera(s) ({cameras[0].model_name}) for {len(names)} photographs, "
             f"{priors} with a focal length from EXIF",
         ],
@@ -129,7 +133,8 @@ def match_features(
 def resolve_pairs(
     manifest: Manifest, features: Path, config: schema.Matches
 ) -> tuple[list[choose.Pair], str]:
-    """The pairs to match, as indices into the photographs sorted by name, and why these."""
+    """The pairs to match, as indices into the photographs sorted by name, and a sentence about
+    them for the log."""
     photos = sorted(manifest.photos, key=lambda photo: photo.name)
     count = len(photos)
 
@@ -146,35 +151,35 @@ def resolve_pairs(
         pairs = sorted({*near, *loops})
     elif config.pairs == "spatial":
         near = choose.spatial_pairs([photo.gps for photo in photos], config.neighbours)
-        unplaced = {i for i, photo in enumerate(photos) if photo.gps is None}
-        if unplaced:
-            alike = choose.retrieval_pairs(descriptors(), config.neighbours)
-            near += [pair for pair in alike if unplaced & set(pair)]
+        without_gps = {i for i, photo in enumerate(photos) if photo.gps is None}
+        if without_gps:
+            similar = choose.retrieval_pairs(descriptors(), config.neighbours)
+            near += [pair for pair in similar if without_gps & set(pair)]
         pairs = sorted(set(near))
     elif config.pairs == "retrieval":
         pairs = choose.retrieval_pairs(descriptors(), config.neighbours)
     else:
-        raise ValueError(f"pairs are not settled: {config.pairs}")
+        raise ValueError(f"the kind of pairs must be chosen, found: {config.pairs}")
     return pairs, f"{config.pairs} pairs: {len(pairs)} of {count * (count - 1) // 2} possible"
 
 
-def shown(names: list[str]) -> str:
-    """The first few names, and how many more there are."""
+def list_names(names: list[str]) -> str:
+    """The first few names, and the number of the others."""
     rest = len(names) - NAMES_SHOWN
     text = ", ".join(names[:NAMES_SHOWN])
     return f"{text} and {rest} more" if rest > 0 else text
 
 
 def _components(names: list[str], verified: list[tuple[str, str]]) -> tuple[list[int], list[str]]:
-    """Sizes of the connected sets, largest first, and the names outside the first of them."""
-    place = {name: i for i, name in enumerate(names)}
-    rows, columns = [place[a] for a, _ in verified], [place[b] for _, b in verified]
+    """Sizes of the connected components, largest first, and the names outside the largest."""
+    index = {name: i for i, name in enumerate(names)}
+    rows, columns = [index[a] for a, _ in verified], [index[b] for _, b in verified]
     shape = (len(names), len(names))
     graph = coo_matrix((np.ones(len(rows)), (rows, columns)), shape=shape)
     _, label = connected_components(graph, directed=False)
     sizes = np.bincount(label)
     largest = int(sizes.argmax())
-    outside = [name for name, at in zip(names, label, strict=True) if at != largest]
+    outside = [name for name, own in zip(names, label, strict=True) if own != largest]
     return sorted((int(size) for size in sizes), reverse=True), outside
 
 

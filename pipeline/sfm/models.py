@@ -1,4 +1,4 @@
-"""COLMAP models in pycolmap's hands: built from poses, coloured, written."""
+"""pycolmap reconstructions: build from known poses, colour, write."""
 
 from __future__ import annotations
 
@@ -35,18 +35,18 @@ def posed_model(
 
 
 def read_colors(files: dict[int, Path]) -> Colors:
-    """Image id -> (F, 3) colours of its keypoints, from image id -> keypoint file."""
+    """Read keypoint colours: image id -> keypoint file to image id -> (F, 3) uint8 RGB."""
     return {image_id: Keypoints.read(file).rgb for image_id, file in files.items()}
 
 
 def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
-    """Give each point the mean colour of its keypoints."""
+    """Set each point's colour to the mean colour of its observations."""
     for point in model.points3D.values():
         seen = [colors[e.image_id][e.point2D_idx] for e in point.track.elements]
         point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)
 
 
 def write_model(model: pycolmap.Reconstruction, folder: Path) -> None:
-    """Write COLMAP's binary files to ``folder``."""
+    """Write ``model`` in COLMAP's binary format to ``folder``."""
     folder.mkdir(parents=True, exist_ok=True)
     model.write_binary(folder)

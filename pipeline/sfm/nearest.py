@@ -1,7 +1,7 @@
-"""Exact matching of descriptors: the Python face of csrc/nearest.cpp.
+"""Exact nearest neighbour matching of descriptors: Python interface of csrc/nearest.cpp.
 
-``python -m pipeline.sfm.nearest`` compiles it beforehand, with ``--target`` for other processors;
-otherwise its first use does.
+The library is compiled at first use, or beforehand by ``python -m pipeline.sfm.nearest`` (with
+``--target`` for other processors).
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ LIBRARY = NativeLibrary(
     file="libmatcher.so",
     sources=Path(__file__).parent / "csrc",
     flags=("-std=c++17", "-O3", "-fPIC", "-Wall", "-Wno-psabi", "-Wno-unknown-warning-option"),
-    # Products of bytes, four to a lane.
+    # Dot product instructions on bytes.
     extensions={
         "x86-64-v3": [Extension("avx_vnni", ("-mavxvnni",))],
         "x86-64-v4": [Extension("avx512_vnni", ("-mavx512vnni",))],
@@ -31,17 +31,18 @@ LIBRARY = NativeLibrary(
     },
 )
 SIZE = 128
-# COLMAP's: descriptors (unit vectors times 512) more than 0.7 radians apart are no match.
+# COLMAP's limit: descriptors (unit vectors times 512) more than 0.7 radians apart do not match.
 MAX_DISTANCE = 2 * 512**2 * (1 - float(np.cos(0.7)))
 
 
 @dataclass(frozen=True)
 class Neighbours:
-    """Of each descriptor of one photograph among those of another.
+    """The two nearest descriptors of another photograph for each of F descriptors.
 
     Attributes:
-        index: (F,) int32, the nearest, the lowest index of equals; -1 where there is none.
-        first, second: (F,) int32, squared distances of the two nearest; 2^28 where there is none.
+        index: (F,) int32 index of the nearest (the lowest index of ties); -1 if there is none.
+        first, second: (F,) int32 squared distances to the nearest and second nearest; 2^28 if there
+            is none.
     """
 
     index: NDArray[np.int32]
@@ -50,15 +51,15 @@ class Neighbours:
 
 
 def nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Neighbours, Neighbours]:
-    """The two nearest of ``b`` to each of ``a``, and the other way round.
+    """The two nearest descriptors of ``b`` for each of ``a``, and of ``a`` for each of ``b``.
 
-    Whole numbers throughout: the same on every machine. Other Python threads run meanwhile.
+    Integer arithmetic: the result is exact and the same on every machine. Releases the GIL.
 
     Args:
         a, b: (F, 128) and (G, 128) uint8.
 
     Raises:
-        UserError: it is not compiled yet and cannot be.
+        UserError: the library is not compiled and cannot be.
     """
     tables = [np.ascontiguousarray(table, np.uint8) for table in (a, b)]
     if any(table.ndim != 2 or table.shape[1] != SIZE for table in tables):
@@ -76,12 +77,14 @@ def nearest(a: NDArray[np.uint8], b: NDArray[np.uint8]) -> tuple[Neighbours, Nei
 def match_descriptors(
     a: NDArray[np.uint8], b: NDArray[np.uint8], max_ratio: float
 ) -> NDArray[np.uint32]:
-    """(M, 2) indices into ``a`` and ``b``, by the first: mutual nearest neighbours that pass
-    Lowe's ratio test both ways, as COLMAP asks for.
+    """Mutual nearest neighbours that pass Lowe's ratio test in both directions, as in COLMAP.
 
     Args:
         a, b: (F, 128), (G, 128) uint8, unit vectors times 512.
-        max_ratio: of the distances to the nearest and to the second nearest.
+        max_ratio: largest ratio of the distances to the nearest and the second nearest.
+
+    Returns:
+        (M, 2) indices into ``a`` and ``b``, sorted by the first.
     """
     of_a, of_b = nearest(a, b)
     if len(a) == 0 or len(b) == 0:

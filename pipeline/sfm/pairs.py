@@ -1,4 +1,4 @@
-"""Which pairs of photographs to match. Pairs are (i, j) indices with i < j, sorted."""
+"""Selection of image pairs to match. Pairs are (i, j) indices with i < j, sorted."""
 
 from __future__ import annotations
 
@@ -15,21 +15,21 @@ from pipeline.runtime.progress import Progress
 
 Pair = tuple[int, int]
 
-# Retrieval by the largest-scale descriptors: with 300 of them, the eight best pairs of an image
-# hold 98% of the pairs that full matching finds best.
+# Retrieval compares the descriptors of the largest scales only.
 RETRIEVAL_DESCRIPTORS = 300
 RETRIEVAL_RATIO = 0.85
-# Above 300 photographs fewer descriptors keep the quadratic cost where it was at 300.
+# Upper bound on photographs times descriptors: more photographs use fewer descriptors each.
 RETRIEVAL_BUDGET = 300 * RETRIEVAL_DESCRIPTORS
 RETRIEVAL_MIN_DESCRIPTORS = 64
-# Mutual matches by chance: unrelated photographs share a few.
+# Unrelated photographs have a few mutual matches by chance; lower scores are ignored.
 RETRIEVAL_MIN_SCORE = 4
-# Photographs compared with one at a time: 300 x 300 distances each, 20 MB together.
+# Number of photographs compared with one at a time: 300 x 300 distances each, 20 MB in all.
 RETRIEVAL_BATCH = 64
 DESCRIPTOR_SIZE = 128
-# Squared distance beyond any two descriptors (2 * 512^2); a whole number in float32.
+# Larger than the squared distance of any two descriptors (2 * 512^2), exact in float32.
 FAR = 2.0**22
 
+# Number of loop closure candidates of each photograph of a sequence.
 LOOP_CLOSURES = 3
 
 
@@ -39,8 +39,8 @@ def exhaustive_pairs(count: int) -> list[Pair]:
 
 
 def sequential_pairs(count: int, overlap: int) -> list[Pair]:
-    """Each photograph with the next ``overlap``, and with those 2, 4, 8, ... 2^overlap after it
-    (which bridge a blurred or covered stretch), in the order given."""
+    """Each photograph with the next ``overlap``, and with the ones 2, 4, 8, ... 2^overlap after it
+    (COLMAP's quadratic overlap, which bridges blurred or occluded stretches)."""
     steps = set(range(1, overlap + 1))
     power = 1
     while power < count and power <= 2**overlap:
@@ -50,17 +50,19 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
 
 
 def spatial_pairs(gps: Sequence[tuple[float, float, float] | None], neighbours: int) -> list[Pair]:
-    """Each photograph with its nearest ``neighbours`` on the ground; altitudes, which GPS
-    measures badly, are left out. Photographs without a position are in no pair.
+    """Each photograph with its ``neighbours`` nearest ones by horizontal distance.
+
+    Altitudes are ignored: GPS measures them inaccurately. Photographs without a position are in no
+    pair.
 
     Args:
-        gps: latitude and longitude in degrees, altitude in metres.
+        gps: latitude and longitude in degrees, altitude in metres; None without a position.
     """
     known = [i for i, position in enumerate(gps) if position is not None]
     if len(known) < 2:
         return []
     degrees = np.array([gps[i][:2] for i in known])  # type: ignore[index]
-    # Equirectangular around the mean latitude: nearness in a scene needs no geodesy.
+    # Equirectangular projection around the mean latitude: accurate enough to find neighbours.
     east = degrees[:, 1] * np.cos(np.radians(degrees[:, 0].mean()))
     metres = np.column_stack([east, degrees[:, 0]]) * 111_320.0
     _, nearest = cKDTree(metres).query(metres, k=min(neighbours + 1, len(known)))
@@ -70,21 +72,22 @@ def spatial_pairs(gps: Sequence[tuple[float, float, float] | None], neighbours: 
 def proximity_pairs(
     centres: NDArray[np.float64], directions: NDArray[np.float64], neighbours: int
 ) -> list[Pair]:
-    """Each camera with its ``neighbours`` nearest ones that look a similar way (within 75
-    degrees), by distance and turn together.
+    """Each camera with its ``neighbours`` nearest ones in position and viewing direction, up to 75
+    degrees apart.
 
     Args:
-        centres, directions: (N, 3), world; directions are unit vectors along the optical axes.
+        centres, directions: (N, 3) in world coordinates; directions are unit vectors along the
+            optical axes.
     """
     count = len(centres)
     if count < 2:
         return []
     distance = cdist(centres, centres)
-    turn = np.arccos(np.clip(directions @ directions.T, -1, 1))
-    # One radian of turn weighs as much as the typical distance of cameras from each other.
+    angle = np.arccos(np.clip(directions @ directions.T, -1, 1))
+    # One radian has the weight of the median distance between cameras.
     unit = float(np.median(distance[np.triu_indices(count, 1)]))
-    cost = distance / max(unit, 1e-12) + turn
-    cost[turn > np.radians(75)] = np.inf
+    cost = distance / max(unit, 1e-12) + angle
+    cost[angle > np.radians(75)] = np.inf
     np.fill_diagonal(cost, np.inf)
     k = min(neighbours, count - 1)
     nearest = np.argsort(cost, axis=1, kind="stable")[:, :k]
@@ -94,8 +97,8 @@ def proximity_pairs(
 
 
 def retrieval_pairs(descriptors: Sequence[NDArray[np.uint8]], neighbours: int) -> list[Pair]:
-    """Each photograph with the ``neighbours`` it shares most features with, and the pairs of the
-    maximum spanning tree of shared features, which keep together what hangs together.
+    """Each photograph with the ``neighbours`` most similar ones by ``retrieval_scores``, and the
+    pairs of the maximum spanning tree of the scores, which keep the view graph connected.
 
     Args:
         descriptors: for each photograph (F, 128) uint8, largest scale first.
@@ -105,32 +108,32 @@ def retrieval_pairs(descriptors: Sequence[NDArray[np.uint8]], neighbours: int) -
 
 
 def loop_closure_pairs(descriptors: Sequence[NDArray[np.uint8]], overlap: int) -> list[Pair]:
-    """For each photograph the best three by shared features that are more than ``overlap``
-    places away in the sequence."""
+    """Each photograph with the most similar ones (by ``retrieval_scores``) that are more than
+    ``overlap`` away in the sequence."""
     score = retrieval_scores(descriptors)
-    place = np.arange(len(score))
-    score[np.abs(place[:, None] - place[None]) <= overlap] = 0
+    index = np.arange(len(score))
+    score[np.abs(index[:, None] - index[None]) <= overlap] = 0
     return _unique(_best(score, LOOP_CLOSURES))
 
 
 def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
-    """(N, N) symmetric: mutual nearest neighbours that pass the ratio test, among the
+    """(N, N) symmetric number of mutual nearest neighbours that pass the ratio test among the
     largest-scale descriptors of two photographs.
 
-    Products of bytes are summed exactly in float32 (below 2^24), so the scores do not depend on
-    the linear algebra library or its threads.
+    Sums of products of bytes are exact in float32 (below 2^24), so the scores do not depend on the
+    BLAS library or its threads.
     """
     count = len(descriptors)
     keep = RETRIEVAL_BUDGET // max(count, 1)
     keep = max(RETRIEVAL_MIN_DESCRIPTORS, min(RETRIEVAL_DESCRIPTORS, keep))
-    # Photographs with fewer descriptors are filled up with ones too far away to be anyone's best.
+    # Photographs with fewer descriptors are padded with ones that are never nearest.
     table = np.zeros((count, keep, DESCRIPTOR_SIZE), np.float32)
     norms = np.full((count, keep), FAR, np.float32)
     for i, found in enumerate(descriptors):
         table[i, : len(found[:keep])] = found[:keep]
         norms[i, : len(found[:keep])] = (table[i, : len(found[:keep])] ** 2).sum(axis=1)
     score = np.zeros((count, count), np.int64)
-    progress = Progress("looking for pairs", count, "photographs")
+    progress = Progress("selecting pairs", count, "photographs")
     for i in range(count):
         own = min(len(descriptors[i]), keep)
         for start in range(i + 1, count, RETRIEVAL_BATCH):
@@ -145,8 +148,12 @@ def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int
 
 
 def _mutual(squared: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(M,) mutual nearest neighbours that pass the ratio test, from the squared distances
-    (F, M, G) of F descriptors to the G descriptors of each of M photographs; overwritten."""
+    """(M,) number of mutual nearest neighbours that pass the ratio test.
+
+    Args:
+        squared: (F, M, G) squared distances of F descriptors to the G descriptors of each of M
+            photographs; overwritten.
+    """
     if squared.shape[0] == 0:
         return np.zeros(squared.shape[1], np.int64)
     nearest = squared.argmin(axis=2)
@@ -159,6 +166,7 @@ def _mutual(squared: NDArray[np.float32]) -> NDArray[np.int64]:
 
 
 def _best(score: NDArray[np.int64], neighbours: int) -> list[Pair]:
+    """Each photograph with the ones of the highest scores."""
     ranked = np.argsort(-score, axis=1, kind="stable")[:, :neighbours]
     return [
         (i, int(j))
@@ -169,7 +177,7 @@ def _best(score: NDArray[np.int64], neighbours: int) -> list[Pair]:
 
 
 def _spanning_tree(score: NDArray[np.int64]) -> list[Pair]:
-    # Distances for the minimum tree: higher score, smaller distance; unconnected are absent.
+    # A minimum spanning tree of inverse scores; zero means no edge.
     weight = np.where(score >= RETRIEVAL_MIN_SCORE, 1.0 / np.maximum(score, 1), 0.0)
     tree = minimum_spanning_tree(csr_matrix(np.triu(weight))).tocoo()
     return [(int(i), int(j)) for i, j in zip(tree.row, tree.col, strict=True)]

@@ -1,4 +1,4 @@
-"""pycolmap's log, kept out of ours."""
+"""pycolmap's log level."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import pycolmap
 
 
 def quiet_colmap() -> None:
-    """Let pycolmap log fatal errors only: what matters is in its results, which are checked.
+    """Set pycolmap's log level to fatal errors; its results are checked instead.
 
     ``pycolmap.bundle_adjustment`` resets the level: call this again after it.
     """

@@ -1,4 +1,4 @@
-"""The last bundle adjustment, with more of the camera free where the geometry carries it."""
+"""Final bundle adjustment, which frees more camera parameters if the data supports them."""
 
 from __future__ import annotations
 
@@ -12,28 +12,31 @@ import pycolmap
 
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 
-# A freed parameter is kept where the robust cost falls by this share at least. On real sets with
-# known cameras the ones that are there gain 0.5% to 8%, the ones that are not 0.01% to 0.1%.
+# Smallest relative decrease of the robust cost for which a freed parameter is accepted. Parameters
+# that the camera has lower the cost by at least 0.5%, others by at most 0.1%.
 MIN_GAIN = 0.004
-# Lenses are centred to a few per cent of the picture; beyond this the fit bends to something else.
+# Largest accepted shift of the principal point over the longer side: lenses are centred to a few
+# per cent of the image, and a larger shift compensates for other errors.
 MAX_SHIFT = 0.06
-# Tracks that fit better than this, in pixels, were made by these very cameras.
+# Below this RMS reprojection error the observations are projections by these cameras (synthetic).
 EXACT_PX = 0.01
 FUNCTION_TOLERANCE = 1e-5
 
 
 @dataclass(frozen=True)
 class Refined:
-    """Attributes:
-    model: adjusted.
-    freed: more of its cameras is free than before.
-    centres: ids of the cameras whose principal points are free.
-    decisions: for people.
+    """Result of ``refine``.
+
+    Attributes:
+        model: the adjusted model.
+        freed: whether any camera parameter was freed.
+        free_principal_points: ids of the cameras whose principal points were freed.
+        decisions: sentences for the log.
     """
 
     model: pycolmap.Reconstruction
     freed: bool
-    centres: Set[int]
+    free_principal_points: Set[int]
     decisions: list[str]
 
 
@@ -44,60 +47,62 @@ def refine(
     principal_point: str,
     inner_iterations: bool = False,
 ) -> Refined:
-    """Adjust all of the model once more, robustly, and free more of its cameras step by step as
-    long as that pays: a second radial term, then the principal point.
+    """Robust bundle adjustment of a whole model, then of more camera parameters: a second radial
+    distortion term, then the principal point. A parameter is accepted if it lowers the cost enough.
+
+    Only cameras with enough images are freed.
 
     Args:
         model: not changed.
-        radial: cameras may turn from SIMPLE_RADIAL to RADIAL.
-        principal_point: "yes", "no", or "auto" (where it pays).
-        inner_iterations: see ``adjust``.
+        radial: SIMPLE_RADIAL cameras may become RADIAL.
+        principal_point: "yes" (always freed), "no", or "auto" (if it lowers the cost).
+        inner_iterations: see ``bundle_adjust``.
     """
-    rich = _rich_cameras(model)
+    shared = _shared_cameras(model)
     best = pycolmap.Reconstruction(model)
-    cost = adjust(best, inner_iterations=inner_iterations)
-    # Ceres halves the squares.
+    cost = bundle_adjust(best, inner_iterations=inner_iterations)
+    # Ceres' cost is half of the sum of squares.
     if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
-        return Refined(best, False, set(), ["the tracks fit exactly: there is nothing to free"])
+        return Refined(best, False, set(), ["the tracks fit exactly: nothing is refined"])
     decisions: list[str] = []
-    freed, centres = False, set[int]()
-    if not rich:
+    freed, free_principal_points = False, set[int]()
+    if not shared:
         if principal_point == "yes":
-            rich = set(model.cameras)
+            shared = set(model.cameras)
         else:
             text = (
-                f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion and principal "
-                "points stay fixed"
+                f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and "
+                "principal points are unchanged"
             )
             return Refined(best, False, set(), [text])
-    if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in rich):
+    if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
         freer = pycolmap.Reconstruction(best)
-        for camera_id in rich:
+        for camera_id in shared:
             _make_radial(freer.camera(camera_id))
-        freer_cost = adjust(freer, inner_iterations=inner_iterations)
+        freer_cost = bundle_adjust(freer, inner_iterations=inner_iterations)
         gain = 1 - freer_cost / max(cost, 1e-12)
-        kept = gain >= MIN_GAIN
+        accepted = gain >= MIN_GAIN
         decisions.append(
-            f"camera model {'RADIAL' if kept else 'SIMPLE_RADIAL'}: a second radial term lowers "
-            f"the cost by {gain:.2%}"
+            f"camera model {'RADIAL' if accepted else 'SIMPLE_RADIAL'}: a second radial term "
+            f"lowers the cost by {gain:.2%}"
         )
-        if kept:
+        if accepted:
             best, cost, freed = freer, freer_cost, True
     if principal_point != "no":
         freer = pycolmap.Reconstruction(best)
-        freer_cost = adjust(freer, rich, inner_iterations=inner_iterations)
-        gain, shift = 1 - freer_cost / max(cost, 1e-12), _largest_shift(best, freer, rich)
-        kept = principal_point == "yes" or (gain >= MIN_GAIN and shift <= MAX_SHIFT)
+        freer_cost = bundle_adjust(freer, shared, inner_iterations=inner_iterations)
+        gain, shift = 1 - freer_cost / max(cost, 1e-12), _largest_shift(best, freer, shared)
+        accepted = principal_point == "yes" or (gain >= MIN_GAIN and shift <= MAX_SHIFT)
         decisions.append(
-            f"principal point {'freed' if kept else 'held'}: freeing it lowers the cost by "
+            f"principal point {'refined' if accepted else 'fixed'}: refining it lowers the cost by "
             f"{gain:.2%} and moves it by {shift:.1%} of the longer side"
         )
-        if kept:
-            best, freed, centres = freer, True, rich
-    return Refined(best, freed, centres, decisions)
+        if accepted:
+            best, freed, free_principal_points = freer, True, shared
+    return Refined(best, freed, free_principal_points, decisions)
 
 
-def adjust(
+def bundle_adjust(
     model: pycolmap.Reconstruction,
     free_principal_point: Set[int] = frozenset(),
     *,
@@ -105,27 +110,31 @@ def adjust(
     tolerance: float = FUNCTION_TOLERANCE,
     inner_iterations: bool = False,
 ) -> float:
-    """Robust bundle adjustment of everything, with the principal points of those cameras; returns
-    the final cost.
+    """Robust bundle adjustment of points, poses and cameras, in place.
 
-    Residuals beyond ``loss_px`` pixels count less (Cauchy's loss). It ends with the first step
-    that lowers the cost by no more than the share ``tolerance``.
+    Args:
+        free_principal_point: ids of cameras whose principal points are refined. If any, the
+            intrinsics of all other cameras are constant.
+        loss_px: scale of the Cauchy loss, pixels.
+        tolerance: relative decrease of the cost at which the solver stops (Ceres'
+            ``function_tolerance``).
+        inner_iterations: use Ceres' inner iterations (block coordinate descent after each step) if
+            their order is unique. They need about a third of the steps and pay for long tracks.
 
-    ``inner_iterations``: points, poses and cameras are adjusted one by one after each step, where
-    that has one order. A robust loss makes steps short; so a third as many are needed. It pays for
-    long tracks, whose steps cost most.
+    Returns:
+        The final cost.
     """
     options = _options(loss_px, tolerance)
     options.refine_principal_point = bool(free_principal_point)
-    if inner_iterations and _has_one_block_order(model):
+    if inner_iterations and _block_order_is_unique(model):
         options.ceres.solver_options.use_inner_iterations = True
-        # No damping: such steps are good, and principal points lag behind.
+        # Hardly any damping: principal points converge faster.
         options.ceres.solver_options.initial_trust_region_radius = 1e8
     config = pycolmap.BundleAdjustmentConfig()
     for image_id in sorted(model.reg_image_ids()):
         config.add_image(image_id)
     if free_principal_point:
-        # pycolmap frees the principal points of all cameras or of none: hold the poor ones whole.
+        # pycolmap refines the principal points of all cameras or of none: fix the other cameras.
         for camera_id in sorted(set(model.cameras) - free_principal_point):
             config.set_constant_cam_intrinsics(camera_id)
     config.fix_gauge(pycolmap.BundleAdjustmentGauge.TWO_CAMS_FROM_WORLD)
@@ -135,22 +144,23 @@ def adjust(
 def adjust_points(
     model: pycolmap.Reconstruction, *, loss_px: float, done: Set[int] = frozenset()
 ) -> None:
-    """The same for the points alone, between cameras that stay.
+    """Adjust the points of a model in place; cameras and poses are fixed.
 
-    ``done``: ids of points that ``adjust`` has moved with these cameras and this loss: they are
-    at their minimum.
+    Args:
+        loss_px: scale of the Cauchy loss, pixels.
+        done: ids of points to skip: ``bundle_adjust`` has adjusted them with these cameras and this
+            loss.
     """
     options = _options(loss_px, FUNCTION_TOLERANCE)
     options.refine_focal_length = False
     options.refine_extra_params = False
     options.refine_rig_from_world = False
-    # Points do not depend on each other: inner iterations bring each to its end in one step, which
-    # undamped does not stop short.
+    # Points are independent: inner iterations solve each in one step without damping.
     options.ceres.solver_options.use_inner_iterations = True
     options.ceres.solver_options.max_num_iterations = 1
     options.ceres.solver_options.initial_trust_region_radius = 1e8
     config = pycolmap.BundleAdjustmentConfig()
-    # Without its images: pycolmap then takes no derivatives by their poses.
+    # The config has no images: pycolmap then computes no derivatives by poses.
     for point_id in sorted(model.point3D_ids() - done):
         config.add_variable_point(point_id)
     if config.num_points():
@@ -160,7 +170,7 @@ def adjust_points(
 
 
 def _options(loss_px: float, tolerance: float) -> pycolmap.BundleAdjustmentOptions:
-    """On one thread: on more, Ceres sums the residuals in the order they come."""
+    """Options of Ceres, on one thread: with more, the order of summation is not fixed."""
     options = pycolmap.BundleAdjustmentOptions(
         refine_principal_point=False,
         print_summary=False,
@@ -184,13 +194,13 @@ def _solve(
     return float(summary.ceres_summary.final_cost)
 
 
-def _has_one_block_order(model: pycolmap.Reconstruction) -> bool:
-    """True where Ceres's inner iterations have one order: all points, all poses, all cameras.
+def _block_order_is_unique(model: pycolmap.Reconstruction) -> bool:
+    """Whether the block order of Ceres' inner iterations is unique: points, poses, cameras.
 
-    Ceres takes the blocks with the fewest neighbours first, and of equal ones the one that lies
-    first in memory, which changes from run to run. So each camera must have more poses than each
-    pose has cameras (one pose is fixed), and each image more points than any point has images and
-    cameras.
+    Ceres orders parameter blocks by their number of neighbours, and blocks with equally many by
+    their address, which differs from run to run. The order is unique if each camera has more poses
+    than each pose has cameras (one pose is fixed), and each image has more points than any point
+    has images and cameras.
     """
     images = [model.image(i) for i in model.reg_image_ids()]
     poses = Counter(image.camera_id for image in images)
@@ -200,7 +210,7 @@ def _has_one_block_order(model: pycolmap.Reconstruction) -> bool:
     return min(poses.values(), default=0) >= 3 and fewest > neighbours
 
 
-def _rich_cameras(model: pycolmap.Reconstruction) -> set[int]:
+def _shared_cameras(model: pycolmap.Reconstruction) -> set[int]:
     """Ids of the cameras with enough registered images."""
     used = [model.image(i).camera_id for i in model.reg_image_ids()]
     return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES_PER_CAMERA}
@@ -214,12 +224,12 @@ def _make_radial(camera: pycolmap.Camera) -> None:
 
 
 def _largest_shift(
-    held: pycolmap.Reconstruction, free: pycolmap.Reconstruction, cameras: set[int]
+    fixed: pycolmap.Reconstruction, refined: pycolmap.Reconstruction, cameras: set[int]
 ) -> float:
-    """The farthest that a principal point moved, over the longer side."""
+    """Largest shift of a principal point, over the longer side."""
     shifts = []
     for camera_id in cameras:
-        before, after = held.camera(camera_id), free.camera(camera_id)
+        before, after = fixed.camera(camera_id), refined.camera(camera_id)
         move = np.hypot(
             after.principal_point_x - before.principal_point_x,
             after.principal_point_y - before.principal_point_y,

@@ -1,4 +1,4 @@
-"""Sparse points for cameras whose poses are given."""
+"""Triangulate sparse points for cameras with known poses."""
 
 from __future__ import annotations
 
@@ -18,11 +18,13 @@ from pipeline.sfm.keypoints import keypoint_file
 
 @dataclass(frozen=True)
 class TriangulationReport:
-    """Attributes:
-    num_points, mean_reprojection_error_px, mean_track_length: of the points; 0 without any.
-    num_pairs, num_verified: pairs matched and verified.
-    num_images: photographs with a pose.
-    decisions, warnings: for people.
+    """Result of ``triangulate``.
+
+    Attributes:
+        num_points, mean_reprojection_error_px, mean_track_length: of the points; 0 without any.
+        num_pairs, num_verified: numbers of matched and of verified pairs.
+        num_images: number of photographs with a pose.
+        decisions, warnings: sentences for the log.
     """
 
     num_points: int
@@ -46,18 +48,19 @@ def triangulate(
     seed: int,
     cache: Path | None = None,
 ) -> TriangulationReport:
-    """Write the model of ``sparse`` with points triangulated from the photographs to
-    ``out/sparse/0``; poses as they were, the points it brought replaced.
+    """Triangulate points with the known poses of a COLMAP model and write the model to
+    ``out/sparse/0``.
 
-    Everything heavy happens in processes of its own, so torch may be loaded here. The bytes do
-    not depend on ``threads``. Few points or none are no error: the report has their number.
+    Poses are unchanged; points of the model are replaced. pycolmap and cv2 run in separate
+    processes, so the caller may use torch. The files do not depend on ``threads``. A result without
+    points is not an error.
 
     Args:
-        sparse: folder of a COLMAP model; its images are found in the manifest by name, and those
-            that are not are left out. A camera of another size than its photographs (reduced
-            copies) is written in theirs.
-        matches: its ratio, inliers and neighbours; pairs are chosen by the cameras' nearness.
-        cache: of the features, where they shall outlive the call.
+        sparse: folder of a COLMAP model. Images that are not in the manifest (by name) are left
+            out. Cameras of another size than their photographs are rescaled to the photographs.
+        matches: options of matching; pairs are chosen by the distance of the cameras
+            (``proximity_pairs``), not by ``pairs``.
+        cache: folder for features that outlives the call; None for a temporary one.
 
     Raises:
         UserError: no image of the model is among the photographs.
@@ -110,12 +113,12 @@ def _triangulate(
         raise UserError(
             "no image of the given model is among the photographs",
             file=sparse,
-            fix="give the images the names they have in the model",
+            fix="rename the photographs to the names in the model",
         )
     cameras = {}
     for image_id in ids:
         image = model.image(image_id)
-        cameras[image.camera_id] = _camera_of(photos[image.name], model.camera(image.camera_id))
+        cameras[image.camera_id] = _rescaled_to(photos[image.name], model.camera(image.camera_id))
     images = [(i, model.image(i).name, model.image(i).camera_id) for i in ids]
     poses = [model.image(i).cam_from_world() for i in ids]
     pairs = proximity_pairs(
@@ -158,8 +161,8 @@ def _triangulate(
     }
 
 
-def _camera_of(photo: Photo, camera: Any) -> Any:
-    """The camera at the size of the photograph: keypoints are in stored pixels."""
+def _rescaled_to(photo: Photo, camera: Any) -> Any:
+    """The camera rescaled to the size of the photograph, whose pixels keypoints refer to."""
     import pycolmap
 
     sized = pycolmap.Camera(camera.todict())

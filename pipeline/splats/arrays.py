@@ -1,4 +1,4 @@
-"""The file of Gaussians as arrays, without torch, which takes seconds to import."""
+"""Write Gaussians as a ``.npz`` file; without torch, which takes seconds to import."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from pipeline.runtime.atomic import write_bytes
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
-    """Write a ``.npz`` file of float32; the same arrays always give the same bytes."""
+    """Write a ``.npz`` file of float32 arrays, atomically and deterministically."""
     buffer = io.BytesIO()
     single = {name: np.asarray(array, np.float32, order="C") for name, array in arrays.items()}
-    # numpy stamps the members of its archives with a fixed date.
+    # Deterministic: numpy writes a fixed date into its archives.
     np.savez(buffer, **single)  # type: ignore[arg-type]
     write_bytes(path, buffer.getvalue())

@@ -1,4 +1,4 @@
-"""The first Gaussians of a training, from sparse points or at random."""
+"""Initial Gaussians of a training run, from sparse points or at random."""
 
 from __future__ import annotations
 
@@ -13,13 +13,13 @@ from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
 
-# Fewer sparse points than this say too little about the scene to start from.
+# With fewer sparse points than this, Gaussians are initialised at random.
 MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
 class FirstGaussians:
-    """The Gaussians with what is recorded of them."""
+    """Initial Gaussians, with the counters, decisions and warnings of the init stage."""
 
     gaussians: InitGaussians
     counters: dict[str, Any]
@@ -30,18 +30,23 @@ class FirstGaussians:
 def first_gaussians(
     points: Points, training: Sequence[View], config: Init, seed: int
 ) -> FirstGaussians:
-    """Gaussians at the sparse ``points``, or at random where ``config`` says so or there are fewer
-    than ``MIN_POINTS``."""
+    """Initialise Gaussians from the sparse ``points``, or at random if ``config.method`` is
+    "random" or there are fewer than ``MIN_POINTS``.
+
+    Args:
+        training: the training views, for random initialisation and the scale of the scene.
+        seed: of random initialisation.
+    """
     method, warnings = config.method, []
     if method != "random" and len(points) < MIN_POINTS:
-        warnings = [f"only {len(points)} sparse points: starting from random Gaussians instead"]
+        warnings = [f"only {len(points)} sparse points: Gaussians are initialised at random"]
         method = "random"
     if method == "random":
         first = gaussians_random(list(training), config, 0, seed)
     else:
         centres = np.array([view.centre for view in training])
         first = gaussians_from_points(points, centres, config, 0)
-    source = "random places" if method == "random" else "points"
+    source = "random positions" if method == "random" else "points"
     counters = {
         "num_gaussians": len(first),
         "points": len(points),

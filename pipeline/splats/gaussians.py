@@ -1,4 +1,4 @@
-"""The Gaussians: five arrays of one length, and how they are kept on disk."""
+"""The parameters of a scene's Gaussians, and their checkpoint file."""
 
 from __future__ import annotations
 
@@ -17,19 +17,19 @@ from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import write_arrays
 from pipeline.splats.init import InitGaussians
 
-FIX = "delete it and run again"
+FIX = "delete the file and run again"
 
 
 @dataclass
 class Gaussians:
-    """Structure of arrays, float32, contiguous, on the CPU.
+    """Parameters of N Gaussians: contiguous float32 tensors on the CPU.
 
     Attributes:
-        means: (N, 3) centres in the world.
+        means: (N, 3) centres in world coordinates.
         log_scales: (N, 3) natural logarithm of the standard deviations.
-        quats: (N, 4) wxyz, not necessarily of unit length.
-        opacity_logits: (N,) inverse sigmoid of the opacity.
-        sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2, coefficient 0 is the constant.
+        quats: (N, 4) rotations as quaternions (wxyz), not necessarily normalised.
+        opacity_logits: (N,) opacity before the sigmoid.
+        sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2; coefficient 0 is the constant.
     """
 
     means: Tensor
@@ -43,23 +43,24 @@ class Gaussians:
 
     @property
     def sh_degree(self) -> int:
+        """Degree of the spherical harmonics."""
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
-        """The arrays by name, in the order of the fields; not copies."""
+        """The tensors by name, in the order of the fields; not copies."""
         return {field.name: getattr(self, field.name) for field in fields(self)}
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The arrays in the order of the fields, the rasterizer's first five arguments."""
+        """The tensors in the order of the fields, which are the rasterizer's first arguments."""
         return self.means, self.log_scales, self.quats, self.opacity_logits, self.sh
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The same as numpy arrays that share the memory."""
+        """The tensors as numpy arrays that share their memory."""
         return {name: tensor.numpy() for name, tensor in self.tensors().items()}
 
     @staticmethod
     def from_arrays(arrays: Mapping[str, NDArray] | InitGaussians) -> Gaussians:
-        """Copies of numpy arrays named as the fields."""
+        """Gaussians with copies of numpy arrays, which are named as the fields."""
         if isinstance(arrays, InitGaussians):
             arrays = arrays.arrays()
         return Gaussians(
@@ -69,15 +70,15 @@ class Gaussians:
             )
         )
 
-    def select(self, rows: Tensor) -> Gaussians:
-        """Copies of the rows named by a boolean mask (N,) or by int64 indices (M,)."""
-        return Gaussians(*(tensor[rows].contiguous() for tensor in self.tensors().values()))
+    def select(self, which: Tensor) -> Gaussians:
+        """Copies of the Gaussians selected by a boolean mask (N,) or int64 indices (M,)."""
+        return Gaussians(*(tensor[which].contiguous() for tensor in self.tensors().values()))
 
     def clone(self) -> Gaussians:
         return Gaussians(*(tensor.clone() for tensor in self.tensors().values()))
 
     def with_sh_degree(self, degree: int) -> Gaussians:
-        """The same Gaussians with higher SH bands cut off, or added as zeros."""
+        """The Gaussians with SH bands removed, or zeros added, to reach ``degree``."""
         return Gaussians(
             self.means,
             self.log_scales,
@@ -87,15 +88,15 @@ class Gaussians:
         )
 
     def save(self, path: Path) -> None:
-        """Write a ``.npz`` file; the same Gaussians always give the same bytes."""
+        """Write a ``.npz`` file, atomically and deterministically."""
         write_arrays(path, self.arrays())
 
     @staticmethod
     def load(path: Path) -> Gaussians:
-        """Read what ``save`` wrote.
+        """Read a file that ``save`` wrote.
 
         Raises:
-            UserError: the file is missing, damaged, or holds something else.
+            UserError: the file is missing, damaged, or not a file of Gaussians.
         """
         try:
             with np.load(path) as archive:
@@ -109,16 +110,16 @@ class Gaussians:
                 f"expected a file of Gaussians, could not read it: {error}", file=path, fix=FIX
             ) from error
         shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
-        wanted = {
+        expected = {
             "means": (n, 3),
             "log_scales": (n, 3),
             "quats": (n, 4),
             "opacity_logits": (n,),
             "sh": (n, k, 3),
         }
-        if shapes != wanted:
+        if shapes != expected:
             raise UserError(
-                f"the arrays of Gaussians do not belong together: {shapes}",
+                f"expected arrays of Gaussians of shapes {expected}, found {shapes}",
                 file=path,
                 fix=FIX,
             )
@@ -126,14 +127,14 @@ class Gaussians:
 
 
 def concat(parts: list[Gaussians]) -> Gaussians:
-    """All rows of ``parts``, one after the other; their SH degrees are the same."""
+    """Concatenate Gaussians of the same SH degree."""
     return Gaussians(
         *(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Gaussians))
     )
 
 
 def resize_bands(sh: Tensor, degree: int) -> Tensor:
-    """(N, K, 3) cut or filled with zeros to (N, (degree + 1)^2, 3), contiguous."""
+    """Truncate or zero-pad (N, K, 3) coefficients to (N, (degree + 1)^2, 3), contiguous."""
     bands = (degree + 1) ** 2
     if bands <= sh.shape[1]:
         return sh[:, :bands].contiguous()

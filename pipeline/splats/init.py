@@ -1,7 +1,7 @@
-"""The first Gaussians, from sparse points or from nothing but the cameras.
+"""Initialisation of Gaussians from sparse points, or at random from the cameras alone.
 
-After Kerbl et al. 2023, section 5.1: a sphere at each point, as wide as the mean distance of its
-three nearest neighbours. Needs numpy and scipy, not torch.
+From points as in Kerbl et al. 2023, section 5.1: an isotropic Gaussian at each point, whose scale
+is the mean distance to its three nearest neighbours. Uses numpy and scipy, not torch.
 """
 
 from __future__ import annotations
@@ -21,25 +21,26 @@ from pipeline.scene.views import View, scene_extent
 # The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient.
 SH_C0 = 0.28209479177387814
 
+# Number of neighbours that determine the scale.
 NEIGHBOURS = 3
-# As many with the point itself tell which way the surface there lies.
-PATCH = 12
-# A first Gaussian's standard deviation as seen from the nearest camera, radians: from a tenth of
-# a pixel (at a focal length of 1000) up to half a view. Less leaves bare walls, where points are
-# few, black for long; more is a stray point's haze over everything.
+# Number of neighbours, with the point itself, that determine the surface normal.
+NORMAL_NEIGHBOURS = 12
+# Range of the standard deviation as seen from the nearest camera, radians: from a tenth of a pixel
+# (at a focal length of 1000) to half a view. A lower maximum leaves holes between sparse points; a
+# higher one lets outliers cover the scene.
 MIN_ANGLE, MAX_ANGLE = 1e-4, 0.5
-LONE_ANGLE = 0.1  # of a single Gaussian
-# Points nearer to a camera than this share of the usual distance are SfM errors (a point at a
-# camera's centre is a known one); points farther than this many usual distances, too.
+# The same for a Gaussian without neighbours.
+LONE_ANGLE = 0.1
+# Range of the distance to the nearest camera, relative to the median: points outside are SfM
+# errors, such as points at a camera's centre.
 TOO_NEAR, TOO_FAR = 0.01, 100.0
-# Of a random start: the cube's side in extents of the scene (a ball alone leaves bonsai's walls to
-# what floats before its cameras: 15.6 dB instead of 23.5; sides of 12 and 24 gave 23.2 and 22.2),
-# and the most opaque it may be (at 0.3 it hides what is behind: 17.9 dB instead of 20.5).
-CUBE, RANDOM_OPACITY = 6.0, 0.1
-# Depths ahead of cameras that look the same way, in extents. What starts nearer stays before one
-# camera as fog (lund_door: 10.9 dB from 0.3 on, 21.6 from 1, 22.6 from 3).
-AHEAD = 1.0, 30.0
-# Thinning is part of the data's preparation, not of the run's randomness.
+# Random initialisation: side of the cube in scene extents, and maximum opacity. Without the cube
+# the background is reconstructed by floaters near the cameras; opaque Gaussians hide the others.
+CUBE_SIDE, RANDOM_OPACITY = 6.0, 0.1
+# Random initialisation in frustums: range of depth in scene extents. Gaussians closer to a camera
+# become floaters.
+DEPTH_RANGE = 1.0, 30.0
+# Subsampling does not depend on the run's seed.
 THINNING_SEED = 0
 
 
@@ -49,8 +50,8 @@ class InitGaussians:
 
     Attributes:
         means, log_scales: (N, 3); quats: (N, 4) wxyz; opacity_logits: (N,); sh: (N, K, 3).
-        num_dropped: points left out because they were not finite, too near or too far.
-        num_thinned: points left out because there were more than ``Init.max_points``.
+        num_dropped: number of points left out because they are not finite, too near or too far.
+        num_thinned: number of points left out because there are more than ``Init.max_points``.
     """
 
     means: NDArray[np.float32]
@@ -72,44 +73,48 @@ class InitGaussians:
 def gaussians_from_points(
     points: Points, camera_centres: NDArray[np.float64], config: Init, sh_degree: int
 ) -> InitGaussians:
-    """A Gaussian at each sparse point.
+    """Initialise one Gaussian at each sparse point.
+
+    The first axis of each Gaussian is the normal of the surface through its neighbours.
 
     Args:
-        camera_centres: (C, 3) float64, world.
+        camera_centres: (C, 3) float64 in world coordinates.
 
     Raises:
-        UserError: no point is left.
+        UserError: no point is usable.
     """
     from scipy.spatial import cKDTree
 
-    # float32's range with room for squares; beyond lies no scene.
+    # The squares of larger coordinates overflow float32.
     usable = np.isfinite(points.xyz).all(1) & (np.abs(points.xyz) < 1e18).all(1)
-    kept = np.flatnonzero(usable)
-    distance = _nearest_distance(points.xyz[kept], camera_centres)
-    usual = float(np.median(distance)) if len(kept) else 0.0
-    inside = (distance >= TOO_NEAR * usual) & (distance <= TOO_FAR * usual)
-    kept, distance = kept[inside], distance[inside]
-    num_dropped = len(points) - len(kept)
-    if not len(kept):
+    chosen = np.flatnonzero(usable)
+    distance = _nearest_distance(points.xyz[chosen], camera_centres)
+    median = float(np.median(distance)) if len(chosen) else 0.0
+    inside = (distance >= TOO_NEAR * median) & (distance <= TOO_FAR * median)
+    chosen, distance = chosen[inside], distance[inside]
+    num_dropped = len(points) - len(chosen)
+    if not len(chosen):
         raise UserError(
-            f"expected sparse points to start the Gaussians from; of {len(points)} none is usable",
+            f"expected sparse points to initialise Gaussians; of {len(points)} none is usable",
             fix="set init.method: random, or check the reconstruction",
         )
-    num_thinned = max(0, len(kept) - config.max_points)
+    num_thinned = max(0, len(chosen) - config.max_points)
     if num_thinned:
         generator = np.random.Generator(np.random.PCG64(THINNING_SEED))
-        chosen = np.sort(generator.choice(len(kept), config.max_points, replace=False))
-        kept, distance = kept[chosen], distance[chosen]
+        subset = np.sort(generator.choice(len(chosen), config.max_points, replace=False))
+        chosen, distance = chosen[subset], distance[subset]
 
-    xyz = points.xyz[kept]
-    found, near = cKDTree(xyz).query(xyz, min(PATCH, len(xyz)))
+    xyz = points.xyz[chosen]
+    distances, neighbours = cKDTree(xyz).query(xyz, min(NORMAL_NEIGHBOURS, len(xyz)))
     spacing = (
-        found[:, 1 : NEIGHBOURS + 1].mean(1) if len(xyz) > 1 else np.full(1, LONE_ANGLE * usual)
+        distances[:, 1 : NEIGHBOURS + 1].mean(1)
+        if len(xyz) > 1
+        else np.full(1, LONE_ANGLE * median)
     )
-    colour = points.rgb[kept].astype(np.float64) / 255.0
-    result = _spheres(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
+    colour = points.rgb[chosen].astype(np.float64) / 255.0
+    result = _isotropic(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
     if len(xyz) > NEIGHBOURS:
-        result.quats[:] = _lying(xyz, near)
+        result.quats[:] = _normal_rotations(xyz, neighbours)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
     return result
 
@@ -117,11 +122,12 @@ def gaussians_from_points(
 def gaussians_random(
     views: Sequence[View], config: Init, sh_degree: int, seed: int
 ) -> InitGaussians:
-    """``config.num_random`` Gaussians of random colour in the volume the cameras look at.
+    """Initialise ``config.num_random`` Gaussians of random colour in the volume that the cameras
+    see.
 
-    Where the cameras look at one place: half of them in a ball around it that all of them see
-    whole, half in a cube around the cameras, for what stands behind. Otherwise (cameras looking
-    ahead, or outward): random depths along the rays of random pixels.
+    If the cameras face a common point, half of the Gaussians are in a ball around it that is inside
+    all views, and half in a cube around the cameras, for the background. Otherwise (forward-facing
+    or outward-facing cameras), Gaussians are at random depths along the rays of random pixels.
     """
     from scipy.spatial import cKDTree
 
@@ -134,7 +140,7 @@ def gaussians_random(
         direction = generator.normal(size=(count, 3))
         direction /= np.maximum(np.linalg.norm(direction, axis=1, keepdims=True), 1e-12)
         xyz = centre + radius * np.cbrt(generator.random((count, 1))) * direction
-        side = CUBE * scene_extent(list(views))
+        side = CUBE_SIDE * scene_extent(list(views))
         cube = centres.mean(0) + side * (generator.random((count, 3)) - 0.5)
         xyz[1::2] = cube[1::2]
     else:
@@ -144,21 +150,22 @@ def gaussians_random(
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
     colour = generator.random((count, 3))
     opacity = min(config.opacity, RANDOM_OPACITY)
-    return _spheres(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
+    return _isotropic(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
 
 
 def _common_ball(
     views: Sequence[View], centres: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], float] | None:
-    """(centre (3,), radius) of what the cameras look at together, None if nothing."""
+    """Centre (3,) and radius of the ball that the cameras face, None if they face no common
+    point."""
     axes = np.stack([view.world_to_camera[2, :3] for view in views])
-    # The point nearest to all optical axes: sum (I - a a^T) (x - c) = 0.
-    across = np.eye(3) - axes[:, :, None] * axes[:, None, :]
-    normal = across.sum(0)
-    # Axes nearly parallel: their nearest point says nothing.
-    if len(views) < 2 or np.linalg.eigvalsh(normal)[0] < 0.02 * len(views):
+    # The point closest to all optical axes: sum (I - a a^T) (x - c) = 0.
+    projections = np.eye(3) - axes[:, :, None] * axes[:, None, :]
+    matrix = projections.sum(0)
+    # Nearly parallel axes do not determine the point.
+    if len(views) < 2 or np.linalg.eigvalsh(matrix)[0] < 0.02 * len(views):
         return None
-    target = np.linalg.solve(normal, (across @ centres[:, :, None]).sum(0))[:, 0]
+    target = np.linalg.solve(matrix, (projections @ centres[:, :, None]).sum(0))[:, 0]
     depth = ((target - centres) * axes).sum(1)
     if np.mean(depth > 0) < 0.9:
         return None
@@ -172,10 +179,10 @@ def _common_ball(
 def _in_frustums(
     views: Sequence[View], extent: float, count: int, generator: np.random.Generator
 ) -> NDArray[np.float64]:
-    """(count, 3) points at log-uniform depths, ``AHEAD`` times the scene's extent."""
+    """(count, 3) points in the views' frustums at log-uniform depths of ``DEPTH_RANGE``."""
     chosen = generator.integers(len(views), size=count)
     uv = generator.random((count, 2))
-    near, far = np.log(AHEAD)
+    near, far = np.log(DEPTH_RANGE)
     depth = extent * np.exp(generator.uniform(near, far, count))
     intrinsics = np.array([(v.width, v.height, v.fx, v.fy, v.cx, v.cy) for v in views])[chosen]
     width, height, fx, fy, cx, cy = intrinsics.T
@@ -196,29 +203,31 @@ def _nearest_distance(
     return np.asarray(cKDTree(centres).query(xyz)[0], np.float64)
 
 
-def _lying(xyz: NDArray[np.float64], near: NDArray[np.intp]) -> NDArray[np.float64]:
-    """(N, 4) wxyz, turned so that the first axis stands on the surface through each point's
-    neighbours (N, k): a sphere that becomes a disc need only shrink."""
-    patch = xyz[near] - xyz[near].mean(1, keepdims=True)
-    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", patch, patch))[1]
+def _normal_rotations(
+    xyz: NDArray[np.float64], neighbours: NDArray[np.intp]
+) -> NDArray[np.float64]:
+    """(N, 4) quaternions (wxyz) whose first axis is the normal of the surface through each point's
+    neighbours (N, k), so that a Gaussian on a surface flattens along an axis."""
+    centred = xyz[neighbours] - xyz[neighbours].mean(1, keepdims=True)
+    axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1]
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return rotation_to_quat(axes)
 
 
 def _clamp(spacing: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Scales that are neither nothing (duplicate points) nor all of the view (lone points)."""
+    """Scales clamped to ``MIN_ANGLE`` (duplicate points) and ``MAX_ANGLE`` (isolated points)."""
     scale = np.clip(spacing, MIN_ANGLE * distance, MAX_ANGLE * distance)
     return np.maximum(scale, 1e-12)
 
 
-def _spheres(
+def _isotropic(
     xyz: NDArray[np.float64],
     scale: NDArray[np.float64],
     colour: NDArray[np.float64],
     opacity: float,
     sh_degree: int,
 ) -> InitGaussians:
-    """Spheres of standard deviation ``scale`` (N,) and linear colour (N, 3) in [0, 1]."""
+    """Isotropic Gaussians of standard deviation ``scale`` (N,) and colour (N, 3) in [0, 1]."""
     n = len(xyz)
     sh = np.zeros((n, (sh_degree + 1) ** 2, 3), np.float32)
     sh[:, 0] = (colour - 0.5) / SH_C0

@@ -1,4 +1,5 @@
-"""An order of Gaussians in which neighbours in space are neighbours in the file."""
+"""Morton (Z-order) sorting of Gaussians, which places neighbours in space near each other in
+memory and in files."""
 
 from __future__ import annotations
 
@@ -7,12 +8,12 @@ from torch import Tensor
 
 from pipeline.splats.gaussians import Gaussians
 
-_BITS = 21  # Three of them fit into 63.
+_BITS = 21  # Three coordinates fit into 63 bits.
 
 
 def morton_order(means: Tensor) -> Tensor:
     """(N,) int64 indices that sort ``means`` (N, 3) along a Z-order curve through their bounding
-    box, of 2^21 cells a side; those of one cell keep their order."""
+    box, which has 2^21 cells per side; the sort is stable."""
     if not len(means):
         return torch.zeros(0, dtype=torch.int64)
     low, high = means.double().aminmax(dim=0)
@@ -28,7 +29,7 @@ def in_morton_order(gaussians: Gaussians) -> Gaussians:
 
 
 def _spread(values: Tensor) -> Tensor:
-    """(N,) int64 of 21 bits with two zeros before each bit."""
+    """Insert two zero bits before each of the 21 bits of (N,) int64 values."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

@@ -1,4 +1,4 @@
-"""Gaussians as they are exported: fewer, or with fewer bands."""
+"""Reduction of Gaussians for export: fewer Gaussians or SH bands, sorted."""
 
 from __future__ import annotations
 
@@ -10,20 +10,20 @@ from pipeline.splats.morton import in_morton_order
 def prepare(
     gaussians: Gaussians, sh_degree: int, min_opacity: float, morton_order: bool
 ) -> Gaussians:
-    """The Gaussians as they are exported: SH bands above ``sh_degree`` cut, those fainter than
-    ``min_opacity`` left out, and sorted if asked for.
+    """Remove SH bands above ``sh_degree`` and Gaussians with an opacity below ``min_opacity``, and
+    optionally sort along a Z-order curve.
 
     Raises:
-        UserError: none are left.
+        UserError: no Gaussian is left.
     """
     if sh_degree < gaussians.sh_degree:
         gaussians = gaussians.with_sh_degree(sh_degree)
     if min_opacity > 0:
-        kept = gaussians.opacity_logits.sigmoid() >= min_opacity
-        if not kept.any():
+        opaque = gaussians.opacity_logits.sigmoid() >= min_opacity
+        if not opaque.any():
             raise UserError(
-                f"all {len(gaussians)} Gaussians are fainter than {min_opacity}",
+                f"all {len(gaussians)} Gaussians have an opacity below {min_opacity}",
                 fix="lower min_opacity",
             )
-        gaussians = gaussians.select(kept)
+        gaussians = gaussians.select(opaque)
     return in_morton_order(gaussians) if morton_order else gaussians

@@ -1,4 +1,4 @@
-"""What Gaussians look like from the views: pictures and depth maps, drawn once and kept on disk."""
+"""Renders and depth maps of the views, computed once and cached on disk."""
 
 from __future__ import annotations
 
@@ -21,20 +21,20 @@ from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
-#: Pixels of less opacity have no depth.
+#: Least accumulated opacity of a pixel with a depth.
 MIN_ALPHA = 0.5
 
 
 @dataclass(frozen=True)
-class Picture:
-    """A view as drawn.
+class RenderedView:
+    """Render and depth of a view.
 
     Attributes:
         view: the camera.
         rgb: (H, W, 3) uint8, over the background.
-        median: (H, W) float32 camera z at pixel centres, world unit, of the Gaussian that takes
-            the transmittance below one half; 0 where none does (opacity under ``MIN_ALPHA``).
-        expected: (H, W) float32, likewise, the mean by weight; 0 in the same places.
+        median: (H, W) float32 camera z, world units, of the Gaussian at which the transmittance
+            falls below one half; 0 if the pixel's opacity is below ``MIN_ALPHA``.
+        expected: (H, W) float32 mean camera z by blending weight; 0 for the same pixels.
     """
 
     view: View
@@ -43,38 +43,38 @@ class Picture:
     expected: NDArray[np.float32]
 
 
-class Pictures:
-    """All views drawn, kept as files that are mapped when looked at: memory stays small."""
+class RenderCache:
+    """Renders of all views, stored in a folder and memory-mapped, to bound memory."""
 
     def __init__(
         self, gaussians: Gaussians, views: Sequence[View], options: RasterOptions, folder: Path
     ):
         self.views, self._folder = list(views), folder
         folder.mkdir(parents=True, exist_ok=True)
-        for i, view in enumerate(track(views, "drawing views", len(views), unit="views")):
-            drawn = render_view(gaussians, view, options)
-            known = drawn.alpha >= MIN_ALPHA
+        for i, view in enumerate(track(views, "rendering views", len(views), unit="views")):
+            rendered = render_view(gaussians, view, options)
+            has_depth = rendered.alpha >= MIN_ALPHA
             depths = [
-                np.where(known, drawn.median_depth, 0),
-                np.where(known, drawn.depth / np.maximum(drawn.alpha, MIN_ALPHA), 0),
+                np.where(has_depth, rendered.median_depth, 0),
+                np.where(has_depth, rendered.depth / np.maximum(rendered.alpha, MIN_ALPHA), 0),
             ]
             np.save(folder / f"{i}.depth.npy", np.stack(depths).astype(np.float32))
-            np.save(folder / f"{i}.rgb.npy", to_bytes(drawn.rgb))
+            np.save(folder / f"{i}.rgb.npy", to_bytes(rendered.rgb))
 
-    def __iter__(self) -> Iterator[Picture]:
+    def __iter__(self) -> Iterator[RenderedView]:
         for i, view in enumerate(self.views):
             median, expected = np.load(self._folder / f"{i}.depth.npy", mmap_mode="r")
-            yield Picture(view, np.load(self._folder / f"{i}.rgb.npy"), median, expected)
+            yield RenderedView(view, np.load(self._folder / f"{i}.rgb.npy"), median, expected)
 
 
 @dataclass(frozen=True)
 class DepthMap:
-    """What a view says of the surface.
+    """Depth observed by a view.
 
     Attributes:
         view: the camera.
-        depth: (H, W) float32 camera z in the world's unit at pixel centres; 0 where nothing is
-            known, inf where the ray meets nothing.
+        depth: (H, W) float32 camera z at pixel centres, world units; 0 if unknown, inf if the ray
+            meets no surface.
         rgb: (H, W, 3) uint8.
     """
 
@@ -83,53 +83,58 @@ class DepthMap:
     rgb: NDArray[np.uint8]
 
     def surface(self, far: float) -> NDArray[np.float32]:
-        """The depths up to ``far``, 0 elsewhere."""
+        """The depths below ``far``; 0 elsewhere."""
         return np.where(self.depth < far, self.depth, np.float32(0))
 
 
 class DepthMaps:
-    """The training views' median depths, as often as they are gone through. Nothing is known of
-    masked pixels; where the photograph is transparent there is nothing."""
+    """Median depth maps of the training views; can be iterated repeatedly.
 
-    def __init__(self, pictures: Pictures):
-        self._pictures = pictures
-        self._count = sum(not view.is_test for view in pictures.views)
+    Masked pixels are unknown (0); transparent pixels of a photograph are empty (inf).
+    """
+
+    def __init__(self, renders: RenderCache):
+        self._renders = renders
+        self._count = sum(not view.is_test for view in renders.views)
 
     def __len__(self) -> int:
         return self._count
 
     def __iter__(self) -> Iterator[DepthMap]:
-        for picture in self._pictures:
-            view = picture.view
+        for rendered in self._renders:
+            view = rendered.view
             if view.is_test:
                 continue
             photo = load_view(view)
-            depth = np.array(picture.median)
+            depth = np.array(rendered.median)
             if photo.alpha is not None:
                 depth[photo.alpha == 0] = np.inf
             if photo.mask is not None:
                 depth[~photo.mask] = 0
-            yield DepthMap(view, depth, picture.rgb)
+            yield DepthMap(view, depth, rendered.rgb)
 
 
-def write_renders(folder: Path, pictures: Pictures) -> None:
-    """``<photograph's name>.png`` of every view, 8 bit."""
-    names = rename({view.name: ".png" for view in pictures.views})
-    for picture in pictures:
+def write_renders(folder: Path, renders: RenderCache) -> None:
+    """Write an 8-bit PNG of each view, named as its photograph."""
+    names = rename({view.name: ".png" for view in renders.views})
+    for rendered in renders:
         buffer = io.BytesIO()
-        Image.fromarray(picture.rgb).save(buffer, "PNG")
-        write_bytes(folder / names[picture.view.name], buffer.getvalue())
+        Image.fromarray(rendered.rgb).save(buffer, "PNG")
+        write_bytes(folder / names[rendered.view.name], buffer.getvalue())
 
 
-def write_depths(folder: Path, pictures: Pictures) -> None:
-    """``median/`` and ``expected/<photograph's name>.tiff`` of every view: one channel of 32-bit
-    floats, camera z (not the ray's length) in the unit of the cameras, 0 where nothing is."""
-    names = rename({view.name: ".tiff" for view in pictures.views})
-    for picture in pictures:
+def write_depths(folder: Path, renders: RenderCache) -> None:
+    """Write a TIFF of each view, named as its photograph, into ``median/`` and ``expected/``.
+
+    One channel of 32-bit floats: camera z (not distance along the ray), world units; 0 if there is
+    no surface.
+    """
+    names = rename({view.name: ".tiff" for view in renders.views})
+    for rendered in renders:
         for kind in ("median", "expected"):
             buffer = io.BytesIO()
-            # A description would be out of order for libtiff, which warns of it.
+            # Without metadata: libtiff warns about the order of the description tag.
             tifffile.imwrite(
-                buffer, np.asarray(getattr(picture, kind)), compression="zlib", metadata=None
+                buffer, np.asarray(getattr(rendered, kind)), compression="zlib", metadata=None
             )
-            write_bytes(folder / kind / names[picture.view.name], buffer.getvalue())
+            write_bytes(folder / kind / names[rendered.view.name], buffer.getvalue())

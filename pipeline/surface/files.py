@@ -1,4 +1,4 @@
-"""Meshes as files: PLY and binary glTF 2.0 (.glb)."""
+"""Mesh files: PLY and binary glTF 2.0 (.glb)."""
 
 from __future__ import annotations
 
@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from pipeline.runtime.atomic import write_bytes
 from pipeline.surface.mesh import Mesh
 
-_FLOAT, _USHORT, _UINT = 5126, 5123, 5125  # glTF's component types
-_ARRAY, _ELEMENT = 34962, 34963  # and its buffer targets
+_FLOAT, _USHORT, _UINT = 5126, 5123, 5125  # component types of glTF
+_ARRAY, _ELEMENT = 34962, 34963  # buffer targets of glTF
 
 
 def write_mesh_ply(path: Path, mesh: Mesh) -> None:
@@ -41,11 +41,11 @@ def write_mesh_ply(path: Path, mesh: Mesh) -> None:
 
 
 def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
-    """Binary glTF 2.0: positions in the world's frame, normals, COLOR_0, unlit (the colours hold
-    the light already).
+    """Binary glTF 2.0: positions in the world's frame, normals, COLOR_0, unlit (the colours
+    include the lighting).
 
     Args:
-        up: (3,) the world's up; the node turns it to glTF's, +y.
+        up: (3,) up vector of the world; the node's rotation takes it to glTF's, +y.
     """
     linear = _linear(mesh.colors / 255.0)
     color = np.full((len(linear), 4), 65535, np.uint16)
@@ -68,7 +68,7 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
             {"bufferView": i, "componentType": kind, "count": len(array), "type": shape}
         )
         parts.append(data)
-        offset += len(data)  # every element is a multiple of 4 bytes: all stay aligned
+        offset += len(data)  # sizes are multiples of 4 bytes, so all views are aligned
     accessors[0] |= {
         "min": mesh.vertices.min(axis=0).astype(float).tolist(),
         "max": mesh.vertices.max(axis=0).astype(float).tolist(),
@@ -80,7 +80,7 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
-        "nodes": [{"mesh": 0, "rotation": _turn_up(up)}],
+        "nodes": [{"mesh": 0, "rotation": _rotation_to_y_up(up)}],
         "meshes": [
             {
                 "primitives": [
@@ -118,8 +118,8 @@ def _linear(srgb: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.where(srgb <= 0.04045, srgb / 12.92, ((srgb + 0.055) / 1.055) ** 2.4)
 
 
-def _turn_up(up: NDArray[np.float64]) -> list[float]:
-    """Quaternion xyzw of the shortest turn that takes the unit vector ``up`` to +y."""
+def _rotation_to_y_up(up: NDArray[np.float64]) -> list[float]:
+    """Quaternion xyzw of the smallest rotation that takes the unit vector ``up`` to +y."""
     cosine = float(up[1])
     if cosine < -1 + 1e-9:
         return [1.0, 0.0, 0.0, 0.0]

@@ -1,4 +1,4 @@
-"""Triangle meshes: out of a distance field, cleaned and coloured."""
+"""Triangle meshes from a distance field, with small pieces removed and vertex colours."""
 
 from __future__ import annotations
 
@@ -22,27 +22,27 @@ from pipeline.surface.tsdf import (
     choose_grid,
     chunks,
     fuse,
-    pixels_of,
+    project_to_pixels,
 )
 
-#: Fewer views that saw a surface in a voxel's neighbourhood, and there is none.
+#: Least weight of a voxel: the number of views that see a surface there.
 MIN_VIEWS = 2
-#: Connected pieces with a smaller share of the triangles are floaters.
+#: Connected pieces with a smaller share of the triangles are removed as floaters.
 SMALL_PIECE = 0.002
 
-# Blocks along the side of the cubes that marching cubes runs over.
+# Side in blocks of the chunks that marching cubes processes.
 _CHUNK = 8
 _VERTICES = 1 << 16
 
 
 @dataclass(frozen=True)
 class Mesh:
-    """Triangles.
+    """A triangle mesh.
 
     Attributes:
         vertices: (V, 3) float32, world.
-        faces: (F, 3) int32, counter-clockwise seen from in front of the surface.
-        normals: (V, 3) float32, unit length, out of the surface.
+        faces: (F, 3) int32, counter-clockwise seen from outside.
+        normals: (V, 3) float32, unit length, pointing outwards.
         colors: (V, 3) uint8, sRGB.
     """
 
@@ -53,39 +53,42 @@ class Mesh:
 
 
 def extract(field: Tsdf, min_weight: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Marching cubes (Lewiner et al. 2003) over cells of which all corners were seen.
+    """Marching cubes (Lewiner et al. 2003) over cells whose corners were all observed.
 
     Args:
-        min_weight: voxels of less weight count as not seen.
+        min_weight: voxels of less weight are treated as unobserved.
 
     Returns:
-        vertices (V, 3) float64 in the world, faces (F, 3); each edge of the grid has one vertex.
+        vertices (V, 3) float64, world, with at most one per grid edge; faces (F, 3).
     """
     grid, side = field.grid, _CHUNK * BLOCK + 1
     parts: list[NDArray[np.float64]] = []
     faces: list[NDArray[np.int64]] = []
     count = 0
     for first, rows in chunks(grid, _CHUNK):
-        values, known = np.ones((side,) * 3, np.float32), np.zeros((side,) * 3, bool)
+        values, observed = np.ones((side,) * 3, np.float32), np.zeros((side,) * 3, bool)
         for row, at in zip(rows, (grid.blocks[rows] - first) * BLOCK, strict=True):
             size = np.minimum(BLOCK, side - at)
-            to = tuple(slice(a, a + n) for a, n in zip(at, size, strict=True))
-            of = (row, *(slice(0, n) for n in size))
-            values[to], known[to] = field.distance[of], field.weight[of] >= min_weight
-        # A vertex on a corner would belong to several edges.
+            target = tuple(slice(a, a + n) for a, n in zip(at, size, strict=True))
+            source = (row, *(slice(0, n) for n in size))
+            values[target], observed[target] = (
+                field.distance[source],
+                field.weight[source] >= min_weight,
+            )
+        # A zero would put a vertex on a grid corner, shared by several edges.
         values[values == 0] = 1e-6
-        # skimage's mask names a cell by its last corner.
-        cells = np.zeros_like(known)
+        # skimage's mask indexes a cell by its last corner.
+        cells = np.zeros_like(observed)
         corners = [slice(0, -1), slice(1, None)]
         cells[1:, 1:, 1:] = np.logical_and.reduce(
-            [known[i, j, k] for i in corners for j in corners for k in corners]
+            [observed[i, j, k] for i in corners for j in corners for k in corners]
         )
         below = values < 0
-        if not (cells.any() and below[known].any() and not below[known].all()):
+        if not (cells.any() and below[observed].any() and not below[observed].all()):
             continue
         try:
             points, triangles, *_ = marching_cubes(values, 0.0, mask=cells)
-        except RuntimeError:  # no surface in the cells that count
+        except RuntimeError:  # no surface in the observed cells
             continue
         parts.append(points.astype(np.float64) + first * BLOCK)
         faces.append(triangles.astype(np.int64) + count)
@@ -99,9 +102,9 @@ def extract(field: Tsdf, min_weight: float) -> tuple[NDArray[np.float64], NDArra
 def _weld(
     vertices: NDArray[np.float64], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """One vertex for each edge of the grid, where chunks brought several; voxel units."""
+    """Merge the vertices of different chunks on the same grid edge; voxel units."""
     base = np.floor(vertices).astype(np.int64)
-    # The axis of the edge that the vertex lies on; 3 for the few inside a cell.
+    # Axis of the grid edge that the vertex lies on; 3 for vertices inside a cell.
     loose = vertices != base
     axis = np.where(loose.sum(axis=1) == 1, loose.argmax(axis=1), 3)
     inner = np.where(axis == 3, np.arange(len(vertices)), -1)
@@ -116,10 +119,10 @@ def _weld(
     return vertices[order[new]], faces[distinct]
 
 
-def drop_small(
+def remove_small_pieces(
     vertices: NDArray[np.float64], faces: NDArray[np.int64], min_faces: int
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Without the connected pieces of fewer triangles, and without loose vertices."""
+    """Remove connected pieces of fewer than ``min_faces`` triangles, and unused vertices."""
     count = len(vertices)
     links = coo_matrix(
         (np.ones(2 * len(faces), np.int8), (faces[:, [0, 1]].ravel(), faces[:, [1, 2]].ravel())),
@@ -134,11 +137,11 @@ def drop_small(
 
 
 def vertex_normals(vertices: NDArray[np.float64], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """(V, 3) unit normals, the mean of the triangles' weighted by area."""
+    """(V, 3) unit normals: area-weighted means of the normals of adjacent triangles."""
     a, b, c = (vertices[faces[:, i]] for i in range(3))
-    across = np.cross(b - a, c - a)
+    cross = np.cross(b - a, c - a)
     total = np.stack(
-        [np.bincount(faces.ravel(), np.repeat(across[:, i], 3), len(vertices)) for i in range(3)],
+        [np.bincount(faces.ravel(), np.repeat(cross[:, i], 3), len(vertices)) for i in range(3)],
         axis=1,
     )
     length = np.linalg.norm(total, axis=1, keepdims=True)
@@ -152,11 +155,11 @@ def vertex_colors(
     tolerance: float,
     threads: int,
 ) -> NDArray[np.uint8]:
-    """(V, 3) uint8: the mean of what the views show there, those that look straight at the surface
-    counting more; grey where none does.
+    """(V, 3) uint8 mean colour over the views that see the vertex, weighted by the squared cosine
+    of the viewing angle; grey if none does.
 
     Args:
-        tolerance: a view sees a vertex if its depth differs by no more, world unit.
+        tolerance: largest difference of depths for a vertex to be visible, world units.
     """
     total, weight = np.zeros((len(vertices), 3)), np.zeros(len(vertices))
     parts = [slice(i, i + _VERTICES) for i in range(0, len(vertices), _VERTICES)]
@@ -164,13 +167,15 @@ def vertex_colors(
     def add(depth: DepthMap, part: slice) -> None:
         view, normal = depth.view, normals[part]
         x, y, z = camera_space(view, vertices[part])
-        pixel, seen = pixels_of(view, x, y, z)
+        pixel, seen = project_to_pixels(view, x, y, z)
         found = depth.depth.reshape(-1)[pixel]
         ray = vertices[part] - view.centre
         facing = -(ray * normal).sum(axis=1) / np.maximum(np.linalg.norm(ray, axis=1), 1e-12)
-        gain = np.where(seen & (np.abs(found - z) < tolerance), np.clip(facing, 0, 1) ** 2, 0.0)
-        weight[part] += gain
-        total[part] += gain[:, None] * depth.rgb.reshape(-1, 3)[pixel]
+        contribution = np.where(
+            seen & (np.abs(found - z) < tolerance), np.clip(facing, 0, 1) ** 2, 0.0
+        )
+        weight[part] += contribution
+        total[part] += contribution[:, None] * depth.rgb.reshape(-1, 3)[pixel]
 
     with ThreadPoolExecutor(max(1, threads)) as pool:
         for depth in depths:
@@ -183,11 +188,13 @@ def vertex_colors(
 def build_mesh(
     depths: DepthMaps, voxel: float | None, threads: int
 ) -> tuple[Mesh | None, Grid | None]:
-    """The surface that the depth maps agree on, coloured and cleaned; the same bits at any number
-    of threads. None where there is no surface.
+    """Fuse depth maps to a mesh; the result is the same bits at any number of threads.
 
     Args:
-        voxel: side of a voxel, world unit; None chooses one (see ``choose_grid``).
+        voxel: side of a voxel, world units; None chooses one (see ``choose_grid``).
+
+    Returns:
+        The mesh and its grid; None if there is no surface.
     """
     grid = choose_grid(depths, voxel)
     if grid is None:
@@ -195,7 +202,7 @@ def build_mesh(
     field = fuse(grid, depths, threads)
     vertices, faces = extract(field, min(MIN_VIEWS, len(depths)))
     del field
-    vertices, faces = drop_small(vertices, faces, int(np.ceil(SMALL_PIECE * len(faces))))
+    vertices, faces = remove_small_pieces(vertices, faces, int(np.ceil(SMALL_PIECE * len(faces))))
     if len(faces) == 0:
         return None, grid
     normals = vertex_normals(vertices, faces)

@@ -16,41 +16,41 @@ Array = NDArray[np.float64]
 
 FRAMES = 90
 FPS = 30
-#: Frames are this share of the views' size.
+#: Size of a frame over that of the views.
 SCALE = 0.5
-#: Cameras all around leave no gap wider than this, degrees.
+#: Cameras surround the subject if no gap in azimuth is wider than this, degrees.
 _CLOSED_GAP = 120.0
-#: A path that does not close swings over the middle of the cameras' range, this share of it...
+#: Otherwise the path swings over this share of the cameras' range of azimuths...
 _SWING_SHARE = 0.8
-#: ...and over this many degrees at least.
+#: ...and over at least this many degrees.
 _MIN_SWING = 6.0
 
 
 def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
     """``FRAMES`` cameras on a closed smooth path, at ``SCALE`` of the views' size.
 
-    Where the views look at something together: around it, at the distance and height that the
-    cameras have in that direction; all the way if they are all around, else to and fro. Where
-    they do not (a room from within, a walk): through the views, in order of their names.
+    If the views look at a common subject, the path goes around it, at the distance and height of
+    the nearby cameras: a full circle if the cameras surround it, else back and forth. If not (a
+    room from inside, a walk), the path goes through the views in the order of their names.
 
     Args:
         views: at least one.
-        depth: how far away from the cameras the scene typically is, world unit.
-        up: (3,) unit vector.
+        depth: typical distance of the scene from the cameras, world units.
+        up: (3,) unit vector, up in the world.
     """
     centres = np.stack([view.centre for view in views])
     forward = np.stack([view.world_to_camera[2, :3] for view in views])
     focus = _focus(centres, forward, depth)
-    towards = focus - centres
-    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
-    if float(np.median((towards * forward).sum(axis=1))) > np.cos(np.radians(30)):
+    to_focus = focus - centres
+    to_focus /= np.maximum(np.linalg.norm(to_focus, axis=1, keepdims=True), 1e-12)
+    if float(np.median((to_focus * forward).sum(axis=1))) > np.cos(np.radians(30)):
         positions = _around(centres - focus, up) + focus
         ahead = focus - positions
     else:
         positions, ahead = _smooth(centres), _smooth(forward)
     frame = _frame(views)
     return [
-        replace(frame, name=f"{i:04d}", world_to_camera=_look(p, d, up))
+        replace(frame, name=f"{i:04d}", world_to_camera=_look_along(p, d, up))
         for i, (p, d) in enumerate(zip(positions, ahead, strict=True))
     ]
 
@@ -73,20 +73,19 @@ def describe_path(path: Sequence[View]) -> dict[str, Any]:
 
 
 def _focus(centres: Array, forward: Array, depth: float) -> Array:
-    """The point nearest to all optical axes; along an axis, where it is not determined, a typical
-    depth away."""
+    """The point nearest to all optical axes, with a weak prior at the typical depth, which decides
+    if the axes are parallel."""
     expected = (centres + depth * forward).mean(axis=0)
     across = np.eye(3) - forward[:, :, None] * forward[:, None, :]
-    # The prior weighs little against axes that cross, and decides where they are parallel.
     system = across.mean(axis=0) + 0.05 * np.eye(3)
     right = (across * centres[:, None, :]).sum(axis=2).mean(axis=0) + 0.05 * expected
     return np.asarray(np.linalg.solve(system, right))
 
 
 def _around(offsets: Array, up: Array) -> Array:
-    """(FRAMES, 3) positions about the origin. In cylinder coordinates about ``up``, distance and
-    height are smooth functions of the azimuth, fitted to the cameras'."""
-    side, front = _plane(up, offsets)
+    """(FRAMES, 3) positions around the origin. In cylindrical coordinates about ``up``, distance
+    and height are smooth functions of the azimuth, fitted to the cameras."""
+    side, front = _horizontal_axes(up, offsets)
     azimuth = np.arctan2(offsets @ front, offsets @ side)
     height = offsets @ up
     radius = np.hypot(offsets @ side, offsets @ front)
@@ -111,19 +110,21 @@ def _around(offsets: Array, up: Array) -> Array:
     return np.asarray(fitted[0][:, None] * flat + fitted[1][:, None] * up)
 
 
-def _fit(terms: list[Any], at: Array, values: Array, wanted: Array) -> Array:
-    """Ridge regression of ``values`` on the terms, kept within the middle of the values."""
+def _fit(terms: list[Any], at: Array, values: Array, query: Array) -> Array:
+    """Ridge regression of ``values`` on the terms, evaluated at ``query`` and clipped to the 10th
+    to 90th percentile of the values."""
     table = np.stack([term(at) for term in terms], axis=1)
     mean = values.mean()
-    # The ridge keeps few cameras, or cameras in one place, from making wild curves.
+    # The ridge avoids extreme curves for few cameras, or cameras in one place.
     ridge = 0.1 * np.eye(len(terms))
     weights = np.linalg.solve(table.T @ table + ridge, table.T @ (values - mean))
-    found = mean + np.stack([term(wanted) for term in terms], axis=1) @ weights
+    found = mean + np.stack([term(query) for term in terms], axis=1) @ weights
     return np.asarray(np.clip(found, *np.percentile(values, [10, 90])))
 
 
-def _plane(up: Array, offsets: Array) -> tuple[Array, Array]:
-    """Two unit vectors across ``up``; the first towards the cameras' mean, where they have one."""
+def _horizontal_axes(up: Array, offsets: Array) -> tuple[Array, Array]:
+    """Two unit vectors orthogonal to ``up``; the first towards the mean of the cameras, unless that
+    is the origin."""
     for guess in (offsets.mean(axis=0), *np.eye(3)):
         side = guess - (guess @ up) * up
         if np.linalg.norm(side) > 1e-3 * (1e-12 + np.linalg.norm(guess)):
@@ -133,18 +134,18 @@ def _plane(up: Array, offsets: Array) -> tuple[Array, Array]:
 
 
 def _smooth(values: Array) -> Array:
-    """(FRAMES, 3) along the polygon of ``values`` to and fro, corners rounded by a Gaussian."""
+    """(FRAMES, 3) positions along the polygon ``values``, back and forth, smoothed by Gaussian."""
     there_and_back = np.concatenate([values, values[-2:0:-1]]) if len(values) > 2 else values
     count = len(there_and_back)
     place = np.arange(FRAMES) * count / FRAMES
     apart = np.abs(place[:, None] - np.arange(count))
     apart = np.minimum(apart, count - apart)
-    # Wide enough to hide the hands' trembling, and never narrower than the frames.
+    # Wide enough to remove hand shake, and never narrower than the spacing of the frames.
     weight = np.exp(-0.5 * (apart / max(1.5, count / FRAMES)) ** 2)
     return np.asarray(weight @ there_and_back / weight.sum(axis=1, keepdims=True))
 
 
-def _look(position: Array, ahead: Array, up: Array) -> Array:
+def _look_along(position: Array, ahead: Array, up: Array) -> Array:
     """(4, 4) world to camera."""
     z = ahead / np.linalg.norm(ahead)
     x = np.cross(z, up)
@@ -158,8 +159,8 @@ def _look(position: Array, ahead: Array, up: Array) -> Array:
 
 
 def _frame(views: Sequence[View]) -> View:
-    """A view of the commonest size at ``SCALE``, with the median focal length; even sides, which
-    video encoders ask for, and the principal point in the middle."""
+    """A view of the most common size at ``SCALE``, with the median focal length, even sides (video
+    encoders require them) and a centred principal point."""
     size = Counter((view.width, view.height) for view in views).most_common(1)[0][0]
     alike = [view for view in views if (view.width, view.height) == size]
     width, height = (max(2, 2 * round(side * SCALE / 2)) for side in size)

@@ -1,7 +1,7 @@
-"""Depth maps fused to a truncated signed distance field (Curless and Levoy 1996), kept only near
-the surface: blocks of 8^3 voxels, sorted by their place.
+"""Depth maps fused to a truncated signed distance field (Curless and Levoy 1996), stored only near
+the surface, in blocks of 8^3 voxels, sorted by position.
 
-World frame, COLMAP cameras. No matrix products: BLAS rounds differently at other thread counts.
+World frame, COLMAP cameras. No matrix products: BLAS rounds differently with the number of threads.
 """
 
 from __future__ import annotations
@@ -19,25 +19,24 @@ from scipy.ndimage import maximum_filter
 from pipeline.scene.views import View
 from pipeline.surface.depth import DepthMap
 
-#: Voxels along a block's side.
+#: Side of a block in voxels.
 BLOCK = 8
-#: Truncation distance in voxels: wider than the depths' noise, narrower than thin things.
+#: Truncation distance in voxels: above the noise of the depths, below the width of thin objects.
 TRUNCATION = 6.0
-#: Voxels are as wide as this many pixels at the median depth.
-PIXELS_A_VOXEL = 2.5
-#: At most so many voxels (8 bytes each); where the scene needs more they become larger.
+#: Default side of a voxel, in pixels at the median depth.
+PIXELS_PER_VOXEL = 2.5
+#: Largest number of voxels (8 bytes each); larger voxels are used if a scene needs more.
 MAX_VOXELS = 24_000_000
-#: Depths beyond this multiple of the median depth carry no surface: pixels there are too coarse.
+#: Depths beyond this multiple of the median depth contribute no surface: pixels are too coarse.
 FAR = 3.0
-#: What seeing through a voxel weighs against a surface seen in it, which weighs 1: a ray that slips
-#: through a gap between Gaussians must not wipe out what others see. By the views' angle was tried
-#: and was no better: the depths' noise hides the angle.
-FREE = 0.2
+#: Weight of an observation of free space; one of a surface weighs 1. Below 1, so that rays through
+#: gaps between Gaussians do not erase surfaces that other views see.
+FREE_SPACE_WEIGHT = 0.2
 
-_BLOCKS_AT_ONCE = 256
+_BLOCKS_PER_TASK = 256
 # Block coordinates are packed into one integer, 21 bits each.
 _BITS, _OFFSET = 21, 1 << 20
-# The depth maps' maximum is taken over this many pixels around a block's centre.
+# Radius in pixels around a block's centre over which the maximum depth is taken.
 _REACH = 24
 
 Array = NDArray[np.float64]
@@ -45,11 +44,11 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Grid:
-    """Where the voxels are: those of the blocks ``keys``.
+    """The voxels: those of ``blocks``.
 
     Attributes:
-        voxel: side in the world's unit. Voxel (i, j, k) has its centre at (i, j, k) * voxel.
-        far: depths beyond this are free space up to there, and no surface.
+        voxel: side, world units. Voxel (i, j, k) has its centre at (i, j, k) * voxel.
+        far: depths beyond this are free space up to ``far``, and no surface.
         blocks: (B, 3) int64, sorted; block b holds voxels b * 8 to b * 8 + 7.
     """
 
@@ -67,11 +66,11 @@ class Tsdf:
     """The fused field.
 
     Attributes:
-        grid: where the voxels are.
+        grid: the voxels.
         distance: (B, 8, 8, 8) float32, mean signed distance over the truncation, -1 to 1, positive
             in front of the surface; 0 where the weight is 0.
-        weight: (B, 8, 8, 8) float32, number of views that saw a surface there, and ``FREE`` for
-            each that saw through.
+        weight: (B, 8, 8, 8) float32, number of views that saw a surface there, plus
+            ``FREE_SPACE_WEIGHT`` for each that saw free space.
     """
 
     grid: Grid
@@ -80,26 +79,26 @@ class Tsdf:
 
 
 def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
-    """Blocks within the truncation of the depths' surface.
+    """Choose the blocks within the truncation distance of the observed surface.
 
     Args:
-        depths: gone through several times.
-        voxel: side in the world's unit; None takes ``PIXELS_A_VOXEL`` at the median depth. Either
-            grows where ``MAX_VOXELS`` would be exceeded.
+        depths: iterated several times.
+        voxel: side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
+            is enlarged if ``MAX_VOXELS`` would be exceeded.
 
     Returns:
-        None where no map knows any depth.
+        None if no map has a depth.
     """
     median, width = _median_depth(depths)
     if median == 0:
         return None
     far = FAR * median
-    side = voxel or PIXELS_A_VOXEL * width
+    side = voxel or PIXELS_PER_VOXEL * width
     while True:
-        # Each scale's blocks are sought afresh: their number depends on the surface's shape.
+        # Blocks are searched again for each size: their number depends on the surface.
         keys = np.zeros(0, np.int64)
         for depth in depths:
-            keys = np.union1d(keys, _touched(depth, side, far))
+            keys = np.union1d(keys, _surface_blocks(depth, side, far))
             if len(keys) * BLOCK**3 > MAX_VOXELS:
                 break
         else:
@@ -113,8 +112,8 @@ def fuse(grid: Grid, depths: Iterable[DepthMap], threads: int) -> Tsdf:
     total, weight = np.zeros(shape, np.float32), np.zeros(shape, np.float32)
     with ThreadPoolExecutor(max(1, threads)) as pool:
         for depth in depths:
-            rows = _in_sight(grid, depth)
-            parts = [rows[i : i + _BLOCKS_AT_ONCE] for i in range(0, len(rows), _BLOCKS_AT_ONCE)]
+            rows = _visible_blocks(grid, depth)
+            parts = [rows[i : i + _BLOCKS_PER_TASK] for i in range(0, len(rows), _BLOCKS_PER_TASK)]
             for _ in pool.map(partial(_integrate, grid, depth, total, weight), parts):
                 pass
     np.divide(total, weight, out=total, where=weight > 0)
@@ -123,7 +122,7 @@ def fuse(grid: Grid, depths: Iterable[DepthMap], threads: int) -> Tsdf:
 
 
 def _median_depth(depths: Iterable[DepthMap]) -> tuple[float, float]:
-    """Median over all views of the depth and of a pixel's width there; 0 without any depth."""
+    """Medians over all pixels of the depth and of a pixel's width there; 0 without any depth."""
     values, widths = [np.zeros(0, np.float32)], [np.zeros(0, np.float32)]
     for depth in depths:
         z = depth.surface(np.inf)[::4, ::4]
@@ -145,9 +144,9 @@ def _unpack(keys: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.stack(parts, axis=-1) - _OFFSET
 
 
-def _touched(depth: DepthMap, voxel: float, far: float) -> NDArray[np.int64]:
-    """Keys of the blocks that hold points of the map's surface, or lie a truncation before or
-    behind it."""
+def _surface_blocks(depth: DepthMap, voxel: float, far: float) -> NDArray[np.int64]:
+    """Keys of the blocks that contain points of the map's surface, or points one truncation
+    distance in front of or behind it."""
     view, z = depth.view, depth.surface(far)
     rows, columns = np.nonzero(z > 0)
     z = z[rows, columns].astype(np.float64)
@@ -170,7 +169,7 @@ def _touched(depth: DepthMap, voxel: float, far: float) -> NDArray[np.int64]:
 
 
 def camera_space(view: View, points: NDArray[Any]) -> tuple[Array, Array, Array]:
-    """x, y, z in the camera's frame of (N, 3) world points."""
+    """x, y, z of (N, 3) world points in the camera frame."""
     rotation, shift = view.world_to_camera[:3, :3], view.world_to_camera[:3, 3]
     px, py, pz = points[:, 0], points[:, 1], points[:, 2]
     x, y, z = (
@@ -179,11 +178,11 @@ def camera_space(view: View, points: NDArray[Any]) -> tuple[Array, Array, Array]
     return x, y, z
 
 
-def pixels_of(
+def project_to_pixels(
     view: View, x: NDArray[Any], y: NDArray[Any], z: NDArray[Any]
 ) -> tuple[NDArray[np.int32], NDArray[np.bool_]]:
-    """Where points of the camera's frame fall: the pixel's index in a flattened picture (0 for
-    those outside), and which are inside."""
+    """Project points in the camera frame: index of the pixel in the flattened image (0 for points
+    outside), and whether the point is inside."""
     front = np.maximum(z, 1e-9)
     u, v = view.fx * x / front + view.cx, view.fy * y / front + view.cy
     seen = (z > 0) & (u >= 0) & (v >= 0) & (u < view.width) & (v < view.height)
@@ -191,15 +190,15 @@ def pixels_of(
     return row * np.int32(view.width) + column, seen
 
 
-def _in_sight(grid: Grid, depth: DepthMap) -> NDArray[np.intp]:
-    """Rows of the blocks that the map may see: inside the picture and not behind its surface."""
+def _visible_blocks(grid: Grid, depth: DepthMap) -> NDArray[np.intp]:
+    """Rows of the blocks that may be visible: inside the image and not behind its surface."""
     view, size = depth.view, BLOCK * grid.voxel
     radius = size * np.sqrt(3) / 2
     centres = (grid.blocks + (0.5 - 0.5 / BLOCK)) * size
     x, y, z = camera_space(view, centres)
     front = np.maximum(z, 1e-9)
     u, v = view.fx * x / front + view.cx, view.fy * y / front + view.cy
-    # A block of radius r covers no more than this around its centre while z > 2 r.
+    # Upper bound of the projected radius of a block of radius r, for z > 2 r.
     spread = 2 * max(view.fx, view.fy) * radius / front
     close = (z > -radius) & (z < 2 * radius)
     inside = (z >= 2 * radius) & (u > -spread) & (v > -spread)
@@ -207,8 +206,8 @@ def _in_sight(grid: Grid, depth: DepthMap) -> NDArray[np.intp]:
     farthest = maximum_filter(depth.depth, 2 * _REACH + 1, mode="nearest")
     column = np.clip(u, 0, view.width - 1).astype(np.intp)
     row = np.clip(v, 0, view.height - 1).astype(np.intp)
-    hidden = (spread < _REACH) & (z - radius > farthest[row, column] + grid.truncation)
-    return np.flatnonzero(close | (inside & ~hidden))
+    occluded = (spread < _REACH) & (z - radius > farthest[row, column] + grid.truncation)
+    return np.flatnonzero(close | (inside & ~occluded))
 
 
 def _integrate(
@@ -234,20 +233,20 @@ def _integrate(
         ).astype(np.float32)
         for i in range(3)
     )
-    pixel, seen = pixels_of(view, x, y, z)
+    pixel, seen = project_to_pixels(view, x, y, z)
     found = depth.depth.reshape(-1)[pixel]
     share = (found - z) * np.float32(1 / grid.truncation)
     seen &= (found > 0) & (share > -1)
-    # Beyond ``far`` only free space is known.
+    # Depths beyond ``far`` only prove free space.
     seen &= (found < grid.far) | (share > 1)
-    gain = seen * np.where(share > 1, np.float32(FREE), np.float32(1))
-    weight[rows] += gain
-    total[rows] += gain * np.clip(share, -1, 1)
+    contribution = seen * np.where(share > 1, np.float32(FREE_SPACE_WEIGHT), np.float32(1))
+    weight[rows] += contribution
+    total[rows] += contribution * np.clip(share, -1, 1)
 
 
 def chunks(grid: Grid, side: int) -> Iterator[tuple[NDArray[np.int64], NDArray[np.intp]]]:
-    """Cubes of ``side``^3 blocks that hold any: first block's coordinates (3,), and rows of the
-    blocks in it and of those just behind it, whose first voxels close its last cells."""
+    """Non-empty chunks of ``side``^3 blocks: coordinates (3,) of the first block, and rows of the
+    blocks in the chunk and of the adjacent ones that complete its last cells."""
     packed = np.unique(_pack(grid.blocks // side))
     for first in _unpack(packed) * side:
         inside = np.all((grid.blocks >= first) & (grid.blocks <= first + side), axis=1)

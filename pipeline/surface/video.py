@@ -1,4 +1,4 @@
-"""Frames to a video that browsers and players open, by whatever encoder there is."""
+"""Encode frames to a video that browsers and players open, with the available encoder."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ Frames = Sequence[NDArray[np.uint8]]
 
 
 def write_video(folder: Path, frames: Frames, fps: int) -> Path:
-    """Write ``video.mp4``, in H.264 where ffmpeg is on the PATH, else in VP9 by OpenCV's own
-    encoder, or, where that is missing too, an animated ``video.webp``; returns the file.
+    """Write ``video.mp4``, in H.264 if ffmpeg is on the PATH, else in VP9 by OpenCV; without
+    either, an animated ``video.webp``. Returns the file.
 
     Args:
-        frames: (H, W, 3) uint8 RGB each, one size, even sides.
+        frames: (H, W, 3) uint8 RGB, all of one size with even sides.
     """
     folder.mkdir(parents=True, exist_ok=True)
     for name, encode in (("mp4", _ffmpeg), ("mp4", _opencv), ("webp", _pillow)):
@@ -41,7 +41,7 @@ def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
     if program is None:
         return False
     height, width = frames[0].shape[:2]
-    # One thread and no version strings: the same frames, the same bytes.
+    # One thread and no version strings: the same frames give the same bytes.
     command = [
         *(program, "-loglevel", "error", "-y", "-f", "rawvideo", "-pix_fmt", "rgb24"),
         *("-s", f"{width}x{height}", "-r", str(fps), "-i", "-", "-an"),
@@ -55,7 +55,7 @@ def _ffmpeg(path: Path, frames: Frames, fps: int) -> bool:
 
 def _opencv(path: Path, frames: Frames, fps: int) -> bool:
     height, width = frames[0].shape[:2]
-    # MP4 and not WebM, which is stamped with a random number: the same frames, the same bytes.
+    # Not WebM, which contains a random number: the same frames give the same bytes.
     writer = cv2.VideoWriter(str(path), cv2.VideoWriter.fourcc(*"vp09"), fps, (width, height))
     if not writer.isOpened():
         return False

@@ -1,1 +1,1 @@
-"""Watching a training from outside, in a browser or in TensorBoard: it knows nothing of it."""
+"""Monitoring of a training from a separate process: in a browser or in TensorBoard."""

@@ -1,4 +1,4 @@
-"""A page in the browser that shows a scene, rendered by our own rasterizer as one moves."""
+"""Interactive page in the browser, rendered by the rasterizer of this package."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 from pipeline.watching.source import Source
 
-# Pixels of the longer side while the camera moves; then the picture is made anew in full.
+# Longer side in pixels while the camera moves; afterwards the image is rendered at full size.
 MOVING_SIDE = 320
-RENEW_SECONDS = 2.0
+POLL_SECONDS = 2.0
 
 
-class Room:
-    """The scene as the browser has it: its cameras' middle at the origin, their spread 1, so that
-    neither a scene in metres from the equator nor one in millimetres is lost in float32.
+class ViewerFrame:
+    """The frame of the browser: cameras centred at the origin and scaled to radius 1, so that
+    float32 is precise enough for scenes of any unit and origin.
 
     Args:
         views: the scene's cameras, at least one.
@@ -36,17 +36,17 @@ class Room:
         self.scale = float(np.linalg.norm(centres - self.origin, axis=1).max()) or 1.0
 
     def from_world(self, point: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(3,) in the room, of (3,) in the world."""
+        """(3,) point in the viewer's frame from (3,) world."""
         return (point - self.origin) / self.scale
 
     def view(
         self, wxyz: NDArray[Any], position: NDArray[Any], fov: float, size: tuple[int, int]
     ) -> View:
-        """The view of a camera in the room.
+        """The view of a camera in the viewer's frame.
 
         Args:
-            wxyz: (4,) rotation, camera to room; x right, y down, z forward.
-            position: (3,).
+            wxyz: (4,) rotation, camera to viewer's frame; x right, y down, z forward.
+            position: (3,), viewer's frame.
             fov: vertical, radians.
             size: width and height in pixels.
         """
@@ -61,51 +61,51 @@ class Room:
 
 
 def picture_size(aspect: float, side: int) -> tuple[int, int]:
-    """Width and height in pixels of a picture with this ratio and longer side."""
+    """Width and height in pixels of an image with this aspect ratio and longer side."""
     width, height = (side, side / aspect) if aspect >= 1 else (side * aspect, side)
     return max(1, round(width)), max(1, round(height))
 
 
-class _Visitor:
-    """One browser: renders what it looks at, in a thread of its own."""
+class _Client:
+    """A connected browser: renders its view in a separate thread."""
 
     def __init__(self, page: Page, client: Any):
         self.page, self.client = page, client
-        self.wanted, self.gone = threading.Event(), False
-        client.camera.on_update(lambda _: self.wanted.set())
+        self.changed, self.closed = threading.Event(), False
+        client.camera.on_update(lambda _: self.changed.set())
         threading.Thread(target=self.work, daemon=True).start()
-        self.wanted.set()
+        self.changed.set()
 
     def work(self) -> None:
-        while not self.gone:
-            self.wanted.wait()
-            self.wanted.clear()
-            if not self.gone:
+        while not self.closed:
+            self.changed.wait()
+            self.changed.clear()
+            if not self.closed:
                 self.show(MOVING_SIDE)
-                # Still where it was: the whole picture.
-                if not self.wanted.wait(0.15):
+                # The camera has stopped: full size.
+                if not self.changed.wait(0.15):
                     self.show(self.page.side)
 
     def show(self, side: int) -> None:
         camera = self.client.camera
         size = picture_size(camera.aspect, side)
-        view = self.page.room.view(camera.wxyz, camera.position, camera.fov, size)
+        view = self.page.frame.view(camera.wxyz, camera.position, camera.fov, size)
         rgb = self.page.render(view)
         self.client.scene.set_background_image(rgb, format="jpeg", jpeg_quality=90)
 
-    def leave(self) -> None:
-        self.gone = True
-        self.wanted.set()
+    def close(self) -> None:
+        self.closed = True
+        self.changed.set()
 
 
 class Page:
-    """The server. ``stop`` ends it.
+    """The web server. ``stop`` ends it.
 
     Args:
-        source: what to show; looked at every two seconds for a newer state.
-        host, port: where the page is; another port is taken if this one is in use.
-        side: longer side of the pictures, pixels.
-        threads: of the rasterizer.
+        source: the scene; polled for newer states.
+        host, port: address of the page; another port is taken if this one is in use.
+        side: longer side of the renders, pixels.
+        threads: number of threads of the rasterizer.
 
     Raises:
         UserError: viser is not installed.
@@ -114,87 +114,86 @@ class Page:
     def __init__(self, source: Source, *, host: str, port: int, side: int, threads: int):
         self.source, self.side = source, side
         self.options = RasterOptions(near=source.near, threads=threads)
-        self.room = Room(source.views)
+        self.frame = ViewerFrame(source.views)
         self.lock = threading.Lock()
-        self.visitors: dict[int, _Visitor] = {}
+        self.clients: dict[int, _Client] = {}
         self.server = _viser().ViserServer(host=host, port=port, label="splatmake", verbose=False)
-        self.text = self.server.gui.add_markdown(source.shown.told)
+        self.text = self.server.gui.add_markdown(source.shown.summary)
         self.names = {view.name: view for view in source.views}
         self.choice = self.server.gui.add_dropdown("camera", tuple(self.names))
         self.choice.on_update(lambda event: self.go_to(event.client, event.target.value))
         self.place_camera()
-        self.server.on_client_connect(self.welcome)
-        self.server.on_client_disconnect(self.part)
+        self.server.on_client_connect(self.connect)
+        self.server.on_client_disconnect(self.disconnect)
         self.stopped = threading.Event()
-        threading.Thread(target=self.look_for_news, daemon=True).start()
+        threading.Thread(target=self.poll, daemon=True).start()
 
     @property
     def port(self) -> int:
         return self.server.get_port()
 
     def place_camera(self) -> None:
-        """Begin where the second photograph was taken (the first one is held out of training),
-        looking at what it sees in its middle."""
+        """Set the initial camera to that of the second view (the first one is a test view)."""
         views = self.source.views
         first = views[:2][-1]
         up = up_direction(np.stack([v.world_to_camera[:3, :3] for v in views]), [1] * len(views))
         ahead = first.centre + first.world_to_camera[2, :3] * self.render_depth(first)
         start = self.server.initial_camera
-        start.position = self.room.from_world(first.centre)
-        start.look_at = self.room.from_world(ahead)
+        start.position = self.frame.from_world(first.centre)
+        start.look_at = self.frame.from_world(ahead)
         start.up = up
         start.fov = 2 * np.arctan(first.height / 2 / first.fy)
         self.server.scene.set_up_direction(up)
 
     def go_to(self, client: Any, name: str) -> None:
-        """Put a browser's camera where this photograph was taken."""
+        """Move the camera of a browser to that of a photograph."""
         view, camera = self.names[name], client.camera
         ahead = view.centre + view.world_to_camera[2, :3] * self.render_depth(view)
         with client.atomic():
-            camera.position = self.room.from_world(view.centre)
-            camera.look_at = self.room.from_world(ahead)
+            camera.position = self.frame.from_world(view.centre)
+            camera.look_at = self.frame.from_world(ahead)
             camera.fov = 2 * np.arctan(view.height / 2 / view.fy)
 
     def render_depth(self, view: View) -> float:
-        """Typical depth in the middle of a view, in the world's unit."""
+        """Median depth of the central quarter of a view, world units."""
         with self.lock:
             depth = render_view(self.source.shown.gaussians, view, self.options).median_depth
         height, width = depth.shape
-        middle = depth[height // 4 : -(height // 4) or None, width // 4 : -(width // 4) or None]
-        seen = middle[middle > 0]
-        return float(np.median(seen)) if seen.size else self.room.scale
+        centre = depth[height // 4 : -(height // 4) or None, width // 4 : -(width // 4) or None]
+        depths = centre[centre > 0]
+        return float(np.median(depths)) if depths.size else self.frame.scale
 
     def render(self, view: View) -> NDArray[np.uint8]:
         with self.lock:
             rgb = render_rgb(self.source.shown.gaussians, view, self.options)
         return to_bytes(rgb)
 
-    def welcome(self, client: Any) -> None:
-        self.visitors[client.client_id] = _Visitor(self, client)
+    def connect(self, client: Any) -> None:
+        self.clients[client.client_id] = _Client(self, client)
 
-    def part(self, client: Any) -> None:
-        visitor = self.visitors.pop(client.client_id, None)
-        if visitor is not None:
-            visitor.leave()
+    def disconnect(self, client: Any) -> None:
+        connected = self.clients.pop(client.client_id, None)
+        if connected is not None:
+            connected.close()
 
-    def look_for_news(self) -> None:
-        while not self.stopped.wait(RENEW_SECONDS):
-            if self.source.renew():
-                self.text.content = self.source.shown.told
-                for visitor in list(self.visitors.values()):
-                    visitor.wanted.set()
+    def poll(self) -> None:
+        while not self.stopped.wait(POLL_SECONDS):
+            if self.source.refresh():
+                self.text.content = self.source.shown.summary
+                for connected in list(self.clients.values()):
+                    connected.changed.set()
 
     def stop(self) -> None:
         self.stopped.set()
-        for visitor in self.visitors.values():
-            visitor.leave()
+        for connected in self.clients.values():
+            connected.close()
         self.server.stop()
 
 
 def serve(source: Source, *, host: str, port: int, side: int, threads: int) -> None:
     """Show ``source`` until interrupted (see ``Page``)."""
     page = Page(source, host=host, port=port, side=side, threads=threads)
-    print(f"open http://{host}:{page.port} (Ctrl-C ends)", flush=True)
+    print(f"open http://{host}:{page.port} (stop with Ctrl-C)", flush=True)
     try:
         while True:
             time.sleep(3600)

@@ -1,4 +1,4 @@
-"""The Gaussians of a file, of a finished scene, or of one that is being trained."""
+"""The Gaussians of a file, of a finished scene, or of a running training."""
 
 from __future__ import annotations
 
@@ -18,65 +18,66 @@ from pipeline.training.loop.state import gaussians_of
 
 
 @dataclass(frozen=True)
-class Shown:
+class Snapshot:
     """A state of a scene.
 
     Attributes:
-        file: where it stands, and ``stamp`` when it was written (ns): a later one is another state.
-        told: one line on it, for a person.
+        file: file of the Gaussians.
+        stamp: modification time of the file, ns.
+        summary: one line for display.
     """
 
     gaussians: Gaussians
     file: Path
     stamp: int
-    told: str
+    summary: str
 
 
 class Source:
-    """Where the Gaussians come from.
+    """Reads the newest Gaussians of a path.
 
     Args:
-        path: a file of Gaussians, or ``results/NAME``, whose training may be under way.
+        path: a file of Gaussians, or ``results/NAME``, whose training may be running.
         cameras: see ``read_cameras``; None: those of ``results/NAME``.
 
     Raises:
-        UserError: nothing there to show yet, or no cameras.
+        UserError: there are no Gaussians yet, or no cameras.
     """
 
     def __init__(self, path: Path, cameras: Path | None):
         self.path = path
         if cameras is None and not path.is_dir():
             raise UserError(
-                "a file of Gaussians says nothing about cameras", file=path, fix="give --cameras"
+                "a file of Gaussians contains no cameras", file=path, fix="give --cameras"
             )
         self.views = camera_views(read_cameras(cameras or path), None)
         self.near = near_plane(scene_extent(self.views))
         self.shown = self._read(None)
 
-    def renew(self) -> bool:
-        """Take the newest state; whether there was a newer one."""
+    def refresh(self) -> bool:
+        """Read the newest state; returns whether it is a newer one."""
         before = self.shown
-        # Half-way between two states there may be neither: the next look finds the next one.
+        # Between two states there may be no file; the next call reads the new one.
         with contextlib.suppress(UserError, OSError):
             self.shown = self._read(before)
         return self.shown is not before
 
-    def _read(self, last: Shown | None) -> Shown:
+    def _read(self, last: Snapshot | None) -> Snapshot:
         file = self._file()
         stamp = file.stat().st_mtime_ns
         if last is not None and (file, stamp) == (last.file, last.stamp):
             return last
         if file == self.path or file.suffix == ".npz":
             gaussians = read_gaussians(file, [])
-            return Shown(gaussians, file, stamp, f"{len(gaussians)} Gaussians, trained")
+            return Snapshot(gaussians, file, stamp, f"{len(gaussians)} Gaussians, trained")
         found = newest(file.parent)
         if found is None:
-            raise UserError("no whole checkpoint", file=file.parent, fix="wait a little")
+            raise UserError("no complete checkpoint", file=file.parent, fix="try again in a moment")
         gaussians = gaussians_of(found.arrays)
-        return Shown(gaussians, file, stamp, self._told(found.step, len(gaussians)))
+        return Snapshot(gaussians, file, stamp, self._summary(found.step, len(gaussians)))
 
     def _file(self) -> Path:
-        """The newest of the finished scene and the checkpoints of a training under way."""
+        """The newest of the finished scene and the checkpoints of a running training."""
         if self.path.is_file():
             return self.path
         finished = self.path / "train" / "gaussians.npz"
@@ -84,13 +85,13 @@ class Source:
         found += self.path.glob(f".scratch/train/*/checkpoints/{PATTERN}")
         if not found:
             raise UserError(
-                "expected a trained scene or a training's checkpoint, found neither",
+                "expected a trained scene or a checkpoint of a training, found neither",
                 file=self.path,
-                fix="start the training; its first checkpoint comes after half a minute",
+                fix="start the training; the first checkpoint is written after half a minute",
             )
         return max(found, key=lambda file: file.stat().st_mtime_ns)
 
-    def _told(self, step: int, count: int) -> str:
+    def _summary(self, step: int, count: int) -> str:
         text = f"step {step}, {count} Gaussians"
         lines = read_journal(self.path / "logs" / NAME)
         if lines and lines[-1]["psnr"] is not None:

@@ -1,4 +1,4 @@
-"""Trainings' journals as TensorBoard's event files."""
+"""Converts the journals of trainings to TensorBoard event files."""
 
 from __future__ import annotations
 
@@ -24,14 +24,14 @@ FOLLOW_SECONDS = 5.0
 
 
 def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
-    """Write each run's journal into ``out/<run>``, in place of the events that stood there.
+    """Write each run's journal into ``out/<run>``, replacing existing events.
 
     Args:
-        folders: results of runs (``results/NAME``), or the folder that holds them.
-        follow: go on with what trainings add, until interrupted.
+        folders: results of runs (``results/NAME``), or the folder that contains them.
+        follow: keep writing new records until interrupted.
 
     Returns:
-        What was done, line by line.
+        Lines that describe what was written.
 
     Raises:
         UserError: no journal found, or TensorBoard is not installed.
@@ -39,9 +39,9 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
     journals = {file.parent.parent.name: file for folder in folders for file in _journals(folder)}
     if not journals:
         raise UserError(
-            f"expected a training's {NAME} in logs/, found none",
+            f"expected {NAME} of a training in logs/, found none",
             file=folders[0],
-            fix="train first; name a run's folder (results/NAME) or the one that holds them",
+            fix="train first; give a folder of a run (results/NAME) or of several runs",
         )
     writer = _writer()
     done = dict.fromkeys(journals, 0)
@@ -54,7 +54,7 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
             for name, file in journals.items():
                 records = read_journal(file)
                 if len(records) < done[name]:
-                    done[name] = 0  # The run has begun anew.
+                    done[name] = 0  # The run has been restarted.
                 for record in records[done[name] :]:
                     _write(files[name], record)
                 done[name] = len(records)
@@ -68,7 +68,7 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
         for each in files.values():
             each.close()
     lines = [f"{out / name}: {count} records" for name, count in done.items()]
-    return [*lines, f"look at them with: tensorboard --logdir {out}"]
+    return [*lines, f"view them with: tensorboard --logdir {out}"]
 
 
 def _write(writer: Any, record: dict[str, float | None]) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.config.runs import Run
-from pipeline.metrics.evaluate import reference
+from pipeline.metrics.evaluate import photo_over_background
 from pipeline.photos.load import ViewPixels, load_rgba, resize_rgba
 from pipeline.reporting.batch import MACHINE, Result, as_csv, as_json
 from pipeline.reporting.data import ranked
@@ -78,7 +78,9 @@ def batch_of(found: list[Result], results: Path) -> Batch:
             rgb, alpha = load_rgba(photo.path, photo.digest)
             pixels = ViewPixels(*resize_rgba(rgb, alpha, width, height), None)
             background = tuple(result.metrics["protocol"]["background"])
-            photos[scene] = thumbnail(reference(pixels, background), photo.orientation, name)
+            photos[scene] = thumbnail(
+                photo_over_background(pixels, background), photo.orientation, name
+            )
     return Batch(found, renders, photos, plans, list(STAGES))
 
 

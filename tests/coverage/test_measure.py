@@ -1,4 +1,4 @@
-"""``coverage.json``: whole, the same at any number of threads, and its trust tells the error."""
+"""``coverage.json``: complete, same at any number of threads, and low trust means high error."""
 
 import json
 from dataclasses import replace
@@ -10,31 +10,31 @@ import torch
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.coverage.measure import World, measure_coverage
+from pipeline.coverage.measure import WorldFrame, measure_coverage
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
-from tests.coverage.room import UP, camera, drawer, wall
+from tests.coverage.scenes import UP, camera, renderer, wall
 
 TRAIN = Train(background="black", exposure="off", lr_boost=1.0, sh_degree=0)
 
 
-def measured(folder: Path, *, threads: int = 1, held_out: bool = True) -> dict:
-    """A wall photographed on the left, with one view farther to the right, where the scene is
-    wrong."""
+def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> dict:
+    """Coverage of a wall photographed on its left side, with a test view of the right side, whose
+    colours are wrong."""
     truth = wall()
     truth.sh[:] = torch.rand(truth.sh.shape, generator=torch.Generator().manual_seed(0)) * 2 - 1
     x = truth.means[:, :1, None]
     wrong = truth.sh + torch.rand_like(truth.sh) * 0.1 + (x > 2.6) * 1.5
     scene = Gaussians(*truth.parameters()[:4], wrong)
     views = [camera(f"{i}.png", (-2 + 0.4 * i, 0.2 * (i % 3), 0)) for i in range(8)]
-    views.append(camera("right.png", (1.6, 0, 0), test=held_out))
+    views.append(camera("right.png", (1.6, 0, 0), test=with_test_view))
     folder.mkdir(parents=True)
     for i, view in enumerate(views):
         path = folder / view.name
-        Image.fromarray(to_bytes(drawer(truth)(view).rgb)).save(path)
+        Image.fromarray(to_bytes(renderer(truth)(view).rgb)).save(path)
         views[i] = replace(view, image=str(path))
-    protocol = choose_protocol(views, Split(holdout_every=8 if held_out else 0), TRAIN)
+    protocol = choose_protocol(views, Split(holdout_every=8 if with_test_view else 0), TRAIN)
     evaluation = evaluate_views(
         scene, protocol, Evaluate(lpips_net="none"), TRAIN, folder / "renders", threads=threads
     )
@@ -46,18 +46,18 @@ def measured(folder: Path, *, threads: int = 1, held_out: bool = True) -> dict:
         TRAIN,
         evaluation,
         folder / "renders",
-        World(UP, None),
+        WorldFrame(UP, None),
         threads=threads,
     )
     return json.loads((folder / "coverage.json").read_text())
 
 
 @pytest.fixture(autouse=True)
-def same_colours() -> None:
+def fixed_seed() -> None:
     torch.manual_seed(0)
 
 
-def test_trust_tells_the_error_and_all_that_is_named_is_there(tmp_path) -> None:
+def test_low_trust_means_high_error_and_all_named_images_exist(tmp_path) -> None:
     found = measured(tmp_path / "a")
     (view,) = found["views"]
     assert view["name"] == "right.png" and 0.1 < view["little_trust"] < 0.95
@@ -65,7 +65,7 @@ def test_trust_tells_the_error_and_all_that_is_named_is_there(tmp_path) -> None:
     assert low["rmse"] > 2 * high["rmse"]
     assert found["surface"]["seen_by"]["3 or more"] > 0.3
     assert 1 <= len(found["viewpoints"]) <= 5
-    # The first place to go to is the right end of the cameras.
+    # The best viewpoint is at the right end of the cameras.
     assert found["viewpoints"][0]["position"][0] > 0.5
     for entry in (view, *found["viewpoints"]):
         for name in (entry["render"], entry["trust_map"]):
@@ -76,7 +76,7 @@ def test_trust_tells_the_error_and_all_that_is_named_is_there(tmp_path) -> None:
     assert place == pytest.approx(found["viewpoints"][0]["position"], abs=1e-5)
 
 
-def test_threads_change_no_byte(tmp_path) -> None:
+def test_output_is_independent_of_threads(tmp_path) -> None:
     def files(folder: Path) -> dict[str, bytes]:
         chosen = [folder / "coverage.json", *(folder / "coverage").iterdir()]
         return {str(f.relative_to(folder)): f.read_bytes() for f in chosen}
@@ -87,8 +87,8 @@ def test_threads_change_no_byte(tmp_path) -> None:
     assert files(tmp_path / "a") == files(tmp_path / "b")
 
 
-def test_nothing_held_out_leaves_no_claim_about_the_error(tmp_path) -> None:
-    found = measured(tmp_path / "a", held_out=False)
+def test_without_test_views_no_error_is_reported(tmp_path) -> None:
+    found = measured(tmp_path / "a", with_test_view=False)
     assert found["views"] == [] and found["error"]["rank_correlation"] is None
     assert found["error"]["by_trust"] == []
     assert found["viewpoints"]

@@ -1,4 +1,4 @@
-"""The demo scene's truth is true, whatever it is written as."""
+"""Ground truth of the demo scene is consistent, in all output formats."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ def to_view(camera: Camera, view: PosedImage, xyz: np.ndarray) -> tuple[np.ndarr
     return project(camera, local[..., :2] / local[..., 2:]), local[..., 2]
 
 
-def test_depth_carries_one_view_onto_the_next(folder: Path) -> None:
+def test_depth_reprojects_one_view_onto_another(folder: Path) -> None:
     camera, views, pictures, depths = load(folder)
     x, y = np.meshgrid(np.arange(160) + 0.5, np.arange(120) + 0.5)
     for first, second in ((0, 1), (2, 1)):
@@ -156,7 +156,7 @@ def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.parametrize("distortion", LENSES)
-def test_transforms_say_the_same_as_the_truth(tmp_path: Path, distortion: str) -> None:
+def test_transforms_equal_the_ground_truth(tmp_path: Path, distortion: str) -> None:
     spec = DemoSpec(
         views=2, width=32, height=24, distortion=distortion, poses="transforms", format="png"
     )
@@ -228,7 +228,7 @@ def test_rays_end_on_surfaces_whose_normals_face_them(shape: Shape) -> None:
     np.testing.assert_allclose(behind, 1e-3, rtol=1e-6)
 
 
-def test_options_that_do_not_go_together_and_foreign_folders(
+def test_incompatible_options_and_foreign_folders(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     assert main([str(tmp_path / "a"), "--alpha"]) == 2

@@ -16,7 +16,7 @@ from pipeline.io.ply import read_splat_ply
 from pipeline.io.spz import count_out_of_range, decode_spz, encode_spz, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
-from tests.splats.samples import Within, sample, turn
+from tests.splats.samples import Within, rotation_angle, sample
 
 DATA = Path(__file__).parent / "data"
 #: What docs/formats.md states. The samples reach to 16: positions have 19 bits behind the point.
@@ -90,7 +90,7 @@ def test_rotations_survive_whichever_component_is_largest() -> None:
     edge = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [1, 1, 1, -1], [0, 0, 1, -1], [-3, 0, 0, 0]])
     gaussians.quats[: len(edge)] = gaussians.quats.new_tensor(edge)
     found = decode_spz(encode_spz(gaussians))
-    assert turn(found, gaussians).max() <= OURS.degrees
+    assert rotation_angle(found, gaussians).max() <= OURS.degrees
     assert np.allclose(found.quats.norm(dim=1), 1, atol=1e-6)
 
 

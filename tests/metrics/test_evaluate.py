@@ -1,4 +1,4 @@
-"""Evaluation: what is measured, on which background, and what masks take out."""
+"""Evaluation: the views measured, the background, and masked pixels."""
 
 from __future__ import annotations
 
@@ -7,7 +7,13 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.metrics.evaluate import NUM_SEEN, choose_protocol, diagnose, evaluate_views, reference
+from pipeline.metrics.evaluate import (
+    NUM_TRAINING_VIEWS,
+    choose_protocol,
+    diagnose,
+    evaluate_views,
+    photo_over_background,
+)
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
@@ -38,7 +44,7 @@ def view(folder, name, picture, mask=None, is_test=True, x=0.0):
 
 
 def nothing():
-    """Gaussians that no view sees: renders are the background."""
+    """Gaussians outside all views: renders show the background only."""
     return Gaussians.from_arrays(
         {
             "means": np.array([[0, 0, -5.0]]),
@@ -60,37 +66,37 @@ def black():
     return np.zeros((SIZE, SIZE, 3), np.uint8)
 
 
-def test_only_held_out_views_are_measured(tmp_path):
+def test_only_test_views_are_measured(tmp_path):
     junk = np.full_like(black(), 255)
     views = [view(tmp_path, "a", black()), view(tmp_path, "b", junk, is_test=False, x=1.0)]
     found = measure(views, tmp_path / "out")
     assert [v["name"] for v in found["per_view"]] == ["a"]
     assert found["psnr"] == 100
-    assert "held out" in found["protocol"]["split"]
+    assert "test views: one view in 8" in found["protocol"]["split"]
 
 
-def test_seen_views_are_measured_beside_the_held_out_ones(tmp_path):
+def test_a_sample_of_training_views_is_measured_as_well(tmp_path):
     junk = np.full_like(black(), 255)
     views = [view(tmp_path, "a", black())]
     views += [view(tmp_path, f"b{i}", junk, is_test=False, x=1.0 + i) for i in range(20)]
     protocol = choose_protocol(views, Split(), Train())
-    assert len(protocol.seen) == NUM_SEEN
-    assert {"b0", "b19"} <= {v.name for v in protocol.seen}
+    assert len(protocol.training_views) == NUM_TRAINING_VIEWS
+    assert {"b0", "b19"} <= {v.name for v in protocol.training_views}
     found = measure(views, tmp_path / "out")
     assert found["train_psnr"] == 0
-    assert any("trained on badly (0.0 dB)" in text for text in found["warnings"])
+    assert any("training photographs badly (0.0 dB)" in text for text in found["warnings"])
 
 
 @pytest.mark.parametrize(
-    ("held_out", "seen", "word"),
+    ("test_psnr", "train_psnr", "word"),
     [(15, 16, "badly"), (19, 28, "few"), (27, 30, None), (31, 30, None), (32, 39, None)],
 )
-def test_bad_scenes_are_told_from_good_ones(held_out, seen, word):
-    found = diagnose(held_out, seen)
+def test_bad_scenes_are_diagnosed(test_psnr, train_psnr, word):
+    found = diagnose(test_psnr, train_psnr)
     assert [word in text for text in found] == ([] if word is None else [True])
 
 
-def test_gains_are_laid_over_the_renders(tmp_path):
+def test_gains_multiply_the_renders(tmp_path):
     grey = np.full_like(black(), 100)
     views = [view(tmp_path, "a", grey), view(tmp_path, "b", grey // 2, x=1.0)]
     config = Train(background="white")
@@ -108,12 +114,12 @@ def test_gains_are_laid_over_the_renders(tmp_path):
     assert "gains" in found["protocol"]["exposure"]
 
 
-def test_measuring_on_training_views_is_said(tmp_path):
+def test_the_protocol_reports_a_missing_test_split(tmp_path):
     found = measure([view(tmp_path, "a", black(), is_test=False)], tmp_path / "out")
     assert "TRAINING" in found["protocol"]["split"]
 
 
-def test_masked_pixels_count_for_nothing(tmp_path):
+def test_masked_pixels_are_excluded(tmp_path):
     picture, mask = black(), np.ones((SIZE, SIZE), bool)
     picture[:, :10], mask[:, :10] = 255, False
     found = measure([view(tmp_path, "a", picture, mask)], tmp_path / "out")
@@ -123,7 +129,7 @@ def test_masked_pixels_count_for_nothing(tmp_path):
     assert measure([view(tmp_path, "b", picture)], tmp_path / "out")["psnr"] < 10
 
 
-def test_a_view_that_its_mask_hides_is_left_out_and_named(tmp_path):
+def test_a_view_without_unmasked_pixels_is_skipped_with_a_warning(tmp_path):
     hidden = view(tmp_path, "a", black(), np.zeros((SIZE, SIZE), bool))
     found = measure([hidden, view(tmp_path, "b", black(), x=1.0)], tmp_path / "out")
     assert found["protocol"]["num_views"] == 1
@@ -133,7 +139,7 @@ def test_a_view_that_its_mask_hides_is_left_out_and_named(tmp_path):
 
 
 @pytest.mark.parametrize(("trained", "expected"), [("black", 0.0), ("white", 1.0), ("random", 1.0)])
-def test_the_background_is_the_trained_one_and_white_for_random(tmp_path, trained, expected):
+def test_background_is_that_of_training_and_white_for_random(tmp_path, trained, expected):
     views = [view(tmp_path, "a", black())]
     protocol = choose_protocol(views, Split(), Train(background=trained))
     assert protocol.background == (expected,) * 3
@@ -141,9 +147,9 @@ def test_the_background_is_the_trained_one_and_white_for_random(tmp_path, traine
     assert (picture["psnr"] > 50) == (expected == 0)
 
 
-def test_transparent_photographs_are_laid_over_the_background():
+def test_transparent_photographs_are_composited_over_the_background():
     rgb = np.full((1, 2, 3), 100, np.uint8)
     alpha = np.array([[0, 255]], np.uint8)
-    over = reference(ViewPixels(rgb, alpha, None), (1.0, 1.0, 1.0))
+    over = photo_over_background(ViewPixels(rgb, alpha, None), (1.0, 1.0, 1.0))
     assert over[0, 0].tolist() == [255] * 3
     assert over[0, 1].tolist() == [100] * 3

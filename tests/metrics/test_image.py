@@ -1,4 +1,4 @@
-"""PSNR and SSIM say what they are named for, and masked pixels say nothing."""
+"""PSNR and SSIM agree with their definitions, and masked pixels are excluded."""
 
 import numpy as np
 import pytest
@@ -104,7 +104,7 @@ def test_masked_pixels_have_no_influence(mask, junk, padding) -> None:
     )
 
 
-def test_masked_psnr_counts_only_what_is_kept() -> None:
+def test_masked_psnr_counts_only_unmasked_pixels() -> None:
     image, reference = pair()
     mask = np.zeros(image.shape[:2], np.uint8)
     mask[:10, :7] = 255
@@ -114,7 +114,7 @@ def test_masked_psnr_counts_only_what_is_kept() -> None:
     assert ssim(image, reference, everything) == pytest.approx(ssim(image, reference), abs=1e-12)
 
 
-def test_a_mask_of_nothing_and_too_small_pictures_are_refused() -> None:
+def test_empty_masks_and_too_small_images_are_rejected() -> None:
     image, reference = pair(12, 12)
     nothing = np.zeros((12, 12), bool)
     for measure in (psnr, ssim):

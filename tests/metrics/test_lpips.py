@@ -1,4 +1,4 @@
-"""LPIPS is wired as published, and never makes up a number where its weights are missing."""
+"""LPIPS equals the published network, and is unavailable without its weights."""
 
 from pathlib import Path
 
@@ -69,14 +69,14 @@ def pictures() -> tuple[np.ndarray, np.ndarray]:
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
-def test_missing_weights_give_the_place_of_each_file_and_no_number(checkpoints, net) -> None:
+def test_missing_weights_are_reported_with_their_paths(checkpoints, net) -> None:
     measure, reason = lpips_available(net)
     assert measure is None
     assert FILES[net] in reason and f"lpips_{net}.pth" in reason and "hub/checkpoints" in reason
     assert str(checkpoints) not in reason, "a path of this machine would stand in metrics.json"
 
 
-def test_a_broken_or_foreign_file_gives_a_reason_and_no_number(checkpoints) -> None:
+def test_invalid_weight_files_are_reported(checkpoints) -> None:
     save_weights(checkpoints, "alex")
     whole = (checkpoints / FILES["alex"]).read_bytes()
     (checkpoints / FILES["alex"]).write_bytes(whole[: len(whole) // 2])
@@ -87,12 +87,12 @@ def test_a_broken_or_foreign_file_gives_a_reason_and_no_number(checkpoints) -> N
     assert measure is None and "features.0" in reason
 
 
-def test_switched_off_says_so() -> None:
+def test_none_is_reported_as_switched_off() -> None:
     assert lpips_available("none") == (None, "switched off")
 
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
-def test_distance_is_zero_for_equals_symmetric_and_positive(checkpoints, net) -> None:
+def test_distance_is_zero_for_equal_images_symmetric_and_positive(checkpoints, net) -> None:
     save_weights(checkpoints, net)
     measure, reason = lpips_available(net)
     assert measure is not None and reason == ""
@@ -105,8 +105,8 @@ def test_distance_is_zero_for_equals_symmetric_and_positive(checkpoints, net) ->
 
 @pytest.mark.parametrize("net", ["vgg", "alex"])
 def test_distance_equals_the_published_network_built_from_modules(checkpoints, net) -> None:
-    """Against nn.Sequential in torchvision's layer order, so that indices, strides, pooling and
-    the layers that LPIPS reads are all held by a second writing-down."""
+    """Against nn.Sequential in torchvision's layer order: an independent implementation of the
+    indices, strides, pooling and compared layers."""
     import torch
     from torch import nn
 
@@ -158,7 +158,7 @@ def test_distance_equals_the_published_network_built_from_modules(checkpoints, n
     assert measure(image, reference, None) == pytest.approx(expected, rel=1e-5)
 
 
-def test_masked_pixels_have_no_influence_and_do_not_dilute(checkpoints) -> None:
+def test_masked_pixels_have_no_influence_and_are_not_averaged(checkpoints) -> None:
     save_weights(checkpoints, "alex")
     measure, _ = lpips_available("alex")
     assert measure is not None
@@ -191,7 +191,7 @@ def test_the_same_bits_on_any_number_of_threads(checkpoints) -> None:
     assert len(values) == 1
 
 
-def test_pictures_too_small_for_the_network_are_refused(checkpoints) -> None:
+def test_images_too_small_for_the_network_are_rejected(checkpoints) -> None:
     save_weights(checkpoints, "alex")
     measure, _ = lpips_available("alex")
     assert measure is not None

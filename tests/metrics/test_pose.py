@@ -1,4 +1,4 @@
-"""Pose errors: the similarity, the angles, and areas under curves worked out by hand."""
+"""Pose errors: alignment, angles, and areas under curves computed by hand."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def scene(seed: int, count: int = 8) -> Reconstruction:
 
 
 def moved(model: Reconstruction, scale: float, rotation, shift) -> Reconstruction:
-    """The same scene in another world: X' = scale * rotation @ X + shift."""
+    """The same scene in another frame: X' = scale * rotation @ X + shift."""
     images = {}
     for i, image in model.images.items():
         r = image.rotation @ rotation.T
@@ -53,7 +53,7 @@ def moved(model: Reconstruction, scale: float, rotation, shift) -> Reconstructio
     scale=st.floats(1e-4, 1e4),
     offset=st.floats(-1e3, 1e3),
 )
-def test_umeyama_finds_the_similarity_points_were_made_with(seed, count, scale, offset):
+def test_umeyama_recovers_a_known_similarity(seed, count, scale, offset):
     rng = np.random.default_rng(seed)
     source, rotation = rng.normal(size=(count, 3)), random_rotation(rng)
     shift = rng.normal(size=3) + offset
@@ -68,7 +68,7 @@ def test_umeyama_finds_the_similarity_points_were_made_with(seed, count, scale, 
 
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(seed=st.integers(0, 2**31), count=st.integers(1, 12), dimensions=st.integers(0, 3))
-def test_umeyama_returns_a_proper_rotation_whatever_the_points(seed, count, dimensions):
+def test_umeyama_always_returns_a_proper_rotation(seed, count, dimensions):
     rng = np.random.default_rng(seed)
     keep = np.arange(3) < dimensions
     source, target = rng.normal(size=(2, count, 3)) * keep
@@ -78,14 +78,14 @@ def test_umeyama_returns_a_proper_rotation_whatever_the_points(seed, count, dime
     assert np.linalg.det(rotation) == pytest.approx(1)
 
 
-def test_umeyama_does_not_mirror():
+def test_umeyama_returns_no_reflection():
     source = np.random.default_rng(0).normal(size=(20, 3))
     _, rotation, _ = umeyama(source, source * [-1, 1, 1])
     assert np.linalg.det(rotation) == pytest.approx(1)
 
 
 @pytest.mark.parametrize("count", [1, 2, 3, 8])
-def test_the_same_scene_in_another_world_has_no_error(count):
+def test_a_similarity_of_the_scene_has_no_error(count):
     truth = scene(1, count)
     rotation = random_rotation(np.random.default_rng(2))
     error = pose_error(moved(truth, 3.0, rotation, np.array([1.0, 2, 3])), truth)
@@ -100,7 +100,7 @@ def test_the_same_scene_in_another_world_has_no_error(count):
         assert error.auc == pytest.approx({1.0: 1.0, 5.0: 1.0, 10.0: 1.0})
 
 
-def test_cameras_on_a_line_still_give_their_rotations():
+def test_collinear_cameras_are_aligned_by_their_rotations():
     rng = np.random.default_rng(3)
     images = {}
     for i in range(6):
@@ -129,7 +129,7 @@ def test_one_camera_turned_in_place_by_two_degrees():
     assert error.auc[10.0] == pytest.approx(auc_of_errors(np.array([0, 0, 0, 2, 2, 2.0]), 10.0))
 
 
-def test_missing_images_fail_their_pairs():
+def test_pairs_with_missing_images_are_failures():
     truth = scene(5, 5)
     found = Reconstruction({}, {i: truth.images[i] for i in (0, 1, 2)})
     error = pose_error(found, truth)
@@ -138,7 +138,7 @@ def test_missing_images_fail_their_pairs():
     assert (error.num_common, error.num_truth) == (3, 5)
 
 
-def test_developed_raw_files_are_found_by_their_stems():
+def test_developed_raw_files_are_matched_by_their_stems():
     truth = scene(5, 5)
     renamed = {
         i: replace(image, name=image.name.rsplit(".", 1)[0] + ".png")
@@ -149,7 +149,7 @@ def test_developed_raw_files_are_found_by_their_stems():
     assert error.rotation_median_deg == pytest.approx(0, abs=1e-5)
 
 
-def test_nothing_in_common_is_no_crash():
+def test_no_common_image_is_accepted():
     error = pose_error(Reconstruction({}, {}), scene(6, 3))
     assert error.rotation_median_deg is None and error.centre_median is None
     assert error.auc == {1.0: 0.0, 5.0: 0.0, 10.0: 0.0}

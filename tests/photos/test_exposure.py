@@ -1,4 +1,4 @@
-"""Exposure: gains are found again from the photographs of one wall."""
+"""Exposure: known gains are recovered from synthetic photographs of a wall."""
 
 from __future__ import annotations
 
@@ -15,17 +15,18 @@ SIZE, POINTS = 64, 400
 
 
 def wall(folder, gains, seed=0):
-    """Views of one wall of coloured dots, each through its own gains; half see but a part."""
+    """Views of a wall of coloured dots, each with its own gains; every second view observes only
+    half of the dots."""
     rng = np.random.default_rng(seed)
     colours = rng.uniform(0.25, 0.6, (POINTS, 3))
-    place = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2) * 3 + 2
+    at = np.stack(np.meshgrid(np.arange(20), np.arange(20)), -1).reshape(-1, 2) * 3 + 2
     views, images, owner, number, xy = [], {}, [], [], []
     for index, gain in enumerate(gains):
         picture = np.zeros((SIZE, SIZE, 3))
-        picture[place[:, 1], place[:, 0]] = colours * gain
-        # Passers-by: a tenth of the dots show something else.
+        picture[at[:, 1], at[:, 0]] = colours * gain
+        # Outliers: a tenth of the dots have other colours.
         wrong = rng.permutation(POINTS)[: POINTS // 10]
-        picture[place[wrong, 1], place[wrong, 0]] = rng.uniform(0.1, 0.9, (len(wrong), 3))
+        picture[at[wrong, 1], at[wrong, 0]] = rng.uniform(0.1, 0.9, (len(wrong), 3))
         path = folder / f"{index}.png"
         Image.fromarray(np.rint(picture.clip(0, 1) * 255).astype(np.uint8)).save(path)
         name, half = f"{index}.png", SIZE / 2
@@ -35,7 +36,7 @@ def wall(folder, gains, seed=0):
         seen = np.arange(POINTS) if index % 2 else np.arange(POINTS // 2)
         owner.append(seen)
         number.append(np.full(len(seen), index + 1))
-        xy.append((place[seen] + 0.5) * 2.0)  # the model's camera is twice the size
+        xy.append((at[seen] + 0.5) * 2.0)  # the model's camera is twice the size
     owner, number, xy = (np.concatenate(part) for part in (owner, number, xy))
     order = np.argsort(owner, kind="stable")
     starts = np.concatenate([[0], np.cumsum(np.bincount(owner, minlength=POINTS))])
@@ -51,7 +52,7 @@ def wall(folder, gains, seed=0):
     return views, Reconstruction({1: camera}, images, points)
 
 
-def test_gains_are_found_again(tmp_path):
+def test_gains_are_recovered(tmp_path):
     rng = np.random.default_rng(1)
     true = 2.0 ** rng.uniform(-0.5, 0.5, (9, 3))
     true /= np.exp(np.log(true).mean(axis=0))
@@ -61,12 +62,12 @@ def test_gains_are_found_again(tmp_path):
     assert found.spread == pytest.approx(2.2 * np.log2(true).std(axis=0).max(), rel=0.05)
 
 
-def test_equal_exposures_show_no_spread(tmp_path):
+def test_equal_exposures_have_no_spread(tmp_path):
     found = measure_exposures(*wall(tmp_path, np.ones((6, 3))))
     assert found.spread < 0.02
 
 
-def test_views_without_points_keep_their_colours(tmp_path):
+def test_views_without_points_have_unit_gains(tmp_path):
     views, model = wall(tmp_path, np.array([[1.0] * 3, [0.5] * 3, [1.5] * 3]))
     only = Reconstruction(model.cameras, model.images)
     found = measure_exposures(views, only)
@@ -74,7 +75,7 @@ def test_views_without_points_keep_their_colours(tmp_path):
     assert (found.gains == 1).all()
 
 
-def test_the_sample_is_spread_over_all(tmp_path):
+def test_the_sample_is_evenly_spaced(tmp_path):
     views, _ = wall(tmp_path, np.ones((3, 3)))
     assert [v.name for v in sample_views(views)] == ["0.png", "1.png", "2.png"]
     many = sample_views(views * 100)

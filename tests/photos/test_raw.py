@@ -1,4 +1,4 @@
-"""RAW files: true colours, all views alike, damaged ones left out by name."""
+"""RAW files: accurate colours, the same settings for all, damaged files are left out."""
 
 from __future__ import annotations
 
@@ -50,31 +50,31 @@ def psnr(a: np.ndarray, b: np.ndarray, peak: float) -> float:
 
 @pytest.fixture(scope="module")
 def light() -> np.ndarray:
-    """A view of the demo scene, linear light, its outlines softened to what a mosaic can tell."""
+    """A view of the demo scene in linear light, blurred to what a Bayer mosaic can resolve."""
     camera = Camera("PINHOLE", 200, 150, np.array([480.0, 480.0, 100.0, 75.0]))
     sharp = render(orbit(["a"] * 8, 0)[0], camera, rays(camera), OBJECTS).light
     return np.asarray(cv2.GaussianBlur(sharp, (0, 0), 0.8))
 
 
-def test_dng_comes_back_as_the_picture_it_was_made_of(tmp_path: Path, light: np.ndarray) -> None:
+def test_a_developed_dng_equals_its_source(tmp_path: Path, light: np.ndarray) -> None:
     write_dng(tmp_path / "a.dng", expose(light, 0.0, (0, 0)), TAKEN)
     source = manifest([tmp_path / "a.dng"], 200, 150)
     report = develop(source, Decode(), tmp_path / "display", threads=1)
     inner = np.s_[4:-4, 4:-4]
-    shown = load_rgb(report.manifest.photos[0].path)
-    assert psnr(shown[inner], to_bytes(srgb(light))[inner], 255) >= 40
+    display = load_rgb(report.manifest.photos[0].path)
+    assert psnr(display[inner], to_bytes(srgb(light))[inner], 255) >= 40
     linear = develop(source, Decode(linear=True), tmp_path / "linear", threads=1)
     deep = load_rgb(linear.manifest.photos[0].path)
     assert deep.dtype == np.uint16 and linear.manifest.photos[0].bits == 16
     assert psnr(deep[inner], np.clip(light, 0, 1)[inner] * 65535, 65535) >= 40
 
 
-def test_identical_light_is_developed_alike_whatever_else_is_in_the_picture(
+def test_development_does_not_depend_on_other_image_content(
     tmp_path: Path,
 ) -> None:
     dark = np.full((64, 96, 3), 0.05)
     bright = dark.copy()
-    bright[:, 48:] = 0.9  # LibRaw's own exposure would darken this picture
+    bright[:, 48:] = 0.9  # LibRaw's automatic exposure would darken this image
     for name, light in (("dark", dark), ("bright", bright)):
         write_dng(tmp_path / f"{name}.dng", expose(light, 0.0, (0, 0)), TAKEN)
     both = manifest([tmp_path / "bright.dng", tmp_path / "dark.dng"], 96, 64)
@@ -94,13 +94,13 @@ def test_manifest_of_developed_files(tmp_path: Path, light: np.ndarray) -> None:
         assert (photo.name, photo.width, photo.height) == (name, 48, 32)
         assert load_rgb(photo.path).shape == (32, 48, 3)
         assert photo.focal_px == 50.0 and not photo.raw and photo.camera_group == "one"
-        assert photo.orientation == 6  # carried along, not applied
+        assert photo.orientation == 6  # recorded, not applied
     (tmp_path / "out").rename(tmp_path / "moved")
     moved = Manifest.read(tmp_path / "moved" / "images.json")
     assert load_rgb(moved.photos[0].path).shape == (32, 48, 3)
 
 
-def test_damaged_raw_is_left_out_by_name_and_all_damaged_is_an_error(
+def test_damaged_raw_files_are_left_out_and_all_damaged_is_an_error(
     tmp_path: Path, light: np.ndarray
 ) -> None:
     for name in ("a.dng", "b.dng", "c.dng"):
@@ -118,7 +118,7 @@ def test_damaged_raw_is_left_out_by_name_and_all_damaged_is_an_error(
         develop(broken, Decode(), tmp_path / "out2", threads=2)
 
 
-def test_same_stems_keep_apart(tmp_path: Path, light: np.ndarray) -> None:
+def test_equal_stems_get_distinct_names(tmp_path: Path, light: np.ndarray) -> None:
     for name in ("a.dng", "a.nef"):
         write_dng(tmp_path / name, expose(light[:64, :96], 0.0, (0, 0)), TAKEN)
     source = manifest([tmp_path / "a.dng", tmp_path / "a.nef"], 96, 64)

@@ -1,4 +1,4 @@
-"""Undistorted photographs are what a pinhole camera would have seen, and so is all with them."""
+"""Undistorted photographs, masks, depth maps and observations equal those of a pinhole camera."""
 
 from __future__ import annotations
 
@@ -31,14 +31,15 @@ def posed(name: str) -> PosedImage:
 
 
 def long_lens(distortion: str) -> Camera:
-    """Longer than the demo's own lens: what it sees is smooth enough at this size."""
+    """A longer lens than the demo's: its image is smooth enough at this size."""
     short = lens(distortion, *SIZE)
     stretch = np.ones(len(short.params))
     stretch[: len(short.intrinsics_names) - 2] = 1.6
     return Camera(short.model, *SIZE, short.params * stretch)
 
 
-def shown(camera: Camera, *, transparent: bool = False) -> tuple[np.ndarray, np.ndarray]:
+def rendered(camera: Camera, *, transparent: bool = False) -> tuple[np.ndarray, np.ndarray]:
+    """(H, W, 3) colours and (H, W) alpha of the demo scene."""
     seen = render(posed("a"), camera, rays(camera), OBJECTS, transparent=transparent)
     straight = seen.light / np.maximum(seen.coverage, 1e-6)[..., None]
     return to_bytes(srgb(straight)), to_bytes(seen.coverage)
@@ -64,48 +65,48 @@ def psnr(a: np.ndarray, b: np.ndarray) -> float:
 @pytest.mark.parametrize("distortion", ["simple_radial", "opencv", "opencv_fisheye"])
 def test_equals_the_render_of_the_pinhole_camera(tmp_path: Path, distortion: str) -> None:
     camera = long_lens(distortion)
-    Image.fromarray(shown(camera)[0]).save(tmp_path / "a.png")
+    Image.fromarray(rendered(camera)[0]).save(tmp_path / "a.png")
     manifest, model = scene(camera, photo(tmp_path / "a.png", *SIZE))
     report = undistort(manifest, model, Undistort(), Views(), tmp_path / "out", threads=2)
     target = read_model(tmp_path / "out" / "sparse" / "0").cameras[1]
     made = load_rgb(report.manifest.photos[0].path)
     assert target.model == "PINHOLE" and made.shape[1::-1] == (target.width, target.height)
-    assert psnr(made, shown(target)[0]) >= 35
+    assert psnr(made, rendered(target)[0]) >= 35
     assert report.manifest.photos[0].mask is None and not report.warnings
 
 
-def test_blank_pixels_keep_all_and_are_masked_out(tmp_path: Path) -> None:
+def test_blank_pixels_are_masked(tmp_path: Path) -> None:
     camera = Camera("SIMPLE_RADIAL", *SIZE, np.array([200.0, 80.0, 60.0, -0.25]))
-    Image.fromarray(shown(camera)[0]).save(tmp_path / "a.png")
+    Image.fromarray(rendered(camera)[0]).save(tmp_path / "a.png")
     manifest, model = scene(camera, photo(tmp_path / "a.png", *SIZE))
-    all_kept = Undistort(blank_pixels=1.0)
-    report = undistort(manifest, model, all_kept, Views(), tmp_path / "out", threads=1)
+    whole_border = Undistort(blank_pixels=1.0)
+    report = undistort(manifest, model, whole_border, Views(), tmp_path / "out", threads=1)
     target = read_model(tmp_path / "out" / "sparse" / "0").cameras[1]
     assert target.width > SIZE[0] and target.height > SIZE[1]
     new = report.manifest.photos[0]
     assert new.mask is not None and len(report.warnings) == 1 and "blank" in report.warnings[0]
     mask = load_mask(new.mask)
     assert 0.8 < mask.mean() < 1.0
-    assert psnr(load_rgb(new.path)[mask], shown(target)[0][mask]) >= 35
+    assert psnr(load_rgb(new.path)[mask], rendered(target)[0][mask]) >= 35
 
 
-def test_reduced_by_area_to_the_asked_size_with_its_camera(tmp_path: Path) -> None:
+def test_images_are_downscaled_by_area_with_their_camera(tmp_path: Path) -> None:
     camera = long_lens("opencv")
-    Image.fromarray(shown(camera)[0]).save(tmp_path / "a.png")
+    Image.fromarray(rendered(camera)[0]).save(tmp_path / "a.png")
     manifest, model = scene(camera, photo(tmp_path / "a.png", *SIZE))
     small = Views(max_long_side_px=100)
     report = undistort(manifest, model, Undistort(), small, tmp_path / "out", threads=1)
     target = read_model(tmp_path / "out" / "sparse" / "0").cameras[1]
     assert max(target.width, target.height) == 100
-    full = shown(pinhole_camera(camera, 0.0))[0]
+    full = rendered(pinhole_camera(camera, 0.0))[0]
     expected = resize_area(full, target.width, target.height)
     assert psnr(load_rgb(report.manifest.photos[0].path), expected) >= 35
     np.testing.assert_allclose(target.params[0], camera.params[0] * 100 / full.shape[1])
 
 
-def test_alpha_masks_and_depth_go_along(tmp_path: Path) -> None:
+def test_alpha_masks_and_depth_are_undistorted(tmp_path: Path) -> None:
     camera = long_lens("opencv")
-    colour, alpha = shown(camera, transparent=True)
+    colour, alpha = rendered(camera, transparent=True)
     depth = render(posed("a"), camera, rays(camera), OBJECTS).depth
     Image.fromarray(np.dstack([colour, alpha])).save(tmp_path / "a.png")
     Image.fromarray((alpha > 127).astype(np.uint8)).save(tmp_path / "mask.png")
@@ -116,7 +117,7 @@ def test_alpha_masks_and_depth_go_along(tmp_path: Path) -> None:
     target = read_model(tmp_path / "out" / "sparse" / "0").cameras[1]
     new = report.manifest.photos[0]
     made, made_alpha = load_rgba(new.path)
-    true, true_alpha = shown(target, transparent=True)
+    true, true_alpha = rendered(target, transparent=True)
     assert made_alpha is not None and psnr(made_alpha, true_alpha) >= 30
     solid = true_alpha == 255
     assert psnr(made[solid], true[solid]) >= 35
@@ -129,11 +130,11 @@ def test_alpha_masks_and_depth_go_along(tmp_path: Path) -> None:
     assert report.manifest.photos[0].mask is None
 
 
-def test_observations_move_with_the_pictures_and_unregistered_photographs_stay_out(
+def test_observations_are_undistorted_and_unregistered_photographs_are_left_out(
     tmp_path: Path,
 ) -> None:
     camera = long_lens("opencv")
-    colour, _ = shown(camera)
+    colour, _ = rendered(camera)
     for name in ("a.png", "a.jpg", "left.png"):
         Image.fromarray(colour).save(tmp_path / name)
     photos = [photo(tmp_path / name, *SIZE) for name in ("a.jpg", "a.png", "left.png")]
@@ -165,9 +166,9 @@ def test_observations_move_with_the_pictures_and_unregistered_photographs_stay_o
     np.testing.assert_allclose(np.sort(found[known], 0), np.sort(expected, 0), atol=1e-6)
 
 
-def test_threads_change_no_byte(tmp_path: Path) -> None:
+def test_files_do_not_depend_on_threads(tmp_path: Path) -> None:
     camera = long_lens("opencv")
-    colour, _ = shown(camera)
+    colour, _ = rendered(camera)
     photos = []
     for i in range(4):
         Image.fromarray(np.roll(colour, i, axis=1)).save(tmp_path / f"{i}.png")
@@ -182,7 +183,7 @@ def test_threads_change_no_byte(tmp_path: Path) -> None:
     assert first == second and len(first) > 6
 
 
-def test_a_pinhole_picture_is_only_reduced(tmp_path: Path) -> None:
+def test_pinhole_images_are_unchanged(tmp_path: Path) -> None:
     camera = Camera("SIMPLE_RADIAL", 40, 20, np.array([50.0, 20.0, 10.0, 0.0]))
     rgb = np.random.default_rng(0).integers(0, 255, (20, 40, 3), np.uint8)
     Image.fromarray(rgb).save(tmp_path / "a.png")
@@ -191,7 +192,7 @@ def test_a_pinhole_picture_is_only_reduced(tmp_path: Path) -> None:
     assert np.array_equal(load_rgb(report.manifest.photos[0].path), rgb)
 
 
-def test_off_centre_lens_keeps_its_principal_point_and_wide_ones_stay_finite() -> None:
+def test_off_centre_principal_points_are_kept_and_wide_lenses_are_limited() -> None:
     off = Camera("SIMPLE_RADIAL", 200, 150, np.array([160.0, 90.0, 80.0, -0.1]))
     cropped = pinhole_camera(off, 0.0)
     assert cropped.width <= 1.1 * 200 and 0 <= cropped.params[2] - 90 < 10
@@ -201,7 +202,7 @@ def test_off_centre_lens_keeps_its_principal_point_and_wide_ones_stay_finite() -
         assert seen.width <= 2 * 640 and seen.height <= 2 * 480
 
 
-def test_photograph_of_another_shape_than_its_camera_is_named(tmp_path: Path) -> None:
+def test_a_photograph_of_another_aspect_ratio_is_an_error(tmp_path: Path) -> None:
     Image.fromarray(np.zeros((40, 20, 3), np.uint8)).save(tmp_path / "turned.png")
     manifest, model = scene(long_lens("opencv"), photo(tmp_path / "turned.png", 20, 40))
     with pytest.raises(UserError, match=r"turned\.png.*20x40"):

@@ -1,4 +1,4 @@
-"""Decoding every photograph once: broken ones are left out by name."""
+"""Photographs that cannot be decoded are left out with a warning."""
 
 import pytest
 
@@ -24,10 +24,10 @@ def manifest(tmp_path):
 
 
 @pytest.mark.parametrize("threads", [1, 3])
-def test_broken_photographs_are_left_out_by_name(manifest, threads):
+def test_damaged_photographs_are_left_out_with_a_warning(manifest, threads):
     broken = {"cut_a.jpg", "cut_b.png", "cut_c.tif", "cut_d.dng"}
-    # A header cut off is seen by the scan already.
-    there = {photo.name for photo in manifest.photos}
+    # The scan leaves out files with a truncated header.
+    scanned = {photo.name for photo in manifest.photos}
     checked, warnings = verify_photos(manifest, threads=threads)
     assert [photo.name for photo in checked.photos] == [
         "good.dng",
@@ -35,19 +35,19 @@ def test_broken_photographs_are_left_out_by_name(manifest, threads):
         "p01.jpg",
         "p02.jpg",
     ]
-    assert len(warnings) == len(broken & there)
+    assert len(warnings) == len(broken & scanned)
     for name in broken:
         assert sum(name in line for line in checked.warnings) == 1, name
 
 
-def test_too_few_left_is_an_error_that_names_them(manifest):
+def test_too_few_photographs_is_an_error_that_names_the_damaged_ones(manifest):
     with pytest.raises(UserError, match=r"only 4 of \d photographs") as error:
         verify_photos(manifest, threads=1, min_photos=5)
     assert "cut_a.jpg" in str(error.value)
 
 
-def test_copies_are_named(tmp_path):
-    """A held-out photograph whose copy is trained on measures memory."""
+def test_copies_are_a_warning(tmp_path):
+    """A test view with a copy among the training views makes the metrics too good."""
     files = photos(tmp_path, 3)
     (tmp_path / "q.jpg").write_bytes(files[1].read_bytes())
     manifest = scan(tmp_path, "s", Config(), cache=None).manifest

@@ -1,4 +1,4 @@
-"""What a page shows, made up."""
+"""Synthetic content of a page."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pipeline.splats.gaussians import Gaussians
 
 
 def ring(count: int = 5, *, width: int = 200, height: int = 150) -> list[View]:
-    """Cameras on a ring around the origin, z up, looking inwards; the principal point is off the
-    middle, the first camera held out."""
+    """Cameras on a ring around the origin, z up, looking inwards; the principal point is
+    off-centre, the first camera a test view."""
     views = []
     for i, angle in enumerate(np.linspace(0, 2 * np.pi, count, endpoint=False)):
         forward = -np.array([np.cos(angle), np.sin(angle), 0.0])

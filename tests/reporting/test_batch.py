@@ -1,4 +1,4 @@
-"""Tables and page of a batch: every run has its line, means compare like with like."""
+"""Tables and page of a batch: one line per run; means over the same scenes."""
 
 import csv
 import html
@@ -20,7 +20,7 @@ from pipeline.reporting.batch import (
     published_for,
     row,
 )
-from pipeline.reporting.charts import Dot, pareto_front, trade_off_chart
+from pipeline.reporting.charts import ChartPoint, pareto_front, trade_off_chart
 from pipeline.reporting.index import Batch, Thumbnail, index_html
 
 
@@ -31,7 +31,7 @@ def metrics(psnr: float, seconds: float = 10.0, photos: int = 20, **more) -> dic
         "ssim": 0.9,
         "lpips": None,
         "train_psnr": psnr + 1,
-        "protocol": {"num_views": 3, "resolution": ["80x60"], "split": "held out", "masks": None},
+        "protocol": {"num_views": 3, "resolution": ["80x60"], "split": "test views", "masks": None},
         "per_view": [],
         "num_gaussians": 1000,
         "registered_images": photos,
@@ -70,7 +70,7 @@ BATCH = [
 ]
 
 
-def test_every_run_is_a_line_that_spreadsheets_read():
+def test_csv_has_one_line_per_run():
     lines = list(csv.DictReader(io.StringIO(as_csv(BATCH, ["decode", "train"]))))
     assert [line["status"] for line in lines] == [r.status for r in BATCH]
     first, lost = lines[0], lines[3]
@@ -99,12 +99,12 @@ def test_means_are_over_scenes_that_all_configurations_finished():
     json.dumps(told, allow_nan=False)
 
 
-def test_a_configuration_that_finished_nothing_does_not_hide_the_others():
+def test_a_configuration_without_results_does_not_hide_the_others():
     scenes, over = by_config([done("fox", "fast", 28.0), failed("fox", "high")])
     assert scenes == ["fox"] and list(over) == ["fast"]
 
 
-def test_all_failed_is_still_a_table_and_a_page():
+def test_a_batch_of_failures_has_a_table_and_a_page():
     lost = [failed("fox", "fast"), failed("cat", "fast")]
     assert as_csv(lost).count("failed") == 2 + 1
     assert as_json(lost)["configs"] == {}
@@ -114,7 +114,7 @@ def test_all_failed_is_still_a_table_and_a_page():
 # --- page ---------------------------------------------------------------------------------
 
 
-def test_the_page_shows_links_failures_and_seeds_and_asks_for_nothing():
+def test_the_page_shows_links_failures_and_seeds_without_requests():
     thumb = Thumbnail("data:image/jpeg;base64,AAAA", 4, 3, "a.jpg")
     page = index_html(Batch(BATCH, {"fox@fast@seed0": thumb}, {"fox": thumb}))
     links = re.findall(r'href="([^"#]*)"', page)
@@ -127,8 +127,8 @@ def test_the_page_shows_links_failures_and_seeds_and_asks_for_nothing():
     assert "as configured" in index_html(Batch([done("fox", "", 28.0)]))
 
 
-def test_the_page_says_where_sizes_of_pictures_differ():
-    """PSNR at 640 pixels and at 800 is no comparison; of scenes that differ it is one."""
+def test_the_page_warns_about_different_image_sizes():
+    """PSNR at 640 and 800 pixels is not comparable; sizes may differ between scenes."""
 
     def page(*runs: tuple[str, str, str]) -> str:
         results = []
@@ -138,13 +138,13 @@ def test_the_page_says_where_sizes_of_pictures_differ():
             results.append(result)
         return index_html(Batch(results))
 
-    said = "pictures of different sizes"
+    said = "images of different sizes"
     assert said in page(("fox", "fast", "64x48"), ("fox", "high", "80x60"))
     alike = [("fox", "fast", "64x48"), ("cat", "fast", "80x60")]
     assert said not in page(*alike, *((scene, "high", size) for scene, _, size in alike))
 
 
-def test_names_of_any_kind_do_no_harm():
+def test_names_are_escaped():
     page = index_html(Batch([done("<b>&\"'", "fast", 20.0), done("a b", "fast", 21.0)]))
     assert "<b>&" not in page
     assert "a%20b%40fast/report.html" in page
@@ -157,14 +157,14 @@ def test_the_same_batch_gives_the_same_bytes():
 # --- trade-off ----------------------------------------------------------------------------
 
 
-def test_the_front_holds_what_no_other_beats():
-    dots = [Dot(s, e, f"{s}", "") for s, e in ((1, 9), (2, 5), (3, 7), (4, 5), (5, 1))]
+def test_the_pareto_front():
+    dots = [ChartPoint(s, e, f"{s}", "") for s, e in ((1, 9), (2, 5), (3, 7), (4, 5), (5, 1))]
     assert [d.seconds for d in pareto_front(dots)] == [1, 2, 5]
 
 
 @pytest.mark.parametrize("dots", [[(5.0, 0.1)], [(1.0, 1.0), (1.0, 1.0)], [(1e-3, 9), (1e5, 1e-6)]])
 def test_a_trade_off_stays_inside_its_frame(dots):
-    named = [Dot(s, e, "a rather long name of a configuration", "<tip>", i)
+    named = [ChartPoint(s, e, "a rather long name of a configuration", "<tip>", i)
              for i, (s, e) in enumerate(dots)]  # fmt: skip
     svg = trade_off_chart(named, title="t", x_title="x", y_label=str)
     spots = re.findall(r'cx="([\d.-]+)" cy="([\d.-]+)"', svg)
@@ -177,7 +177,7 @@ def test_a_trade_off_stays_inside_its_frame(dots):
 
 
 def test_published_scenes_average_to_the_papers_means():
-    """The papers give means as well: a slip in a scene's number shows in them."""
+    """The papers give means as well, which reveals wrong figures of scenes."""
     for entry in json.loads(PUBLISHED.read_text())["results"]:
         for measure, mean in entry["mean"].items():
             ours = fmean(scene[measure] for scene in entry["scenes"].values())
@@ -185,7 +185,7 @@ def test_published_scenes_average_to_the_papers_means():
         assert entry["source"] and entry["protocol"]
 
 
-def test_a_published_scene_is_known_by_name_and_number_of_photographs():
+def test_a_published_scene_is_identified_by_name_and_number_of_photographs():
     named = published_for("mip360_bonsai", 292)
     assert {p["method"] for p in named} >= {"3DGS, 7k steps", "3DGS, 30k steps"}
     assert {p["psnr"] for p in named} >= {31.98}
@@ -197,12 +197,12 @@ def test_a_published_scene_is_known_by_name_and_number_of_photographs():
     assert "31.98" in page and html.escape("Kerbl, Kopanas") in page
 
 
-def test_the_conventions_scenes_are_the_published_ones():
+def test_benchmark_scenes_are_the_published_ones():
     published = json.loads(PUBLISHED.read_text())["photographs"]["Mip-NeRF 360"]
     assert published.keys() == MIP_NERF_360.keys()
     assert benchmark_scene("360_v2_Bonsai") == benchmark_scene("mipnerf360-bonsai") == "bonsai"
     assert benchmark_scene("living_room") == "living_room"
 
 
-def test_a_rows_columns_do_not_depend_on_how_the_run_ended():
+def test_columns_do_not_depend_on_the_status_of_a_run():
     assert list(row(BATCH[0])) == list(row(BATCH[3])) == list(row(BATCH[-1]))

@@ -1,4 +1,4 @@
-"""Charts stay readable whatever numbers they are given."""
+"""Charts are readable for any numbers."""
 
 import re
 
@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.reporting.charts import (
-    Dot,
+    ChartPoint,
     clock,
     histogram,
     line_chart,
@@ -84,8 +84,8 @@ positive = st.floats(1e-3, 1e6)
 @settings(max_examples=100, derandomize=True, deadline=None)
 @given(st.lists(st.tuples(positive, positive), min_size=1, max_size=12))
 def test_any_time_and_error_make_a_trade_off(pairs) -> None:
-    """One run that took a time between two round ones, too."""
-    dots = [Dot(seconds, error, "a", "tip") for seconds, error in pairs]
+    """Including a single run between two round times."""
+    dots = [ChartPoint(seconds, error, "a", "tip") for seconds, error in pairs]
     svg = trade_off_chart(dots, title="t", x_title="x", y_label=str)
     assert "nan" not in svg
-    assert trade_off_chart([Dot(196.0, 0.3, "a", "")], title="t", x_title="x", y_label=str)
+    assert trade_off_chart([ChartPoint(196.0, 0.3, "a", "")], title="t", x_title="x", y_label=str)

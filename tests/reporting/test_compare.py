@@ -1,4 +1,4 @@
-"""The tables that a batch's benchmark.json gives."""
+"""Tables from the benchmark.json of a batch."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def row(scene: str, config: str, psnr: float, **changes: Any) -> dict[str, Any]:
     }
 
 
-def test_configurations_stand_beside_the_base() -> None:
+def test_configurations_are_compared_with_the_base() -> None:
     lines = compare.against(
         [
             row("a", "plan", 30.0),
@@ -48,7 +48,7 @@ def test_configurations_stand_beside_the_base() -> None:
 
 
 def test_several_seeds_give_medians_and_spreads() -> None:
-    """Seed by seed: what a seed does to both is no difference between them."""
+    """Compared seed by seed, so that the effect of a seed on both cancels."""
     lines = compare.against(
         [
             row("a", "plan", 30.0),
@@ -65,7 +65,7 @@ def test_several_seeds_give_medians_and_spreads() -> None:
 
 
 def test_each_run_of_a_batch_is_a_row() -> None:
-    """Stages that a scene did not need count as no time; a truth that is not known stays blank."""
+    """Skipped stages count as no time; without ground truth the cell is blank."""
     stages = ("decode", "features", "matches", "sfm", "undistort", "train")
     times = {f"{stage}_wall_s": 5.0 for stage in stages} | {
         "decode_wall_s": None,
@@ -88,7 +88,7 @@ def test_each_run_of_a_batch_is_a_row() -> None:
     assert {line.count("|") for line in lines} == {lines[0].count("|")}
 
 
-def test_a_second_batch_is_the_same_or_says_in_what_it_differs(tmp_path: Path) -> None:
+def test_differences_of_a_second_batch_are_listed(tmp_path: Path) -> None:
     first = [row("a", "fast", 30.0), row("b", "fast", 20.0)]
     second = [row("a", "fast", 30.0, wall_s=33.0), row("b", "fast", 20.5, ssim=0.5)]
     files = []
@@ -101,7 +101,9 @@ def test_a_second_batch_is_the_same_or_says_in_what_it_differs(tmp_path: Path) -
     assert "wall_s, second to first: median 1.05, 1.00 to 1.10" in told
 
 
-def test_what_is_no_batch_is_said(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_file_that_is_no_batch_is_an_error(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
     file = tmp_path / "benchmark.json"
     file.write_text("{}")
     assert main(["compare", str(file)]) == 2

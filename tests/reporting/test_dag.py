@@ -1,4 +1,4 @@
-"""The picture of a plan: what it says of running and skipped stages, as a file and in a page."""
+"""The diagram of a plan: running and skipped stages."""
 
 import xml.etree.ElementTree as ET
 
@@ -26,7 +26,7 @@ def drawn(found: dict) -> tuple[dict[str, tuple[float, float]], ET.Element]:
     return boxes, root
 
 
-def test_every_stage_has_a_box_of_its_own_inside_the_picture():
+def test_every_stage_has_a_box_inside_the_diagram():
     for skipped in ((), ("decode",), ("decode", "features", "matches", "sfm", "undistort")):
         boxes, root = drawn(plan(*skipped))
         assert list(boxes) == list(STAGES)
@@ -35,7 +35,7 @@ def test_every_stage_has_a_box_of_its_own_inside_the_picture():
         assert all(0 <= x <= width - 92 and 0 <= y <= height - 34 for x, y in boxes.values())
 
 
-def test_skipped_stages_stand_below_with_their_reason():
+def test_skipped_stages_are_below_with_their_reason():
     boxes, root = drawn(plan("decode", "sfm"))
     assert boxes["decode"][1] == boxes["sfm"][1] > boxes["inspect"][1] == boxes["train"][1]
     groups = {g.find(f"{SVG}text").text: g for g in root.iter(f"{SVG}g")}
@@ -45,7 +45,7 @@ def test_skipped_stages_stand_below_with_their_reason():
     assert title is not None and title.text == "train: why train <&\nso"
 
 
-def test_arrows_are_what_feeds_what_and_no_more():
+def test_arrows_are_the_inputs_without_implied_ones():
     """All run: a chain, and export beside coverage between train and report."""
     boxes, root = drawn(plan())
     assert boxes["coverage"][0] == boxes["export"][0]
@@ -54,7 +54,7 @@ def test_arrows_are_what_feeds_what_and_no_more():
     assert len([p for p in drawn(plan("decode"))[1].iter(f"{SVG}path")]) == 2 * (len(STAGES) - 1)
 
 
-def test_a_plan_as_read_from_its_file_gives_the_same_picture():
+def test_a_plan_read_from_its_file_gives_the_same_diagram():
     found = plan("decode")
     alphabetical = found | {"stages": dict(sorted(found["stages"].items()))}
     assert plan_svg(alphabetical) == plan_svg(found)

@@ -92,7 +92,7 @@ def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
     assert stages["decode"]["wall_s"] == 0.0 and stages["sfm"]["cpu_s"] == 6.0
 
 
-def test_the_headline_says_quality_size_poses_and_time(folder, capsys):
+def test_the_headline_has_quality_size_poses_and_time(folder, capsys):
     line = "barn: PSNR 27.50 dB, SSIM 0.9000, LPIPS n/a, 1000 Gaussians, 6/8 images, 2 warnings"
     assert headline(read_metrics(folder)) == line
     assert main([str(folder / "metrics.json")]) == 0
@@ -108,6 +108,6 @@ def test_a_damaged_file_is_one_clear_error(folder, name, capsys):
     assert "--forcerun" in capsys.readouterr().err
 
 
-def test_a_number_that_is_none_is_refused():
+def test_a_value_that_is_no_number_is_rejected():
     with pytest.raises(ValueError, match="psnr"):
         Metrics.model_validate({"psnr": "good"})

@@ -1,4 +1,4 @@
-"""The page is one file that needs nothing else, says every number, and trusts no string."""
+"""The page is one self-contained file with all figures, and escapes all strings."""
 
 import dataclasses
 import json
@@ -19,7 +19,7 @@ NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
 
 @pytest.fixture(autouse=True)
 def no_viewer(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Its three megabytes are not this file's matter; test_viewer.py has them in a browser."""
+    """Replaces the viewer, which test_viewer.py tests in a browser."""
     monkeypatch.setattr("pipeline.reporting.page.viewer_script", str)
 
 
@@ -63,22 +63,22 @@ def test_every_number_is_on_the_page() -> None:
         *("17.89 dB", "23.45 dB", "0.1234", "7,003", "640x480", "every 8th", "a window"),
         *("because of decode", "skipped", "incremental mapper: 49 images", "300 sparse points"),
         *("0.jpg: mean trust 0.43, PSNR 18.77 dB", "by 1: 1.2%", "41\u00b0", "3.21% of pixels"),
-        *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 squares"),
-        *("0.222 (11.1% of squares)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
-        *("63 % of this picture is unknown", "fill 17 % of what is missing"),
-        *("1 held-out", "4 training", "1: 0.9", "one photograph was left out"),
+        *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 blocks"),
+        *("0.222 (11.1% of blocks)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
+        *("63 % of this view is unknown", "add 17 % of the trust that is missing"),
+        *("1 test cameras", "4 training", "1: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
 
 
-def test_the_whole_of_metrics_and_plan_is_kept_word_for_word() -> None:
+def test_metrics_and_plan_are_embedded_verbatim() -> None:
     data = report()
     page = Page(report_html(data))
     found = [json.loads(t) for t in page.text if t.startswith("{\n")]
     assert found == [data.metrics, data.plan]
 
 
-def test_nothing_is_asked_of_a_network() -> None:
+def test_no_network_requests() -> None:
     html = report_html(report())
     assert "http:" not in html and "https:" not in html and "//cdn" not in html
     assert "@import" not in html and "url(" not in html
@@ -100,7 +100,7 @@ def nasty_coverage():
     return made
 
 
-def test_viewpoints_are_marked_from_above_among_the_cameras() -> None:
+def test_viewpoints_are_on_the_map_of_cameras() -> None:
     page = Page(report_html(report()))
     marks = [a.get("class") for tag, a in page.tags if tag == "circle" and "class" in a]
     assert [marks.count(kind) for kind in ("train", "test", "next")] == [4, 1, 1]
@@ -161,25 +161,25 @@ def nothing_held_out() -> Coverage:
         {"metrics": metrics() | {"registered_images": None, "reprojection_error_px": None}},
     ],
 )
-def test_what_is_missing_breaks_nothing(changes) -> None:
+def test_missing_values_are_accepted(changes) -> None:
     html = report_html(report(**changes))
     Page(html)
     apart = re.sub(r"&quot;.*?&quot;", "", html)
     assert ">nan<" not in html and not re.search(r"(?<![\w+/])NaN(?![\w+/=])", apart)
 
 
-def test_a_page_of_nothing_at_all_is_still_a_page(tmp_path: Path) -> None:
+def test_an_empty_page(tmp_path: Path) -> None:
     write_report(ReportData("empty", {}), tmp_path / "r.html")
     assert "No warnings" in Page((tmp_path / "r.html").read_text()).all_text()
 
 
-def test_missing_lpips_says_why_and_shows_no_number() -> None:
+def test_missing_lpips_shows_the_reason() -> None:
     changed = metrics() | {"lpips": None, "lpips_reason": "weights not found: put them there"}
     text = Page(report_html(report(metrics=changed))).all_text()
     assert "LPIPS n/a weights not found: put them there" in text
 
 
-def test_warnings_come_before_all_else_and_once() -> None:
+def test_warnings_come_first_and_once() -> None:
     html = report_html(report())
     assert html.count("<li>it is dark</li>") == 1
     assert html.index('class="warnings"') < html.index("<section")

@@ -1,4 +1,4 @@
-"""Pictures on the page show what they claim."""
+"""Error maps, display orientation and sizes of images on the page."""
 
 import io
 
@@ -45,7 +45,7 @@ def test_error_map_is_the_same_for_bytes_and_floats_and_greys_masked_pixels() ->
 
 
 @pytest.mark.parametrize("orientation", range(1, 9))
-def test_upright_is_what_exif_means(orientation: int) -> None:
+def test_upright_follows_exif(orientation: int) -> None:
     picture = view().photograph
     exif = Image.Exif()
     exif[0x0112] = orientation
@@ -69,7 +69,7 @@ def test_shrinking_keeps_the_shape_and_never_enlarges() -> None:
 
 
 def test_pictures_of_a_page_stay_within_its_budget() -> None:
-    """Noise compresses worst of all; ten such views still leave a page of a few megabytes."""
+    """Noise compresses worst; ten such views stay within a few megabytes."""
     views = [view(700, 900, seed) for seed in range(4)]
     pictures = page_pictures(views)
     assert sum(len(uri) for row in pictures for uri, _, _ in row) < 4_700_000

@@ -1,4 +1,4 @@
-"""What the page's viewer is given: upright, in the scene's size, within the page's."""
+"""Input of the page's viewer: frame, cameras, points and reduced Gaussians."""
 
 from __future__ import annotations
 
@@ -63,7 +63,7 @@ def test_the_frame_is_upright_robust_and_keeps_shapes() -> None:
 
 @pytest.mark.parametrize("unit", [1e-4, 1e4])
 def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
-    """In the page's SPZ sizes and places are of a fixed unit; what is seen is the same."""
+    """SPZ quantises positions and scales in a fixed unit; renders must not depend on the unit."""
     rng = np.random.default_rng(0)
     whole = gaussians()
     large = dataclasses.replace(
@@ -92,8 +92,8 @@ def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
     assert sized_for_spz(made) is made
 
 
-def test_from_the_air_up_is_what_lies_behind_the_cameras() -> None:
-    """Looking straight down, flown to and fro: their own ups cancel out."""
+def test_aerial_images_up_is_opposite_to_the_viewing_direction() -> None:
+    """Cameras that look straight down, flown back and forth: their up directions cancel."""
     views = []
     for i, side in enumerate([1.0, -1.0] * 4):
         pose = np.eye(4)
@@ -115,8 +115,8 @@ def test_many_points_are_thinned() -> None:
 
 
 @pytest.mark.parametrize("orientation", [0, 1, 3, 6, 8])
-def test_cameras_turn_with_their_photographs(orientation: int) -> None:
-    """A point's pixel, found by the turned camera, is the turned picture's pixel of that point."""
+def test_cameras_are_rotated_with_their_photographs(orientation: int) -> None:
+    """The rotated camera projects a point to its pixel in the rotated image."""
     view = ring(3, width=40, height=30)[1]
     picture = np.zeros((30, 40, 3), np.uint8)
     column, row = 31, 4
@@ -136,7 +136,7 @@ def test_cameras_turn_with_their_photographs(orientation: int) -> None:
     assert turned[int(v), int(u), 0] == 255
 
 
-def test_the_view_of_median_quality_comes_first() -> None:
+def test_the_start_is_the_view_of_median_quality() -> None:
     median = dataclasses.replace(report().comparisons[0], label="median", name="3.jpg")
     assert viewer_data(report(comparisons=[median]), trained())["start"] == 3
     assert viewer_data(report(), trained())["start"] == 2
@@ -147,7 +147,7 @@ MANY = gaussians(5000)
 CENTRES = np.array([view.centre for view in ring()])
 
 
-def test_what_fits_is_whole() -> None:
+def test_scenes_that_fit_are_complete() -> None:
     whole = gaussians(3000)
     packed = fit(whole, CENTRES, 1_000_000)
     read = decode_spz(packed.spz)
@@ -159,7 +159,7 @@ def size(degree: int) -> int:
     return len(encode_spz(MANY.with_sh_degree(degree)))
 
 
-def test_harmonics_go_first_then_what_is_least_prominent() -> None:
+def test_harmonics_are_dropped_first_then_the_least_prominent() -> None:
     rooms = [size(3) * 1.1, size(1) * 1.1, size(0) * 0.6, size(0) * 0.2]
     kept = [fit(MANY, CENTRES, int(room)) for room in rooms]
     assert [packed.sh_degree for packed in kept] == [3, 1, 0, 0]
@@ -185,13 +185,13 @@ def test_prominence_is_opacity_times_the_angle_seen() -> None:
     np.testing.assert_allclose(values / values[0], [1, 0.5, 2, 0.5], rtol=1e-5)
 
 
-def test_the_page_says_what_it_left_out() -> None:
+def test_the_page_reports_what_was_dropped() -> None:
     data = report(trained=trained(gaussians=MANY))
     assert "5,000 Gaussians</span>" in space_section(data, 10_000_000)
     small = space_section(data, size(0) * 3 // 2)
-    assert "5,000 Gaussians (this page, to stay small, has SH of degree 0 instead of 3;" in small
+    assert "5,000 Gaussians (to limit its size, this page has SH of degree 0 instead of 3" in small
     smaller = space_section(data, size(0) // 2)
-    assert "most prominent with SH of degree 0 instead of 3; the exports are whole)" in smaller
+    assert "most prominent with SH of degree 0 instead of 3)" in smaller
 
 
 def test_a_page_of_a_hundred_thousand_gaussians_stays_under_15_mb() -> None:

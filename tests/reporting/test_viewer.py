@@ -1,5 +1,4 @@
-"""The page in a real browser: nothing leaves it, the scene is drawn as we draw it, all of it can
-be worked by mouse and keyboard."""
+"""The page in a browser: no requests, renders as by our rasterizer, mouse and keyboard control."""
 
 from __future__ import annotations
 
@@ -48,7 +47,7 @@ def browser() -> Iterator[Any]:
 
 @pytest.fixture
 def page(browser: Any) -> Iterator[Any]:
-    """Small, since every pixel is drawn by the processor."""
+    """Small, because the browser renders on the CPU."""
     with browser.new_context(viewport={"width": 480, "height": 400}) as context:
         context.set_default_timeout(1000 * SECONDS)
         yield context.new_page()
@@ -101,7 +100,7 @@ def settled(page: Any) -> Pixels:
     return seen[-1]
 
 
-def test_the_scene_appears_and_nothing_is_asked_of_a_network(page: Any, file: Path) -> None:
+def test_the_scene_appears_without_network_requests(page: Any, file: Path) -> None:
     asked: list[str] = []
     said: list[str] = []
     page.on("request", lambda request: asked.append(request.url))
@@ -117,11 +116,10 @@ def test_the_scene_appears_and_nothing_is_asked_of_a_network(page: Any, file: Pa
 
 
 @pytest.mark.parametrize(("kind", "antialias"), [("spz", False), ("spz", True), ("ply", False)])
-def test_the_viewer_draws_what_we_draw(
+def test_the_viewer_renders_as_our_rasterizer(
     page: Any, tmp_path: Path, kind: str, antialias: bool
 ) -> None:
-    """Spark's render of the page's SPZ, and of our PLY in its place, against the rasterizer's of
-    the Gaussians themselves."""
+    """Spark's render of the page's SPZ, or of our PLY instead, against the rasterizer's."""
     path = tmp_path / "report.html"
     scene = trained(gaussians=gaussians(3000), background=(0.2, 0.5, 1.0), antialias=antialias)
     write_report(report(trained=scene), path)
@@ -173,7 +171,7 @@ def test_views_cameras_and_points_can_be_chosen(scene: Any) -> None:
     tools.get_by_role("button", name="next view").click()
     assert tools.locator("select").input_value() == "3"
     changed(scene, first)
-    tools.locator("select").select_option("from afar")
+    tools.locator("select").select_option("overview")
     changed(scene, first)
     afar = settled(scene)
     tools.get_by_label("Cameras").uncheck()
@@ -210,7 +208,7 @@ def test_mouse_wheel_and_keys_turn_and_zoom(scene: Any) -> None:
     changed(scene, zoomed)
 
 
-def test_without_webgl_the_page_says_so(page: Any, file: Path) -> None:
+def test_without_webgl_the_page_shows_a_message(page: Any, file: Path) -> None:
     page.add_init_script("HTMLCanvasElement.prototype.getContext = () => null")
     page.goto(file.as_uri())
     said = page.locator("#space p")

@@ -15,7 +15,7 @@ from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 _TEXTURE = 512
-# Origin and the two sides (unit length) of the floor and the two walls; the corner is at 0.
+# Origin and the two edges (unit length) of the floor and the two walls; the corner is at 0.
 _PLANES = [
     (np.zeros(3), np.array([1.0, 0, 0]), np.array([0, 0, -1.0])),
     (np.zeros(3), np.array([1.0, 0, 0]), np.array([0, -1.0, 0])),
@@ -29,7 +29,7 @@ def camera() -> Camera:
 
 
 def poses(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
-    """World to camera, on an arc that rises, all looking at the middle of the corner."""
+    """World to camera poses on a rising and falling arc, directed at the corner."""
     found = []
     for angle in np.linspace(np.radians(15), np.radians(75), count):
         height = -0.7 - 0.5 * np.sin(3 * angle)
@@ -45,7 +45,7 @@ def poses(count: int) -> list[tuple[np.ndarray, np.ndarray]]:
 
 @lru_cache
 def texture(seed: int) -> np.ndarray:
-    """(512, 512, 3) uint8: blobs of all sizes, all different."""
+    """(512, 512, 3) uint8: random blobs of several sizes."""
     rng = np.random.default_rng(seed)
     total = np.zeros((_TEXTURE, _TEXTURE, 3))
     for cells in (16, 32, 64, 128):
@@ -55,10 +55,10 @@ def texture(seed: int) -> np.ndarray:
 
 
 def picture(rotation: np.ndarray, translation: np.ndarray, seed: int) -> np.ndarray:
-    """(300, 400, 3) uint8 BGR; drawn at twice the size and reduced."""
+    """(300, 400, 3) uint8 BGR render of the corner, supersampled twice."""
     intrinsics = np.array([[FOCAL, 0, WIDTH / 2], [0, FOCAL, HEIGHT / 2], [0, 0, 1.0]])
     larger = np.diag([2.0, 2.0, 1.0])
-    # Indices are half a pixel off coordinates, in the texture and in the picture.
+    # From coordinates (pixel centres at .5) to array indices, of textures and images.
     to_index = np.array([[1, 0, -0.5], [0, 1, -0.5], [0, 0, 1.0]])
     image = np.zeros((2 * HEIGHT, 2 * WIDTH, 3), np.uint8)
     for index, (origin, u, v) in enumerate(_PLANES):
@@ -89,7 +89,7 @@ def photo(path: Path, name: str | None = None, **facts) -> Photo:
 def write_scene(
     folder: Path, count: int, *, seed: int = 1, prefix: str = "view ", **facts
 ) -> tuple[list[Photo], Reconstruction]:
-    """Write ``count`` PNG photographs; names with spaces, as people have them."""
+    """Write ``count`` PNG photographs, with spaces in their names."""
     folder.mkdir(parents=True, exist_ok=True)
     photos, images = [], {}
     for index, (rotation, translation) in enumerate(poses(count), start=1):

@@ -1,4 +1,5 @@
-"""What the tests run in processes of their own: pycolmap must not meet torch in pytest's."""
+"""Functions that tests run in separate processes: pycolmap is incompatible with torch (see
+``pipeline.sfm.isolate``)."""
 
 from __future__ import annotations
 
@@ -63,7 +64,7 @@ def match_and_reconstruct(
 def planned_cameras(
     manifest: Manifest, sharings: list[str]
 ) -> dict[str, list[tuple[str, float, bool]]]:
-    """Sharing -> (model, focal length, whether that is a prior) of each camera."""
+    """``share_cameras`` -> (model, focal length, whether that is a prior) of each camera."""
     from pipeline.sfm.database import plan_cameras
 
     return {
@@ -84,7 +85,7 @@ def returned(value: Any) -> Any:
 def raise_user_error() -> None:
     from pipeline.runtime.errors import UserError
 
-    raise UserError("is wrong", file="a.jpg", fix="mend it")
+    raise UserError("is wrong", file="a.jpg", fix="repair it")
 
 
 def raise_bug() -> None:
@@ -98,7 +99,7 @@ def die() -> None:
     os.kill(os.getpid(), signal.SIGKILL)
 
 
-def sleep_forever(started: Path) -> None:
+def sleep_long(started: Path) -> None:
     import os
     import time
 
@@ -109,4 +110,4 @@ def sleep_forever(started: Path) -> None:
 def wait_for_sleeper(started: Path) -> None:
     from pipeline.sfm.isolate import run_isolated
 
-    run_isolated(sleep_forever, started)
+    run_isolated(sleep_long, started)

@@ -1,5 +1,5 @@
-// Runs the matcher outside Python, for an emulated processor.
-// nearest_driver N M INPUT OUTPUT: INPUT holds the N + M descriptors, OUTPUT gets the six results.
+// Runs the matcher without Python, for an emulated processor.
+// nearest_driver N M INPUT OUTPUT: INPUT contains N + M descriptors; OUTPUT receives six arrays.
 #include <cstdint>
 #include <cstdio>
 #include <cstdlib>

@@ -1,4 +1,4 @@
-"""benchmarks.sfm: what it chooses, how it sums up, and that it runs."""
+"""benchmarks.sfm: choice of configurations, summaries, and a run."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def test_runs_without_any_model_have_times_and_no_errors():
     assert plot([summary]).startswith("<svg")
 
 
-def test_the_table_compares_with_pycolmap_and_the_plot_shows_both():
+def test_table_and_plot_compare_with_pycolmap():
     rows = [summarise([run(10, 0.5, "pycolmap")]), summarise([run(2, 0.1)])]
     lines = table(rows).splitlines()
     assert len({line.count("|") for line in lines}) == 1
@@ -64,11 +64,11 @@ def demo(tmp_path_factory):
     return folder
 
 
-def test_patterns_choose_what_the_plan_can(demo):
+def test_patterns_select_configurations_that_are_possible(demo):
     scene = load_scene(demo)
     assert len(scene.manifest.photos) == len(scene.truth.images) == 6
     names = {c.name: c.planned for c in configurations(scene, ["balanced/*", "plan"])}
-    # No GPS; the plan's choice under the other presets comes on top.
+    # No GPS. The plan's choice under the other presets is added.
     assert not any("spatial" in name for name in names)
     assert {n for n, planned in names.items() if planned} == {
         f"{preset}/incremental/exhaustive" for preset in ("fast", "balanced", "high")
@@ -78,18 +78,18 @@ def test_patterns_choose_what_the_plan_can(demo):
     assert {c.config.features.max_features for c in fast} == {3000}
 
 
-def test_every_takes_photographs_and_truth_together(demo):
+def test_every_thins_photographs_and_true_poses_alike(demo):
     scene = load_scene(demo, every=3)
     assert len(scene.manifest.photos) == len(scene.truth.images) == 2
 
 
-def test_a_folder_without_poses_is_refused(demo, tmp_path):
+def test_a_folder_without_poses_is_an_error(demo, tmp_path):
     (tmp_path / "images").symlink_to(demo / "images")
     with pytest.raises(UserError, match="no poses to measure against"):
         load_scene(tmp_path)
 
 
-def test_it_measures_ours_and_pycolmaps(demo, tmp_path, capsys):
+def test_a_run_measures_the_pipeline_and_pycolmap(demo, tmp_path, capsys):
     arguments = [str(demo), "--configs", "pycolmap", "fast/incremental/exhaustive"]
     main([*arguments, "--json", str(tmp_path / "a.json"), "--plot", str(tmp_path / "a.svg")])
     found = json.loads((tmp_path / "a.json").read_text())
@@ -102,12 +102,12 @@ def test_it_measures_ours_and_pycolmaps(demo, tmp_path, capsys):
     assert "<circle" in (tmp_path / "a.svg").read_text()
 
 
-def test_views_between_cameras_lie_between_neighbours():
-    # On a line, all turned alike but for one: a view is between it and its two nearest.
-    turned = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
+def test_interpolated_views_lie_between_neighbouring_cameras():
+    # Cameras on a line with equal rotations except for one.
+    rotated = np.array([[0.0, 0, 1], [0, 1, 0], [-1, 0, 0]])
     images = {}
     for i in range(6):
-        rotation = turned if i == 5 else np.eye(3)
+        rotation = rotated if i == 5 else np.eye(3)
         images[i] = PosedImage(f"{i}.jpg", 1, rotation, -rotation @ np.array([float(i * i), 0, 0]))
     model = Reconstruction({}, images)
     found = between(model, 40)
@@ -121,7 +121,7 @@ def test_views_between_cameras_lie_between_neighbours():
     assert len({float(centre[0]) for _, centre in found}) == 40
 
 
-def test_the_mappers_table_tells_seeds_and_mappers_apart():
+def test_the_mappers_table_separates_seeds_and_mappers():
     names = [(mapper, seed) for mapper in ("incremental", "global") for seed in (0, 1)]
     costs = {name: Cost(10.0 if name[0] == "global" else 4.0, 1.0) for name in names}
     likeness = {

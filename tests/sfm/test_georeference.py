@@ -1,4 +1,4 @@
-"""Models find their place: metres, level, north; and say so where nothing tells them."""
+"""World frames from GPS, ground control points and camera orientations."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ from pipeline.geometry.geodesy import to_ecef, to_enu
 from pipeline.geometry.similarity import Similarity
 from pipeline.io.gcp import GroundControl, read_ground_control
 from pipeline.runtime.errors import UserError
-from pipeline.sfm.georeference import Cameras, Frame, from_gcp, from_gps, level
+from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
 
 ORIGIN = np.array([47.37, 8.54, 410.0])
-METRES_A_DEGREE = 111_194.0
+METRES_PER_DEGREE = 111_194.0
 
 
 def rotation(seed: int) -> np.ndarray:
@@ -26,15 +26,15 @@ def rotation(seed: int) -> np.ndarray:
 def geodetic(enu: np.ndarray) -> np.ndarray:
     """Inverse of ``to_enu`` around ORIGIN, by Newton's method."""
     found = np.tile(ORIGIN, (len(enu), 1))
-    scale = [1 / METRES_A_DEGREE, 1 / METRES_A_DEGREE / np.cos(np.radians(ORIGIN[0])), 1.0]
+    scale = [1 / METRES_PER_DEGREE, 1 / METRES_PER_DEGREE / np.cos(np.radians(ORIGIN[0])), 1.0]
     for _ in range(20):
-        miss = enu - to_enu(found, ORIGIN)
-        found += miss[:, [1, 0, 2]] * scale
+        error = enu - to_enu(found, ORIGIN)
+        found += error[:, [1, 0, 2]] * scale
     return found
 
 
 def scene(enu: np.ndarray, seed: int = 3) -> tuple[Cameras, Similarity]:
-    """Cameras as a mapper leaves them, somewhere, some size; and what takes them back."""
+    """Cameras in an arbitrary frame, and the similarity from there to metres."""
     turn, size, shift = rotation(seed), 0.037, np.array([3.0, -2.0, 9.0])
     centres = size * enu @ turn.T + shift
     names = [f"{i}.jpg" for i in range(len(enu))]
@@ -47,20 +47,20 @@ def positions(cameras: Cameras, enu: np.ndarray) -> dict:
 
 
 def survey(seed: int = 0, count: int = 40) -> np.ndarray:
-    """A flight over 80 m by 60 m at 50 m, metres."""
+    """(count, 3) positions of a flight over 80 m by 60 m at a height of 50 m, metres."""
     rng = np.random.default_rng(seed)
     return rng.uniform((-40, -30, 48), (40, 30, 52), (count, 3))
 
 
-def test_ecef_of_known_places():
-    # Where the equator and Greenwich meet, and the pole: the ellipsoid's half axes.
+def test_ecef_of_known_positions():
+    # On the equator at longitude 0, and at the pole: the semi-axes of the ellipsoid.
     np.testing.assert_allclose(to_ecef(np.array([0.0, 0.0, 0.0])), [6378137.0, 0, 0], atol=1e-6)
     np.testing.assert_allclose(
         to_ecef(np.array([90.0, 0.0, 0.0])), [0, 0, 6356752.314245], atol=1e-5
     )
 
 
-def test_east_is_east_and_north_is_north():
+def test_enu_axes():
     places = np.array([[47.37, 8.541, 410.0], [47.371, 8.54, 410.0], [47.37, 8.54, 420.0]])
     east, north, up = to_enu(places, ORIGIN)
     assert east[0] == pytest.approx(75.5, rel=0.01) and abs(east[1]) < 0.01
@@ -70,42 +70,42 @@ def test_east_is_east_and_north_is_north():
 
 @settings(max_examples=5, derandomize=True, deadline=None)
 @given(st.integers(0, 10_000))
-def test_exact_gps_gives_exact_metres(seed):
+def test_exact_gps_gives_the_exact_frame(seed):
     enu = survey(seed)
     cameras, _ = scene(enu, seed)
     frame = from_gps(cameras, positions(cameras, enu))
-    assert isinstance(frame, Frame) and frame.method == "gps"
+    assert isinstance(frame, WorldFrame) and frame.method == "gps"
     found = frame.similarity(cameras.centres)
-    # The frame's origin is the median position: the same metres, from elsewhere.
+    # The origin of the frame is the median position.
     np.testing.assert_allclose(found - found.mean(0), enu - enu.mean(0), atol=0.02)
     assert {"latitude", "longitude", "altitude"} == set(frame.origin or {})
 
 
-def test_gps_with_noisy_altitudes_and_wrong_fixes():
-    """Heights are 15 m off and a fifth of the places is from elsewhere: tilt and size still hold,
-    and the wrong ones are named."""
+def test_gps_with_noisy_altitudes_and_outliers():
+    """Noisy altitudes and a fifth of outliers: rotation and scale are still accurate, and the
+    outliers are listed."""
     rng, true = np.random.default_rng(1), survey(count=60)
     measured = true + rng.normal(0, (2.0, 2.0, 8.0), true.shape)
     measured[::5, :2] += rng.uniform(200, 400, (12, 2))
     cameras, back = scene(true)
     frame = from_gps(cameras, positions(cameras, measured))
-    assert isinstance(frame, Frame)
+    assert isinstance(frame, WorldFrame)
     assert frame.similarity.scale == pytest.approx(back.scale, rel=0.05)
     turn = frame.similarity.rotation @ back.rotation.T
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 8
     left_out = {row["name"] for row in frame.residuals if not row["used"]}
     assert left_out >= {f"{i}.jpg" for i in range(0, 60, 5)}
-    assert any("contradict" in text for text in frame.warnings)
+    assert any("outliers" in text for text in frame.warnings)
 
 
-def test_a_walk_along_a_line_takes_up_from_the_cameras():
+def test_gps_on_a_line_uses_the_up_direction_of_the_cameras():
     along = np.linspace(0, 60, 25)
     true = np.column_stack([along * 0.6, along * 0.8, np.full(25, 1.6)])
     rng = np.random.default_rng(2)
     measured = true + rng.normal(0, (1.0, 1.0, 3.0), true.shape)
     cameras, back = scene(true)
     frame = from_gps(cameras, positions(cameras, measured))
-    assert isinstance(frame, Frame)
+    assert isinstance(frame, WorldFrame)
     assert any("on a line" in text for text in frame.warnings)
     assert frame.similarity.scale == pytest.approx(back.scale, rel=0.1)
     up = frame.similarity.rotation @ cameras.up
@@ -119,15 +119,15 @@ def test_a_walk_along_a_line_takes_up_from_the_cameras():
     ("size", "noise", "why"),
     [(1.0, 4.0, "spread over"), (0.0, 0.0, "line along|spread over|positions lie")],
 )
-def test_gps_that_says_too_little_is_refused(size, noise, why):
-    """A statue walked around with a phone: its GPS is coarser than the walk."""
+def test_gps_that_is_too_inaccurate_is_rejected(size, noise, why):
+    """The path is smaller than the error of GPS, or all positions are equal."""
     rng = np.random.default_rng(4)
     angle = np.linspace(0, 2 * np.pi, 24, endpoint=False)
     ring = np.column_stack([np.cos(angle), np.sin(angle), 0 * angle]) * 2.0
     cameras, _ = scene(ring)
     measured = size * ring + rng.normal(0, 1, ring.shape) * noise
-    assert isinstance(refused := from_gps(cameras, positions(cameras, measured)), str)
-    assert any(part in refused for part in why.split("|")), refused
+    assert isinstance(reason := from_gps(cameras, positions(cameras, measured)), str)
+    assert any(part in reason for part in why.split("|")), reason
     assert isinstance(from_gps(cameras, {}), str)
 
 
@@ -139,10 +139,10 @@ def test_positions_on_both_sides_of_the_date_line():
     assert np.ptp(lonlat[:, 1]) > 300
     given_ = {n: tuple(p) for n, p in zip(cameras.names, lonlat.tolist(), strict=True)}
     frame = from_gps(cameras, given_)
-    assert isinstance(frame, Frame) and max(r["horizontal_m"] for r in frame.residuals) < 0.1
+    assert isinstance(frame, WorldFrame) and max(r["horizontal_m"] for r in frame.residuals) < 0.1
 
 
-def test_without_a_place_the_scene_is_level_and_of_unit_size():
+def test_the_level_frame_has_unit_scale():
     true = survey()
     cameras, _ = scene(true)
     frame = level(cameras)
@@ -151,7 +151,7 @@ def test_without_a_place_the_scene_is_level_and_of_unit_size():
     distances = np.sort(np.linalg.norm(centres, axis=1))
     assert distances[int(0.95 * len(distances))] == pytest.approx(1.0, abs=0.05)
     np.testing.assert_allclose(frame.similarity.rotation @ cameras.up, [0, -1, 0], atol=1e-9)
-    # One camera has no size, and up may be down already.
+    # A single camera has no extent, and needs a rotation by 180 degrees.
     alone = Cameras(["a"], np.array([[1.0, 2, 3]]), np.array([0.0, 1.0, 0.0]))
     moved = level(alone).similarity
     np.testing.assert_allclose(moved.rotation @ alone.up, [0, -1, 0], atol=1e-9)
@@ -192,7 +192,7 @@ def test_ground_control_file(tmp_path):
         ("EPSG:32632\n\n1 2 3 4 5\n", "line 3 is malformed"),
     ],
 )
-def test_malformed_ground_control_is_told(tmp_path, text, what):
+def test_malformed_ground_control_is_an_error(tmp_path, text, what):
     path = tmp_path / "gcp_list.txt"
     path.write_text(text)
     with pytest.raises(UserError, match=what) as error:
@@ -208,8 +208,8 @@ def control_of(places: np.ndarray, tmp_path) -> GroundControl:
     return read_ground_control(path, ["a.jpg"])
 
 
-def test_ground_control_gives_projected_metres_from_a_near_origin(tmp_path):
-    """UTM's numbers are too large for float32: the origin is taken off; a wrong point is out."""
+def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
+    """UTM coordinates are too large for float32: an origin is subtracted. Outliers are left out."""
     rng = np.random.default_rng(5)
     places = rng.uniform((465000, 5246000, 400), (465080, 5246060, 415), (9, 3))
     _, back = scene(places)
@@ -222,7 +222,7 @@ def test_ground_control_gives_projected_metres_from_a_near_origin(tmp_path):
         return ours[round(seen["a.jpg"][0] - 0.5)]
 
     frame = from_gcp(control, triangulate)
-    assert isinstance(frame, Frame) and frame.projection == "EPSG:32632"
+    assert isinstance(frame, WorldFrame) and frame.projection == "EPSG:32632"
     origin = np.array([frame.origin[k] for k in "xyz"])
     moved = frame.similarity(ours)
     assert np.abs(moved).max() < 100
@@ -231,9 +231,9 @@ def test_ground_control_gives_projected_metres_from_a_near_origin(tmp_path):
     assert frame.sidecar()["residuals_m"]["left_out"] == 1
 
 
-def test_ground_control_on_a_line_or_unseen_is_refused(tmp_path):
+def test_ground_control_on_a_line_or_unobserved_is_rejected(tmp_path):
     line = np.linspace(0, 1, 6)[:, None] * [30.0, 40.0, 1.0]
     control = control_of(line, tmp_path)
-    refused = from_gcp(control, lambda seen: line[round(seen["a.jpg"][0] - 0.5)])
-    assert isinstance(refused, str) and "line" in refused
+    reason = from_gcp(control, lambda seen: line[round(seen["a.jpg"][0] - 0.5)])
+    assert isinstance(reason, str) and "line" in reason
     assert "only 0 of 6" in str(from_gcp(control, lambda seen: None))

@@ -1,4 +1,4 @@
-"""Processes that keep libraries apart hand back values and errors, and never stay behind."""
+"""``run_isolated`` returns values, raises errors of its process and leaves no process behind."""
 
 from __future__ import annotations
 
@@ -13,31 +13,31 @@ from pipeline.sfm.isolate import run_isolated
 from tests.sfm import jobs
 
 
-def test_values_come_back():
+def test_the_value_is_returned():
     assert run_isolated(jobs.returned, {"a": [1, 2]}) == {"a": [1, 2]}
 
 
-def test_a_user_error_keeps_its_parts():
+def test_a_user_error_keeps_its_fields():
     with pytest.raises(UserError) as caught:
         run_isolated(jobs.raise_user_error)
     assert (caught.value.what, caught.value.file, caught.value.fix) == (
         "is wrong",
         "a.jpg",
-        "mend it",
+        "repair it",
     )
 
 
-def test_a_bug_shows_its_traceback():
+def test_other_exceptions_show_their_traceback():
     with pytest.raises(RuntimeError, match=r"raise_bug(.|\n)*KeyError: 'lost'"):
         run_isolated(jobs.raise_bug)
 
 
-def test_a_killed_process_is_named_not_waited_for():
+def test_a_killed_process_raises_with_the_name_of_the_signal():
     with pytest.raises(RuntimeError, match="SIGKILL"):
         run_isolated(jobs.die)
 
 
-def test_a_process_dies_with_the_one_that_started_it(tmp_path):
+def test_the_process_ends_with_its_parent(tmp_path):
     started = tmp_path / "pid"
     parent = multiprocessing.get_context("spawn").Process(
         target=jobs.wait_for_sleeper, args=(started,)
@@ -59,7 +59,7 @@ def test_a_process_dies_with_the_one_that_started_it(tmp_path):
 
 
 def _alive(pid: int) -> bool:
-    """False for a zombie too, which only waits for init to collect it."""
+    """False for a zombie too."""
     try:
         with open(f"/proc/{pid}/stat") as file:
             return file.read().rsplit(")", 1)[1].split()[0] != "Z"

@@ -1,4 +1,4 @@
-"""The judge on captures made by code: nothing wrong is called good, nothing right failed."""
+"""The quality check on synthetic captures: no wrong model is good, no correct one has failed."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ import pytest
 
 from pipeline.sfm.isolate import run_isolated
 
-# Cases that cost a second or two; all of them: python -m benchmarks.judge (docs/judge.md).
+# Fast cases; all of them: python -m benchmarks.judge.
 GOOD = ("three_views", "prior_x3.0", "duplicates")
 WEAK = ("outliers_30",)
 FAILED = ("turning", "one_photo_8_times")
-# Both are bent or folded, and both register every photograph at a third of a pixel.
-SEEMING = ("tower_4_bare", "windows")
+# Folded or bent models that register every photograph at a small reprojection error.
+WRONG_BUT_COMPLETE = ("tower_4_bare", "windows")
 
 
 def judged(case: str, seed: int, folder: Path) -> dict:
-    """The first attempt of a case: its truth, its verdict, what speaks against it."""
+    """True grade, verdict, reasons and evidence of the first mapping attempt of a case."""
     from benchmarks.judge.__main__ import run_made
     from pipeline.sfm.quiet import quiet_colmap
 
@@ -35,26 +35,26 @@ def judged(case: str, seed: int, folder: Path) -> dict:
 
 
 @pytest.mark.parametrize("case", GOOD)
-def test_right_models_are_called_good(case, tmp_path):
+def test_correct_models_are_good(case, tmp_path):
     row = run_isolated(judged, case, 0, tmp_path)
     assert row["truth"] == "good" and row["verdict"] == "good", row
 
 
 @pytest.mark.parametrize("case", WEAK)
-def test_right_models_of_a_part_are_called_weak(case, tmp_path):
+def test_correct_but_incomplete_models_are_weak(case, tmp_path):
     row = run_isolated(judged, case, 0, tmp_path)
     assert row["truth"] == "good" and row["verdict"] == "weak", row
 
 
 @pytest.mark.parametrize("case", FAILED)
-def test_failures_are_called_failed(case, tmp_path):
+def test_wrong_models_are_failed(case, tmp_path):
     row = run_isolated(judged, case, 0, tmp_path)
     assert row["truth"] == "failed" and row["verdict"] == "failed", row
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("case", SEEMING)
-def test_models_that_register_all_and_are_wrong_are_called_failed(case, tmp_path):
+@pytest.mark.parametrize("case", WRONG_BUT_COMPLETE)
+def test_wrong_models_that_register_all_images_are_failed(case, tmp_path):
     row = run_isolated(judged, case, 0, tmp_path)
     evidence = row["evidence"]
     assert evidence["registered"] == evidence["total"] and evidence["reprojection_px"] < 0.6, row
@@ -62,8 +62,9 @@ def test_models_that_register_all_and_are_wrong_are_called_failed(case, tmp_path
     assert "look alike" in row["reasons"]
 
 
-def test_the_truth_finds_the_similarity_that_most_views_share():
-    """Half of the views right and half folded by half a turn: a mean would blame all of them."""
+def test_the_benchmark_aligns_a_model_by_the_majority_of_its_views():
+    """A part of the views is rotated by 180 degrees: a least squares alignment would be off for
+    all of them."""
     from benchmarks.judge.truth import grade
     from pipeline.geometry.cameras import Camera
     from pipeline.scene.reconstruction import PosedImage, Reconstruction
@@ -87,7 +88,7 @@ def test_the_truth_finds_the_similarity_that_most_views_share():
     folded = [
         (r @ half_turn, half_turn @ c) if i >= 14 else (r, c) for i, (r, c) in enumerate(true)
     ]
-    # Another frame: a turn, a scale and a shift.
+    # The same model in another frame.
     turn = np.array([[0, 0, 1.0], [1, 0, 0], [0, 1, 0]])
     moved = [(r @ turn.T, 0.2 * turn @ c + 7) for r, c in folded]
     found = grade(model(moved), [model(true)], 20)

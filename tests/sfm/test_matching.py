@@ -1,4 +1,4 @@
-"""Matching: exact on any processor, kept pair by pair, the same bytes whatever was kept."""
+"""Matching: exact on any processor, cached pair by pair, the same file for any cache content."""
 
 from __future__ import annotations
 
@@ -34,7 +34,8 @@ from tests.tools import need, unsupported
 FEATURES = schema.Features(max_features=500)
 
 
-def plainly(a: np.ndarray, b: np.ndarray) -> near.Neighbours:
+def reference(a: np.ndarray, b: np.ndarray) -> near.Neighbours:
+    """Reference implementation of one direction of ``nearest``."""
     far = 1 << 28
     whole = np.full((len(a), len(b) + 2), far, np.int64)
     whole[:, : len(b)] = ((a[:, None].astype(np.int64) - b[None]) ** 2).sum(-1)
@@ -43,16 +44,16 @@ def plainly(a: np.ndarray, b: np.ndarray) -> near.Neighbours:
     return near.Neighbours(np.where(index < len(b), index, -1), ordered[:, 0], ordered[:, 1])
 
 
-def same(one: near.Neighbours, two: near.Neighbours) -> None:
+def assert_equal(one: near.Neighbours, two: near.Neighbours) -> None:
     for name in ("index", "first", "second"):
         np.testing.assert_array_equal(getattr(one, name), getattr(two, name))
 
 
-def wild(seed: int, count: int, kind: str) -> np.ndarray:
+def random_descriptors(seed: int, count: int, kind: str) -> np.ndarray:
     rng = np.random.default_rng(seed)
-    values = {"bytes": 256, "extremes": 2, "alike": 2}[kind]
+    values = {"bytes": 256, "extremes": 2, "ties": 2}[kind]
     table = rng.integers(0, values, (count, 128))
-    if kind == "alike":  # a few kinds of descriptors only: ties everywhere
+    if kind == "ties":  # a few distinct descriptors only
         table = table[rng.integers(0, min(3, count), count)] if count else table
     return (table * (255 if kind == "extremes" else 1)).astype(np.uint8)
 
@@ -60,37 +61,37 @@ def wild(seed: int, count: int, kind: str) -> np.ndarray:
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(
     counts=st.tuples(st.integers(0, 90), st.integers(0, 90)),
-    kind=st.sampled_from(["bytes", "extremes", "alike"]),
+    kind=st.sampled_from(["bytes", "extremes", "ties"]),
     seed=st.integers(0, 99),
 )
 @example(counts=(1, 1), kind="extremes", seed=0)
 @example(counts=(64, 64), kind="bytes", seed=0)
-def test_the_two_nearest_are_the_two_nearest(counts, kind, seed):
-    a, b = wild(seed, counts[0], kind), wild(seed + 1, counts[1], kind)
+def test_the_two_nearest_equal_the_reference(counts, kind, seed):
+    a, b = random_descriptors(seed, counts[0], kind), random_descriptors(seed + 1, counts[1], kind)
     of_a, of_b = near.nearest(a, b)
-    same(of_a, plainly(a, b))
-    same(of_b, plainly(b, a))
+    assert_equal(of_a, reference(a, b))
+    assert_equal(of_b, reference(b, a))
 
 
 SOURCE = near.LIBRARY.sources / "nearest.cpp"
 
 
 def cases() -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Descriptors that leave vectors part full, with the largest products and with ties."""
-    for kinds in (("bytes", "extremes"), ("extremes", "extremes"), ("alike", "alike")):
-        yield wild(1, 301, kinds[0]), wild(2, 277, kinds[1])
+    """Descriptors that fill vectors partly, with the largest products and with ties."""
+    for kinds in (("bytes", "extremes"), ("extremes", "extremes"), ("ties", "ties")):
+        yield random_descriptors(1, 301, kinds[0]), random_descriptors(2, 277, kinds[1])
 
 
 def check_library(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, flags: list[str]) -> None:
-    """Compile the matcher with these flags and compare it with numpy."""
+    """Compile the matcher with these flags and compare it with the reference."""
     library = tmp_path / "matcher.so"
     command = [*compiler(), *flags, "-Werror", "-shared", str(SOURCE), "-o", str(library)]
     subprocess.run(command, check=True)
     monkeypatch.setattr(near, "_library", lambda: ctypes.CDLL(str(library)))
     for a, b in cases():
         of_a, of_b = near.nearest(a, b)
-        same(of_a, plainly(a, b))
-        same(of_b, plainly(b, a))
+        assert_equal(of_a, reference(a, b))
+        assert_equal(of_b, reference(b, a))
 
 
 VARIANTS = [
@@ -101,15 +102,15 @@ VARIANTS = [
 
 
 @pytest.mark.parametrize("variant", VARIANTS, ids=lambda variant: variant.name)
-def test_every_target_finds_the_same(tmp_path, monkeypatch, variant):
-    wanted = {extension.feature for extension in variant.extensions}
-    if variant.target.missing or not wanted <= processor.features():
+def test_every_target_equals_the_reference(tmp_path, monkeypatch, variant):
+    required = {extension.feature for extension in variant.extensions}
+    if variant.target.missing or not required <= processor.features():
         unsupported(f"this processor cannot run {variant.name}")
     check_library(tmp_path, monkeypatch, near.LIBRARY.flags_for(variant))
 
 
-def test_the_form_for_avx_vnni_finds_the_same(tmp_path, monkeypatch):
-    """Few processors have it: its one instruction is replaced by some of AVX2's."""
+def test_the_avx_vnni_code_equals_the_reference(tmp_path, monkeypatch):
+    """AVX2 instructions emulate the one AVX-VNNI instruction, which few processors have."""
     target = targets.named("x86-64-v3")
     if target.missing:
         unsupported(f"this processor cannot run {target.name}")
@@ -125,7 +126,7 @@ ARM_COMPILER, ARM_EMULATOR = "aarch64-linux-gnu-g++", "qemu-aarch64"
     [variant for variant in VARIANTS if variant.target.name == "aarch64"],
     ids=lambda variant: variant.name,
 )
-def test_an_emulated_arm_processor_finds_the_same(tmp_path, variant):
+def test_an_emulated_arm_processor_equals_the_reference(tmp_path, variant):
     need(ARM_COMPILER, ARM_EMULATOR)
     program, found = tmp_path / "driver", tmp_path / "found"
     files = [str(Path(__file__).with_name("nearest_driver.cpp")), str(SOURCE)]
@@ -136,16 +137,16 @@ def test_an_emulated_arm_processor_finds_the_same(tmp_path, variant):
         command = [ARM_EMULATOR, program, str(len(a)), str(len(b)), tmp_path / "input", found]
         subprocess.run(command, check=True)
         values = np.fromfile(found, np.int32)
-        same(near.Neighbours(*values[: 3 * len(a)].reshape(3, -1)), plainly(a, b))
-        same(near.Neighbours(*values[3 * len(a) :].reshape(3, -1)), plainly(b, a))
+        assert_equal(near.Neighbours(*values[: 3 * len(a)].reshape(3, -1)), reference(a, b))
+        assert_equal(near.Neighbours(*values[3 * len(a) :].reshape(3, -1)), reference(b, a))
 
 
-def test_matches_are_mutual_distinct_and_near():
+def test_matches_are_mutual_and_pass_the_ratio_and_distance_tests():
     rng = np.random.default_rng(0)
     a = rng.integers(30, 60, (6, 128)).astype(np.uint8)
     b = a[[3, 0, 1, 2, 4]].copy()
-    b[4] = np.clip(rng.integers(0, 90, 128), 0, 255)  # the fifth looks like nothing
-    b = np.vstack([b, b[1], np.zeros((1, 128), np.uint8)])  # the first has a twin in b
+    b[4] = np.clip(rng.integers(0, 90, 128), 0, 255)  # the fifth has no match
+    b = np.vstack([b, b[1], np.zeros((1, 128), np.uint8)])  # the first has two equal matches
     found = near.match_descriptors(a, b, 0.8)
     assert found.dtype == np.uint32 and found.tolist() == [[1, 2], [2, 3], [3, 0]]
     assert near.match_descriptors(a[:0], b, 0.8).shape == (0, 2)
@@ -161,9 +162,9 @@ def room(tmp_path_factory):
     return folder, photos
 
 
-def test_one_more_photograph_matches_its_own_pairs_alone(room, tmp_path):
+def test_adding_a_photograph_matches_its_pairs_only(room, tmp_path):
     folder, photos = room
-    # The new one stands in the middle: ids of the others move.
+    # The added one is in the middle of the order: image ids of the others change.
     fewer = corner.manifest([p for p in photos if p.name != photos[3].name])
     first = run_isolated(jobs.match, fewer, folder / "features", tmp_path / "matches", threads=1)
     whole = corner.manifest(photos)
@@ -185,7 +186,7 @@ def test_copies_of_a_photograph_share_their_results(room, tmp_path):
     assert report["num_pairs"] == report["num_verified"] == 6
 
 
-def pairs_kept(cache: Path) -> int:
+def cached_pairs(cache: Path) -> int:
     (file,) = cache.glob("pairs-*.db")
     connection = sqlite3.connect(file)
     try:
@@ -194,9 +195,9 @@ def pairs_kept(cache: Path) -> int:
         connection.close()
 
 
-def test_the_cache_knows_other_settings_and_does_not_grow_for_ever(room, tmp_path):
+def test_the_cache_distinguishes_settings_and_is_pruned(room, tmp_path):
     folder, photos = room
-    for inliers, cached, kept in ((15, 0, 3), (16, 0, 6), (15, 3, 6), (17, 0, 3)):
+    for inliers, cached, stored in ((15, 0, 3), (16, 0, 6), (15, 3, 6), (17, 0, 3)):
         report = run_isolated(
             jobs.match,
             corner.manifest(photos[:3]),
@@ -204,10 +205,11 @@ def test_the_cache_knows_other_settings_and_does_not_grow_for_ever(room, tmp_pat
             tmp_path / "matches",
             min_inliers=inliers,
         )
-        assert (report["num_cached"], pairs_kept(tmp_path / "cache")) == (cached, kept), inliers
+        found = report["num_cached"], cached_pairs(tmp_path / "cache")
+        assert found == (cached, stored), inliers
 
 
-def test_a_damaged_cache_is_made_again(room, tmp_path):
+def test_a_corrupt_cache_is_replaced(room, tmp_path):
     folder, photos = room
     manifest = corner.manifest(photos[:3])
     run_isolated(jobs.match, manifest, folder / "features", tmp_path / "matches")
@@ -244,6 +246,6 @@ def test_the_stages_record_that_one_photograph_was_added(room, tmp_path):
     assert first["features"]["num_cached"] == first["matches"]["num_cached"] == 0
     shutil.copy(photos[5].path, scene / "images")
     second = run_stages(scene, results)
-    # Six photographs and 15 pairs now: one is extracted, its five pairs are matched.
+    # Six photographs and 15 pairs: one photograph is extracted and its five pairs are matched.
     assert second["features"]["num_cached"] == 5
     assert second["matches"]["num_cached"] == 10

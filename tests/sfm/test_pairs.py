@@ -1,4 +1,4 @@
-"""Pair choosers choose what they promise."""
+"""Selection of image pairs."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def proper(pairs, count):
 
 
 def descriptors(rng, ids, noise=2.0):
-    """A descriptor for each scene point in ``ids``, the same point alike in all photographs."""
+    """Descriptors of the scene points ``ids``; those of the same point differ by noise only."""
     table = np.random.default_rng(99).uniform(0, 90, (2000, 128))
     return np.clip(table[ids] + rng.normal(0, noise, (len(ids), 128)), 0, 255).astype(np.uint8)
 
 
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(count=st.integers(0, 40), overlap=st.integers(1, 12))
-def test_sequences_hold_each_near_pair_once(count, overlap):
+def test_sequential_pairs_contain_each_overlapping_pair_once(count, overlap):
     found = choose.sequential_pairs(count, overlap)
     proper(found, count)
     assert {(i, j) for i, j in choose.exhaustive_pairs(count) if j - i <= overlap} <= set(found)
@@ -31,13 +31,13 @@ def test_sequences_hold_each_near_pair_once(count, overlap):
     assert all(step & (step - 1) == 0 for step in far)
 
 
-def test_all_pairs():
+def test_exhaustive_pairs():
     assert choose.exhaustive_pairs(3) == [(0, 1), (0, 2), (1, 2)]
 
 
-def test_spatial_takes_the_nearest_on_the_ground_and_skips_the_unplaced():
+def test_spatial_pairs_use_horizontal_distance_and_skip_photographs_without_gps():
     # 55.7 degrees north: a degree of longitude is 0.56 of one of latitude. From 0, photograph 2
-    # (0.0015 degrees east, 94 m) is nearer than 3 (0.001 north, 111 m). Altitudes mislead.
+    # (0.0015 degrees east, 94 m) is nearer than 3 (0.001 north, 111 m). Altitudes are ignored.
     gps = [(55.7, 13.1, 0.0), None, (55.7, 13.1015, 900.0), (55.701, 13.1, 0.0)]
     found = choose.spatial_pairs(gps, 1)
     proper(found, 4)
@@ -46,16 +46,16 @@ def test_spatial_takes_the_nearest_on_the_ground_and_skips_the_unplaced():
     assert choose.spatial_pairs([None, (1.0, 1.0, 0.0)], 3) == []
 
 
-def test_proximity_prefers_cameras_that_look_the_same_way():
+def test_proximity_pairs_prefer_similar_viewing_directions():
     centres = np.array([[0.0, 0, 0], [0.1, 0, 0], [1.0, 0, 0], [1.2, 0, 0]])
     directions = np.array([[0.0, 0, 1], [0, 0, -1], [0, 0, 1], [0, 0, 1]])
     found = choose.proximity_pairs(centres, directions, 2)
     proper(found, 4)
-    # Camera 1 is nearest to 0, but looks away from all others.
+    # Camera 1 is nearest to 0, but faces the opposite direction.
     assert found == [(0, 2), (0, 3), (2, 3)]
 
 
-def test_retrieval_finds_the_photographs_that_share_points():
+def test_retrieval_pairs_share_points():
     rng = np.random.default_rng(0)
     photographs = [
         descriptors(rng, rng.permutation(np.arange(start, start + 200)))
@@ -78,7 +78,7 @@ def test_retrieval_scores_equal_plain_mutual_nearest_neighbours():
         for j, second in enumerate(photographs[:i]):
             expected = 0
             if len(first) and len(second) > 1:
-                # The chooser takes the ratio on the side of the photograph that comes first.
+                # The ratio test is applied to the descriptors of the first photograph.
                 a, b = second.astype(float), first.astype(float)
                 squared = ((a[:, None] - b[None]) ** 2).sum(-1)
                 for row, near in enumerate(squared.argmin(1)):
@@ -88,16 +88,15 @@ def test_retrieval_scores_equal_plain_mutual_nearest_neighbours():
                 assert score[i, j] == expected, (i, j)
 
 
-def test_the_spanning_tree_keeps_a_chain_together():
-    # Each photograph shares most with its left neighbour: the best one alone would leave pairs
-    # (0,1), (2,3)... apart where the sharing alternates in strength.
+def test_the_spanning_tree_keeps_the_view_graph_connected():
+    # The best neighbour alone gives (0, 1) and (2, 3), which are not connected.
     rng = np.random.default_rng(2)
     ids = [np.r_[0:100], np.r_[20:100, 500:520], np.r_[500:520, 600:680], np.r_[600:680, 700:720]]
     photographs = [descriptors(rng, i) for i in ids]
     assert choose.retrieval_pairs(photographs, 1) == [(0, 1), (1, 2), (2, 3)]
 
 
-def test_loops_close_only_beyond_the_overlap():
+def test_loop_closures_are_beyond_the_overlap():
     rng = np.random.default_rng(3)
     ids = [np.r_[0:80], np.r_[40:120], np.r_[300:380], np.r_[0:80]]
     photographs = [descriptors(rng, i) for i in ids]
@@ -107,7 +106,7 @@ def test_loops_close_only_beyond_the_overlap():
 
 
 @pytest.mark.parametrize("count", [0, 1])
-def test_too_few_photographs_have_no_pairs(count):
+def test_fewer_than_two_photographs_have_no_pairs(count):
     few = [np.zeros((5, 128), np.uint8)] * count
     assert choose.retrieval_pairs(few, 5) == []
     assert choose.proximity_pairs(np.zeros((count, 3)), np.zeros((count, 3)), 5) == []

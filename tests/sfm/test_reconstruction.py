@@ -1,4 +1,4 @@
-"""From photographs to poses: right, the same for any threads, and never silently wrong."""
+"""From photographs to poses: accuracy, independence of the number of threads, quality check."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ def room(tmp_path_factory):
     return folder, photos, truth, features(folder, photos)
 
 
-def test_poses_are_right_and_bytes_equal_on_one_and_two_threads(room, tmp_path):
+def test_poses_are_accurate_and_files_do_not_depend_on_threads(room, tmp_path):
     _, photos, truth, found = room
     manifest = corner.manifest(photos)
     for threads in (1, 2):
@@ -59,12 +59,12 @@ def test_poses_are_right_and_bytes_equal_on_one_and_two_threads(room, tmp_path):
     assert len(model.points) == report["num_points"] > 500
     error = pose_error(model, truth)
     assert error.rotation_median_deg < 0.1 and error.centre_relative_median < 0.003
-    # Coloured like the textures, not grey.
+    # Points have the colours of the textures.
     assert model.points.rgb.astype(float).std(axis=0).min() > 20
 
 
 @pytest.mark.slow
-def test_global_mapping_is_right_and_bytes_equal_on_one_and_two_threads(room, tmp_path):
+def test_global_mapping_is_accurate_and_does_not_depend_on_threads(room, tmp_path):
     _, photos, truth, found = room
     manifest, config = corner.manifest(photos), schema.Sfm(mapper="global")
     run_isolated(jobs.match, manifest, found, tmp_path / "matches")
@@ -82,7 +82,7 @@ def test_global_mapping_is_right_and_bytes_equal_on_one_and_two_threads(room, tm
 
 
 @pytest.mark.slow
-def test_two_scenes_in_one_folder_give_the_larger_and_say_so(room, tmp_path):
+def test_of_two_scenes_in_one_folder_the_larger_is_used_with_a_warning(room, tmp_path):
     folder, photos, _, _ = room
     others, _ = corner.write_scene(tmp_path / "photos", 4, seed=2, prefix="other ")
     both = [*photos, *others]
@@ -94,25 +94,27 @@ def test_two_scenes_in_one_folder_give_the_larger_and_say_so(room, tmp_path):
     )
     assert matched["components"] == [8, 4]
     assert matched["isolated"] == [photo.name for photo in others]
-    assert "fall into 2 sets" in matched["warnings"][0] and "8 of 12" in matched["warnings"][0]
+    assert (
+        "into 2 separate groups" in matched["warnings"][0] and "8 of 12" in matched["warnings"][0]
+    )
     assert report["registered"] == 8 and report["other_models"] == [4]
     assert report["not_registered"] == [photo.name for photo in others]
     assert report["verdict"] == "weak"
     assert len(read_model(tmp_path / "sfm" / "other_models" / "1").images) == 4
 
 
-def test_photographs_of_nothing_in_common_end_in_one_message(tmp_path):
+def test_photographs_without_overlap_are_an_error(tmp_path):
     photos = []
     for seed in range(3):
         photos += corner.write_scene(tmp_path / "p", 1, seed=20 + seed, prefix=f"{seed} ")[0]
-    with pytest.raises(UserError, match="no two of the 3 photographs show the same thing") as e:
+    with pytest.raises(UserError, match="no two of the 3 photographs overlap") as e:
         run_isolated(
             jobs.match, corner.manifest(photos), features(tmp_path, photos), tmp_path / "m"
         )
     assert e.value.fix is not None
 
 
-def test_photographs_without_features_end_in_the_same_message(tmp_path):
+def test_photographs_without_features_are_the_same_error(tmp_path):
     tmp_path.joinpath("p").mkdir()
     photos = []
     for name in ("a.png", "b.png"):
@@ -130,7 +132,7 @@ def test_photographs_without_features_end_in_the_same_message(tmp_path):
 
 
 @pytest.mark.slow
-def test_a_camera_that_only_turns_is_no_reconstruction(tmp_path):
+def test_pure_rotation_is_an_error(tmp_path):
     rotation, translation = corner.poses(3)[1]
     photos = []
     for index, angle in enumerate(np.radians([-8, -4, 0, 4, 8])):
@@ -159,7 +161,7 @@ def test_a_photograph_missing_from_the_database_is_named(room, tmp_path):
         )
 
 
-def test_cameras_are_shared_as_configured_with_their_priors(room):
+def test_cameras_are_shared_as_configured_with_median_priors(room):
     _, photos, _, _ = room
     facts = [("a", 300.0), ("a", 380.0), ("a", 400.0), ("b", None)]
     manifest = corner.manifest(
@@ -169,15 +171,15 @@ def test_cameras_are_shared_as_configured_with_their_priors(room):
         ]
     )
     cameras = run_isolated(jobs.planned_cameras, manifest, ["group", "single", "image"])
-    # The prior of a group is the median of its photographs'; without any it is a guess.
+    # The prior of a group is the median of its photographs' priors; the default without any.
     assert cameras["group"] == [("SIMPLE_RADIAL", 380.0, True), ("SIMPLE_RADIAL", 480.0, False)]
     assert cameras["single"] == [("SIMPLE_RADIAL", 380.0, True)]
     assert [focal for _, focal, _ in cameras["image"]] == [300.0, 380.0, 400.0, 480.0]
 
 
-def test_known_poses_get_points_and_stay_as_they_are(room, tmp_path):
+def test_known_poses_are_triangulated_and_unchanged(room, tmp_path):
     _, photos, truth, _ = room
-    # Given at half the size, as with images_2; one image has no photograph.
+    # Cameras of half the size, as for images_2; one image has no photograph.
     half = replace(truth, cameras={1: corner.camera().resized(200, 150)})
     write_model(tmp_path / "given", half)
     report = triangulate(
@@ -232,13 +234,13 @@ def test_two_photographs_are_enough(room, tmp_path):
     names = set(model.by_name())
     pair = replace(truth, images={i: v for i, v in truth.images.items() if v.name in names})
     error = pose_error(model, pair)
-    # Two views with an unknown focal length determine it badly: the rotation tells enough.
+    # Two views hardly determine the focal length: only the rotation is checked.
     assert error.rotation_median_deg < 5
 
 
-def test_sharing_cameras_by_size_saves_photographs_with_wrong_priors(tmp_path):
+def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
     photos, truth = corner.write_scene(tmp_path / "photos", 5)
-    # Few features, or mapping recovers from the priors by itself.
+    # With more features, mapping recovers from the priors by itself.
     found = tmp_path / "features"
     few = schema.Features(max_features=600)
     extract_features(corner.manifest(photos), few, found, cache=tmp_path / "cache", threads=2)
@@ -269,7 +271,7 @@ GOOD = Evidence(
     explained_matches=0.9,
     agreeing_matches=0.99,
     agreeing_pairs=1.0,
-    strangers=0.02,
+    missing_covisibility=0.02,
     behind_camera=0.0,
     parallax=0.05,
     median_angle_deg=12.0,
@@ -292,21 +294,21 @@ GOOD = Evidence(
         ({"observations_per_image": 8}, "failed", "only 8 points"),
         ({"observations_per_image": 40}, "weak", "only 40 points"),
         ({"focal_off": 2.5}, "good", None),
-        ({"focal_off": 1.5, "focal_certainty": 0.02}, "weak", "1.5 times off"),
-        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "hardly tell the focal length"),
+        ({"focal_off": 1.5, "focal_certainty": 0.02}, "weak", "by a factor of 1.5"),
+        ({"focal_off": None, "focal_certainty": 0.02}, "weak", "hardly determine the focal length"),
         ({"agreeing_pairs": 0.8}, "failed", "20% of the strongest pairs"),
         ({"agreeing_pairs": 0.95}, "weak", "5% of the strongest pairs"),
-        ({"strangers": 0.5}, "failed", "50% of neighbouring"),
-        ({"strangers": 0.25}, "weak", "25% of neighbouring"),
-        ({"agreeing_pairs": 0.96, "strangers": 0.2}, "failed", "look alike"),
-        ({"focal_relative": 0.1}, "failed", "0.10 times the picture"),
+        ({"missing_covisibility": 0.5}, "failed", "50% of neighbouring"),
+        ({"missing_covisibility": 0.25}, "weak", "25% of neighbouring"),
+        ({"agreeing_pairs": 0.96, "missing_covisibility": 0.2}, "failed", "look alike"),
+        ({"focal_relative": 0.1}, "failed", "0.10 times the image"),
         ({"behind_camera": 0.2}, "failed", "20% of the points are behind"),
         ({"parallax": 0.003}, "weak", "only turned"),
         ({"parallax": 0.001}, "failed", "only turned"),
         ({"median_angle_deg": 0.5}, "weak", "hardly moved"),
     ],
 )
-def test_the_judge_by_its_evidence(change, grade, reason):
+def test_verdicts_follow_from_the_evidence(change, grade, reason):
     verdict = judge(replace(GOOD, **change), min_registered_share=0.5)
     assert verdict.grade == grade
     assert reason is None or reason in "; ".join(verdict.reasons)
@@ -316,14 +318,14 @@ def test_no_model_is_a_failure():
     assert judge(None, 0.5).grade == "failed"
 
 
-def test_a_failure_says_what_to_change_and_whether_mapping_again_may_help():
-    turned = judge(replace(GOOD, parallax=0.001), 0.5)
-    assert "move sideways" in turned.remedies[0] and not turned.curable
-    alike = judge(replace(GOOD, agreeing_pairs=0.5), 0.5)
-    assert "look alike" in alike.remedies[0] and alike.curable
-    # All that pairs link have a pose: no mapper can add those of another place.
-    apart = judge(replace(GOOD, registered=12, reachable=12), 0.5)
-    assert apart.grade == "weak" and not apart.curable
-    assert judge(replace(GOOD, registered=12), 0.5).curable
+def test_a_verdict_has_remedies_and_whether_another_attempt_may_help():
+    rotating = judge(replace(GOOD, parallax=0.001), 0.5)
+    assert "move sideways" in rotating.remedies[0] and not rotating.worth_retrying
+    repeated = judge(replace(GOOD, agreeing_pairs=0.5), 0.5)
+    assert "look alike" in repeated.remedies[0] and repeated.worth_retrying
+    # The largest connected component is registered: no mapper can add the other images.
+    complete = judge(replace(GOOD, registered=12, reachable=12), 0.5)
+    assert complete.grade == "weak" and not complete.worth_retrying
+    assert judge(replace(GOOD, registered=12), 0.5).worth_retrying
     both = judge(replace(GOOD, registered=12, parallax=0.003), 0.5)
-    assert both.grade == "weak" and not both.curable
+    assert both.grade == "weak" and not both.worth_retrying

@@ -1,4 +1,4 @@
-"""Given poses are adjusted to their tracks where their principal point was only assumed."""
+"""Known poses are refined if freeing the principal point lowers the cost."""
 
 from __future__ import annotations
 
@@ -19,24 +19,26 @@ from tests.sfm import corner
 from tests.sfm.jobs import digests
 
 COUNT, POINTS = 16, 250
-# Of the longer side, 1.5 and 1 per cent: a common phone.
+# Offset of the principal point from the image centre, pixels (1.5 and 1 per cent of the longer
+# side, as in common phones).
 OFF = np.array([-6.0, 4.0])
 
 
 def roll(degrees: float) -> np.ndarray:
-    """As hands hold a camera: what tells a shifted principal point from a turned camera."""
+    """Rotation about the optical axis: different rolls distinguish an offset principal point from
+    a rotated camera."""
     c, s = np.cos(np.radians(degrees)), np.sin(np.radians(degrees))
     return np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
 
 
 def truth(off: np.ndarray, noise_px: float, points: int = POINTS) -> Reconstruction:
-    """Cameras on an arc around points that they all see, ``noise_px`` beside where they are."""
+    """Cameras on an arc that observe all points, with Gaussian noise on the observations."""
     rng = np.random.default_rng(0)
     params = np.array([corner.FOCAL, corner.WIDTH / 2 + off[0], corner.HEIGHT / 2 + off[1], 0.0])
     images = {}
     for i, (rotation, translation) in enumerate(corner.poses(COUNT), start=1):
-        turn = roll(30 * (-1) ** i)
-        images[i] = PosedImage(f"{i:02d}.png", 1, turn @ rotation, turn @ translation)
+        about_axis = roll(30 * (-1) ** i)
+        images[i] = PosedImage(f"{i:02d}.png", 1, about_axis @ rotation, about_axis @ translation)
     xyz = rng.uniform(0, 0.8, (points, 3)) * (1, -1, -1)
     seen = []
     for image in images.values():
@@ -55,86 +57,87 @@ def truth(off: np.ndarray, noise_px: float, points: int = POINTS) -> Reconstruct
     return Reconstruction({1: camera}, images, cloud)
 
 
-def centred(model: Reconstruction) -> Reconstruction:
+def with_central_principal_point(model: Reconstruction) -> Reconstruction:
     camera = model.cameras[1]
     params = camera.params.copy()
     params[1:3] = camera.width / 2, camera.height / 2
     return replace(model, cameras={1: replace(camera, params=params)})
 
 
-def adjusted(given: Reconstruction, folder: Path, **options: Any) -> tuple[Any, Reconstruction]:
+def refined(given: Reconstruction, folder: Path, **options: Any) -> tuple[Any, Reconstruction]:
     write_model(folder / "given", given)
     report = run_isolated(_refine, folder / "given", Sfm.model_validate(options), folder / "out")
     return report, read_model(folder / "out")
 
 
 def _refine(sparse: Path, config: Sfm, out: Path) -> Any:
-    from pipeline.sfm.refine_given import refine_given
+    from pipeline.sfm.known_poses import refine_known_poses
 
-    return refine_given(sparse, config, out)
+    return refine_known_poses(sparse, config, out)
 
 
 @pytest.fixture(scope="module")
-def bent(tmp_path_factory) -> Reconstruction:
-    """What a program gives that holds the principal point in the middle: all else makes up."""
-    folder = tmp_path_factory.mktemp("bent")
-    write_model(folder / "free", centred(truth(OFF, 0.3)))
-    run_isolated(_hold, folder / "free", folder / "held")
-    return read_model(folder / "held")
+def biased(tmp_path_factory) -> Reconstruction:
+    """A model adjusted with the principal point fixed at the image centre: poses and points
+    compensate for its offset."""
+    folder = tmp_path_factory.mktemp("biased")
+    write_model(folder / "initial", with_central_principal_point(truth(OFF, 0.3)))
+    run_isolated(_adjust_fixed, folder / "initial", folder / "fixed")
+    return read_model(folder / "fixed")
 
 
-def _hold(sparse: Path, out: Path) -> None:
+def _adjust_fixed(sparse: Path, out: Path) -> None:
     import pycolmap
 
     from pipeline.sfm.models import write_model as write
     from pipeline.sfm.quiet import quiet_colmap
-    from pipeline.sfm.refine import adjust
+    from pipeline.sfm.refine import bundle_adjust
 
     quiet_colmap()
     model = pycolmap.Reconstruction(sparse)
-    adjust(model)
+    bundle_adjust(model)
     write(model, out)
 
 
-def test_a_principal_point_that_was_held_is_found_and_the_poses_with_it(bent, tmp_path):
+def test_an_offset_principal_point_and_the_poses_are_recovered(biased, tmp_path):
     true = truth(OFF, 0.0)
-    report, model = adjusted(bent, tmp_path)
+    report, model = refined(biased, tmp_path)
     assert report.freed and report.error_px < report.error_before_px
     np.testing.assert_allclose(model.cameras[1].pinhole[2:], true.cameras[1].pinhole[2:], atol=0.7)
-    before, now = pose_error(bent, true), pose_error(model, true)
+    before, now = pose_error(biased, true), pose_error(model, true)
     assert now.rotation_median_deg < 0.2 * before.rotation_median_deg
 
 
-def test_the_adjusted_model_stays_in_the_given_world(bent, tmp_path):
-    """Another scale and another place: nothing else that users have in this world may move."""
+def test_the_refined_model_stays_in_the_input_frame(biased, tmp_path):
+    """Tested at another scale and origin: other data of the user refers to the input frame."""
     far = replace(
-        bent,
+        biased,
         images={
             number: replace(
                 image, translation=40 * image.translation - image.rotation @ [300, 0, 50]
             )
-            for number, image in bent.images.items()
+            for number, image in biased.images.items()
         },
-        points=replace(bent.points, xyz=40 * bent.points.xyz + [300, 0, 50]),
+        points=replace(biased.points, xyz=40 * biased.points.xyz + [300, 0, 50]),
     )
-    report, model = adjusted(far, tmp_path)
+    report, model = refined(far, tmp_path)
     assert report.freed
     assert len(model.points) == POINTS
     moved = np.linalg.norm(model.points.xyz - far.points.xyz, axis=1)
     assert np.median(moved) < 0.1  # of 32
 
 
-@pytest.mark.parametrize("noise_px, why", [(0.3, "held"), (0.0, "exactly")])
-def test_what_gains_nothing_stays_as_it_was_given(tmp_path, noise_px, why):
-    report, _ = adjusted(truth(np.zeros(2), noise_px), tmp_path)
+@pytest.mark.parametrize("noise_px, why", [(0.3, "fixed"), (0.0, "exactly")])
+def test_a_model_without_gain_is_copied(tmp_path, noise_px, why):
+    report, _ = refined(truth(np.zeros(2), noise_px), tmp_path)
     assert not report.freed and why in " ".join(report.decisions)
     assert digests(tmp_path / "out") == digests(tmp_path / "given")
 
 
-def test_points_beyond_what_poses_need_are_adjusted_too(bent, tmp_path):
-    """With fewer tracks a photograph than there are, the others are moved between the cameras."""
-    report, all_of_them = adjusted(bent, tmp_path)
-    few = run_isolated(_refine_with, 150, tmp_path / "given", tmp_path / "few")
+def test_points_outside_the_longest_tracks_are_adjusted_too(biased, tmp_path):
+    """With a smaller limit of tracks per image, the other points follow the adjusted cameras."""
+    report, all_of_them = refined(biased, tmp_path)
+    few = run_isolated(_refine_with_limit, 150, tmp_path / "given", tmp_path / "few")
     assert report.freed and few.freed
     model = read_model(tmp_path / "few")
     assert len(model.points) == POINTS
@@ -143,22 +146,21 @@ def test_points_beyond_what_poses_need_are_adjusted_too(bent, tmp_path):
     assert np.median(apart) < 0.005
 
 
-def _refine_with(tracks: int, sparse: Path, out: Path) -> Any:
-    from pipeline.sfm import refine_given as given
+def _refine_with_limit(tracks: int, sparse: Path, out: Path) -> Any:
+    from pipeline.sfm import known_poses
 
-    given.TRACKS_PER_IMAGE = tracks
-    return given.refine_given(sparse, Sfm(), out)
+    known_poses.TRACKS_PER_IMAGE = tracks
+    return known_poses.refine_known_poses(sparse, Sfm(), out)
 
 
-def test_the_same_bytes_each_time(bent, tmp_path):
+def test_the_result_is_deterministic(biased, tmp_path):
     for name in "ab":
-        assert adjusted(bent, tmp_path / name)[0].freed
+        assert refined(biased, tmp_path / name)[0].freed
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 
 
-def test_inner_iterations_are_left_out_where_their_order_is_open(tmp_path):
-    """Two equally connected blocks of different kinds would come in the order of their addresses:
-    other bits each time."""
+def test_inner_iterations_are_used_only_if_their_block_order_is_unique(tmp_path):
+    """Ceres orders blocks with equally many neighbours by their address, which varies."""
     shared = truth(OFF, 0.3)
     own = replace(
         shared,
@@ -166,14 +168,14 @@ def test_inner_iterations_are_left_out_where_their_order_is_open(tmp_path):
         images={n: replace(image, camera_id=n) for n, image in shared.images.items()},
     )
     few = truth(OFF, 0.3, points=COUNT)
-    for name, model, clear in [("shared", shared, True), ("own", own, False), ("few", few, False)]:
+    for name, model, unique in [("shared", shared, True), ("own", own, False), ("few", few, False)]:
         write_model(tmp_path / name, model)
-        assert run_isolated(_is_clear, tmp_path / name) is clear, name
+        assert run_isolated(_is_unique, tmp_path / name) is unique, name
 
 
-def _is_clear(sparse: Path) -> bool:
+def _is_unique(sparse: Path) -> bool:
     import pycolmap
 
-    from pipeline.sfm.refine import _has_one_block_order
+    from pipeline.sfm.refine import _block_order_is_unique
 
-    return _has_one_block_order(pycolmap.Reconstruction(sparse))
+    return _block_order_is_unique(pycolmap.Reconstruction(sparse))

@@ -1,4 +1,4 @@
-"""Gaussians like those of a trained scene, and how far two of them may be apart."""
+"""Random Gaussians with typical parameters, and comparison with tolerances."""
 
 from __future__ import annotations
 
@@ -28,8 +28,8 @@ def sample(count: int = 40, degree: int = 3, seed: int = 0) -> Gaussians:
 
 @dataclass(frozen=True)
 class Within:
-    """Largest differences allowed: position, log scale, opacity, degrees of rotation, DC and
-    higher SH coefficients."""
+    """Tolerances: position, log scale, opacity, rotation in degrees, constant and higher SH
+    coefficients."""
 
     position: float
     log_scale: float
@@ -44,18 +44,18 @@ class Within:
         for array in a.values():
             assert array.dtype == np.float32 and array.flags.c_contiguous
 
-        def most(values: np.ndarray) -> float:
+        def largest(values: np.ndarray) -> float:
             return float(np.abs(values).max(initial=0.0))
 
-        assert most(a["means"] - b["means"]) <= self.position
-        assert most(a["log_scales"] - b["log_scales"]) <= self.log_scale
-        assert most(opacity(found) - opacity(expected)) <= self.opacity
-        assert most(turn(found, expected)) <= self.degrees
-        assert most(a["sh"][:, 0] - b["sh"][:, 0]) <= self.dc
-        assert most(a["sh"][:, 1:] - b["sh"][:, 1:]) <= self.higher
+        assert largest(a["means"] - b["means"]) <= self.position
+        assert largest(a["log_scales"] - b["log_scales"]) <= self.log_scale
+        assert largest(opacity(found) - opacity(expected)) <= self.opacity
+        assert largest(rotation_angle(found, expected)) <= self.degrees
+        assert largest(a["sh"][:, 0] - b["sh"][:, 0]) <= self.dc
+        assert largest(a["sh"][:, 1:] - b["sh"][:, 1:]) <= self.higher
 
 
-#: Float32 with an operation or two in between.
+#: Equal up to float32 rounding.
 EXACT = Within(1e-6, 1e-6, 1e-6, 0.05, 1e-6, 1e-6)
 
 
@@ -63,8 +63,8 @@ def opacity(gaussians: Gaussians) -> np.ndarray:
     return 1 / (1 + np.exp(-np.float64(gaussians.arrays()["opacity_logits"])))
 
 
-def turn(a: Gaussians, b: Gaussians) -> np.ndarray:
-    """(N,) degrees between the rotations; q and -q are one."""
+def rotation_angle(a: Gaussians, b: Gaussians) -> np.ndarray:
+    """(N,) degrees between the rotations; q and -q are the same rotation."""
     p, q = (np.float64(g.arrays()["quats"]) for g in (a, b))
     p, q = (v / np.linalg.norm(v, axis=1, keepdims=True) for v in (p, q))
     # The chord is exact for small angles, where the arc cosine is not.

@@ -1,4 +1,4 @@
-"""The first Gaussians: finite whatever the points, where and as large as they should be."""
+"""Initial Gaussians: finite for any points; positions, scales and rotations."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def looking_at(centre: np.ndarray, target: np.ndarray) -> View:
     return View("v", "v.png", None, 80, 60, 70.0, 70.0, 40.0, 30.0, pose, False)
 
 
-def assert_whole(gaussians: InitGaussians) -> None:
+def assert_valid(gaussians: InitGaussians) -> None:
     n = len(gaussians)
     for array in gaussians.arrays().values():
         assert array.dtype == np.float32
@@ -65,19 +65,19 @@ coordinate = st.one_of(
 
 @settings(max_examples=80, deadline=None, derandomize=True)
 @given(st.lists(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=40))
-def test_any_points_give_finite_gaussians_or_one_clear_error(rows: list) -> None:
+def test_any_points_give_finite_gaussians_or_a_user_error(rows: list) -> None:
     try:
         result = gaussians_from_points(points_at(np.array(rows)), CENTRES, Init(), 1)
     except UserError:
         return
-    assert_whole(result)
+    assert_valid(result)
     assert len(result) + result.num_dropped == len(rows)
 
 
-def test_duplicates_and_a_single_point_have_a_size() -> None:
+def test_duplicates_and_a_single_point_have_a_positive_scale() -> None:
     for xyz in (np.zeros((1, 3)), np.zeros((20, 3))):
         result = gaussians_from_points(points_at(xyz), CENTRES, Init(), 0)
-        assert_whole(result)
+        assert_valid(result)
         assert np.exp(result.log_scales).min() > 1e-5
 
 
@@ -97,15 +97,16 @@ def test_points_next_to_a_camera_and_far_outliers_are_dropped() -> None:
     assert np.allclose(result.means, good.astype(np.float32))
 
 
-def test_a_lone_point_does_not_fill_the_view() -> None:
+def test_the_scale_of_an_isolated_point_is_limited() -> None:
     cluster = np.random.default_rng(0).normal(size=(100, 3)) * 0.01
-    lone = np.array([[40.0, 0.0, 0.0]])
-    result = gaussians_from_points(points_at(np.concatenate([cluster, lone])), CENTRES, Init(), 0)
-    distance = np.linalg.norm(lone - CENTRES, axis=1).min()
+    isolated = np.array([[40.0, 0.0, 0.0]])
+    points = points_at(np.concatenate([cluster, isolated]))
+    result = gaussians_from_points(points, CENTRES, Init(), 0)
+    distance = np.linalg.norm(isolated - CENTRES, axis=1).min()
     assert np.exp(result.log_scales[-1, 0]) <= MAX_ANGLE * distance * 1.0001
 
 
-def test_thinning_keeps_the_number_asked_for_and_is_repeatable() -> None:
+def test_thinning_keeps_max_points_and_is_deterministic() -> None:
     xyz = np.random.default_rng(0).normal(size=(500, 3))
     first = gaussians_from_points(points_at(xyz), CENTRES, Init(max_points=50), 0)
     again = gaussians_from_points(points_at(xyz), CENTRES, Init(max_points=50), 0)
@@ -114,39 +115,38 @@ def test_thinning_keeps_the_number_asked_for_and_is_repeatable() -> None:
     assert np.array_equal(first.means, again.means)
 
 
-def test_first_axes_stand_on_the_surface_and_turn_with_it() -> None:
-    """What is to be a disc on a wall need not turn first, however the world is turned."""
+def test_first_axes_are_surface_normals_in_any_world_frame() -> None:
     rng = np.random.default_rng(2)
     wall = np.column_stack([rng.uniform(-1, 1, (200, 2)), 0.01 * rng.normal(size=200)])
-    turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-    turn *= np.sign(np.linalg.det(turn))
+    other = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+    other *= np.sign(np.linalg.det(other))
     normals = []
-    for rotation in (np.eye(3), turn):
+    for rotation in (np.eye(3), other):
         result = gaussians_from_points(points_at(wall @ rotation.T), CENTRES, Init(), 0)
         axes = quat_to_rotation(result.quats.astype(np.float64))
         assert np.allclose(np.linalg.det(axes), 1.0)
         normals.append(axes[:, :, 0])
-    along = np.abs(np.einsum("ni,ni->n", normals[0] @ turn.T, normals[1]))
-    assert np.allclose(along, 1.0, atol=1e-6)
+    cosine = np.abs(np.einsum("ni,ni->n", normals[0] @ other.T, normals[1]))
+    assert np.allclose(cosine, 1.0, atol=1e-6)
     assert np.median(np.abs(normals[0][:, 2])) > 0.99
 
 
-def test_no_point_left_is_a_clear_error() -> None:
+def test_no_usable_point_is_a_user_error() -> None:
     with pytest.raises(UserError, match="none is usable"):
         gaussians_from_points(points_at(np.full((3, 3), np.nan)), CENTRES, Init(), 0)
     with pytest.raises(UserError, match="none is usable"):
         gaussians_from_points(Points.empty(), CENTRES, Init(), 0)
 
 
-def test_random_start_fills_what_inward_cameras_share() -> None:
+def test_random_gaussians_of_inward_facing_cameras() -> None:
     target = np.array([3.0, -2.0, 7.0])
     directions = np.random.default_rng(0).normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     views = [looking_at(target + 4.0 * d, target) for d in directions]
     result = gaussians_random(views, Init(num_random=500), 2, seed=1)
-    assert_whole(result)
+    assert_valid(result)
     assert result.sh.shape == (500, 9, 3)
-    # Every second stands in the cameras' common ball, the others anywhere about them.
+    # Every second Gaussian is in the ball inside all views, the others in the cube.
     inner, others = result.means[::2], result.means[1::2]
     assert np.allclose(inner.mean(0), target, atol=0.3)
     assert np.abs(others - target).max() > 2 * 4.0
@@ -161,8 +161,8 @@ def test_random_start_fills_what_inward_cameras_share() -> None:
     assert not np.array_equal(result.means, other.means)
 
 
-def test_random_start_of_cameras_looking_ahead_lies_in_front_of_them() -> None:
+def test_random_gaussians_of_forward_facing_cameras_are_in_front_of_them() -> None:
     views = [looking_at(np.array([0.1 * i, 0.0, 0.0]), np.array([0.1 * i, 0, 9])) for i in range(5)]
     result = gaussians_random(views, Init(num_random=300), 0, seed=1)
-    assert_whole(result)
+    assert_valid(result)
     assert (result.means[:, 2] > 0).all()

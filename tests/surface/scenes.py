@@ -29,7 +29,7 @@ def rays(view: View) -> np.ndarray:
 
 
 class Maps:
-    """What ``DepthMaps`` is to the fusion, without Gaussians and files."""
+    """Replaces ``DepthMaps``, without Gaussians and files."""
 
     def __init__(self, maps: list[DepthMap]):
         self._maps = maps
@@ -42,7 +42,7 @@ class Maps:
 
 
 def ball(radius=1.0, views=14, size=96) -> Maps:
-    """A ball at the origin, red where x > 0, blue elsewhere, nothing around it."""
+    """A ball at the origin, red for x > 0, blue elsewhere, on an empty background."""
     maps = []
     for i in range(views):
         # Fibonacci's sphere: no direction is left out.

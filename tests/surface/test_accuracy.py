@@ -1,4 +1,4 @@
-"""The benchmark's measure, and the fusion measured by it on exact depths of the demo scene."""
+"""The accuracy measure of the benchmark, and fusion of exact depth maps of the demo scene."""
 
 from __future__ import annotations
 
@@ -14,18 +14,18 @@ from tests.surface.scenes import demo_room
 
 @pytest.fixture
 def few_samples(monkeypatch):
-    """Enough for the middle of the room."""
+    """Few enough to be fast."""
     monkeypatch.setattr(surface, "SAMPLES", 60_000)
 
 
 def middle(mesh):
-    """The faces near what the cameras look at."""
+    """The faces near the focus of the cameras."""
     near = np.linalg.norm(mesh.vertices[mesh.faces[:, 0]] - FOCUS, axis=1) < 1.3
     return mesh.faces[near]
 
 
-def test_signed_distances_are_those_of_the_shapes_that_rays_hit():
-    """Zero where rays hit, and as far as one goes along the normal."""
+def test_signed_distances_agree_with_ray_hits():
+    """Zero at hits, and equal to the offset along the normal."""
     rng = np.random.default_rng(0)
     origin = np.array([[1.9], [-1.4], [1.3]])
     direction = np.array([[0.0], [0.0], [0.45]]) - origin + 0.4 * rng.normal(size=(3, 4000))
@@ -44,8 +44,8 @@ def test_signed_distances_are_those_of_the_shapes_that_rays_hit():
         assert (shape.distance(at - 0.01 * normal) < 0).all()
 
 
-def test_exact_depths_give_the_demo_scene_its_surface(few_samples):
-    """In another frame and scale, as structure from motion has it."""
+def test_exact_depths_reconstruct_the_demo_scene(few_samples):
+    """In an arbitrary frame and scale, as from structure from motion."""
     maps, views = demo_room(views=12, width=120, height=90)
     frame = Similarity(1.0, np.eye(3), np.zeros(3))
     mesh, _ = build_mesh(maps, 0.04, threads=2)
@@ -59,7 +59,7 @@ def test_exact_depths_give_the_demo_scene_its_surface(few_samples):
     assert np.isclose(again["foreground"].median, found["foreground"].median, rtol=1e-3)
 
 
-def test_the_measure_sees_a_shift_and_a_hole(few_samples):
+def test_the_measure_detects_a_shift_and_a_hole(few_samples):
     maps, views = demo_room(views=6, width=80, height=60)
     frame = Similarity(1.0, np.eye(3), np.zeros(3))
     truth = true_points(views, frame)

@@ -1,4 +1,4 @@
-"""PLY and GLB as other programs read them: by their own words alone."""
+"""PLY and GLB files, read back by their headers alone."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def mesh():
     )
 
 
-def test_ply_header_says_what_follows(tmp_path, mesh):
+def test_ply_header_describes_the_data(tmp_path, mesh):
     write_mesh_ply(tmp_path / "mesh.ply", mesh)
     header, body = (tmp_path / "mesh.ply").read_bytes().split(b"end_header\n", 1)
     lines = header.decode().splitlines()

@@ -1,4 +1,4 @@
-"""Fusion and meshing of exact depth maps: shape, closedness, colours, bounds, same bits."""
+"""Fusion and meshing of exact depth maps: shape, closedness, colours, memory bound, threads."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 import pipeline.surface.tsdf as tsdf
-from pipeline.surface.mesh import build_mesh, drop_small
+from pipeline.surface.mesh import build_mesh, remove_small_pieces
 from tests.surface.scenes import Maps, ball, view_at
 
 
@@ -73,8 +73,8 @@ def test_voxels_grow_until_they_fit(maps, monkeypatch):
     assert np.median(np.abs(np.linalg.norm(mesh.vertices, axis=1) - 1)) < 0.5 * grid.voxel
 
 
-def test_what_no_view_knows_has_no_surface(maps):
-    """Masked pixels (depth 0) on one side leave a hole there, and no lid over it."""
+def test_unobserved_regions_have_no_surface(maps):
+    """Masked pixels (depth 0) on one side leave a hole."""
     hidden = []
     for depth in maps:
         red = depth.rgb[..., 0] > 0
@@ -89,8 +89,8 @@ def test_no_depth_no_mesh(maps):
     assert build_mesh(Maps(blank), None, threads=1) == (None, None)
 
 
-def test_one_view_that_dreams_a_surface_is_outvoted(maps):
-    """A floater in a single view: the others see through it, and it is too small to stay."""
+def test_a_floater_in_one_view_is_removed(maps):
+    """The other views see free space there, and the piece is small."""
     first, *rest = maps
     depth = first.depth.copy()
     depth[40:44, 2:6] = 1.5
@@ -98,16 +98,16 @@ def test_one_view_that_dreams_a_surface_is_outvoted(maps):
     assert np.linalg.norm(mesh.vertices, axis=1).max() < 1.1
 
 
-def test_small_pieces_go_and_faces_still_name_their_corners():
+def test_small_pieces_are_removed_and_faces_reindexed():
     vertices = np.arange(21, dtype=float).reshape(7, 3)
     faces = np.array([[4, 5, 6], [0, 1, 2], [1, 2, 3]])
-    kept, triangles = drop_small(vertices, faces, 2)
+    kept, triangles = remove_small_pieces(vertices, faces, 2)
     assert np.array_equal(kept, vertices[:4])
     assert np.array_equal(triangles, [[0, 1, 2], [1, 2, 3]])
 
 
-def test_far_away_things_stretch_no_voxels(maps):
-    """A wall fifty times as far as the ball: the grid stays by the ball, and so does the mesh."""
+def test_distant_surfaces_do_not_enlarge_the_voxels(maps):
+    """A wall fifty times as far as the ball: grid and mesh contain the ball only."""
     behind = [replace(d, depth=np.where(np.isinf(d.depth), np.float32(150), d.depth)) for d in maps]
     near = [replace(d, depth=np.where(d.depth > 100, np.float32(0), d.depth)) for d in behind]
     with_wall, grid = build_mesh(Maps(behind + near), 0.03, threads=1)
@@ -115,8 +115,8 @@ def test_far_away_things_stretch_no_voxels(maps):
     assert np.linalg.norm(with_wall.vertices, axis=1).max() < 1.1
 
 
-def test_a_camera_inside_the_grid_sees_only_what_is_before_it():
-    """Blocks beside and behind a camera between two walls project to nowhere."""
+def test_a_camera_inside_the_grid_updates_only_blocks_in_front():
+    """Blocks beside and behind a camera between two walls are not projected."""
     maps = []
     for sign in (1.0, -1.0):
         for shift in (-0.2, 0.0, 0.2):

@@ -1,4 +1,4 @@
-"""Drawn from real Gaussians to real files: depth maps, renders, mesh, video."""
+"""Depth maps, renders, mesh and video of real Gaussians, read back from files."""
 
 from __future__ import annotations
 
@@ -16,8 +16,8 @@ import pipeline.surface.video as video
 from pipeline.config.schema import Split, Train
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.splats.gaussians import Gaussians
-from pipeline.surface.depth import DepthMaps, Pictures
-from pipeline.surface.outputs import write_drawn
+from pipeline.surface.depth import DepthMaps, RenderCache
+from pipeline.surface.outputs import write_rendered
 from tests.surface.scenes import view_at
 
 UP = np.array([0.0, 0.0, 1.0])
@@ -25,7 +25,7 @@ UP = np.array([0.0, 0.0, 1.0])
 
 @pytest.fixture(scope="module")
 def ball():
-    """Opaque flat Gaussians all over the unit ball."""
+    """Opaque flat Gaussians on the unit sphere."""
     i = np.arange(3000)
     z = 1 - (2 * i + 1) / len(i)
     angle = i * np.pi * (3 - np.sqrt(5))
@@ -44,7 +44,7 @@ def ball():
 
 @pytest.fixture
 def views(tmp_path):
-    """A dozen views around the ball, two of one name but for the suffix, one of them masked."""
+    """A dozen views around the ball, two with equal names but for the suffix, one masked."""
     found = []
     for i in range(12):
         a, b = i * np.pi / 6, (-0.9, 0.0, 0.9)[i % 3]
@@ -68,7 +68,7 @@ def look(views):
 
 def test_depth_maps_and_renders_open_in_other_programs(tmp_path, ball, views):
     out = tmp_path / "out"
-    write_drawn(out, {"depths", "renders"}, ball, views, look(views), up=UP, mesh_voxel=None)
+    write_rendered(out, {"depths", "renders"}, ball, views, look(views), up=UP, mesh_voxel=None)
     names = {str(p.relative_to(out)) for p in out.rglob("*") if p.is_file()}
     assert len(names) == 3 * len(views)
     assert {"depths/median/a/00.jpg.tiff", "depths/median/a/00.png.tiff"} <= names
@@ -84,12 +84,12 @@ def test_depth_maps_and_renders_open_in_other_programs(tmp_path, ball, views):
     assert picture[40, 40, 0] > 180 > 100 > picture[40, 40, 2]
 
 
-def test_masks_alpha_and_held_out_views_in_depth_maps(tmp_path, ball, views):
+def test_masks_alpha_and_test_views_in_depth_maps(tmp_path, ball, views):
     clear = np.zeros((80, 80, 4), np.uint8)
     clear[30:, :, 3] = 255
     Image.fromarray(clear).save(tmp_path / "alpha.png")
     views[3] = replace(views[3], image=str(tmp_path / "alpha.png"))
-    pictures = Pictures(ball, views, look(views), tmp_path / "drawn")
+    pictures = RenderCache(ball, views, look(views), tmp_path / "drawn")
     maps = {depth.view.name: depth.depth for depth in DepthMaps(pictures)}
     assert len(maps) == len(DepthMaps(pictures)) == len(views) - 1
     assert "a/04.jpg" not in maps
@@ -100,8 +100,8 @@ def test_masks_alpha_and_held_out_views_in_depth_maps(tmp_path, ball, views):
 
 
 def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
-    told = write_drawn(tmp_path, {"mesh"}, ball, views, look(views), up=UP, mesh_voxel=0.05)
-    assert "triangles from 11 views" in told.decisions[0] and not told.warnings
+    messages = write_rendered(tmp_path, {"mesh"}, ball, views, look(views), up=UP, mesh_voxel=0.05)
+    assert "triangles from 11 views" in messages.decisions[0] and not messages.warnings
     data = (tmp_path / "mesh.ply").read_bytes()
     count = int(data.split(b"element vertex ")[1].split()[0])
     start = data.index(b"end_header\n") + 11
@@ -113,19 +113,19 @@ def test_mesh_of_gaussians_lies_on_them(tmp_path, ball, views):
     assert (tmp_path / "mesh.glb").stat().st_size > 1000
 
 
-def test_nothing_to_mesh_is_a_warning_and_no_file(tmp_path, ball, views):
+def test_no_surface_gives_a_warning_and_no_mesh(tmp_path, ball, views):
     faint = replace(ball, opacity_logits=torch.full((len(ball),), -6.0))
-    told = write_drawn(
+    messages = write_rendered(
         tmp_path / "out", {"mesh"}, faint, views, look(views), up=UP, mesh_voxel=None
     )
-    assert told.warnings and "no mesh" in told.warnings[0]
+    assert messages.warnings and "no mesh" in messages.warnings[0]
     assert not (tmp_path / "out" / "mesh.ply").exists()
 
 
 def test_video_and_its_path(tmp_path, ball, views, monkeypatch):
     monkeypatch.setattr(path_module, "FRAMES", 12)
     for out in ("one", "two"):
-        write_drawn(tmp_path / out, {"video"}, ball, views, look(views), up=UP, mesh_voxel=None)
+        write_rendered(tmp_path / out, {"video"}, ball, views, look(views), up=UP, mesh_voxel=None)
     one, two = (tmp_path / out / "video.mp4" for out in ("one", "two"))
     assert one.read_bytes() == two.read_bytes()
     capture = cv2.VideoCapture(str(one))
@@ -134,12 +134,12 @@ def test_video_and_its_path(tmp_path, ball, views, monkeypatch):
         frames.append(read[1])
     assert len(frames) == 12 and frames[0].shape == (40, 40, 3)
     assert frames[3][20, 20, 2] > 180, "the ball is red, and in the middle"
-    told = json.loads((tmp_path / "one" / "path.json").read_text())
-    assert len(told["world_to_camera"]) == 12
+    messages = json.loads((tmp_path / "one" / "path.json").read_text())
+    assert len(messages["world_to_camera"]) == 12
     assert sorted(p.name for p in one.parent.iterdir()) == ["path.json", "video.mp4"]
 
 
-def test_without_encoders_the_video_is_an_animated_picture(tmp_path, monkeypatch):
+def test_without_encoders_the_video_is_an_animated_webp(tmp_path, monkeypatch):
     monkeypatch.setattr(video, "_ffmpeg", lambda *_: False)
     monkeypatch.setattr(video, "_opencv", lambda *_: False)
     frames = [np.full((16, 16, 3), shade, np.uint8) for shade in (0, 120, 240)]

@@ -1,4 +1,4 @@
-"""The camera path stays smooth and where photographs were taken, whatever way they were taken."""
+"""The camera path is smooth and near the photographs, for all kinds of captures."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ def test_around_a_full_ring():
     assert abs(angle[-1] - angle[0]) > 2 * np.pi * 0.95
 
 
-def test_to_and_fro_over_an_arc_and_never_behind_the_subject():
+def test_back_and_forth_over_an_arc_and_never_behind_the_subject():
     path = camera_path(ring(120), 3.0, UP)
     check_smooth(path)
     at = centres(path)
@@ -56,8 +56,8 @@ def test_to_and_fro_over_an_arc_and_never_behind_the_subject():
     assert angle.max() - angle.min() > 60
 
 
-def test_before_a_wall():
-    """Parallel cameras: the focus is on the wall, at the depth that is told."""
+def test_facing_a_wall():
+    """Parallel cameras: the focus is on the wall, at the given depth."""
     views = [view_at((-3, y, z), (5, y, z)) for y in (-0.5, 0, 0.5) for z in (-0.2, 0.2)]
     path = camera_path(views, 4.0, UP)
     check_smooth(path)
@@ -67,8 +67,8 @@ def test_before_a_wall():
     assert np.ptp(at[:, 1]) > 0.2
 
 
-def test_out_of_a_room():
-    """Cameras that look outwards are followed in their order."""
+def test_inside_a_room():
+    """Cameras that look outwards are visited in their order."""
     angles = np.linspace(0, 2 * np.pi, 20, endpoint=False)
     views = [
         view_at((0.3 * np.cos(a), 0.3 * np.sin(a), 1), (9 * np.cos(a), 9 * np.sin(a), 1))

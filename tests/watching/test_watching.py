@@ -1,4 +1,4 @@
-"""Watching from outside: the newest state, as the right camera sees it; curves arrive."""
+"""Monitoring of a training: newest state, cameras, the page, TensorBoard curves."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
 from pipeline.training.loop.metrics_log import NAME
-from pipeline.watching.server import Page, Room, picture_size
+from pipeline.watching.server import Page, ViewerFrame, picture_size
 from pipeline.watching.source import Source
 from tests.tools import need_package
 from tests.training.conftest import FOCAL, HEIGHT, WIDTH, ball, camera_at
@@ -28,7 +28,7 @@ from tests.training.conftest import FOCAL, HEIGHT, WIDTH, ball, camera_at
 
 @pytest.fixture
 def scene(tmp_path: Path) -> Path:
-    """A run's folder with cameras, as it is while training."""
+    """A folder of a running training, with cameras."""
     folder = tmp_path / "results" / "ball"
     poses = {}
     for index in range(4):
@@ -61,38 +61,38 @@ def test_the_newest_state_is_shown(scene: Path) -> None:
         Source(scene, None)
     add_checkpoint(scene, 10, 30, 1000)
     source = Source(scene, None)
-    assert source.shown.told == "step 10, 30 Gaussians"
-    assert not source.renew()
+    assert source.shown.summary == "step 10, 30 Gaussians"
+    assert not source.refresh()
     add_checkpoint(scene, 20, 40, 2000)
     add_journal(scene, 5)
-    assert source.renew()
-    assert source.shown.told == "step 20, 40 Gaussians, PSNR 25.00 dB, 50% done"
+    assert source.refresh()
+    assert source.shown.summary == "step 20, 40 Gaussians, PSNR 25.00 dB, 50% done"
     (scene / "train").mkdir()
     ball(50, 1).save(scene / "train" / "gaussians.npz")
-    assert source.renew()
-    assert source.shown.told == "50 Gaussians, trained"
-    # Snakemake removes what it makes anew: the last state stays in sight.
+    assert source.refresh()
+    assert source.shown.summary == "50 Gaussians, trained"
+    # Snakemake removes outputs before it recreates them: the last state is still shown.
     (scene / "train" / "gaussians.npz").unlink()
     for file in (scene / ".scratch").rglob("checkpoint_*"):
         file.unlink()
-    assert not source.renew()
+    assert not source.refresh()
 
 
-def test_a_file_of_gaussians_wants_cameras(scene: Path, tmp_path: Path) -> None:
+def test_a_file_of_gaussians_needs_cameras(scene: Path, tmp_path: Path) -> None:
     file = tmp_path / "scene.ply"
     write_splat_ply(file, ball(20, 1))
-    with pytest.raises(UserError, match="says nothing about cameras"):
+    with pytest.raises(UserError, match="contains no cameras"):
         Source(file, None)
     assert len(Source(file, scene).shown.gaussians) == 20
 
 
-def test_a_camera_of_the_browser_is_the_one_of_the_scene() -> None:
+def test_cameras_convert_between_viewer_and_scene() -> None:
     views = [camera_at(angle) for angle in (0.3, 1.7, 4.0)]
-    room = Room(views)
+    frame = ViewerFrame(views)
     for view in views:
-        placed = room.from_world(view.centre)
+        placed = frame.from_world(view.centre)
         assert np.linalg.norm(placed) <= 1 + 1e-12
-        again = room.view(
+        again = frame.view(
             rotation_to_quat(view.world_to_camera[:3, :3].T),
             placed,
             2 * np.arctan(HEIGHT / 2 / FOCAL),
@@ -104,7 +104,7 @@ def test_a_camera_of_the_browser_is_the_one_of_the_scene() -> None:
 
 
 @pytest.mark.parametrize(("aspect", "size"), [(2.0, (100, 50)), (0.5, (50, 100)), (1e-4, (1, 100))])
-def test_a_picture_has_the_windows_shape(aspect: float, size: tuple[int, int]) -> None:
+def test_picture_size_follows_the_aspect_ratio(aspect: float, size: tuple[int, int]) -> None:
     assert picture_size(aspect, 100) == size
 
 
@@ -119,12 +119,12 @@ def test_the_page_is_served_and_renders(scene: Path) -> None:
         assert picture.shape == (HEIGHT, WIDTH, 3)
         assert picture.max() > 50
         start = np.asarray(page.server.initial_camera.position)
-        np.testing.assert_allclose(start, page.room.from_world(page.source.views[1].centre))
+        np.testing.assert_allclose(start, page.frame.from_world(page.source.views[1].centre))
     finally:
         page.stop()
 
 
-def test_curves_arrive_in_tensorboard(
+def test_curves_are_written_for_tensorboard(
     scene: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     need_package("tensorboard")

@@ -1,4 +1,4 @@
-"""A model's frame, found and applied: what ``georeference`` computes, in pycolmap's hands."""
+"""Align a pycolmap model to the world: by ground control points, GPS, or to a level frame."""
 
 from __future__ import annotations
 
@@ -15,26 +15,26 @@ from pipeline.geometry.up_direction import up_direction
 from pipeline.io.gcp import GCP_FILE, read_ground_control
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.georeference import Cameras, Frame, from_gcp, from_gps, level
+from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
 
 Georeference = Literal["auto", "gps", "gcp", "none"]
 
-# Rays that meet at less than this angle say too little about where.
+# Smallest angle between the rays of a triangulated ground control point.
 MIN_RAY_ANGLE_DEG = 1.0
 
 
-def place(
-    model: pycolmap.Reconstruction, manifest: Manifest, wanted: Georeference, control: Path | None
-) -> Frame:
-    """Move ``model`` to the best frame there is and return it.
+def align_model(
+    model: pycolmap.Reconstruction, manifest: Manifest, method: Georeference, control: Path | None
+) -> WorldFrame:
+    """Transform ``model`` into a world frame and return that frame.
 
     Args:
-        wanted: "auto" takes ground control points, else GPS, else a level frame; "gcp" and "gps"
-            warn where they must fall back, "none" does not look.
+        method: "auto" uses ground control points if there are any, else GPS, else a level frame.
+            "gcp" and "gps" fall back to a level frame with a warning. "none" is the level frame.
         control: the scene's ``gcp_list.txt``, None without one.
 
     Raises:
-        UserError: a malformed ``gcp_list.txt``; "gcp" without one.
+        UserError: ``gcp_list.txt`` is malformed, or ``method`` is "gcp" and there is none.
     """
     photos = {photo.name: photo for photo in manifest.photos}
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
@@ -44,31 +44,32 @@ def place(
         centres=np.stack([image.projection_center() for image in images]),
         up=up_direction(rotations, [photos[image.name].orientation for image in images]),
     )
-    refused: list[str] = []
-    frame: Frame | str | None = None
-    if wanted == "gcp" and control is None:
+    fallbacks: list[str] = []
+    frame: WorldFrame | str | None = None
+    if method == "gcp" and control is None:
         raise UserError(
             "sfm.georeference is gcp, but there are no ground control points",
             file=GCP_FILE,
             fix="put the file into the scene folder, or set sfm.georeference: auto",
         )
-    if wanted in ("auto", "gcp") and control is not None:
+    if method in ("auto", "gcp") and control is not None:
         points = read_ground_control(control, photos)
         frame = from_gcp(points, partial(_triangulate, model))
         if isinstance(frame, str):
-            refused.append(f"not georeferenced by ground control points: {frame}")
+            fallbacks.append(f"not georeferenced by ground control points: {frame}")
     positions = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
-    if not isinstance(frame, Frame) and wanted != "none" and (positions or wanted == "gps"):
+    if not isinstance(frame, WorldFrame) and method != "none" and (positions or method == "gps"):
         frame = from_gps(cameras, positions)
         if isinstance(frame, str):
-            refused.append(f"not georeferenced by GPS: {frame}")
-    found = frame if isinstance(frame, Frame) else level(cameras)
-    found.warnings[:0] = refused
-    apply(model, found.similarity)
+            fallbacks.append(f"not georeferenced by GPS: {frame}")
+    found = frame if isinstance(frame, WorldFrame) else level(cameras)
+    found.warnings[:0] = fallbacks
+    transform_model(model, found.similarity)
     return found
 
 
-def apply(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+def transform_model(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
+    """Apply a similarity to the poses and points of ``model``."""
     model.transform(
         pycolmap.Sim3d(
             similarity.scale, pycolmap.Rotation3d(similarity.rotation), similarity.translation
@@ -79,17 +80,18 @@ def apply(model: pycolmap.Reconstruction, similarity: Similarity) -> None:
 def _triangulate(
     model: pycolmap.Reconstruction, seen: dict[str, tuple[float, float]]
 ) -> NDArray[np.float64] | None:
-    """(3,) nearest to the rays through the photographs' pixels."""
+    """(3,) point closest to the rays through pixels of photographs (name -> pixel), by least
+    squares; None if fewer than two are registered or the rays are nearly parallel."""
     by_name = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
     centres, rays = [], []
     for name, pixel in sorted(seen.items()):
         if name not in by_name:
             continue
         image = by_name[name]
-        plane = model.camera(image.camera_id).cam_from_img(np.array(pixel, np.float64))
-        if plane is None:
+        normalized = model.camera(image.camera_id).cam_from_img(np.array(pixel, np.float64))
+        if normalized is None:
             continue
-        ray = image.cam_from_world().rotation.matrix().T @ np.append(plane, 1.0)
+        ray = image.cam_from_world().rotation.matrix().T @ np.append(normalized, 1.0)
         centres.append(image.projection_center())
         rays.append(ray / np.linalg.norm(ray))
     if len(rays) < 2:

@@ -1,11 +1,11 @@
-"""A made scene: a wall, and cameras that see parts of it."""
+"""Synthetic scenes of Gaussians, and cameras that see parts of them."""
 
 from __future__ import annotations
 
 import numpy as np
 import torch
 
-from pipeline.coverage.probe_views import Draw
+from pipeline.coverage.probe_views import Renderer
 from pipeline.render import RasterOptions
 from pipeline.render.views import Render, render_view
 from pipeline.scene.views import View
@@ -63,8 +63,8 @@ def _discs(means: np.ndarray, size: float, *, flat: bool = True) -> Gaussians:
     )
 
 
-def drawer(gaussians: Gaussians, threads: int = 1) -> Draw:
-    def draw(view: View) -> Render:
+def renderer(gaussians: Gaussians, threads: int = 1) -> Renderer:
+    def render(view: View) -> Render:
         return render_view(gaussians, view, RasterOptions(threads=threads))
 
-    return draw
+    return render

@@ -1,4 +1,4 @@
-"""A pycolmap model is moved to where ground control points, GPS or the cameras put it."""
+"""Models are aligned by ground control points, GPS or the orientation of the cameras."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from tests.sfm import corner
 from tests.sfm.test_georeference import geodetic
 
 COUNT = 8
-# The room's corner (y down, x to the east), eighty metres across instead of two.
+# From the frame of ``corner`` (y down) to metres east, north, up, forty times as large.
 TO_ENU = 40.0 * np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
 
 
@@ -37,12 +37,12 @@ def photos(with_gps: bool) -> Manifest:
     )
 
 
-def placed(manifest: Manifest, wanted: str, control: Path | None) -> tuple[str, np.ndarray, list]:
-    """Method, the cameras' centres in the new frame, and warnings."""
+def aligned(manifest: Manifest, method: str, control: Path | None) -> tuple[str, np.ndarray, list]:
+    """Method, camera centres in the world frame, and warnings."""
     import pycolmap
 
+    from pipeline.sfm.alignment import align_model
     from pipeline.sfm.models import posed_model
-    from pipeline.sfm.placement import place
 
     camera = pycolmap.Camera.create_from_model_name(
         1, "SIMPLE_RADIAL", corner.FOCAL, corner.WIDTH, corner.HEIGHT
@@ -52,23 +52,23 @@ def placed(manifest: Manifest, wanted: str, control: Path | None) -> tuple[str, 
         for rotation, shift in corner.poses(COUNT)
     ]
     model = posed_model([camera], [(i + 1, f"{i}.jpg", 1) for i in range(COUNT)], poses)
-    frame = place(model, manifest, wanted, control)  # type: ignore[arg-type]
+    frame = align_model(model, manifest, method, control)  # type: ignore[arg-type]
     centres = np.array([model.image(i + 1).projection_center() for i in range(COUNT)])
     return frame.method, centres, frame.warnings
 
 
-def spans(centres: np.ndarray) -> np.ndarray:
+def centred(centres: np.ndarray) -> np.ndarray:
     return np.asarray(centres - centres.mean(0))
 
 
-def test_gps_puts_a_model_into_metres():
-    method, centres, warnings = run_isolated(placed, photos(True), "auto", None)
+def test_gps_aligns_a_model_to_metres():
+    method, centres, warnings = run_isolated(aligned, photos(True), "auto", None)
     true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gps" and not warnings
-    np.testing.assert_allclose(spans(centres), spans(true), atol=0.05)
+    np.testing.assert_allclose(centred(centres), centred(true), atol=0.05)
 
 
-def test_ground_control_goes_before_gps_and_is_triangulated(tmp_path):
+def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
     rng = np.random.default_rng(0)
     lines = ["WGS84 UTM 32N"]
     for xyz in rng.uniform(0.1, 0.8, (6, 3)) * (1, -1, -1):
@@ -81,25 +81,25 @@ def test_ground_control_goes_before_gps_and_is_triangulated(tmp_path):
             lines.append(f"{east} {north} {up} {px} {py} {i}.jpg")
     control = tmp_path / "gcp_list.txt"
     control.write_text("\n".join(lines))
-    method, centres, warnings = run_isolated(placed, photos(True), "auto", control)
+    method, centres, warnings = run_isolated(aligned, photos(True), "auto", control)
     true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gcp" and not warnings
-    np.testing.assert_allclose(spans(centres), spans(true), atol=1e-3)
+    np.testing.assert_allclose(centred(centres), centred(true), atol=1e-3)
     assert np.abs(centres).max() < 200
 
 
-def test_without_either_the_model_is_level_and_small():
-    method, centres, warnings = run_isolated(placed, photos(False), "auto", None)
+def test_without_gps_and_ground_control_the_frame_is_level():
+    method, centres, warnings = run_isolated(aligned, photos(False), "auto", None)
     assert method == "level" and not warnings
     assert np.linalg.norm(centres, axis=1).max() == pytest.approx(1.0)
-    # Cameras that stand higher have the smaller y.
+    # y points down.
     heights = [(-rotation.T @ shift)[1] for rotation, shift in corner.poses(COUNT)]
     assert np.corrcoef(centres[:, 1], heights)[0, 1] > 0.97
-    assert run_isolated(placed, photos(True), "none", None)[0] == "level"
+    assert run_isolated(aligned, photos(True), "none", None)[0] == "level"
 
 
-def test_asking_for_what_is_not_there_is_told():
-    method, _, warnings = run_isolated(placed, photos(False), "gps", None)
+def test_a_method_without_its_data_warns_or_raises():
+    method, _, warnings = run_isolated(aligned, photos(False), "gps", None)
     assert method == "level" and "only 0 photographs" in warnings[0]
     with pytest.raises(UserError, match="no ground control points"):
-        run_isolated(placed, photos(False), "gcp", None)
+        run_isolated(aligned, photos(False), "gcp", None)

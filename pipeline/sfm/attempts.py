@@ -1,8 +1,8 @@
-"""Mapping again, another way, where the first model is not good; at most so many times.
+"""Mapping attempts: if the first model is not good, map again with another mapper or other cameras.
 
-Each attempt starts from the same verified matches. What is changed is the mapper, or what is
-believed of the cameras before any geometry is seen. More features and more pairs are other stages'
-work: the message of a failure names their options.
+All attempts use the same verified matches. They differ in the mapper or in the initial camera
+parameters. More features or more pairs need other stages: the message of a failure names the
+options.
 """
 
 from __future__ import annotations
@@ -16,26 +16,28 @@ from pathlib import Path
 import pycolmap
 
 from pipeline.sfm.database import DEFAULT_FOCAL_FACTOR, share_cameras_by_size
-from pipeline.sfm.evidence import gather
+from pipeline.sfm.evidence import collect_evidence
 from pipeline.sfm.judge import Evidence, Grade, Verdict, judge
 from pipeline.sfm.mappers import Mapper, run_mapper
 
-# Focal lengths over the longer side that are tried where none is known: wide, normal, long lens.
+# Initial focal lengths over the longer side that are tried: wide, normal and long lens.
 SWEPT_FOCALS = (0.55, DEFAULT_FOCAL_FACTOR, 2.5)
-# Those nearer to one another than this lead to the same place.
-SAME_FOCAL = 1.4
+# Initial focal lengths within this ratio converge to the same result.
+SAME_FOCAL_RATIO = 1.4
 FISHEYE_FOCAL = 0.4
-# Wider lenses than this (focal length over the longer side) may be fisheyes.
+# A lens with a focal length over the longer side below this may be a fisheye.
 FISHEYE_BELOW = 0.6
 
 
 @dataclass(frozen=True)
 class AttemptRecord:
-    """One attempt, for the stage's record.
+    """One mapping attempt, as recorded in ``stage.json``.
 
     Attributes:
-        change: what was done otherwise than in the first, "" for the first.
-        registered: photographs of the largest model, 0 without one.
+        change: difference from the first attempt in words, "" for the first.
+        registered: number of registered photographs in the largest model, 0 without a model.
+        verdict, reasons: see ``judge.Verdict``.
+        taken: whether the stage uses the model of this attempt.
     """
 
     mapper: Mapper
@@ -48,9 +50,12 @@ class AttemptRecord:
 
 @dataclass(frozen=True)
 class Attempt:
-    """Attributes:
-    models: largest first.
-    database: what they were made from.
+    """One mapping attempt and its models.
+
+    Attributes:
+        models: the models found, largest first.
+        evidence, verdict: quality of the largest model.
+        database: the database that was mapped.
     """
 
     mapper: Mapper
@@ -74,12 +79,27 @@ class Attempt:
 def map_until_good(
     database: Path, first: Mapper, total: int, min_share: float, seed: int, budget: int
 ) -> tuple[Attempt, list[AttemptRecord]]:
-    """The best of at most ``budget`` attempts, of which the first that is good is the last; and the
-    record of all. The database is not changed; others are made beside it."""
+    """Map a scene until a model is good.
+
+    Args:
+        database: database of verified matches. It is not changed; changed copies are written
+            beside it.
+        first: mapper of the first attempt.
+        total: number of photographs of the scene.
+        min_share: see ``judge``.
+        budget: maximum number of attempts.
+
+    Returns:
+        The best attempt and the records of all attempts, in order.
+    """
     best = _attempt(database, first, "", total, min_share, seed)
     attempts = [best]
     for mapper, change, prepare in _alternatives(database, first):
-        if best.verdict.grade == "good" or not best.verdict.curable or len(attempts) >= budget:
+        if (
+            best.verdict.grade == "good"
+            or not best.verdict.worth_retrying
+            or len(attempts) >= budget
+        ):
             break
         path = database
         if prepare is not None:
@@ -96,8 +116,12 @@ def map_until_good(
 def _alternatives(
     database: Path, first: Mapper
 ) -> Iterator[tuple[Mapper, str, Callable[[Path], bool] | None]]:
-    """Mapper, what is changed, and what makes the changed database (False where it would be no
-    change), the most promising first."""
+    """Alternatives to the first attempt, the most promising first.
+
+    Yields:
+        The mapper, the difference in words, and a function that writes a changed database to a
+        path and returns False if nothing would change (None: the same database).
+    """
     other: Mapper = "global" if first == "incremental" else "incremental"
     yield other, "", None
 
@@ -109,20 +133,21 @@ def _alternatives(
     def fisheye(path: Path) -> bool:
         return _set_cameras(database, path, "OPENCV_FISHEYE", FISHEYE_FOCAL)
 
-    tried = _believed_focals(database)
-    seen = _view_graph_focal(database)
-    wide = min(seen, *tried) < FISHEYE_BELOW
+    tried = _initial_focal_range(database)
+    estimated = _view_graph_focal(database)
+    wide = min(estimated, *tried) < FISHEYE_BELOW
     if wide:
         yield first, "fisheye cameras", fisheye
-    for focal in (seen, *SWEPT_FOCALS):
-        if any(max(focal / t, t / focal) < SAME_FOCAL for t in tried):
+    for focal in (estimated, *SWEPT_FOCALS):
+        if any(max(focal / t, t / focal) < SAME_FOCAL_RATIO for t in tried):
             continue
         tried.append(focal)
 
-        def believed(path: Path, focal: float = focal) -> bool:
+        def other_focal(path: Path, focal: float = focal) -> bool:
             return _set_cameras(database, path, None, focal)
 
-        yield first, f"EXIF ignored, a focal length of {focal:.2f} times the longer side", believed
+        change = f"EXIF ignored, initial focal length {focal:.2f} times the longer side"
+        yield first, change, other_focal
     if not wide:
         yield first, "fisheye cameras", fisheye
 
@@ -131,11 +156,12 @@ def _attempt(
     database: Path, mapper: Mapper, change: str, total: int, min_share: float, seed: int
 ) -> Attempt:
     models = run_mapper(mapper, database, total, seed)
-    evidence = gather(models[0], database, total) if models else None
+    evidence = collect_evidence(models[0], database, total) if models else None
     return Attempt(mapper, change, models, evidence, judge(evidence, min_share), database)
 
 
 def _rank(attempt: Attempt) -> tuple[int, float]:
+    """Sort key of attempts: larger is better."""
     e = attempt.evidence
     if e is None:
         return -1, 0.0
@@ -143,8 +169,8 @@ def _rank(attempt: Attempt) -> tuple[int, float]:
     return grade, e.registered * e.explained_matches * e.agreeing_pairs
 
 
-def _believed_focals(database: Path) -> list[float]:
-    """Focal lengths over the longer side that the first attempt started from: the extremes."""
+def _initial_focal_range(database: Path) -> list[float]:
+    """Smallest and largest initial focal length of the cameras, over the longer side."""
     with pycolmap.Database.open(database) as opened:
         cameras = opened.read_all_cameras()
     found = [c.mean_focal_length() / max(c.width, c.height) for c in cameras]
@@ -152,8 +178,8 @@ def _believed_focals(database: Path) -> list[float]:
 
 
 def _view_graph_focal(database: Path) -> float:
-    """What the pairs' fundamental matrices say of the focal length, over the longer side: the
-    median camera's. Right within a factor of two where the photographs tell it."""
+    """Median focal length over the longer side, estimated from the pairs' fundamental matrices
+    (view graph calibration). Accurate within a factor of two if the images determine it."""
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         copy = Path(folder) / "calibrated.db"
         _set_cameras(database, copy, None, DEFAULT_FOCAL_FACTOR)
@@ -161,10 +187,10 @@ def _view_graph_focal(database: Path) -> float:
             copy,
             pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False),
         )
-        return _believed_median(copy)
+        return _median_focal(copy)
 
 
-def _believed_median(database: Path) -> float:
+def _median_focal(database: Path) -> float:
     with pycolmap.Database.open(database) as opened:
         cameras = opened.read_all_cameras()
     found = sorted(c.mean_focal_length() / max(c.width, c.height) for c in cameras)
@@ -172,8 +198,8 @@ def _believed_median(database: Path) -> float:
 
 
 def _set_cameras(source: Path, target: Path, model: str | None, focal: float) -> bool:
-    """Copy a database, its cameras without a prior, of this model (None: as they are) and focal
-    length (over the longer side)."""
+    """Copy a database; its cameras get this model (None: unchanged) and focal length (over the
+    longer side), without a prior."""
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
         for camera in database.read_all_cameras():

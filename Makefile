@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 
 READERS := tests/io/independent
 
-.PHONY: demo test test-native test-packages lint format docs viewer setup extension clean
+.PHONY: demo test test-native test-packages lint format docs site viewer setup extension clean
 .DEFAULT_GOAL := help
 
 help:
@@ -17,7 +17,8 @@ help:
 	@echo "make test-packages  other projects' packages that some tests compare with (needs Node)"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
-	@echo "make docs   regenerate docs/configuration.md and config/config.yaml"
+	@echo "make docs   regenerate the generated pages of docs/ and config/config.yaml"
+	@echo "make site   build the docs as a site in build/site; broken links are errors"
 	@echo "make viewer rebuild the pages' viewer (needs Node 20 or newer)"
 	@echo "make clean  remove results/ and data/demo"
 
@@ -41,7 +42,7 @@ $(VENV)/product: pyproject.toml
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
 
-$(VENV)/watch $(VENV)/dev $(VENV)/test: $(VENV)/product
+$(VENV)/watch $(VENV)/dev $(VENV)/test $(VENV)/docs: $(VENV)/product
 	@echo "installing the packages of '$(@F)' into $(VENV)"
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
@@ -90,6 +91,11 @@ format: $(VENV)/dev
 
 docs: $(VENV)/product
 	@$(BIN)/python -m pipeline.config.docs
+	@$(BIN)/python -m pipeline.command.reference_pages
+	@$(BIN)/python -m benchmarks.tables
+
+site: $(VENV)/docs
+	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 VIEWER := pipeline/reporting/viewer
 viewer:

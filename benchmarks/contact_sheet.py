@@ -1,9 +1,10 @@
-"""One held-out view of a scene under every configuration of a batch, side by side, as a PNG.
+"""One test view of a scene under every configuration of a batch, side by side, as an image.
 
     python -m benchmarks.contact_sheet results/benchmark.json --scene demo --out sheet.png
 
 Below each stand the configuration and the PSNR of this view. ``--configs`` takes some, in that
-order; ``--view`` another view than the one in the middle of the first configuration's PSNRs.
+order; ``--view`` another view than the one in the middle of the first configuration's PSNRs;
+``--photograph`` puts the photograph first.
 """
 
 from __future__ import annotations
@@ -24,7 +25,13 @@ GAP, LABEL = 6, 20  # pixels
 
 
 def sheet(
-    batch: Path, scene: str, configs: Sequence[str], view: str | None, width: int, columns: int
+    batch: Path,
+    scene: str,
+    configs: Sequence[str],
+    view: str | None,
+    width: int,
+    columns: int,
+    photograph: bool = False,
 ) -> Image.Image:
     """The picture.
 
@@ -33,6 +40,7 @@ def sheet(
         configs: which, in order; all where empty.
         view: its name; else the median one of the first configuration.
         width: of one render, pixels.
+        photograph: put the undistorted photograph of the view before the renders.
 
     Raises:
         UserError: the batch has no such scene, configuration or view, or cannot be read.
@@ -64,11 +72,24 @@ def sheet(
         if found is None:
             names = ", ".join(v["name"] for v in per_view)
             raise UserError(f"no held-out view {view}", file=folder, fix=f"take of these: {names}")
-        with Image.open(folder / "evaluate" / "renders" / found["render"]) as opened:
-            height = round(opened.height * width / opened.width)
-            picture = opened.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
+        picture = _scaled(folder / "evaluate" / "renders" / found["render"], width)
+        if photograph and not tiles:
+            original = folder / "undistort" / "images" / found["name"]
+            if not original.is_file():
+                raise UserError(
+                    "the scene was not undistorted: no photograph at the renders' grid",
+                    file=original,
+                    fix="leave out --photograph",
+                )
+            tiles.append(("photograph", _scaled(original, width)))
         tiles.append((f"{config}  {found['psnr']:.1f} dB", picture))
     return _laid_out(tiles, min(columns, len(tiles)))
+
+
+def _scaled(path: Path, width: int) -> Image.Image:
+    with Image.open(path) as opened:
+        height = round(opened.height * width / opened.width)
+        return opened.convert("RGB").resize((width, height), Image.Resampling.LANCZOS)
 
 
 def _laid_out(tiles: Sequence[tuple[str, Image.Image]], columns: int) -> Image.Image:
@@ -87,27 +108,28 @@ def _laid_out(tiles: Sequence[tuple[str, Image.Image]], columns: int) -> Image.I
 def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.contact_sheet",
-        description="One view under every configuration of a batch, as a PNG.",
+        description="One view under every configuration of a batch, as an image.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("batch", type=Path, metavar="benchmark.json")
     parser.add_argument("--scene", required=True)
     parser.add_argument("--configs", nargs="+", default=[], help="which, in order (default: all)")
-    parser.add_argument("--view", help="name of a held-out view (default: the median one)")
+    parser.add_argument("--view", help="name of a test view (default: the median one)")
+    parser.add_argument("--photograph", action="store_true", help="the photograph first")
     parser.add_argument("--width", type=int, default=240, help="of a render, pixels")
     parser.add_argument("--columns", type=int, default=4)
-    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png")
+    parser.add_argument("--out", type=Path, required=True, metavar="FILE.png|.jpg")
     options = parser.parse_args()
     try:
         picture = sheet(
             options.batch, options.scene, options.configs, options.view, options.width,
-            options.columns,
+            options.columns, options.photograph,
         )  # fmt: skip
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USER_ERROR
     options.out.parent.mkdir(parents=True, exist_ok=True)
-    picture.save(options.out, "PNG", optimize=True)
+    picture.save(options.out, optimize=True)
     return 0
 
 

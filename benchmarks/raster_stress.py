@@ -1,5 +1,5 @@
 """Wild inputs by the million: counts values that are not finite, and holds the float32 kernels to
-the float64 twin. ``python -m benchmarks.raster_stress --cases 1000000``; see docs/raster.md."""
+the float64 twin. ``python -m benchmarks.raster_stress --cases 1000000``."""
 
 from __future__ import annotations
 

@@ -30,8 +30,8 @@ def _frame(scan: Scan, config: Config) -> str:
         return "georeferenced by the ground control points in gcp_list.txt"
     if wanted in ("auto", "gps") and scan.num_gps:
         return f"georeferenced by GPS positions of {scan.num_gps} photographs, if these suffice"
-    why = "as configured" if wanted == "none" else "without GPS or ground control points"
-    return f"not georeferenced, {why}: the scene is levelled and scaled to unit size"
+    why = "as configured" if wanted == "none" else "no GPS or ground control points"
+    return f"not georeferenced ({why}): the scene is levelled and scaled to unit size"
 
 
 def work(job: Job) -> None:

@@ -1,6 +1,6 @@
 """Times the rasterizer's operators, or drawing alone, and compares them with the reference.
 
-See docs/raster.md.
+See docs/explanation/rasterizer.md.
 """
 
 from __future__ import annotations

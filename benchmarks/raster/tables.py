@@ -1,23 +1,14 @@
-"""Writes the speed tables of a page from stored records: ``python -m benchmarks.raster.tables``.
-
-A table stands below a line ``<!-- raster: RECORD [RECORD ...] -->``, of records in
-``benchmarks/records`` that ``python -m benchmarks.raster --json`` wrote.
-"""
+"""The rasterizer's tables from the records that ``python -m benchmarks.raster --json`` wrote."""
 
 from __future__ import annotations
 
-import json
-import re
-from pathlib import Path
+from collections.abc import Sequence
 from typing import Any
 
-ROOT = Path(__file__).parents[2]
-PAGE, RECORDS = ROOT / "docs" / "raster.md", ROOT / "benchmarks" / "records"
 PHASES = [
     *("projection, SH", "bin", "blend", "loss", "blend backward", "projection, SH backward"),
     *("Adam", "step"),
 ]
-MARKER = re.compile(r"<!-- raster: ([^>]+) -->\n(?:\|[^\n]*\n)*")
 
 
 def column(record: dict[str, Any], result: dict[str, Any]) -> list[str]:
@@ -32,7 +23,7 @@ def column(record: dict[str, Any], result: dict[str, Any]) -> list[str]:
     return cells
 
 
-def table(records: list[dict[str, Any]]) -> str:
+def table(records: Sequence[dict[str, Any]]) -> str:
     """One column for each scene and number of threads of each record."""
     columns = [["", *PHASES]]
     columns += [column(record, result) for record in records for result in record["results"]]
@@ -41,16 +32,12 @@ def table(records: list[dict[str, Any]]) -> str:
     return "\n".join(rows) + "\n"
 
 
-def rewritten(page: str) -> str:
-    """The page with its tables made anew."""
-
-    def fill(match: re.Match[str]) -> str:
-        names = match[1].split()
-        records = [json.loads((RECORDS / name).read_text()) for name in names]
-        return f"<!-- raster: {' '.join(names)} -->\n{table(records)}"
-
-    return MARKER.sub(fill, page)
-
-
-if __name__ == "__main__":
-    PAGE.write_text(rewritten(PAGE.read_text()))
+def steps_table(records: Sequence[dict[str, Any]]) -> str:
+    """Medians of a step's phases in each build of one record, ms of wall time."""
+    (record,) = records
+    builds: dict[str, dict[str, float]] = record["ms"]
+    rows = [["", *builds]]
+    rows += [[phase, *(f"{ms[phase]:.2f}" for ms in builds.values())] for phase in PHASES]
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    lines.insert(1, "|---" * len(rows[0]) + "|")
+    return "\n".join(lines) + "\n"

@@ -1,5 +1,5 @@
 """Times camera poses from photographs alone, and measures them against the poses the scene brings;
-see docs/sfm.md."""
+see docs/explanation/sfm.md."""
 
 from __future__ import annotations
 

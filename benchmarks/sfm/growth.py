@@ -1,7 +1,7 @@
 """How mapping grows with the number of photographs: a street of that length, its matches made up.
 
 Each camera stands a metre from the last and looks across the street, so that a point is seen by
-some five cameras, however many there are. See docs/sfm.md.
+some five cameras, however many there are. See docs/explanation/sfm.md.
 """
 
 from __future__ import annotations

@@ -3,7 +3,7 @@ trained from either are.
 
 For each seed both map the same verified matches, the same short training follows, and random
 views between neighbouring cameras are rendered from all of the models. Two seeds of one mapper
-differ, too: that is the scale to read the rest by. See docs/sfm.md.
+differ, too: that is the scale to read the rest by. See docs/explanation/sfm.md.
 """
 
 from __future__ import annotations

@@ -2,7 +2,8 @@
 
 One gzip stream: a header of 16 bytes, then one section per attribute with the values of all
 Gaussians. Coordinates are in the PLY's frame, as in programs that convert PLY to SPZ. Source of
-the layout: github.com/nianticlabs/spz, README.md. docs/formats.md states the quantisation errors.
+the layout: github.com/nianticlabs/spz, README.md. Quantisation errors:
+docs/reference/formats.md.
 """
 
 from __future__ import annotations

@@ -129,7 +129,7 @@ def _mapper(config: Config) -> Choice:
     wanted = config.sfm.mapper
     if wanted != "auto":
         return wanted, f"{wanted} mapper, as configured"
-    # Its time is linear in the number of photographs, the global mapper's quadratic (docs/sfm.md).
+    # Its time is linear in the number of photographs, the global mapper's quadratic.
     return "incremental", "incremental mapper; the global mapper if its model is not good"
 
 

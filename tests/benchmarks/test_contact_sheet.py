@@ -42,6 +42,18 @@ def test_the_same_view_of_every_run_that_finished(tmp_path: Path) -> None:
     assert below[GAP + 7, GAP + 10].tolist() == [100, 160, 255]
 
 
+def test_the_photograph_comes_first(tmp_path: Path) -> None:
+    path = batch(tmp_path)
+    with pytest.raises(UserError, match="not undistorted"):
+        sheet(path, "room", ["plain"], None, 20, 4, photograph=True)
+    images = tmp_path / "room@plain" / "undistort" / "images"
+    images.mkdir(parents=True)
+    Image.new("RGB", (40, 30), (9, 9, 9)).save(images / "view_1.png")
+    picture = np.asarray(sheet(path, "room", ["plain"], None, 20, 4, photograph=True))
+    assert picture[GAP + 7, GAP + 10].tolist() == [9, 9, 9]
+    assert picture[GAP + 7, 2 * GAP + 30].tolist() == [0, 80, 255]
+
+
 @pytest.mark.parametrize(
     ("scene", "configs", "view", "told"),
     [

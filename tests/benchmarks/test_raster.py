@@ -13,7 +13,6 @@ from benchmarks.raster.library import heading, measured_library, measured_on
 from benchmarks.raster.measure import Step
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import synthetic, trained
-from benchmarks.raster.tables import PAGE, rewritten
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.io.ply import write_splat_ply
@@ -75,9 +74,3 @@ def test_a_trained_scene_is_drawn_from_its_views_at_any_size(tmp_path: Path) -> 
     assert larger.views[0].fx == pytest.approx(2 * 115.2)
     drawn = drawings(larger, [1], seconds=0.0)[0]
     assert drawn.views == 16 and drawn.visible > 40
-
-
-def test_the_page_states_what_the_records_hold() -> None:
-    page = PAGE.read_text()
-    assert rewritten(page) == page
-    assert "| step |" in page

@@ -24,7 +24,9 @@ from tests.install.package import (
 )
 from tests.once import made_once
 
-EXAMPLE = re.search(r"```python\n(.+?)```", (ROOT / "docs" / "api.md").read_text(), re.S)
+EXAMPLE = re.search(
+    r"```python\n(.+?)```", (ROOT / "docs" / "reference" / "api.md").read_text(), re.S
+)
 CACHE = ROOT / "build" / "native"
 CONFIG = [f"{name}={json.dumps(value)}" for name, value in TINY.items()]
 
@@ -101,7 +103,7 @@ def test_libraries_are_not_compiled_into_the_installation(installed: Path, tmp_p
 @pytest.mark.slow
 def test_photographs_to_measurements(installed: Path, finished: Path, tmp_path: Path) -> None:
     """``splatmake run`` on photographs elsewhere gives what a checkout gives, and the example of
-    docs/api.md loads it."""
+    docs/reference/api.md loads it."""
     photos = copy_run(finished / "data", tmp_path / "my photos") / "tiny"
     work = tmp_path / "work"
     work.mkdir()

@@ -12,7 +12,7 @@ from pipeline.runtime.errors import UserError
 from tests.splats.samples import Within, sample
 
 C0 = 0.28209479177387814
-#: What docs/formats.md states, for colours within [0, 1].
+#: What docs/reference/formats.md states, for colours within [0, 1].
 OURS = Within(0, 1e-6, 0.5001 / 255, 0.91, 0.5001 / 255 / C0, 0)
 
 

@@ -19,7 +19,8 @@ from pipeline.splats.gaussians import Gaussians
 from tests.splats.samples import Within, rotation_angle, sample
 
 DATA = Path(__file__).parent / "data"
-#: What docs/formats.md states. The samples reach to 16: positions have 19 bits behind the point.
+#: What docs/reference/formats.md states. The samples reach to 16: positions have 19 bits behind the
+#: point.
 OURS = Within(2**-20 + 5e-7, 1 / 32 + 1e-6, 0.5001 / 255, 0.23, 0.5001 / 38.25, 0.5001 / 128)
 #: Other encoders keep 12 bits behind the point, 5 bits of SH degree 1 and 4 of the others.
 OTHERS = Within(2**-13 + 1e-6, 1 / 32 + 1e-6, 0.5001 / 255, 0.23, 0.5001 / 38.25, 0.0626)

@@ -28,7 +28,7 @@ LONG_AXIS, OTHER_AXES, HALVES_OPACITY = 0.5, 0.85, 0.8
 LONG_OFFSET = math.sqrt(1 - LONG_AXIS**2)
 RESET_OPACITY = 0.01
 # What shows less than this may make room for others, if it is of this share that is pulled at
-# least: what is faint because it is new is pulled at (docs/training.md).
+# least: what is faint because it is new is pulled at (docs/explanation/training.md).
 RECYCLED_OPACITY, IDLE_SHARE = 0.1, 0.1
 
 

@@ -20,9 +20,8 @@ NOMINAL_STEPS = 7000
 MIN_REFINE_INTERVAL = 10
 COARSE_FACTORS = (4, 2)
 # Shares of a run. A coarse step costs a third of a full one, or a ninth, so 0.15 of the steps are
-# 0.03 of the time. Of the minutes 0.1: in as much time as 500 to 1000 full steps bonsai gains 0.2
-# to 0.5 dB over 0.3, and 0.2 to 0.3 over 0.05 and 0; of 300 it loses 0.1 (docs/training.md; with an
-# older training 0.15 lost 0.2 in 4 minutes). Many minutes want small pictures for no longer.
+# 0.03 of the time; a time budget spends more on them, because more steps fit. Long runs need small
+# pictures for no longer.
 COARSE_STEPS, COARSE_MINUTES, MOST_COARSE_MINUTES = 0.15, 0.1, 1.2
 # The papers' length of a run, for which the configured learning rates are right. The noise of one
 # view a step asks that a run of fewer goes farther in each: by the root, as for batches. At 3000

@@ -1,0 +1,209 @@
+"""Writes the tables and figures of the docs from stored records: ``python -m benchmarks.tables``.
+
+A table stands below a line ``<!-- KIND: RECORD [RECORD ...] -->``, of records in
+``benchmarks/records``; a figure within a sentence stands in
+``<!-- figure: RECORD NAME -->...<!-- end -->``. ``--check`` writes nothing and exits with 1 where a
+page and its records differ.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+import statistics
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from benchmarks.raster.tables import steps_table, table
+from benchmarks.record import POSES
+
+ROOT = Path(__file__).parents[1]
+RECORDS = ROOT / "benchmarks" / "records"
+Record = dict[str, Any]
+
+
+def pages() -> list[Path]:
+    """Every page whose figures come from records."""
+    return [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+
+
+def scenes(records: Sequence[Record]) -> str:
+    """A row for each scene: quality, pose errors and CPU minutes."""
+    head = [
+        *("scene", "photographs", "test views, pixels", "seeds", "PSNR (dB)", "SSIM", "Gaussians"),
+        *("with a pose", "rotation, centre error", "CPU min: poses, training, all", "memory"),
+    ]
+    rows = [head]
+    for record in records:
+        runs, protocol = record["runs"], record["protocol"]
+        error = runs[0]["pose_error"]
+        poses = ""
+        if error is not None:
+            rotation = statistics.median(run["pose_error"]["rotation_median_deg"] for run in runs)
+            centre = statistics.median(run["pose_error"]["centre_relative_median"] for run in runs)
+            poses = f"{rotation:.3f}°, {centre:.2%}"
+        minutes = [
+            _minutes(runs, stages) for stages in (POSES, ("train",), tuple(runs[0]["cpu_s"]))
+        ]
+        if "report" not in runs[0]["cpu_s"]:  # of training alone
+            minutes[2] = "-"
+        rows.append(
+            [
+                record["scene"],
+                str(record["photographs"]),
+                f"{protocol['num_views']}, {', '.join(protocol['resolution'])}",
+                str(len(runs)),
+                _middle([run["psnr"] for run in runs], "{:.2f}"),
+                _middle([run["ssim"] for run in runs], "{:.3f}"),
+                f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",
+                f"{min(run['registered'] for run in runs)}",
+                poses,
+                ", ".join(minutes),
+                _memory(runs),
+            ]
+        )
+    return _markdown(rows)
+
+
+def headline(records: Sequence[Record]) -> str:
+    """The short table of the README."""
+    rows = [["scene", "photographs", "PSNR (dB)", "SSIM", "Gaussians", "CPU minutes in all"]]
+    for record in records:
+        runs = record["runs"]
+        rows.append(
+            [
+                record["scene"],
+                str(record["photographs"]),
+                _middle([run["psnr"] for run in runs], "{:.2f}"),
+                _middle([run["ssim"] for run in runs], "{:.3f}"),
+                f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",
+                _middle([sum(run["cpu_s"].values()) / 60 for run in runs], "{:.1f}"),
+            ]
+        )
+    return _markdown(rows)
+
+
+def sources(records: Sequence[Record]) -> str:
+    """Where and how the records of a page were measured."""
+    rows = [["scene", "command", "commit", "processor", "instruction set", "remark"]]
+    for record in records:
+        processor = f"{record['processor']}, {record['cores']} cores"
+        rows.append(
+            [
+                record["scene"],
+                f"`{record['command']}`",
+                record["commit"][:7],
+                processor,
+                record["instruction_set"],
+                record["note"],
+            ]
+        )
+    return _markdown(rows)
+
+
+def stages(records: Sequence[Record]) -> str:
+    """CPU seconds of each stage of one scene."""
+    (record,) = records
+    run = record["runs"][0]
+    rows = [["stage", "CPU s"], *([name, f"{value:.0f}"] for name, value in run["cpu_s"].items())]
+    return _markdown(rows)
+
+
+def formats(records: Sequence[Record]) -> str:
+    """What a format costs in size and quality."""
+    (record,) = records
+    rows = [["format", "bytes a Gaussian", "MB", "PSNR (dB)"]]
+    for each in record["formats"]:
+        size = each["bytes"] / record["gaussians"]
+        rows.append(
+            [each["format"], f"{size:.0f}", f"{each['bytes'] / 1e6:.1f}", f"{each['psnr']:.2f}"]
+        )
+    return _markdown(rows)
+
+
+def _memory(runs: Sequence[Record]) -> str:
+    known = [run["peak_mb"] for run in runs if run["peak_mb"] is not None]
+    return f"{max(known) / 1e3:.1f} GB" if known else ""
+
+
+def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
+    """CPU minutes of some stages; a dash where none was recorded."""
+    if not runs[0]["cpu_s"].keys() & set(stages):
+        return "-"
+    sums = [sum(run["cpu_s"].get(stage, 0.0) for stage in stages) / 60 for run in runs]
+    return _middle(sums, "{:.1f}")
+
+
+def _middle(values: Sequence[float], form: str) -> str:
+    """The median, and of several values half their range."""
+    middle = form.format(statistics.median(values))
+    if len(values) == 1:
+        return middle
+    return f"{middle} ±{form.format((max(values) - min(values)) / 2)}"
+
+
+def _markdown(rows: Sequence[Sequence[str]]) -> str:
+    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
+    lines.insert(1, "|---" * len(rows[0]) + "|")
+    return "\n".join(lines) + "\n"
+
+
+KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
+    "raster": table,
+    "raster-steps": steps_table,
+    "scenes": scenes,
+    "headline": headline,
+    "sources": sources,
+    "stages": stages,
+    "formats": formats,
+}
+MARKER = re.compile(rf"<!-- ({'|'.join(KINDS)}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?")
+FIGURE = re.compile(r"<!-- figure: (\S+) (\S+) -->.*?<!-- end -->", re.DOTALL)
+
+
+def read_record(name: str) -> Record:
+    record: Record = json.loads((RECORDS / name).read_text())
+    return record
+
+
+def rewritten(page: str) -> str:
+    """The page with its tables and figures made anew."""
+
+    def fill(match: re.Match[str]) -> str:
+        kind, names = match[1], match[2].split()
+        made = KINDS[kind]([read_record(name) for name in names])
+        return f"<!-- {kind}: {' '.join(names)} -->\n\n{made}"
+
+    def figure(match: re.Match[str]) -> str:
+        name, key = match[1], match[2]
+        value = read_record(name)["figures"][key]
+        return f"<!-- figure: {name} {key} -->{value}<!-- end -->"
+
+    return FIGURE.sub(figure, MARKER.sub(fill, page))
+
+
+def figures_outside(page: str) -> list[str]:
+    """Measured values of a page that no record stands behind."""
+    rest = FIGURE.sub("", MARKER.sub("", page))
+    rest = re.sub(r"```.*?```", "", rest, flags=re.DOTALL)
+    return re.findall(r"\b\d[\d ,.]*\s(?:dB|CPU s|CPU min|GFLOP/s|frames a second)\b", rest)
+
+
+def main() -> int:
+    check, stale = "--check" in sys.argv[1:], []
+    for page in pages():
+        text = page.read_text()
+        new = rewritten(text)
+        if new != text:
+            stale.append(page.relative_to(ROOT))
+            if not check:
+                page.write_text(new)
+    for path in stale:
+        print(f"{path}: {'differs from its records' if check else 'written'}")
+    return 1 if check and stale else 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

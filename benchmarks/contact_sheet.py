@@ -61,7 +61,7 @@ def sheet(
             fix="take of these: "
             + ", ".join(f"{r['scene']}@{r['config']}" for r in rows if r["status"] == "ok"),
         )
-    tiles = []
+    tiles: list[Image.Image] = []
     for config in configs or done:
         # Without seeds of its own, a batch's folders name none.
         named = batch.parent / done[config].name

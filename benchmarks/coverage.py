@@ -22,7 +22,8 @@ from numpy.typing import NDArray
 from PIL import Image
 from scipy.stats import spearmanr
 
-from pipeline.config.schema import Density, Init, Train
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Gradient, Init, Train
 from pipeline.coverage.probe_views import Renderer, render_probe
 from pipeline.coverage.trust import trust_map
 from pipeline.coverage.viewpoints import MAX_PROPOSALS, Viewpoint, propose_viewpoints
@@ -41,7 +42,7 @@ from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -125,15 +126,16 @@ def train_scene(studio: Studio, views: Sequence[View], steps: int, extent: float
         steps=steps,
         background="black",
         exposure="off",
-        lr_boost=4.0,
-        density=Density(max_gaussians=MAX_GAUSSIANS),
+        density=Gradient(max_gaussians=MAX_GAUSSIANS),
     )
+    experiments = TrainExperiments(learning_rate_factor=4.0)
     centres = np.stack([view.centre for view in views])
     first = gaussians_from_points(studio.sparse(views), centres, Init(), config.sh_degree)
     with TemporaryDirectory() as folder:
         return train(
             Inputs(views, Gaussians.from_arrays(first), extent),
             config,
+            experiments,
             seed=0,
             threads=2,
             checkpoint_dir=Path(folder),

@@ -16,7 +16,8 @@ from tempfile import TemporaryDirectory
 import numpy as np
 from PIL import Image
 
-from pipeline.config.schema import Density, Train
+from pipeline.config.experiments import DEFAULT
+from pipeline.config.schema import Gradient, Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.plan.training_memory import memory_mb
 from pipeline.runtime.atomic import write_json
@@ -25,8 +26,8 @@ from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop import trainer
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop import session
+from pipeline.training.loop.train import train
 
 PIXELS_ACROSS = 3.0  # of a Gaussian's 3-sigma radius
 
@@ -76,7 +77,7 @@ def main() -> int:
     parser.add_argument("--json", type=Path, help="write the figures as data")
     args = parser.parse_args()
     width, height = args.size
-    trainer.CHECKPOINT_SECONDS = 5.0
+    session.CHECKPOINT_SECONDS = 5.0
     with TemporaryDirectory() as name:
         folder = Path(name)
         views = made_views(args.views, width, height, folder)
@@ -84,8 +85,9 @@ def main() -> int:
             Inputs(views, made_gaussians(args.gaussians, views[0].fx), scene_extent(views)),
             Train(
                 steps=args.steps,
-                density=Density(max_gaussians=args.gaussians),
+                density=Gradient(max_gaussians=args.gaussians),
             ),
+            DEFAULT.train,
             seed=0,
             threads=args.threads,
             memory_mb=args.memory_mb,

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
     from pipeline.plan.settle import Settled
 
 # With refined cameras, the poses of test views are fitted to their photographs before measuring.
-FIT_OPTIONS = ("train.refine_poses", "train.ssim_weight")
+FIT_OPTIONS = ("train.refine_poses", "train.ssim_loss_weight")
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    every = settled.config.split.holdout_every
+    every = settled.config.split.test_every
     truth = ["pose errors with respect to sparse_gt/"] if scan.truth is not None else []
     reason = f"one view in {every}, sorted by name, is a test view"
     if every == 0:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Export, Split, Train, Views
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
@@ -46,7 +47,13 @@ def work(job: Job) -> None:
         folder=job.inputs["train"].parent / job.stage,
     )
     report = export_scene(
-        job.out, scene, job.section(Export), job.section(Train), split, threads=job.threads
+        job.out,
+        scene,
+        job.section(Export),
+        job.section(Experiments).export,
+        job.section(Train),
+        split,
+        threads=job.threads,
     )
     job.record(report)
 
@@ -56,6 +63,6 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     inputs=inputs.TRAINED,
-    options=("export", "views", "split", *inputs.DRAWING_OPTIONS),
+    options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Features, Init, Matches
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.errors import UserError
@@ -14,21 +15,21 @@ if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
+EXPERIMENTS = ("experiments.init", "experiments.matches")
+
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config.init
     if config.method == "random":
-        return StagePlan(run=True, reason=f"{config.num_random} random Gaussians")
+        count = settled.config.experiments.init.num_random
+        return StagePlan(run=True, reason=f"{count} random Gaussians")
     if scan.poses is None:
         return StagePlan(run=True, reason="Gaussians from the sparse points of sfm")
-    if scan.poses.num_points:
-        points = f"{scan.poses.num_points} sparse points"
-        return StagePlan(run=True, reason=f"Gaussians from the given {points}")
-    return StagePlan(
-        run=True,
-        reason="Gaussians from points triangulated with the given poses, which have no points",
-        decisions=["pairs of cameras with near positions and similar directions"],
-    )
+    if count := scan.poses.num_points:
+        return StagePlan(run=True, reason=f"Gaussians from the given {count} sparse points")
+    reason = "Gaussians from points triangulated with the given poses, which have no points"
+    pairs = "pairs of cameras with near positions and similar directions"
+    return StagePlan(run=True, reason=reason, decisions=[pairs])
 
 
 def work(job: Job) -> None:
@@ -37,7 +38,7 @@ def work(job: Job) -> None:
     from pipeline.splats.arrays import write_arrays
     from pipeline.splats.first import first_gaussians
 
-    config = job.section(Init)
+    config, experiments = job.section(Init), job.section(Experiments)
     training = [view for view in inputs.input_views(job) if not view.is_test]
     if not training:
         raise UserError(
@@ -56,11 +57,12 @@ def work(job: Job) -> None:
             job.section(Matches),
             threads=job.threads,
             seed=job.seed,
+            experiments=experiments.matches,
         )
         job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
         job.counters["triangulated_points"] = len(points)
-    first = first_gaussians(points, training, config, job.seed)
+    first = first_gaussians(points, training, config, experiments.init, job.seed)
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.add_messages(first.decisions, first.warnings)
     job.counters |= first.counters
@@ -71,7 +73,7 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     inputs={"views": inputs.VIEWS, "model": inputs.MODEL},
-    options=("init", "views", "split", "features", "matches"),
+    options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,
     memory_mb=3000,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Matches, Sfm
 from pipeline.plan.stage import StagePlan, StageSpec, unless_posed
 from pipeline.runtime.job import Job
@@ -30,6 +31,7 @@ def work(job: Job) -> None:
         cache=job.shared_cache,
         threads=job.threads,
         seed=job.seed,
+        experiments=job.section(Experiments).matches,
     )
     job.record(report)
     # Not a counter: it depends on earlier runs.
@@ -41,7 +43,7 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     inputs={"photos": inputs.PHOTOS, "features": ("features",)},
-    options=("matches", "sfm.camera_model", "sfm.share_cameras"),
+    options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
     packages=("pycolmap",),
     seeded=True,
     memory_mb=3000,

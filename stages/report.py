@@ -5,7 +5,8 @@ from __future__ import annotations
 import time
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Report, Split, Train
+from pipeline.config.experiments import Experiments
+from pipeline.config.schema import Split, Train
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
@@ -50,7 +51,7 @@ def work(job: Job) -> None:
         protocol=choose_protocol(views, job.section(Split), train),
         antialias=train.antialias,
     )
-    data = report_data(scene, evaluation, shown=job.section(Report).views)
+    data = report_data(scene, evaluation, shown=job.section(Experiments).report.views)
     write_report(data, job.out / "report.html")
     job.decide(headline(metrics))
 
@@ -61,7 +62,7 @@ SPEC = StageSpec(
     decide=decide,
     inputs=inputs.TRAINED
     | {name: (name,) for name in ("inspect", "evaluate", "coverage", "export")},
-    options=("report", "views", "split", "train.antialias", "train.background"),
+    options=("experiments.report", "views", "split", "train.antialias", "train.background"),
     seeded=True,
     publishes={
         "metrics.json": "pipeline/reporting/captions/metrics.rst",

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
+from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.atomic import write_json
@@ -21,18 +22,14 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     from pipeline.plan.budget import length_line, memory_line, resolution_line
 
     config, why = settled.config, settled.why
+    settled_options = ("train.density.max_gaussians", "train.background", "train.depth_loss_weight")
     decisions = [
         resolution_line(scan, config),
-        why["train.density.max_gaussians"],
-        why["train.background"],
-        why["train.depth_weight"],
-        why["views.masks"],
+        *(why[name] for name in (*settled_options, "views.masks")),
         memory_line(scan, config),
     ]
     return StagePlan(
-        run=True,
-        reason=length_line(config),
-        decisions=[text for text in decisions if text],
+        run=True, reason=length_line(config), decisions=[text for text in decisions if text]
     )
 
 
@@ -47,6 +44,7 @@ def work(job: Job) -> None:
         inputs.input_model(job),
         Gaussians.load(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
+        job.section(Experiments).train,
         seed=job.seed,
         threads=job.threads,
         memory_mb=job.memory_mb,
@@ -72,7 +70,7 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     inputs={"views": inputs.VIEWS, "model": inputs.MODEL, "init": ("init",)},
-    options=("train", "views", "split"),
+    options=("train", "views", "split", "experiments.train"),
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,
     memory_mb=memory_mb,

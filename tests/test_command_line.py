@@ -156,7 +156,7 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
     plan = {"stages": {"inspect": {"run": True}, "undistort": {"run": False}}}
     (scene / "plan.json").write_text(json.dumps(plan))
     config = Config().model_dump(mode="json")
-    config["split"]["holdout_every"], config["train"]["background"] = 2, "black"
+    config["split"]["test_every"], config["train"]["background"] = 2, "black"
     (scene / "train").mkdir()
     key = {"config": {name: config[name] for name in ("views", "split", "train")}}
     (scene / "train" / "stage.json").write_text(json.dumps({"key": key}))

@@ -63,7 +63,9 @@ def scene(tmp_path: Path) -> Path:
 
 def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
     config = Config().model_dump(mode="json")
-    config["export"] |= options
+    for name, value in options.items():
+        where = config if name in config["export"] else config["experiments"]
+        where["export"][name] = value
     config["train"] |= {"background": "random", "antialias": antialias}
     out = scene / ".scratch" / "out"
     job = Job(

@@ -12,12 +12,14 @@ import torch
 
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import Scene
+from pipeline.config.experiments import DEFAULT
 from pipeline.config.schema import Train
 from pipeline.render import RasterOptions, forward
 from pipeline.render.cpu import build
 
 BACKGROUND = (0.1, 0.2, 0.3)
-SSIM_WEIGHT, SQUARE_WEIGHT = Train().ssim_weight, Train().square_weight
+SSIM_WEIGHT = Train().ssim_loss_weight
+SQUARED_ERROR_WEIGHT = DEFAULT.train.squared_error_loss_weight
 MIN_TURNS = 5  # quartiles of fewer say nothing
 TILE_PIXELS = 16 * 16
 # Operations on all pixels of a block that one Gaussian takes at least: place 2, exponent 2, 2^x 11,
@@ -94,7 +96,7 @@ class Step:
         # Rates of 0, so that every repeat draws the same.
         rate, rates = torch.zeros(1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
         sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
-        loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARE_WEIGHT, threads)
+        loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
         self.d_color = kernels.l1_ssim(*loss_of)[3]
         kept: dict[str, Any] = {}
 

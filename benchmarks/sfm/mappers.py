@@ -81,14 +81,16 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
     from pipeline.splats.init import gaussians_from_points
     from pipeline.training.data.inputs import Inputs
     from pipeline.training.data.known_depths import point_depths, scene_scale
-    from pipeline.training.loop.trainer import train
+    from pipeline.training.loop.train import train
 
     pinhole = folder / "pinhole"
     model = read_model(folder / "sparse" / "0")
     report = undistort(manifest, model, config.undistort, config.views, pinhole, threads=threads)
     model = read_model(pinhole / "sparse" / "0")
     views = load_views(report.manifest, model, config.views, config.split)
-    first = gaussians_from_points(model.points, np.array([v.centre for v in views]), config.init, 0)
+    first = gaussians_from_points(
+        model.points, np.array([v.centre for v in views]), config.init, 0, config.experiments.init
+    )
     extent = scene_extent(views)
     result = train(
         Inputs(
@@ -98,6 +100,7 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
             scale=scene_scale(extent, point_depths(views, model)),
         ),
         config.train,
+        config.experiments.train,
         seed=config.seed,
         threads=threads,
         checkpoint_dir=folder / "checkpoints",
@@ -215,7 +218,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     raw: dict[str, object] = {
         "preset": "fast",
         "views": {"max_long_side_px": args.side},
-        "split": {"holdout_every": 0},
+        "split": {"test_every": 0},
         "train": {"steps": args.steps},
     }
     found = {}

@@ -29,7 +29,8 @@ ROOT = Path(__file__).resolve().parents[2]
 TOLERANCE_DB = 0.1
 CONFIG: dict[str, Any] = {
     "views": {"max_long_side_px": 200},
-    "train": {"steps": 300, "density": {"max_gaussians": 6000, "stop_share": 0.0}},
+    "train": {"steps": 300, "density": {"max_gaussians": 6000}},
+    "experiments": {"train": {"gradient": {"stop_share": 0.0}}},
     "export": {"formats": ["ply", "spz", "splat", "gltf", "points", "colmap_text", "transforms"]},
 }
 

@@ -314,8 +314,8 @@ WORLDS = {
 }
 # Rounding decides which of near-equal gradients densify, and what follows differs as from seed to
 # seed: only without density control can worlds be compared to a tenth of a decibel.
-_DENSE = {"train": {"density": {"stop_share": 0.7}}}
-_MCMC = {"train": {"density": {"stop_share": 0.7, "strategy": "mcmc"}}}
+_DENSE = {"experiments": {"train": {"gradient": {"stop_share": 0.7}}}}
+_MCMC = {"train": {"density": {"strategy": "mcmc"}}}
 WORLDS |= {
     "dense": Case(world(), "density control", "works", least=20.0, config=_DENSE),
     "dense_1e4": Case(world(1e4), "the same x 1e4", "works", least=20.0, config=_DENSE),

@@ -1,1 +1,1 @@
-"""Options: schemas, presets, and how a run's configuration is put together."""
+"""Options: schemas, presets, and the configuration of each run."""

@@ -1,22 +1,33 @@
-"""Options by their dotted paths: which there are, and the values of those that a stage declares."""
+"""Options by their dotted paths: their names, and the values of those that a stage declares."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, get_args
 
 from pydantic import BaseModel
+from pydantic.fields import FieldInfo
 
 from pipeline.config.schema import Config
 from pipeline.runtime.section import decides_nothing
 
 
+def sections_of(field: FieldInfo) -> tuple[type[BaseModel], ...]:
+    """The section that a field holds, or the alternatives of a union; empty for an option."""
+    kinds = (field.annotation, *get_args(field.annotation))
+    return tuple(k for k in kinds if isinstance(k, type) and issubclass(k, BaseModel))
+
+
 def option_paths(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[str]:
-    """Dotted paths of all options that decide a result, in the order of the schema."""
+    """Dotted paths of all options that decide a result, in the order of the schema.
+
+    Alternatives of a union have their options at the same place: each path comes once.
+    """
     for name, field in model.model_fields.items():
-        inner = field.annotation
-        if isinstance(inner, type) and issubclass(inner, BaseModel):
-            yield from option_paths(inner, f"{prefix}{name}.")
+        sections = sections_of(field)
+        if sections:
+            paths = (p for section in sections for p in option_paths(section, f"{prefix}{name}."))
+            yield from dict.fromkeys(paths)
         elif not decides_nothing(model, name):
             yield prefix + name
 
@@ -39,5 +50,6 @@ def select(config: Config, paths: Iterable[str]) -> dict[str, Any]:
             source, target = dumped, selected
             for section in sections:
                 source, target = source[section], target.setdefault(section, {})
-            target[option] = source[option]
+            if option in source:  # another alternative of a union has it
+                target[option] = source[option]
     return selected

@@ -1,7 +1,7 @@
-"""A scene under one configuration and seed: what a batch is made of, and how its folder is called.
+"""Runs of a batch: a scene with one configuration and seed, and the name of its results folder.
 
-``fox`` is the scene with the project's own options, ``fox@fast`` with those of the configuration
-``fast`` over them, ``fox@fast@seed1`` and ``fox@seed1`` the same with another seed.
+``fox`` is the scene with the project's options, ``fox@fast`` with the configuration ``fast``,
+``fox@fast@seed1`` and ``fox@seed1`` the same with another seed.
 """
 
 from __future__ import annotations
@@ -16,12 +16,12 @@ _SEED = re.compile(r"seed(\d+)")
 
 @dataclass(frozen=True)
 class Run:
-    """One scene's way through the pipeline.
+    """One run of the pipeline on a scene.
 
     Attributes:
         scene: name of the scene's folder.
-        config: name of a configuration in ``configs``; empty for the project's own options.
-        seed: instead of the configured one; or None.
+        config: name of a configuration in ``configs``, or empty for the project's options.
+        seed: replaces the configured seed; None keeps it.
     """
 
     scene: str
@@ -30,18 +30,18 @@ class Run:
 
     @property
     def name(self) -> str:
-        """Name of its folder below ``results/``."""
+        """Name of the folder below ``results/``."""
         seed = "" if self.seed is None else f"seed{self.seed}"
         return "@".join(part for part in (self.scene, self.config, seed) if part)
 
 
 def parse_run(name: str, configs: Collection[str], scenes: Collection[str] = ()) -> Run:
-    """The run that ``name`` names: the inverse of ``Run.name``.
+    """The run with this name: the inverse of ``Run.name``.
 
     Args:
         name: a folder's name below ``results/``.
-        configs: the configurations there are.
-        scenes: names that are scenes as they stand, whatever they hold.
+        configs: names of all configurations.
+        scenes: names of scenes, which take precedence even if they look like those of runs.
     """
     if name in scenes:
         return Run(name)
@@ -56,13 +56,13 @@ def parse_run(name: str, configs: Collection[str], scenes: Collection[str] = ())
 
 
 def is_config_name(name: str) -> bool:
-    """Whether ``name`` can stand in a folder's name and be told from a seed."""
+    """Whether ``name`` is valid in a folder's name and different from a seed."""
     return re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name) is not None and not _SEED.fullmatch(name)
 
 
 def all_runs(
     scenes: Collection[str], configs: Collection[str], seeds: Collection[int]
 ) -> list[Run]:
-    """Each scene under each configuration and seed, scene by scene."""
+    """Each scene with each configuration and seed, scene by scene."""
     each: list[int | None] = [*seeds] or [None]
     return [Run(*run) for run in product(scenes, configs or [""], each)]

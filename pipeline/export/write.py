@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
+from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
 from pipeline.io.colmap import write_model
 from pipeline.io.frame_json import describe_frame
@@ -89,10 +90,18 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
 
 
 def export_scene(
-    out: Path, scene: ExportScene, config: Export, train: Train, split: Split, threads: int
+    out: Path,
+    scene: ExportScene,
+    config: Export,
+    experiments: ExportExperiments,
+    train: Train,
+    split: Split,
+    threads: int,
 ) -> ExportReport:
     """Write the configured formats and ``frame.json`` into ``out``."""
-    gaussians = prepare(scene.trained, config.sh_degree, config.min_opacity, config.morton_order)
+    gaussians = prepare(
+        scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
+    )
     has_points = "points" in config.formats and len(scene.model.points) > 0
     files = _Files(scene, gaussians, train.antialias, WRITERS["points"][0] if has_points else None)
     written = []

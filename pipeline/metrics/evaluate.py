@@ -99,7 +99,7 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
     return Protocol(
         test or list(views),
         [training[i] for i in picks] if test else [],
-        split.holdout_every if test else 0,
+        split.test_every if test else 0,
         WHITE if white else BLACK,
         near_plane(extent),
         extent,
@@ -147,7 +147,7 @@ def evaluate_views(
         pixels = load_view(view)
         photo = photo_over_background(pixels, protocol.background)
         if train.refine_poses and view.is_test:
-            gain, weight = gains.get(view.name), train.ssim_weight
+            gain, weight = gains.get(view.name), train.ssim_loss_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )

@@ -39,6 +39,8 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     by_scene = width * height * len(scan.photos) / TRAINING_PIXELS_PER_GAUSSIAN
     by_time = math.inf if minutes is None else GAUSSIANS_PER_MINUTE * minutes
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_time)))
+    if density.strategy == "original" and density.pixels_per_gaussian == "auto":
+        wanted = density.max_gaussians
     limited = _by_memory(config, min(wanted, density.max_gaussians))
     if limited is not None:
         return limited

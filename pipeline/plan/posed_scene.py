@@ -53,7 +53,7 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
     if (folder / "plan.json").is_file():
         return _finished(folder, max_long_side, every)
     side = Views(max_long_side_px=max_long_side or 2**31)
-    split = Split() if every is None else Split(holdout_every=every)
+    split = Split() if every is None else Split(test_every=every)
     found = scan(folder, folder.name, Config(views=side), cache=None)
     if found.poses is None:
         raise UserError(
@@ -91,7 +91,7 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
     if max_long_side is not None:
         views = views.model_copy(update={"max_long_side_px": max_long_side})
     if every is not None:
-        split = split.model_copy(update={"holdout_every": every})
+        split = split.model_copy(update={"test_every": every})
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
     model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"))
     _check_pinhole(model, folder)

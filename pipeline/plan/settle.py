@@ -59,7 +59,7 @@ def settle(scan: Scan, config: Config) -> Settled:
         "sfm.camera_model": _camera_model(scan, config),
         "sfm.share_cameras": _share_cameras(scan, config),
         "train.background": _background(scan, config),
-        "train.depth_weight": _depth_weight(scan, config),
+        "train.depth_loss_weight": _depth_loss_weight(scan, config),
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
     budget, budget_reason = gaussian_budget(scan, config)
@@ -77,7 +77,7 @@ def settle(scan: Scan, config: Config) -> Settled:
             },
             "train": {
                 "background": value["train.background"],
-                "depth_weight": value["train.depth_weight"],
+                "depth_loss_weight": value["train.depth_loss_weight"],
                 "density": config.train.density.model_copy(update={"max_gaussians": budget}),
             },
         },
@@ -174,9 +174,9 @@ def _masks(scan: Scan, config: Config) -> str:
     return f"{scan.num_masks} photographs have masks" if scan.num_masks else ""
 
 
-def _depth_weight(scan: Scan, config: Config) -> tuple[float, str]:
+def _depth_loss_weight(scan: Scan, config: Config) -> tuple[float, str]:
     """The weight of the depth loss; with many photographs it is not needed."""
-    wanted = config.train.depth_weight
+    wanted = config.train.depth_loss_weight
     if wanted != "auto":
         return wanted, f"the loss on depths has weight {wanted:g}, as configured"
     if scan.num_depths:

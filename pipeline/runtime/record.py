@@ -167,8 +167,7 @@ def read_record(path: Path, model: type[M]) -> M:
         where = ".".join(map(str, first["loc"]))
         found = f"{where}: {first['msg']}" if where else first["msg"]
         raise UserError(
-            f"expected a {path.name} of this version of the program, found a damaged file or one "
-            f"of another version ({found})",
+            f"cannot be read: it is damaged or from another version of the program ({found})",
             file=path,
             fix=rerun(path.parent),
         ) from None

@@ -87,7 +87,7 @@ def load_views(
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
     # A single view is a training view.
-    every = split.holdout_every if len(photos) > 1 else 0
+    every = split.test_every if len(photos) > 1 else 0
     result = []
     for index, photo in enumerate(photos):
         image = posed[photo.name]

@@ -14,6 +14,7 @@ from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.config import schema
+from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
@@ -65,6 +66,7 @@ def match_features(
     seed: int,
     cache: Path | None = None,
     threads: int = 1,
+    experiments: MatchesExperiments = DEFAULT.matches,
 ) -> MatchReport:
     """Choose pairs, match them and verify their two-view geometry.
 
@@ -88,7 +90,7 @@ def match_features(
     cameras, camera_of = plan_cameras(manifest, sharing)
     images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
     pairs, decision = resolve_pairs(manifest, features, config)
-    settings = MatchingSettings(config.max_ratio, config.min_inliers, seed)
+    settings = MatchingSettings(experiments.max_ratio, config.min_inliers, seed)
     database = out / "database.db"
     num_cached = build_database(
         database, cameras, images, features, pairs, settings, cache=cache, threads=threads

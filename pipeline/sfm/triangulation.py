@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.config import schema
+from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.isolate import run_isolated
@@ -47,6 +48,7 @@ def triangulate(
     threads: int,
     seed: int,
     cache: Path | None = None,
+    experiments: MatchesExperiments = DEFAULT.matches,
 ) -> TriangulationReport:
     """Triangulate points with the known poses of a COLMAP model and write the model to
     ``out/sparse/0``.
@@ -70,7 +72,7 @@ def triangulate(
         cache = cache or Path(folder) / "cache"
         feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
         facts: dict[str, Any] = run_isolated(
-            _triangulate, manifest, sparse, out, found, matches, seed
+            _triangulate, manifest, sparse, out, found, matches, experiments.max_ratio, seed
         )
     return TriangulationReport(
         **facts,
@@ -96,6 +98,7 @@ def _triangulate(
     out: Path,
     features: Path,
     config: schema.Matches,
+    max_ratio: float,
     seed: int,
 ) -> dict[str, Any]:
     import pycolmap
@@ -134,7 +137,7 @@ def _triangulate(
             images,
             features,
             pairs,
-            MatchingSettings(config.max_ratio, config.min_inliers, seed),
+            MatchingSettings(max_ratio, config.min_inliers, seed),
         )
         verified = verified_inliers(database)
         points = posed_model(list(cameras.values()), images, poses)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
@@ -28,7 +29,11 @@ class FirstGaussians:
 
 
 def first_gaussians(
-    points: Points, training: Sequence[View], config: Init, seed: int
+    points: Points,
+    training: Sequence[View],
+    config: Init,
+    experiments: InitExperiments,
+    seed: int,
 ) -> FirstGaussians:
     """Initialise Gaussians from the sparse ``points``, or at random if ``config.method`` is
     "random" or there are fewer than ``MIN_POINTS``.
@@ -42,10 +47,10 @@ def first_gaussians(
         warnings = [f"only {len(points)} sparse points: Gaussians are initialised at random"]
         method = "random"
     if method == "random":
-        first = gaussians_random(list(training), config, 0, seed)
+        first = gaussians_random(list(training), 0, seed, experiments)
     else:
         centres = np.array([view.centre for view in training])
-        first = gaussians_from_points(points, centres, config, 0)
+        first = gaussians_from_points(points, centres, config, 0, experiments)
     source = "random positions" if method == "random" else "points"
     counters = {
         "num_gaussians": len(first),

@@ -12,6 +12,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.config.experiments import DEFAULT, InitExperiments
 from pipeline.config.schema import Init
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.runtime.errors import UserError
@@ -71,7 +72,11 @@ class InitGaussians:
 
 
 def gaussians_from_points(
-    points: Points, camera_centres: NDArray[np.float64], config: Init, sh_degree: int
+    points: Points,
+    camera_centres: NDArray[np.float64],
+    config: Init,
+    sh_degree: int,
+    experiments: InitExperiments = DEFAULT.init,
 ) -> InitGaussians:
     """Initialise one Gaussian at each sparse point.
 
@@ -112,7 +117,7 @@ def gaussians_from_points(
         else np.full(1, LONE_ANGLE * median)
     )
     colour = points.rgb[chosen].astype(np.float64) / 255.0
-    result = _isotropic(xyz, _clamp(spacing, distance), colour, config.opacity, sh_degree)
+    result = _isotropic(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
     if len(xyz) > NEIGHBOURS:
         result.quats[:] = _normal_rotations(xyz, neighbours)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
@@ -120,10 +125,10 @@ def gaussians_from_points(
 
 
 def gaussians_random(
-    views: Sequence[View], config: Init, sh_degree: int, seed: int
+    views: Sequence[View], sh_degree: int, seed: int, experiments: InitExperiments = DEFAULT.init
 ) -> InitGaussians:
-    """Initialise ``config.num_random`` Gaussians of random colour in the volume that the cameras
-    see.
+    """Initialise ``experiments.num_random`` Gaussians of random colour in the volume that the
+    cameras see.
 
     If the cameras face a common point, half of the Gaussians are in a ball around it that is inside
     all views, and half in a cube around the cameras, for the background. Otherwise (forward-facing
@@ -133,7 +138,7 @@ def gaussians_random(
 
     generator = np.random.Generator(np.random.PCG64(seed))
     centres = np.stack([view.centre for view in views])
-    count = config.num_random
+    count = experiments.num_random
     ball = _common_ball(views, centres)
     if ball is not None:
         centre, radius = ball
@@ -149,7 +154,7 @@ def gaussians_random(
     k = min(NEIGHBOURS, count - 1)
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
     colour = generator.random((count, 3))
-    opacity = min(config.opacity, RANDOM_OPACITY)
+    opacity = min(experiments.opacity, RANDOM_OPACITY)
     return _isotropic(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
 
 

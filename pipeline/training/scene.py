@@ -1,4 +1,4 @@
-"""A scene's training: its inputs from the photographs, the training itself, and the report."""
+"""Training of a scene: prepares the inputs, runs the optimisation and describes the result."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.cameras.lenses import changed_by, with_lenses
-from pipeline.training.cameras.poses import followed, moved_by
+from pipeline.training.cameras.intrinsics import describe_intrinsics, with_intrinsics
+from pipeline.training.cameras.poses import describe_poses, with_common_motion
 from pipeline.training.data.depth_maps import add_maps
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
-from pipeline.training.density.floaters import air_depths
+from pipeline.training.density.floaters import empty_depths
 from pipeline.training.loop import metrics_log
-from pipeline.training.loop.trainer import TrainResult, train
+from pipeline.training.loop.result import TrainResult
+from pipeline.training.loop.train import train
 
-# Standard deviation in stops from which photographs count as differently exposed: cameras that hold
-# their exposure show 0 to 0.1, collections from the internet 0.5.
+# Standard deviation in stops from which photographs are taken as differently exposed: with fixed
+# exposure it is 0 to 0.1, in collections from the internet 0.5.
 EXPOSURES_DIFFER = 0.2
 # Epochs (passes over the training views) below which no scene is sharp.
 MIN_EPOCHS = 3.0
@@ -71,6 +73,7 @@ def train_scene(
     model: Reconstruction,
     initial: Gaussians,
     config: Train,
+    experiments: TrainExperiments,
     *,
     seed: int,
     threads: int,
@@ -81,12 +84,12 @@ def train_scene(
     """Train on the views that are not test views.
 
     Args:
-        memory_mb: that training may use; see ``trainer.train``.
+        memory_mb: memory limit; see ``training.loop.train``.
         checkpoint_dir: where a killed training is resumed from.
-        logs: folder of the training journal.
+        logs: folder of the metrics log.
 
     Raises:
-        UserError: see ``trainer.train``.
+        UserError: see ``training.loop.train``.
     """
     notes = _Notes()
     has_alpha = any(photo.alpha for photo in manifest.photos)
@@ -96,23 +99,24 @@ def train_scene(
     result = train(
         inputs,
         config,
+        experiments,
         seed=seed,
         threads=threads,
         memory_mb=memory_mb,
         checkpoint_dir=checkpoint_dir,
-        journal=logs / metrics_log.NAME,
+        metrics_log=logs / metrics_log.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
     )
     # Seconds that earlier, killed processes spent on this training.
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
     _describe(result, len(inputs.views), config, notes)
     refined = model
-    if result.lenses is not None:
-        refined = with_lenses(refined, result.lenses)
-        notes.decisions.append(changed_by(result.lenses))
+    if result.intrinsics is not None:
+        refined = with_intrinsics(refined, result.intrinsics)
+        notes.decisions.append(describe_intrinsics(result.intrinsics))
     if result.poses is not None:
-        refined = with_poses(refined, followed(views, result.poses))
-        notes.decisions.append(moved_by(views, result.poses))
+        refined = with_poses(refined, with_common_motion(views, result.poses))
+        notes.decisions.append(describe_poses(views, result.poses))
     notes.counters |= {
         "num_gaussians": len(result.gaussians),
         "steps": result.steps,
@@ -153,8 +157,10 @@ def _inputs(
         extent=extent,
         scale=scene_scale(extent, points),
         gains=np.array([gains[view.name] for view in training]) if gains else None,
-        depths=_known_depths(training, manifest, points, notes) if config.depth_weight else None,
-        air=air_depths(points),
+        depths=(
+            _known_depths(training, manifest, points, notes) if config.depth_loss_weight else None
+        ),
+        empty_depths=empty_depths(points),
     )
 
 
@@ -169,8 +175,8 @@ def _known_depths(
         notes.decisions.append(f"depth maps fitted to the sparse points: {fits}")
     if refused:
         notes.warnings.append(
-            f"depth maps of {len(refused)} views do not fit the sparse points, or see too few of "
-            f"them, and are left out: {', '.join(refused[:5])}"
+            f"depth maps of {len(refused)} views are not used, because they do not fit the sparse "
+            f"points or contain too few of them: {', '.join(refused[:5])}"
         )
     notes.counters["depth_maps"] = sum(kinds.values())
     return known
@@ -189,8 +195,8 @@ def _choose_gains(
             return {}
     found = measure_exposures(views, model)
     notes.decisions.append(
-        f"exposures differ by {found.spread:.2f} stops: renders are compared through gains that "
-        f"were measured in {found.measured} of {len(views)} photographs"
+        f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
+        f"measured in {found.measured} of {len(views)} photographs"
     )
     return {v.name: gain.tolist() for v, gain in zip(views, found.gains, strict=True)}
 
@@ -206,20 +212,20 @@ def _describe(result: TrainResult, num_views: int, config: Train, notes: _Notes)
             "machine and its load, so another run gives other bits"
         )
     if unseen := result.counters["unseen"]:
-        notes.decisions.append(f"{unseen} Gaussians that no training photograph sees are left out")
+        notes.decisions.append(f"{unseen} Gaussians that no training view sees were removed")
     if floaters := result.counters["floaters"]:
         notes.decisions.append(f"{floaters} floaters close to a single camera were removed")
 
 
 def too_few_epochs(steps: int, views: int, seconds: float, minutes: float | None) -> str | None:
-    """The warning about a training too short for its number of views; None where it is not."""
+    """A warning if the run is too short for its number of views, else None."""
     if steps >= MIN_EPOCHS * views:
         return None
     epochs = f"{steps} steps are {steps / views:.1f} epochs over {views} training views"
     if minutes is None:
         return f"{epochs}, too few for a sharp scene: raise train.steps"
     return (
-        f"{epochs}, too few for a sharp scene: all that this machine did in {minutes:g} minutes, "
-        f"{seconds / steps:.2g} s a step; raise train.budget_minutes or lower "
-        "views.max_long_side_px, and see that nothing else keeps the machine busy"
+        f"{epochs}, too few for a sharp scene, in {minutes:g} minutes at {seconds / steps:.2g} s a "
+        "step: raise train.budget_minutes, lower views.max_long_side_px, or stop other programs on "
+        "this machine"
     )

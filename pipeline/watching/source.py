@@ -13,7 +13,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.views import camera_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.checkpoints.checkpoint import PATTERN, newest
-from pipeline.training.loop.metrics_log import NAME, read_journal
+from pipeline.training.loop.metrics_log import NAME, read_metrics_log
 from pipeline.training.loop.state import gaussians_of
 
 
@@ -93,7 +93,7 @@ class Source:
 
     def _summary(self, step: int, count: int) -> str:
         text = f"step {step}, {count} Gaussians"
-        lines = read_journal(self.path / "logs" / NAME)
+        lines = read_metrics_log(self.path / "logs" / NAME)
         if lines and lines[-1]["psnr"] is not None:
             last = lines[-1]
             text += f", PSNR {last['psnr']:.2f} dB, {last['share']:.0%} done"

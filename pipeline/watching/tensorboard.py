@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runtime.errors import UserError
-from pipeline.training.loop.metrics_log import NAME, read_journal
+from pipeline.training.loop.metrics_log import NAME, read_metrics_log
 
 SCALARS = {
     "loss": "train/loss",
@@ -52,7 +52,7 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
     try:
         while True:
             for name, file in journals.items():
-                records = read_journal(file)
+                records = read_metrics_log(file)
                 if len(records) < done[name]:
                     done[name] = 0  # The run has been restarted.
                 for record in records[done[name] :]:

@@ -1,13 +1,17 @@
 """Configuration: what is validated, merged and documented."""
 
+import re
 from pathlib import Path
+from typing import Any
 
 import pytest
 import yaml
 
 from pipeline.config import docs
 from pipeline.config.load import Project, load_project, merge, scene_config
+from pipeline.config.options import option_paths
 from pipeline.config.presets import PRESETS
+from pipeline.config.renamed import RENAMED
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
 
@@ -18,7 +22,20 @@ from pipeline.runtime.errors import UserError
         ({"trian": {"steps": 1}}, "trian: no such option (did you mean train?)"),
         ({"train": {"stps": 1}}, "train.stps: no such option (did you mean steps?)"),
         ({"train": {"steps": 0}}, "train.steps"),
-        ({"train": {"lr_means": float("nan")}}, "train.lr_means"),
+        ({"train": {"mask_loss_weight": float("nan")}}, "train.mask_loss_weight"),
+        (
+            {"train": {"density": {"max_gausians": 5}}},
+            "train.density.max_gausians: no such option (did you mean max_gaussians?)",
+        ),
+        ({"train": {"density": {"strategy": "none"}}}, "train.density: "),
+        (
+            {"train": {"density": {"strategy": "original", "remove_floaters": True}}},
+            "train.density.remove_floaters: no such option",
+        ),
+        (
+            {"experiments": {"train": {"gradient": {"clone_": True}}}},
+            "experiments.train.gradient.clone_: no such option (did you mean clone?)",
+        ),
         ({"scenes": {"fox": {"exprt": {}}}}, "scenes.fox: exprt"),
         ({"preset": "quick"}, "preset"),
         ({"matches": {"pairs": "all"}}, "matches.pairs"),
@@ -38,12 +55,12 @@ def test_a_wrong_option_is_named(raw, named):
 def test_scene_options_win_over_project_over_preset():
     raw = {
         "preset": "fast",
-        "train": {"steps": 50, "density": {"interval": 7}},
+        "train": {"steps": 50, "density": {"max_gaussians": 7}},
         "scenes": {"fox": {"train": {"steps": 60}}},
     }
     fox, other = scene_config(raw, "fox"), scene_config(raw, "other")
     assert (fox.train.steps, other.train.steps) == (60, 50)
-    assert fox.train.density.interval == 7
+    assert fox.train.density.max_gaussians == 7
     fast = PRESETS["fast"]["train"]["density"]["pixels_per_gaussian"]
     assert fox.train.density.pixels_per_gaussian == fast
 
@@ -51,13 +68,13 @@ def test_scene_options_win_over_project_over_preset():
 def test_a_configuration_wins_over_the_scene_and_brings_its_preset():
     raw = {
         "preset": "balanced",
-        "train": {"ssim_weight": 0.3},
-        "scenes": {"fox": {"train": {"sh_degree": 2, "lr_quats": 0.5}}},
+        "train": {"ssim_loss_weight": 0.3},
+        "scenes": {"fox": {"train": {"sh_degree": 2, "mask_loss_weight": 0.5}}},
         "configs": {"plain": {"preset": "fast", "train": {"sh_degree": 0}}},
     }
     plain = scene_config(raw, "fox", "plain", seed=7)
     assert (plain.preset, plain.seed, plain.train.sh_degree) == ("fast", 7, 0)
-    assert (plain.train.ssim_weight, plain.train.lr_quats) == (0.3, 0.5)
+    assert (plain.train.ssim_loss_weight, plain.train.mask_loss_weight) == (0.3, 0.5)
     assert plain.train.steps == PRESETS["fast"]["train"]["steps"]
     assert scene_config(raw, "fox").train.sh_degree == 2
 
@@ -72,7 +89,7 @@ def test_numbers_that_arrive_as_text_are_numbers():
     assert scene_config({"train": {"steps": "100"}}, "x").train.steps == 100
 
 
-@pytest.mark.parametrize("preset", ["fast", "balanced", "high"])
+@pytest.mark.parametrize("preset", list(PRESETS))
 def test_presets_are_valid_and_keep_the_defaults_of_the_rest(preset):
     config = scene_config({"preset": preset}, "x")
     assert config.preset == preset
@@ -87,6 +104,7 @@ def test_merge_leaves_its_arguments_alone():
 
 def test_generated_page_and_defaults_are_current():
     assert docs.PAGE.read_text() == docs.page(), "run make docs"
+    assert docs.EXPERIMENTS_PAGE.read_text() == docs.experiments_page(), "run make docs"
     assert docs.DEFAULTS.read_text() == docs.defaults(), "run make docs"
     schemas = docs.json_schemas()
     assert set(docs.SCHEMAS.iterdir()) == set(schemas), "a schema of no file, or none of one"
@@ -110,17 +128,21 @@ def batch(file: str) -> dict[str, Config]:
 
 
 def test_the_original_is_the_same_in_all_batches():
-    """Of any length: its budget and when density control ends are all that differ."""
+    """At the resolution of the others, of any length; in ablations with the limit of Gaussians."""
     quality = batch("quality")
-    wanted = batch("ablations")["original"]
+    found = {name: quality[name] for name in ("original_7k", "original_30k")}
+    found["original"] = batch("ablations")["original"]
     assert len(set(map(Config.model_dump_json, quality.values()))) == len(quality)
-    for name, steps in [("original_7k", 7000), ("original_30k", 30_000)]:
-        assert quality[name].train.steps == steps
-        density = wanted.train.density.model_dump(exclude={"stop_share"})
-        density |= {"pixels_per_gaussian": 0.1, "max_gaussians": 3_000_000}
-        assert quality[name].train.density.model_dump(exclude={"stop_share"}) == density
-        same = {"train": {"steps", "density"}}
-        assert quality[name].model_dump(exclude=same) == wanted.model_dump(exclude=same)
+    steps = {name: config.train.steps for name, config in found.items()}
+    assert steps == {"original_7k": 7000, "original_30k": 30_000, "original": 4000}
+    published = scene_config({"preset": "original"}, "fox")
+    chosen = {
+        "views": {"max_long_side_px"},
+        "train": {"steps": True, "density": {"pixels_per_gaussian"}},
+    }
+    for config in found.values():
+        assert config.views.max_long_side_px == Config().views.max_long_side_px
+        assert config.model_dump(exclude=chosen) == published.model_dump(exclude=chosen)
 
 
 @pytest.mark.parametrize(("file", "base"), [("ablations", "balanced"), ("skipping", "plan")])
@@ -134,4 +156,33 @@ def test_every_configuration_of_a_batch_differs_from_the_default(file, base):
 def test_the_option_page_speaks_of_values_not_of_types():
     page = docs.page()
     assert not any(word in page for word in ("typing.", "<class", "FieldInfo"))
-    assert "| `budget_minutes` | number > 0, `null` | `null` |" in page
+    assert "| `budget_minutes` | number > 0, `null` | minutes | `null` |" in page
+
+
+def test_the_product_has_few_options():
+    """Each with a description and, if it is a number, a range and a unit."""
+    assert docs.num_options() < 60
+    for page in (docs.page(), docs.experiments_page()):
+        rows = [line.split(" | ") for line in page.splitlines() if line.startswith("| `")]
+        options = [row for row in rows if len(row) == 5]
+        assert len(options) >= 30
+        for name, values, unit, _, meaning in options:
+            assert meaning.removesuffix(" |").strip().endswith("."), name
+            assert not re.search(r"(^|, )(whole )?number(,|$)", values), f"{name} has no range"
+            assert ("number" in values) <= bool(unit), f"{name} has no unit"
+
+
+@pytest.mark.parametrize(("old", "new"), RENAMED.items())
+def test_an_old_name_is_an_error_that_says_the_new_one(old, new):
+    """And every new name is an option."""
+    assert set(new) <= set(option_paths())
+    assert old not in set(option_paths())
+    for prefix in ((), ("scenes", "fox"), ("configs", "other")):
+        raw: Any = 1
+        for name in reversed((*prefix, *old.split("."))):
+            raw = {name: raw}
+        with pytest.raises(UserError) as caught:
+            load_project(raw)
+        (line,) = str(caught.value).split("not valid:")[1].splitlines()[1:2]
+        where = f"{'.'.join(prefix)}: " if prefix else ""
+        assert line.strip() == f"{where}{old} is now {' or '.join(new)}"

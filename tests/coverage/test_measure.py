@@ -16,7 +16,7 @@ from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
 from tests.coverage.scenes import UP, camera, renderer, wall
 
-TRAIN = Train(background="black", exposure="off", lr_boost=1.0, sh_degree=0)
+TRAIN = Train(background="black", exposure="off", sh_degree=0)
 
 
 def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> dict:
@@ -34,7 +34,7 @@ def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> 
         path = folder / view.name
         Image.fromarray(to_bytes(renderer(truth)(view).rgb)).save(path)
         views[i] = replace(view, image=str(path))
-    protocol = choose_protocol(views, Split(holdout_every=8 if with_test_view else 0), TRAIN)
+    protocol = choose_protocol(views, Split(test_every=8 if with_test_view else 0), TRAIN)
     evaluation = evaluate_views(
         scene, protocol, Evaluate(lpips_net="none"), TRAIN, folder / "renders", threads=threads
     )

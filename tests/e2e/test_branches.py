@@ -74,9 +74,9 @@ def test_given_poses_can_be_ignored(project, masked):
 def test_cameras_that_training_moves_are_what_comes_out(project, masked):
     """On the masked scene: its poses are exact, so that what moves them must do no harm."""
     shutil.copytree(masked, project / "data/moving")
-    moves = {"refine_poses": True, "pose_reach": 0.003}
-    moves |= {"refine_intrinsics": True, "intrinsics_reach": 0.003}
-    config = {**TINY, "train": {**TINY["train"], **moves}}
+    moves = {"refine_poses": True, "refine_intrinsics": True}
+    limits = {"max_pose_change": 0.003, "max_intrinsics_change": 0.003}
+    config = {**TINY, "train": {**TINY["train"], **moves}, "experiments": {"train": limits}}
     snakemake(project, "results/moving/metrics.json", config=config)
     results = project / "results" / "moving"
     found = json.loads((results / "metrics.json").read_text())

@@ -78,7 +78,7 @@ def test_an_export_option_never_retrains(project):
 
 
 def test_a_training_option_keeps_the_poses(project):
-    config = TINY | {"train": TINY["train"] | {"lr_scales": 0.004}}
+    config = TINY | {"experiments": {"train": {"scales_learning_rate": 0.004}}}
     done = snakemake(project, "-n", TARGET, config=config)
     assert rules_run(done) == {"train", "evaluate", "coverage", "export", "report"}
 

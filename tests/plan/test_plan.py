@@ -283,13 +283,11 @@ def test_cameras(tmp_path, group, share, model):
 
 def test_decisions_contain_the_resolution_and_the_split(tmp_path):
     photos(tmp_path / "images", 2, (72, 128))
-    plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"holdout_every": 5})
+    plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"test_every": 5})
     assert plan.facts["view_size"] == [54, 96]
     assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
     assert "one view in 5" in plan.stages["evaluate"].reason
-    assert (
-        "no test views" in plan_of(tmp_path, split={"holdout_every": 0}).stages["evaluate"].reason
-    )
+    assert "no test views" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
 
 
 def test_facts_and_warnings_go_with_the_plan(tmp_path):
@@ -344,13 +342,19 @@ def test_the_number_of_gaussians_follows_the_pixels(tmp_path, count, options, bu
     assert again.config == plan.config
 
 
+def test_the_published_strategy_is_limited_by_its_maximum_alone(tmp_path):
+    config = Config.model_validate({"train": {"density": {"strategy": "original"}}})
+    plan = make_plan(many(tmp_path, 30), config)
+    assert plan.config.train.density.max_gaussians == 3_000_000
+
+
 @pytest.mark.parametrize(
     "count, wanted, weight", [(30, "auto", 0.03), (31, "auto", 0.0), (31, 0.5, 0.5), (9, 0.0, 0.0)]
 )
 def test_few_photographs_get_a_loss_on_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
-    config = Config.model_validate({"train": {"depth_weight": wanted}})
+    config = Config.model_validate({"train": {"depth_loss_weight": wanted}})
     plan = make_plan(many(tmp_path, count), config)
-    assert plan.config.train.depth_weight == weight
+    assert plan.config.train.depth_loss_weight == weight
     assert any("depths" in text for text in plan.stages["train"].decisions) == (
         count != 31 or wanted != "auto"
     )
@@ -364,7 +368,7 @@ def test_depth_maps_are_used_with_any_number_of_photographs(tmp_path):
         depth_digest=lambda i: f"{i}" if i < 30 else None,
     )
     plan = make_plan(some, Config())
-    assert plan.config.train.depth_weight == 0.3
+    assert plan.config.train.depth_loss_weight == 0.3
     assert any("30 depth maps" in text for text in plan.stages["train"].decisions)
 
 

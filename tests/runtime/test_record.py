@@ -116,7 +116,7 @@ def test_a_damaged_record_is_one_clear_error(first, name, content):
     file = first.out / name
     file.write_text(content)
     read = {"stage.json": read_stage, "run.json": read_run}
-    with pytest.raises(UserError, match=f"{name}: expected a {name}.*damaged.*\n.*--forcerun first"):
+    with pytest.raises(UserError, match=f"{name}: cannot be read.*\n.*--forcerun first"):
         read.get(name, lambda folder: Manifest.read(folder / name))(first.out)
 
 

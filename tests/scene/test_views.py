@@ -47,7 +47,7 @@ def test_every_eighth_photograph_with_a_pose_is_a_test_view():
     views = load_views(manifest, model, Views(), Split())
     assert [view.name for view in views if view.is_test] == ["p01.jpg", "p09.jpg", "p17.jpg"]
     assert not any(
-        view.is_test for view in load_views(manifest, model, Views(), Split(holdout_every=0))
+        view.is_test for view in load_views(manifest, model, Views(), Split(test_every=0))
     )
 
 
@@ -65,7 +65,7 @@ def test_cameras_with_lens_distortion_are_an_error():
 
 def test_extent():
     manifest, model = make(9)
-    views = load_views(manifest, model, Views(), Split(holdout_every=8))
+    views = load_views(manifest, model, Views(), Split(test_every=8))
     # Training cameras are at x = 1 ... 7, at most 3 from their mean.
     assert scene_extent(views) == pytest.approx(3.3)
     assert scene_extent(views[:1]) == 1.0

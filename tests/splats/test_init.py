@@ -7,6 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.runtime.errors import UserError
@@ -86,7 +87,9 @@ def test_scale_is_the_mean_distance_of_three_neighbours() -> None:
     result = gaussians_from_points(points_at(grid), CENTRES, Init(), 0)
     assert np.allclose(np.exp(result.log_scales), 0.1, rtol=1e-5)
     assert np.allclose(0.5 + SH_C0 * result.sh[:, 0], 200 / 255, atol=1e-6)
-    assert np.allclose(1 / (1 + np.exp(-result.opacity_logits)), Init().opacity, atol=1e-6)
+    assert np.allclose(
+        1 / (1 + np.exp(-result.opacity_logits)), InitExperiments().opacity, atol=1e-6
+    )
 
 
 def test_points_next_to_a_camera_and_far_outliers_are_dropped() -> None:
@@ -143,7 +146,7 @@ def test_random_gaussians_of_inward_facing_cameras() -> None:
     directions = np.random.default_rng(0).normal(size=(12, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
     views = [looking_at(target + 4.0 * d, target) for d in directions]
-    result = gaussians_random(views, Init(num_random=500), 2, seed=1)
+    result = gaussians_random(views, 2, 1, InitExperiments(num_random=500))
     assert_valid(result)
     assert result.sh.shape == (500, 9, 3)
     # Every second Gaussian is in the ball inside all views, the others in the cube.
@@ -157,12 +160,12 @@ def test_random_gaussians_of_inward_facing_cameras() -> None:
         pixel = camera[:, :2] / camera[:, 2:] * 70.0 + [40.0, 30.0]
         assert (camera[:, 2] > 0).all()
         assert ((pixel >= -0.5) & (pixel <= [80.5, 60.5])).all()
-    other = gaussians_random(views, Init(num_random=500), 2, seed=2)
+    other = gaussians_random(views, 2, 2, InitExperiments(num_random=500))
     assert not np.array_equal(result.means, other.means)
 
 
 def test_random_gaussians_of_forward_facing_cameras_are_in_front_of_them() -> None:
     views = [looking_at(np.array([0.1 * i, 0.0, 0.0]), np.array([0.1 * i, 0, 9])) for i in range(5)]
-    result = gaussians_random(views, Init(num_random=300), 0, seed=1)
+    result = gaussians_random(views, 0, 1, InitExperiments(num_random=300))
     assert_valid(result)
     assert (result.means[:, 2] > 0).all()

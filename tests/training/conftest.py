@@ -1,4 +1,4 @@
-"""A tiny scene of known Gaussians, photographed by the rasterizer itself."""
+"""A tiny scene: renders of known Gaussians as photographs."""
 
 from __future__ import annotations
 
@@ -6,18 +6,20 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.config.schema import Density, Train
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.options import option_paths
+from pipeline.config.schema import Train
 from pipeline.render import make_backend
 from pipeline.render.views import render_view
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.loop import trainer
+from pipeline.training.loop import session
 
 WIDTH, HEIGHT, FOCAL = 40, 32, 40.0
 NUM_VIEWS = 6
@@ -25,7 +27,7 @@ NUM_VIEWS = 6
 
 @dataclass
 class TinyScene:
-    """``views`` have files without alpha, ``alpha_views`` the same with it."""
+    """``views`` have images without alpha, ``alpha_views`` the same with alpha."""
 
     truth: Gaussians
     initial: Gaussians
@@ -34,12 +36,38 @@ class TinyScene:
     extent: float
 
 
-def tiny_config(steps: int = 40, **changes: object) -> Train:
-    """Training short enough for a test, with every phase in it."""
-    density = {"start_step": 700, "interval": 1750, "stop_share": 0.7, "max_gaussians": 130}
-    density |= changes.pop("density", {})  # type: ignore[arg-type]
-    values = {"steps": steps, "sh_degree": 1, "sh_interval": 2000, "coarse_until": 0.0}
-    return Train(**(values | changes), density=Density(**density))  # type: ignore[arg-type]
+class Options(NamedTuple):
+    """The arguments of ``train`` that hold its options."""
+
+    train: Train
+    experiments: TrainExperiments
+
+
+def tiny_config(
+    steps: int = 40, density: dict[str, object] | None = None, **changes: object
+) -> Options:
+    """Options of a training short enough for a test, with every phase in it.
+
+    Args:
+        density: options of density control and of experiments with it, for each strategy.
+        changes: other options of ``Train`` and ``TrainExperiments``.
+    """
+    values: dict[str, object] = {"steps": steps, "sh_degree": 1}
+    values |= {"sh_degree_interval": 2000, "coarse_share": 0.0} | changes
+    control = {"start_step": 700, "interval": 1750, "stop_share": 0.7, "max_gaussians": 130}
+    control |= density or {}  # type: ignore[arg-type]
+    product = {path.removeprefix("train.density.") for path in option_paths()}
+    kept = {name: control.pop(name) for name in list(control) if name in product}
+    strategies = {
+        name: {k: v for k, v in control.items() if k in field.annotation.model_fields}  # type: ignore[union-attr]
+        for name, field in TrainExperiments.model_fields.items()
+        if name in ("gradient", "mcmc")
+    }
+    train = {name: values.pop(name) for name in list(values) if name in Train.model_fields}
+    return Options(
+        Train.model_validate(train | {"density": kept}),
+        TrainExperiments.model_validate(values | strategies),
+    )
 
 
 def ball(count: int, seed: int) -> Gaussians:
@@ -95,7 +123,7 @@ def scene(tmp_path_factory: pytest.TempPathFactory) -> TinyScene:
 
 @contextmanager
 def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
-    """What trains inside writes a checkpoint after every step, and dies in this one."""
+    """Training inside writes a checkpoint after every step and is interrupted in this step."""
     original, calls = make_backend().backward, 0
 
     def dying(*args: Any, **kwargs: Any) -> Any:
@@ -106,6 +134,6 @@ def killed_in_step(patch: pytest.MonkeyPatch, step: int) -> Iterator[None]:
         return original(*args, **kwargs)
 
     with patch.context() as inside, pytest.raises(KeyboardInterrupt):
-        inside.setattr(trainer, "CHECKPOINT_SECONDS", 0.0)
+        inside.setattr(session, "CHECKPOINT_SECONDS", 0.0)
         inside.setattr(make_backend(), "backward", dying)
         yield

@@ -1,1 +1,1 @@
-"""Camera refinement: poses and lenses that train with the Gaussians."""
+"""Camera refinement: poses and intrinsics that are optimised with the Gaussians."""

@@ -1,4 +1,4 @@
-"""The pose of a test view, fitted to its photograph in a scene that stays as it is."""
+"""Alignment of a test view to its photograph, in a fixed scene."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from pipeline.render import Backend, RasterOptions, make_backend
 from pipeline.render.views import raster_camera, within
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.cameras.poses import Poses
+from pipeline.training.cameras.poses import PoseRefinement
 
-# A held-out camera is fitted in so many looks; the rate falls from the first to the last by this.
-FIT_STEPS, FIT_RATE, FIT_FALL = 100, 5e-3, 0.01
+# Number of steps, learning rate of the first (radians, extents), and of the last relative to it.
+FIT_STEPS, FIT_RATE, FIT_DECAY = 100, 5e-3, 0.01
 
 
 def fit_pose(
@@ -31,32 +31,33 @@ def fit_pose(
     ssim_weight: float,
     backend: Backend | None = None,
 ) -> View:
-    """A held-out view with its pose moved to where the scene fits its photograph best; the scene
-    stays as it is.
+    """The view with the pose at which the render of the fixed scene is closest to its photograph.
 
     Args:
         photo: (H, W, 3), over the background of ``options``.
-        mask: (H, W), false where a pixel counts for nothing.
-        gain: a factor for each channel of the render.
-        backend: that draws; None: the default.
+        mask: (H, W), False for ignored pixels.
+        gain: factor of each channel of the render.
+        extent: unit of translations (``scene.views.scene_extent``), world units.
+        ssim_weight: as in training.
+        backend: None: the default.
     """
     backend = backend or make_backend()
     options = within(options, gaussians)
-    poses = Poses.of([view], gaussians, extent)
+    poses = PoseRefinement.of([view], gaussians, extent, limit=math.inf)
     camera = raster_camera(view)
-    wanted = torch.from_numpy(np.ascontiguousarray(photo))
+    target = torch.from_numpy(np.ascontiguousarray(photo))
     ignored = None if mask is None else torch.from_numpy(~mask)
     factor = torch.tensor([1.0, 1.0, 1.0] if gain is None else list(gain), dtype=torch.float32)
     best, least = poses.poses[0].copy(), math.inf
     for number in range(FIT_STEPS):
         rendered = backend.forward(*gaussians.parameters(), poses.camera(camera, 0), options)
         loss = backend.l1_ssim(
-            rendered.color * factor, wanted, ssim_weight, ignored, threads=options.threads
+            rendered.color * factor, target, ssim_weight, ignored, threads=options.threads
         )
         if loss.loss < least:
             best, least = poses.poses[0].copy(), loss.loss
         d_color = loss.grad * factor
-        found = backend.backward(rendered, d_color, means2d_abs=False, camera=True)
-        assert found.camera is not None
-        poses.step(0, found.camera, FIT_RATE * FIT_FALL ** (number / (FIT_STEPS - 1)))
+        gradients = backend.backward(rendered, d_color, means2d_abs=False, camera=True).camera
+        assert gradients is not None
+        poses.step(0, gradients, FIT_RATE * FIT_DECAY ** (number / (FIT_STEPS - 1)))
     return replace(view, world_to_camera=best)

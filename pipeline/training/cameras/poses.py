@@ -1,10 +1,9 @@
-"""Poses that move with the Gaussians, for cameras that are off by a little.
+"""Refinement of poses during training (as in BARF, Lin et al. 2021).
 
-Each view's pose goes down the loss's gradient (``render.CameraGradients``) by an Adam of its own:
-after each look at the view, a turn and a shift of the scene in the camera's frame are laid over the
-pose. Lin et al. 2021, "BARF", and its followers do so; coarse pictures first help here, too. The
-turn is about what the view sees: about the camera's centre it would be nearly the same as a shift,
-and where two parameters do the same thing a gradient hardly tells them apart.
+After each step, the pose of its view is changed by a rotation and a translation in the camera's
+frame, by Adam on the gradient of the loss (``render.CameraGradients``). The rotation is about the
+centre of what the view sees: about the camera's centre it would be nearly the same as a
+translation, and gradients hardly separate two such parameters.
 """
 
 from __future__ import annotations
@@ -21,54 +20,59 @@ from numpy.typing import NDArray
 from pipeline.render import CameraGradients, RasterCamera
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.optimisers.per_camera_adam import RowAdam
+from pipeline.training.optimisers.per_camera_adam import PerCameraAdam
 
 Array = NDArray[np.float64]
 
 
 @dataclass
-class Poses:
-    """All views' poses and their moments.
+class PoseRefinement:
+    """Refined poses of the training views.
 
     Attributes:
         poses: (V, 4, 4) world to camera.
-        pivots: (V,) how far before the camera is what the view sees, world unit.
-        extent: the scene's size; shifts count in it.
-        adam: (V, 6) of the turn (radians) and the shift (extents).
+        pivots: (V,) depth of the centre of rotation in the camera's frame, world units.
+        extent: unit of translations (``scene.views.scene_extent``), world units.
+        limit: upper limit of a pose's total change, in radians and extents.
+        adam: (V, 6) moments of the rotation (radians) and the translation (extents).
     """
 
     poses: Array
     pivots: Array
     extent: float
-    adam: RowAdam = field(init=False)
+    limit: float
+    adam: PerCameraAdam = field(init=False)
 
     def __post_init__(self) -> None:
-        self.adam = RowAdam((len(self.poses), 6))
+        self.adam = PerCameraAdam((len(self.poses), 6))
 
     @staticmethod
-    def of(views: Sequence[View], gaussians: Gaussians, extent: float) -> Poses:
-        """The views' poses as they are, in a scene that looks like ``gaussians``."""
+    def of(
+        views: Sequence[View], gaussians: Gaussians, extent: float, limit: float
+    ) -> PoseRefinement:
+        """The given poses; ``gaussians`` determine the centres of rotation."""
         means = gaussians.means.double().numpy()
-        pivots = np.array([_distance(view, means, extent) for view in views])
-        return Poses(np.stack([view.world_to_camera for view in views]), pivots, extent)
+        pivots = np.array([_median_depth(view, means, extent) for view in views])
+        poses = np.stack([view.world_to_camera for view in views])
+        return PoseRefinement(poses, pivots, extent, limit)
 
     def camera(self, camera: RasterCamera, index: int) -> RasterCamera:
-        """A view's camera where it is now."""
+        """The camera of a view with its refined pose."""
         return replace(camera, world_to_camera=torch.from_numpy(self.poses[index].copy()))
 
     def step(self, index: int, gradients: CameraGradients, rate: float) -> None:
-        """Move one view's pose; ``rate`` is radians and extents."""
+        """Refine the pose of a view; ``rate`` is in radians and extents."""
         pivot = np.array([0.0, 0.0, self.pivots[index]])
         shift = gradients.translation.numpy()
         turn = gradients.rotation.numpy() - np.cross(pivot, shift)
         change = self.adam.step(index, np.concatenate([turn, shift * self.extent]), rate)
         left = rigid(change[:3], change[3:] * self.extent + pivot)
         left[:3, 3] -= (left[:3, :3] * pivot).sum(1)
-        # Sums, not "@": its bits may depend on the number of threads.
+        # Not a matrix product: BLAS may round differently with the number of threads.
         self.poses[index] = (left[:, :, None] * self.poses[index][None]).sum(1)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What a checkpoint must hold."""
+        """The arrays of a checkpoint."""
         return {"pose.poses": self.poses, **self.adam.arrays("pose")}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
@@ -76,21 +80,21 @@ class Poses:
         self.adam.restore("pose", arrays)
 
 
-def followed(views: Sequence[View], moved: Mapping[str, Array]) -> dict[str, Array]:
-    """All views' poses, (4, 4) by name, after some of them have ``moved``: the others, held out of
-    training, follow the motion that is common to those, for a scene may drift as a whole.
+def with_common_motion(views: Sequence[View], refined: Mapping[str, Array]) -> dict[str, Array]:
+    """(4, 4) poses of all views by name: the ``refined`` ones, and for the others, the test views,
+    the given pose moved like the refined ones on average, since a scene can drift as a whole.
 
-    The motion is a turn, the mean of all cameras' (Markley et al. 2007 in matrices: the rotation
-    nearest to their sum), and a shift between the means of their centres.
+    The average motion is a rotation, the mean of all cameras' (Markley et al. 2007 in matrices: the
+    rotation nearest to their sum), and the translation between the means of their centres.
     """
-    old = {view.name: view for view in views if view.name in moved}
+    old = {view.name: view for view in views if view.name in refined}
     total = np.zeros((3, 3))
     before, after = np.zeros(3), np.zeros(3)
     for name, view in old.items():
-        rotation = moved[name][:3, :3]
+        rotation = refined[name][:3, :3]
         total += np.einsum("ki,kj->ij", rotation, view.world_to_camera[:3, :3])
         before += view.centre / len(old)
-        after -= np.einsum("ki,k->i", rotation, moved[name][:3, 3]) / len(old)
+        after -= np.einsum("ki,k->i", rotation, refined[name][:3, 3]) / len(old)
     u, _, vt = np.linalg.svd(total)
     sign = np.diag([1.0, 1.0, np.sign(np.linalg.det(u) * np.linalg.det(vt))])
     turn = np.einsum("ij,jk,kl->il", u, sign, vt)
@@ -100,12 +104,12 @@ def followed(views: Sequence[View], moved: Mapping[str, Array]) -> dict[str, Arr
         pose[:3, :3] = np.einsum("ij,kj->ik", view.world_to_camera[:3, :3], turn)
         centre = np.einsum("ij,j->i", turn, view.centre - before) + after
         pose[:3, 3] = -np.einsum("ij,j->i", pose[:3, :3], centre)
-        result[view.name] = moved.get(view.name, pose)
+        result[view.name] = refined.get(view.name, pose)
     return result
 
 
-def moved_by(views: Sequence[View], poses: Mapping[str, Array]) -> str:
-    """How far training has moved the cameras, to these ``poses`` by name, in words."""
+def describe_poses(views: Sequence[View], poses: Mapping[str, Array]) -> str:
+    """A sentence on the change from the views' given poses to ``poses`` by name."""
     turned, shifted = [], []
     for view in views:
         if view.name in poses:
@@ -116,13 +120,13 @@ def moved_by(views: Sequence[View], poses: Mapping[str, Array]) -> str:
             shifted.append(float(np.linalg.norm(centre - view.centre)))
     share = np.median(shifted) / scene_extent(list(views))
     return (
-        f"cameras were moved with the scene: by {np.median(turned):.3f} degrees and {share:.2%} of "
-        "the scene's extent (medians)"
+        f"poses were refined: by {np.median(turned):.3f} degrees and {share:.2%} of the scene's "
+        "extent (medians)"
     )
 
 
-def _distance(view: View, means: Array, extent: float) -> float:
-    """Median depth of the means (N, 3) that lie in the view, the extent if none does."""
+def _median_depth(view: View, means: Array, extent: float) -> float:
+    """Median depth of the means (N, 3) inside the view, or the extent if there are none."""
     pose = view.world_to_camera
     cam = np.stack([(means * row[:3]).sum(1) + row[3] for row in pose[:3]], 1)
     z = np.maximum(cam[:, 2], 1e-12)
@@ -132,12 +136,12 @@ def _distance(view: View, means: Array, extent: float) -> float:
 
 
 def rigid(turn: Array, shift: Array) -> Array:
-    """(4, 4) exp of the turn (3,), radians, by Rodrigues' formula, and then the shift (3,)."""
+    """(4, 4) rotation vector ``turn`` (3,), radians (Rodrigues' formula), then ``shift`` (3,)."""
     angle = math.sqrt(float((turn**2).sum()))
     x, y, z = turn
     skew = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
     square = np.outer(turn, turn) - angle**2 * np.eye(3)
-    # sin(a) / a and (1 - cos(a)) / a^2, whose quotients lose all digits at 0
+    # sin(a) / a and (1 - cos(a)) / a^2; by their series near 0, where the quotients lose digits
     sine = math.sin(angle) / angle if angle > 1e-4 else 1 - angle**2 / 6
     cosine = (1 - math.cos(angle)) / angle**2 if angle > 1e-4 else 0.5 - angle**2 / 24
     matrix = np.eye(4)

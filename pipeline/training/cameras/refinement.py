@@ -1,4 +1,4 @@
-"""What of the cameras moves while the Gaussians are trained: poses, lenses, both or nothing."""
+"""Camera refinement during training: poses, intrinsics, both or neither."""
 
 from __future__ import annotations
 
@@ -8,44 +8,58 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.render import CameraGradients, RasterCamera
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.cameras.lenses import Lenses
-from pipeline.training.cameras.poses import Poses
+from pipeline.training.cameras.intrinsics import IntrinsicsRefinement
+from pipeline.training.cameras.poses import PoseRefinement
 
 
 @dataclass
-class MovingCameras:
-    """Poses and lenses, None where they stay as they are given.
+class CameraRefinement:
+    """The refined cameras of the training views.
 
     Attributes:
-        views: how many are trained on.
+        num_views: number of training views.
+        poses: None if poses are not refined.
+        intrinsics: None if intrinsics are not refined.
     """
 
-    views: int
-    poses: Poses | None
-    lenses: Lenses | None
+    num_views: int
+    poses: PoseRefinement | None
+    intrinsics: IntrinsicsRefinement | None
 
     @staticmethod
     def of(
-        views: Sequence[View], gaussians: Gaussians, extent: float, config: Train
-    ) -> MovingCameras:
-        return MovingCameras(
-            len(views),
-            Poses.of(views, gaussians, extent) if config.refine_poses else None,
-            Lenses.of(views) if config.refine_intrinsics else None,
-        )
+        views: Sequence[View],
+        gaussians: Gaussians,
+        extent: float,
+        config: Train,
+        experiments: TrainExperiments,
+    ) -> CameraRefinement:
+        """The given cameras, refined as ``config`` says.
+
+        Args:
+            extent: ``scene.views.scene_extent``, world units.
+        """
+        poses, intrinsics = None, None
+        if config.refine_poses:
+            limit = experiments.max_pose_change
+            poses = PoseRefinement.of(views, gaussians, extent, limit)
+        if config.refine_intrinsics:
+            intrinsics = IntrinsicsRefinement.of(views, experiments.max_intrinsics_change)
+        return CameraRefinement(len(views), poses, intrinsics)
 
     @property
-    def move(self) -> bool:
-        return self.poses is not None or self.lenses is not None
+    def enabled(self) -> bool:
+        return self.poses is not None or self.intrinsics is not None
 
     def camera(self, camera: RasterCamera, index: int) -> RasterCamera:
-        """A view's camera, given as it was, as it is now."""
-        if self.lenses is not None:
-            camera = self.lenses.camera(camera, index)
+        """The refined camera of a view, from the given one."""
+        if self.intrinsics is not None:
+            camera = self.intrinsics.camera(camera, index)
         return camera if self.poses is None else self.poses.camera(camera, index)
 
     def step(
@@ -53,28 +67,27 @@ class MovingCameras:
         index: int,
         camera: RasterCamera,
         gradients: CameraGradients,
-        config: Train,
-        share: Callable[[float], float],
+        rate: Callable[[float], float],
     ) -> None:
-        """Move what a view was drawn with.
+        """Refine the camera of a view.
 
         Args:
-            camera: with which it was drawn.
-            share: of all that may be gone, what is due now for something that this share of the
-                steps looks at.
+            camera: the refined camera that the view was rendered with.
+            rate: learning rate of parameters that this share of the steps changes, relative to
+                the upper limit of their total change (``Schedule.camera_rate``).
         """
         if self.poses is not None:
-            self.poses.step(index, gradients, config.pose_reach * share(1 / self.views))
-        if self.lenses is not None:
-            due = share(self.lenses.sharing(index) / self.views)
-            self.lenses.step(index, camera, gradients, config.intrinsics_reach * due)
+            self.poses.step(index, gradients, self.poses.limit * rate(1 / self.num_views))
+        if self.intrinsics is not None:
+            share = self.intrinsics.num_sharing(index) / self.num_views
+            self.intrinsics.step(index, camera, gradients, self.intrinsics.limit * rate(share))
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What a checkpoint must hold."""
+        """The arrays of a checkpoint."""
         poses = {} if self.poses is None else self.poses.arrays()
-        return poses if self.lenses is None else poses | self.lenses.arrays()
+        return poses if self.intrinsics is None else poses | self.intrinsics.arrays()
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        for part in (self.poses, self.lenses):
+        for part in (self.poses, self.intrinsics):
             if part is not None:
                 part.restore(arrays)

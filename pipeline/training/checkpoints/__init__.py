@@ -1,1 +1,1 @@
-"""Checkpoints, and which run each is of."""
+"""Checkpoints, and the identity of the run that they belong to."""

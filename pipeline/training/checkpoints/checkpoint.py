@@ -1,7 +1,7 @@
-"""Checkpoints that are whole or are not used.
+"""Checkpoints of training.
 
-A file is a numpy archive followed by the 32 bytes of its SHA-256. It is written under a temporary
-name, synced and renamed; the last two are kept.
+A file is a numpy archive followed by the 32 bytes of its SHA-256; a damaged file is not used. It is
+written under a temporary name, synced and renamed. The last two are kept.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ class Checkpoint:
 
     Attributes:
         step: steps done.
-        identity: names the run (its inputs and settings); another run's state is no use.
+        identity: digest of the run's inputs and options.
         arrays: by name.
-        values: everything else, as JSON.
+        values: the rest of the state, as JSON.
     """
 
     step: int
@@ -40,7 +40,7 @@ class Checkpoint:
 
 
 class _HashingWriter(io.RawIOBase):
-    """Passes bytes on and hashes them; not seekable, so that each byte passes once."""
+    """Writes and hashes bytes; not seekable, so that each byte is written once."""
 
     def __init__(self, file: BinaryIO):
         self.file, self.hash = file, hashlib.sha256()
@@ -82,21 +82,23 @@ def save(folder: Path, checkpoint: Checkpoint) -> Path:
 def load_latest(
     folder: Path, identity: str, on_warning: Callable[[str], None]
 ) -> Checkpoint | None:
-    """The newest whole checkpoint of this run, None if there is none. Damaged ones and those of
-    another run are left out with a warning."""
+    """The newest intact checkpoint of this run, or None. Damaged ones and those of other runs are
+    skipped with a warning."""
     for path in sorted(folder.glob(PATTERN), reverse=True):
         checkpoint = _load(path)
         if checkpoint is None:
-            on_warning(f"{path}: the checkpoint is damaged; an older one or none is used")
+            on_warning(f"{path}: the checkpoint is damaged and not used")
         elif checkpoint.identity != identity:
-            on_warning(f"{path}: the checkpoint is of a run with other inputs; it is not used")
+            on_warning(
+                f"{path}: the checkpoint belongs to a run with other inputs or options; not used"
+            )
         else:
             return checkpoint
     return None
 
 
 def newest(folder: Path) -> Checkpoint | None:
-    """The newest whole checkpoint of any run, for looking at; None if there is none."""
+    """The newest intact checkpoint of any run, for display; None if there is none."""
     found = map(_load, sorted(folder.glob(PATTERN), reverse=True))
     return next((checkpoint for checkpoint in found if checkpoint is not None), None)
 

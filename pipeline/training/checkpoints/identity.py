@@ -1,4 +1,4 @@
-"""Which run a checkpoint is of."""
+"""The identity of a run, by which its checkpoints are recognised."""
 
 from __future__ import annotations
 
@@ -8,16 +8,17 @@ from typing import Any
 
 from numpy.typing import NDArray
 
+from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.training.data.inputs import Inputs
 
-# Raise it when the state of a training or its meaning changes.
-STATE_VERSION = 15
+# Increment when the contents of checkpoints or their meaning change.
+STATE_VERSION = 16
 
 
-def identity_of(inputs: Inputs, config: Train, seed: int) -> str:
-    """A digest of all that determines the result, apart from the pixels (whose stage's key names
-    the folder of checkpoints)."""
+def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, seed: int) -> str:
+    """Digest of everything that determines the result but the pixels, which the key of the stage
+    (in the name of the folder of checkpoints) covers."""
     digest = hashlib.sha256()
     views = [
         (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
@@ -25,8 +26,9 @@ def identity_of(inputs: Inputs, config: Train, seed: int) -> str:
     ]
     sizes = (inputs.extent, inputs.size)
     gains = None if inputs.gains is None else inputs.gains.tolist()
-    air = None if inputs.air is None else inputs.air.tolist()
-    text = json.dumps([STATE_VERSION, config.model_dump(), seed, sizes, views, gains, air])
+    empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
+    options = [config.model_dump(), experiments.model_dump()]
+    text = json.dumps([STATE_VERSION, options, seed, sizes, views, gains, empty])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
     for known in inputs.depths or ():

@@ -1,1 +1,1 @@
-"""What training reads: images, depths, the first Gaussians."""
+"""The inputs of training: images, depths, initial Gaussians."""

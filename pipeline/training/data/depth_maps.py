@@ -1,8 +1,8 @@
-"""Depth maps that the user brings, brought to the scene's unit and sampled.
+"""The user's depth maps, scaled to the scene and sampled.
 
-A sensor's maps are right up to a factor (millimetres, say); a network's up to factor and shift, of
-the depth or, as most, of its inverse. Which it is, and the numbers, the sparse points of each view
-tell: of three fits the one that meets them best is taken, the simplest of about equal ones.
+A sensor's depths are known up to a factor (for example millimetres); a network's up to factor and
+shift, of the depth or, more often, of its inverse. Each map is fitted to the view's sparse points
+in these three ways; the best fit is used, the simplest of about equal ones.
 """
 
 from __future__ import annotations
@@ -17,18 +17,18 @@ from pipeline.photos.load import load_depth
 from pipeline.scene.views import View
 from pipeline.training.data.known_depths import KnownDepths
 
-#: Samples a view: dense enough for walls, and a few more than the points of most views.
+#: Samples per view: dense enough for walls, somewhat more than the sparse points of most views.
 SAMPLES = 3000
-#: Fewer points tell nothing about a map.
+#: With fewer points a map is not used.
 MIN_POINTS = 12
-#: Median error of the logarithm at the points beyond which a map is not believed.
+#: A map with a larger median error of the logarithm at the points is not used.
 MAX_ERROR = 0.1
-#: A fit with more freedom must be this much better, and a good one is not bettered: points and
-#: pixels err as much themselves.
+#: A fit with more parameters replaces a simpler one only if its error is below this share of the
+#: other's, and only if the other's is above GOOD, the accuracy of points and pixels.
 BETTER, GOOD = 0.8, 0.03
-#: Neighbouring pixels that differ by more than this share are an edge, whose place is uncertain.
+#: Pixels that differ from a neighbour by more than this share are at an edge and not sampled.
 EDGE = 0.05
-#: Pairs of points that a line is laid through.
+#: Pairs of points whose lines are tried.
 PAIRS = 300
 
 Array = NDArray[np.float64]
@@ -36,7 +36,7 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Fit:
-    """How a map's values v become camera z.
+    """Camera z as a function of a map's values v.
 
     Attributes:
         kind: "factor": z = a v; "depth": z = a v + b; "inverse": 1 / z = a v + b.
@@ -49,7 +49,7 @@ class Fit:
     error: float
 
     def depth(self, values: Array) -> Array:
-        """Camera z of map values; not a number where the fit has none."""
+        """Camera z of map values; NaN outside the range of the fit."""
         line = self.a * values + self.b
         with np.errstate(divide="ignore", invalid="ignore"):
             z = 1.0 / line if self.kind == "inverse" else line
@@ -57,7 +57,7 @@ class Fit:
 
 
 def fit_map(values: Array, z: Array) -> Fit | None:
-    """How ``values`` (M,) of a map at points become their depths ``z`` (M,); None if they don't."""
+    """The fit of a map's ``values`` (M,) at points to their depths ``z`` (M,), or None."""
     usable = np.isfinite(values) & (values > 0)
     values, z = values[usable], z[usable]
     if len(z) < MIN_POINTS:
@@ -67,7 +67,7 @@ def fit_map(values: Array, z: Array) -> Fit | None:
         a, b = _solve(kind, values, z)
         fit = Fit(kind, a, b, 0.0)
         off = np.abs(np.log(fit.depth(values) / z))
-        # What the fit has no depth for counts as far off.
+        # Values without a depth count as infinitely wrong.
         fit = Fit(kind, a, b, float(np.median(np.where(np.isfinite(off), off, np.inf))))
         if best is None or (best.error > GOOD and fit.error < BETTER * best.error):
             best = fit
@@ -83,10 +83,10 @@ def map_depths(
         digest: the file's recorded digest.
 
     Returns:
-        the samples, each of weight 1, and the fit; None where points and map do not agree.
+        the samples, each of weight 1, and the fit; None if the map does not fit the points.
 
     Raises:
-        UserError: the file is no depth map that can be read, or not of the view's shape.
+        UserError: the file is not a readable depth map, or has another aspect ratio.
     """
     full = load_depth(path, view.width / view.height, digest)
     height, width = full.shape
@@ -115,7 +115,7 @@ def map_depths(
 
 
 def merged(points: KnownDepths, samples: KnownDepths) -> KnownDepths:
-    """Both, every observation counting by its own weight."""
+    """Both sets, with their own weights."""
     return KnownDepths(
         np.concatenate([points.xy, samples.xy]),
         np.concatenate([points.z, samples.z]),
@@ -134,8 +134,8 @@ def add_maps(
         maps: each view's file and its recorded digest; None for a view without a depth map.
 
     Returns:
-        known depths by view; how many maps each kind of fit took; names of views whose maps
-        the points contradict.
+        known depths by view; the number of maps by kind of fit; names of views whose maps do not
+        fit the points.
     """
     known, kinds, refused = list(points), dict.fromkeys(("factor", "depth", "inverse"), 0), []
     for index, (view, file) in enumerate(zip(views, maps, strict=True)):
@@ -152,8 +152,8 @@ def add_maps(
 
 
 def _solve(kind: str, values: Array, z: Array) -> tuple[float, float]:
-    """a and b by the pair of points whose line suits the median point best, then by least squares
-    of relative errors over the points that this line meets."""
+    """a and b of the line through two points with the least median error, refined by least squares
+    of relative errors over its inliers."""
     if kind == "factor":
         return float(np.exp(np.median(np.log(z / values)))), 0.0
     target = 1.0 / z if kind == "inverse" else z
@@ -167,9 +167,9 @@ def _solve(kind: str, values: Array, z: Array) -> tuple[float, float]:
     off = np.abs((a[:, None] * values + b[:, None]) / target - 1.0)
     median = np.median(off, axis=1)
     best = int(median.argmin())
-    met = off[best] <= max(3 * float(median[best]), 1e-9)
-    # The normal equations, in plain sums: BLAS sums by the number of threads.
-    u, w = values[met] / target[met], 1.0 / target[met]
+    inlier = off[best] <= max(3 * float(median[best]), 1e-9)
+    # The normal equations in plain sums: BLAS may round differently with the number of threads.
+    u, w = values[inlier] / target[inlier], 1.0 / target[inlier]
     uu, uw, ww, u1, w1 = (float(term.sum()) for term in (u * u, u * w, w * w, u, w))
     scale = uu * ww - uw * uw
     if scale <= 0:

@@ -1,4 +1,4 @@
-"""Where pictures wait for their turn: in memory, or in a file where that is too small."""
+"""Storage for training images: in memory, or in a temporary file when they do not fit."""
 
 from __future__ import annotations
 
@@ -14,37 +14,39 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 Planes = tuple[Tensor | None, ...]
-"""The tensors of one picture, uint8 or bool; None where it has none of a kind."""
+"""The tensors of one image, uint8 or bool; None for those that it does not have."""
 
 
-class Shelf(Protocol):
-    def put(self, planes: Planes) -> Callable[[], Planes]:
-        """Keep the planes; what is returned gives them back, bit for bit, as often as it is called.
-        Any thread may call either."""
+class ImageStore(Protocol):
+    """Holds images. Any thread may call its methods."""
+
+    def add(self, planes: Planes) -> Callable[[], Planes]:
+        """Store the planes; the returned function reads them back, any number of times."""
 
 
-class MemoryShelf:
-    """In memory, where they cost nothing to get."""
+class MemoryStore:
+    """In memory."""
 
-    def put(self, planes: Planes) -> Callable[[], Planes]:
+    def add(self, planes: Planes) -> Callable[[], Planes]:
         return lambda: planes
 
 
-class DiskShelf:
-    """In a file without a name, in the folder for temporary files: gone with the process, however
-    that ends. The system keeps in spare memory what of it there is room for.
+class DiskStore:
+    """In an anonymous temporary file, which disappears with the process.
+
+    The system's page cache holds as much of it as fits into free memory.
 
     Raises:
-        OSError: the disk is full, or cannot be written to.
+        OSError: the disk is full or not writable.
     """
 
     def __init__(self) -> None:
-        self._file = tempfile.TemporaryFile()  # noqa: SIM115 (open for as long as the shelf is)
+        self._file = tempfile.TemporaryFile()  # noqa: SIM115 (open as long as the store)
         self._end, self._lock = 0, Lock()
 
-    def put(self, planes: Planes) -> Callable[[], Planes]:
-        places = [None if plane is None else self._write(plane) for plane in planes]
-        return lambda: tuple(None if place is None else place() for place in places)
+    def add(self, planes: Planes) -> Callable[[], Planes]:
+        readers = [None if plane is None else self._write(plane) for plane in planes]
+        return lambda: tuple(None if read is None else read() for read in readers)
 
     def _write(self, plane: Tensor) -> Callable[[], Tensor]:
         array = plane.contiguous().numpy()
@@ -62,7 +64,7 @@ class DiskShelf:
             while done < len(into):
                 got = os.preadv(self._file.fileno(), [into[done:]], begin + done)
                 if not got:
-                    raise OSError("a temporary file of pictures has been cut short")
+                    raise OSError("the temporary file of training images was truncated")
                 done += got
             return torch.from_numpy(found)
 

@@ -1,4 +1,4 @@
-"""What training starts from."""
+"""The inputs of training."""
 
 from __future__ import annotations
 
@@ -18,19 +18,18 @@ class Inputs:
     """A scene before training.
 
     Attributes:
-        views: training views only.
-        initial: the first Gaussians.
-        extent: how far apart the cameras stand, world unit (``scene.views.scene_extent``): the near
-            plane and the cameras' own steps are measured by it.
-        scale: by which the means' steps and the sizes of Gaussians are measured
+        views: the training views.
+        initial: the initial Gaussians.
+        extent: ``scene.views.scene_extent``, world units: determines the near plane and is the unit
+            of camera refinement.
+        scale: unit of the means' learning rate and of the sizes of Gaussians, world units
             (``training.data.known_depths.scene_scale``); None: the extent.
-        gains: (V, 3), by which a view's photograph is brighter than the scene's typical one
-            (``photos.exposure``): renders are multiplied before they are compared. Only for
-            views without alpha.
-        depths: what is known beforehand of each view's depths (``training.losses.depth``), to which
-            renders are held with ``Train.depth_weight``.
-        air: (V,) camera z, world unit, up to which each view sees nothing
-            (``training.density.floaters.air_depths``); 0 where that is not known.
+        gains: (V, 3) brightness of each photograph relative to the scene's typical one
+            (``photos.exposure``), by which renders are multiplied before the loss. Only for views
+            without alpha.
+        depths: known depths of each view for the depth loss (``training.losses.depth``).
+        empty_depths: (V,) camera z, world units, up to which each view sees empty space
+            (``training.density.floaters.empty_depths``); 0 if unknown.
     """
 
     views: Sequence[View]
@@ -39,20 +38,20 @@ class Inputs:
     scale: float | None = None
     gains: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
-    air: NDArray[np.float64] | None = None
+    empty_depths: NDArray[np.float64] | None = None
 
     @property
     def size(self) -> float:
-        """The scale, or the extent where there is none."""
+        """The scale, or the extent if there is none."""
         return self.extent if self.scale is None else self.scale
 
     def without(self, views: Collection[int]) -> Inputs:
-        """Without the views of these indices."""
+        """The same without the views with these indices."""
         kept = [index for index in range(len(self.views)) if index not in views]
         return replace(
             self,
             views=[self.views[index] for index in kept],
             gains=None if self.gains is None else self.gains[kept],
             depths=None if self.depths is None else [self.depths[index] for index in kept],
-            air=None if self.air is None else self.air[kept],
+            empty_depths=None if self.empty_depths is None else self.empty_depths[kept],
         )

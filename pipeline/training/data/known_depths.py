@@ -1,4 +1,4 @@
-"""Depths that are known before training: of sparse points, where views see them."""
+"""Depths that are known before training: those of sparse points in the views that see them."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-#: Of the middle of what views see, the most that lengths of a training are measured by.
+#: Upper limit of the scene's scale, in median depths of the sparse points.
 SCALE_SHARE = 0.5
 
 
 @dataclass(frozen=True)
 class KnownDepths:
-    """What is known of one view.
+    """Known depths of one view.
 
     Attributes:
         xy: (M, 2) float64 pixels of the view at its full size.
         z: (M,) float32 camera z, world unit, positive.
-        weight: (M,) float32, of mean 1.
+        weight: (M,) float32, mean 1.
     """
 
     xy: NDArray[np.float64]
@@ -36,18 +36,20 @@ class KnownDepths:
 def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDepths]:
     """The depths of the sparse points of ``model`` in each of ``views`` that sees them.
 
-    A point counts by the number of its views, at most eight: what two views made is often wrong.
+    The weight of a point is its track length, at most eight: points of two views are often wrong.
     """
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
     order = np.argsort(points.track_image_id, kind="stable")
     ids = points.track_image_id[order]
-    numbers = {image.name: number for number, image in model.images.items()}
+    image_ids = {image.name: image_id for image_id, image in model.images.items()}
     found = []
     for view in views:
-        number = numbers[view.name]
-        here = owner[order[np.searchsorted(ids, number) : np.searchsorted(ids, number, "right")]]
-        # einsum, not a product of matrices: BLAS may round by the number of threads.
+        image_id = image_ids[view.name]
+        here = owner[
+            order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, "right")]
+        ]
+        # einsum, not a matrix product: BLAS may round differently with the number of threads.
         camera = np.einsum("ij,nj->ni", view.world_to_camera[:3, :3], points.xyz[here])
         camera += view.world_to_camera[:3, 3]
         z = camera[:, 2]
@@ -61,11 +63,11 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
 
 
 def scene_scale(extent: float, known: Sequence[KnownDepths]) -> float:
-    """By what a training measures the means' steps and the sizes at which Gaussians split or go,
-    world unit: the extent, but at most half of the median depth that is known.
+    """Unit of the means' learning rate and of thresholds of scales, world units: the extent, but at
+    most half the median known depth.
 
-    3DGS's measure is the extent, how far apart the cameras stand. Along a street that is many
-    times the distance of anything they see, and steps that are measured by it go through walls.
+    3DGS uses the extent. Cameras along a street have an extent of many times the depth of what they
+    see, and steps of that size pass through surfaces.
     """
     depths = np.concatenate([view.z for view in known]) if known else np.zeros(0)
     return min(extent, SCALE_SHARE * float(np.median(depths))) if len(depths) else extent

@@ -1,4 +1,4 @@
-"""What the renders are compared with: the views' pixels, as 8 bits, at the resolution in use."""
+"""Training images: 8-bit pixels of the views at the resolution in use, and losses on alpha."""
 
 from __future__ import annotations
 
@@ -14,13 +14,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.config.schema import Train
 from pipeline.photos.load import ViewPixels, load_view, resize_area
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
-from pipeline.training.data.image_store import MemoryShelf, Planes, Shelf
+from pipeline.training.data.image_store import ImageStore, MemoryStore, Planes
 
-# Below this (pixels on the shorter side) SSIM's window of 11 sees little but borders.
+# Shorter side, pixels, below which SSIM's windows of 11 pixels mostly cover borders.
 MIN_SHORT_SIDE = 64
 
 
@@ -30,8 +29,8 @@ class Target:
 
     Attributes:
         rgb: (H, W, 3) uint8, multiplied by alpha; 0 where ignored.
-        alpha: (H, W) uint8, or None where the view is opaque; 255 where ignored.
-        ignored: (H, W) bool, True where pixels count for nothing, or None where all count.
+        alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
+        ignored: (H, W) bool, True for ignored pixels, or None if there are none.
     """
 
     rgb: Tensor
@@ -39,36 +38,47 @@ class Target:
     ignored: Tensor | None
 
     def over(self, background: tuple[float, float, float]) -> Tensor:
-        """The picture in front of ``background`` (linear in [0, 1]): (H, W, 3), uint8 where the
-        view is opaque, else float32 in [0, 1]."""
+        """The image over ``background`` (in [0, 1]): (H, W, 3), uint8 if the view is opaque, else
+        float32 in [0, 1]."""
         if self.alpha is None:
             return self.rgb
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
 
-    def alpha_gradient(self, alpha: Tensor, config: Train) -> Tensor | None:
-        """(H, W) float32 dL/d(alpha) of what is asked of the rendered ``alpha`` (H, W) itself: to
-        vanish where a mask hides the photograph, and elsewhere to be the photograph's."""
-        hidden = self.thinning(config.masked_opacity)
-        shown = self.covering(alpha, config.alpha_weight, config.square_weight)
-        if hidden is None or shown is None:
-            return shown if hidden is None else hidden
-        return hidden + shown
+    def alpha_gradient(
+        self,
+        alpha: Tensor,
+        mask_loss_weight: float,
+        alpha_loss_weight: float,
+        squared_error_weight: float,
+    ) -> Tensor | None:
+        """(H, W) float32 gradient of the losses on the rendered ``alpha`` (H, W); None without any.
 
-    def thinning(self, weight: float) -> Tensor | None:
-        """(H, W) float32 dL/d(alpha) by which what is drawn on ignored pixels grows thin, None
-        where nothing is asked of them. ``weight``: of such a pixel's alpha beside the mean error
-        of another pixel's colours."""
+        Args:
+            mask_loss_weight: of alpha on ignored pixels (``mask_gradient``).
+            alpha_loss_weight, squared_error_weight: of the error on other pixels
+                (``error_gradient``).
+        """
+        masked = self.mask_gradient(mask_loss_weight)
+        error = self.error_gradient(alpha, alpha_loss_weight, squared_error_weight)
+        if masked is None or error is None:
+            return error if masked is None else masked
+        return masked + error
+
+    def mask_gradient(self, weight: float) -> Tensor | None:
+        """(H, W) float32 gradient of ``weight`` times the sum of alpha over ignored pixels, divided
+        by the number of the other pixels; None without ignored pixels or weight."""
         if self.ignored is None or not weight:
             return None
         counted = self.ignored.numel() - int(self.ignored.sum())
         return self.ignored * (weight / max(1, counted))
 
-    def covering(self, alpha: Tensor, weight: float, square_weight: float) -> Tensor | None:
-        """(H, W) float32 dL/d(alpha) of ``weight`` times the mean error, L1 and ``square_weight``
-        times its square, of the rendered ``alpha`` over the pixels that count, None where the view
-        is opaque or nothing is asked. It says with every background what random ones say on
-        average, and adds none of their noise."""
+    def error_gradient(
+        self, alpha: Tensor, weight: float, squared_error_weight: float
+    ) -> Tensor | None:
+        """(H, W) float32 gradient of ``weight`` times the mean error of the rendered ``alpha``, L1
+        plus ``squared_error_weight`` times its square, over pixels that are not ignored; None for
+        an opaque view or without weight. It replaces random backgrounds, without their noise."""
         if self.alpha is None or not weight:
             return None
         error = alpha - self.alpha.to(torch.float32) / 255.0
@@ -76,12 +86,12 @@ class Target:
         if self.ignored is not None:
             error = error.masked_fill(self.ignored, 0.0)
             counted -= int(self.ignored.sum())
-        return (weight / max(1, counted)) * (error.sign() + 2 * square_weight * error)
+        return (weight / max(1, counted)) * (error.sign() + 2 * squared_error_weight * error)
 
-    def psnr(self, rendered: Tensor, wanted: Tensor) -> float:
-        """PSNR in dB over the pixels that count, of (H, W, 3) against ``over``'s picture."""
-        scale = 1 / 255.0 if wanted.dtype == torch.uint8 else 1.0
-        difference = rendered - wanted.to(torch.float32) * scale
+    def psnr(self, rendered: Tensor, image: Tensor) -> float:
+        """PSNR in dB of ``rendered`` (H, W, 3) and ``over``'s image, without ignored pixels."""
+        scale = 1 / 255.0 if image.dtype == torch.uint8 else 1.0
+        difference = rendered - image.to(torch.float32) * scale
         if self.ignored is not None:
             difference = difference[~self.ignored]
         error = float(difference.square().mean()) if difference.numel() else 0.0
@@ -89,13 +99,13 @@ class Target:
 
 
 class Targets:
-    """All views' pixels; those of a reduced resolution are made once, when first asked for, and
-    only one reduced resolution is kept.
+    """The pixels of all views. Images of a reduced resolution are computed at their first use; only
+    one reduced resolution is stored at a time.
 
     Args:
-        noise: share of the pixels that are made black or white, the same for the same ``seed``
-            and name.
-        shelf: where the pixels are kept; None: in memory. It changes no bit.
+        noise: share of the pixels that become black or white, deterministic by ``seed`` and the
+            view's name.
+        store: holds the pixels; None: in memory.
     """
 
     def __init__(
@@ -104,33 +114,33 @@ class Targets:
         threads: int,
         noise: float = 0.0,
         seed: int = 0,
-        shelf: Shelf | None = None,
+        store: ImageStore | None = None,
     ):
-        self._shelf = MemoryShelf() if shelf is None else shelf
+        self._store = MemoryStore() if store is None else store
 
-        def load(view: View) -> _Kept:
+        def load(view: View) -> _StoredTarget:
             pixels = load_view(view)
             if noise:
                 _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
-            return _Kept(_target(pixels), self._shelf)
+            return _StoredTarget(_target(pixels), self._store)
 
         with ThreadPoolExecutor(max(1, threads)) as pool:
             self._full = list(
                 track(pool.map(load, views), "reading views", len(views), unit="views")
             )
         self._factor = 1
-        self._reduced: dict[int, _Kept] = {}
+        self._reduced: dict[int, _StoredTarget] = {}
 
     @property
     def have_alpha(self) -> bool:
-        return any(kept.has_alpha for kept in self._full)
+        return any(stored.has_alpha for stored in self._full)
 
     def hidden(self) -> list[int]:
-        """Indices of the views of which no pixel counts."""
-        return [index for index, kept in enumerate(self._full) if kept.hidden]
+        """Indices of the views whose pixels are all ignored."""
+        return [index for index, stored in enumerate(self._full) if stored.hidden]
 
     def drop(self, indices: Sequence[int]) -> None:
-        """Forget these views; the others move up."""
+        """Remove these views; the indices of later views decrease."""
         self._full = [t for index, t in enumerate(self._full) if index not in indices]
 
     def get(self, index: int, factor: int) -> Target:
@@ -142,26 +152,26 @@ class Targets:
             self._factor, self._reduced = factor, {}
         if index not in self._reduced:
             reduced = _reduce(self._full[index].get(), factor)
-            self._reduced[index] = _Kept(reduced, self._shelf)
+            self._reduced[index] = _StoredTarget(reduced, self._store)
         return self._reduced[index].get()
 
 
-class _Kept:
-    """A target on a shelf, and what is asked of it without a look."""
+class _StoredTarget:
+    """A target in an image store, with the facts that are needed without reading it."""
 
-    def __init__(self, target: Target, shelf: Shelf):
+    def __init__(self, target: Target, store: ImageStore):
         self.has_alpha = target.alpha is not None
         self.hidden = target.ignored is not None and bool(target.ignored.all())
-        self._take: Callable[[], Planes] = shelf.put((target.rgb, target.alpha, target.ignored))
+        self._read: Callable[[], Planes] = store.add((target.rgb, target.alpha, target.ignored))
 
     def get(self) -> Target:
-        rgb, alpha, ignored = self._take()
+        rgb, alpha, ignored = self._read()
         assert rgb is not None
         return Target(rgb, alpha, ignored)
 
 
 def usable_factor(views: Sequence[View], factor: int) -> int:
-    """``factor``, halved until every view keeps ``MIN_SHORT_SIDE`` pixels (or 1 is reached)."""
+    """``factor``, halved until every reduced view has ``MIN_SHORT_SIDE`` pixels, or until 1."""
     shortest = min(min(view.width, view.height) for view in views)
     while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
         factor //= 2
@@ -181,7 +191,7 @@ def _target(pixels: ViewPixels) -> Target:
     if alpha is not None:
         rgb = np.rint(rgb * (alpha[..., None].astype(np.float32) / 255.0)).astype(np.uint8)
     if ignored is not None:
-        # SSIM's windows reach across a mask's edge: what lies behind must be the same everywhere.
+        # SSIM's windows include pixels across a mask's edge: all ignored pixels have one value.
         rgb = np.where(ignored[..., None], np.uint8(0), rgb)
         alpha = None if alpha is None else np.where(ignored, np.uint8(255), alpha)
     if alpha is not None and alpha.min() == 255:
@@ -190,8 +200,8 @@ def _target(pixels: ViewPixels) -> Target:
 
 
 def _reduce(target: Target, factor: int) -> Target:
-    """The mean of the pixels that count; a reduced pixel is ignored if fewer than half of those
-    under it do."""
+    """The mean over pixels that are not ignored; a reduced pixel is ignored if over half of its
+    pixels are."""
     height, width = target.rgb.shape[:2]
     size = max(1, round(width / factor)), max(1, round(height / factor))
     rgb, alpha = target.rgb.numpy(), None if target.alpha is None else target.alpha.numpy()

@@ -1,15 +1,13 @@
-"""Floaters: Gaussians that hang in the air before one camera or very few.
+"""Floaters: Gaussians close to one camera, or to very few, that no other view contradicts.
 
-Specks right before a camera explain its photograph as well as what stands behind them, and no other
-view contradicts: the cameras beside it look past them, and to those across the room they are dots.
-From a place between the cameras they are clouds. Where the light changed between photographs, a few
-neighbours agree on a fog before them instead.
+They explain the photographs of these cameras as well as the surface behind them, and other cameras
+look past them or see them as dots. With changing light, a few neighbouring views can agree on them.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -21,87 +19,119 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 from pipeline.training.data.known_depths import KnownDepths
 
-#: A view is taken to see nothing nearer than this share of the depth at which its nearest sparse
-#: points stand: the quantile (a few are wrong) of at least so many. In bonsai what one view alone
-#: sees lies at 0.13 to 0.27 of that depth, or beyond it; nothing between.
-AIR, NEAREST, LEAST_POINTS = 0.5, 0.02, 20
-#: Views before which a Gaussian hangs have this share of its weight in all views, and so many
-#: pixels of it. They are the ones that see most of it, one in so many views; of fewer, one.
-MOST, LEAST_WEIGHT = 0.5, 0.1
-ONE_IN = 100
-FAINT = -20.0  # an opacity's logit
+#: Space closer than this share of the depth of a view's nearest sparse points is taken as empty.
+#: Nearest is this quantile, since a few points are wrong, of at least so many points.
+EMPTY_SHARE, NEAREST, MIN_POINTS = 0.5, 0.02, 20
+#: A floater has more than this share of its weight, and more than this number of pixels, in the
+#: empty space of the views that have most of it: one in so many views, at least one.
+WEIGHT_SHARE, MIN_WEIGHT = 0.5, 0.1
+VIEWS_PER_FLOATER_VIEW = 100
+FADED_LOGIT = -20.0  # of the opacity
+#: Floaters are removed after these shares of a run, so that others can take their place.
+RUN_SHARES = 0.3, 0.5, 0.7, 0.9
+#: Runs of fewer epochs have hardly any floaters, and one removal costs as much as two epochs.
+MIN_EPOCHS = 50
+#: Images are rendered at 1 / this of their size.
+IMAGE_FACTOR = 4
 
 
-def air_depths(known: Sequence[KnownDepths]) -> NDArray[np.float64]:
-    """(V,) camera z, world unit, up to which each view is taken to see nothing; 0 where too few
-    sparse points say so."""
+def empty_depths(known: Sequence[KnownDepths]) -> NDArray[np.float64]:
+    """(V,) camera z, world unit, up to which each view sees empty space; 0 with too few points."""
     return np.array(
-        [AIR * np.quantile(k.z, NEAREST) if len(k) >= LEAST_POINTS else 0.0 for k in known]
+        [EMPTY_SHARE * np.quantile(k.z, NEAREST) if len(k) >= MIN_POINTS else 0.0 for k in known]
     )
+
+
+@dataclass(frozen=True)
+class FloaterRemoval:
+    """Removes floaters a few times in a run.
+
+    Attributes:
+        depths: (V,) camera z (``empty_depths``).
+        steps: length of the schedule.
+    """
+
+    depths: NDArray[np.float64]
+    steps: int
+
+    def is_due(self, steps: range, run_length: float) -> bool:
+        """Whether floaters are removed after these steps of the schedule.
+
+        Args:
+            run_length: expected number of optimiser steps of the run.
+        """
+        if run_length < MIN_EPOCHS * len(self.depths):
+            return False
+        return any(round(share * self.steps) in steps for share in RUN_SHARES)
+
+    def fade(
+        self,
+        gaussians: Gaussians,
+        cameras: Sequence[RasterCamera],
+        options: RasterOptions,
+        pixel: float,
+        backend: Backend,
+    ) -> int:
+        """Make floaters transparent, in place, so that density control prunes them.
+
+        See ``floaters`` for the arguments.
+
+        Returns:
+            the number of floaters.
+        """
+        found = floaters(gaussians, cameras, self.depths, options, pixel, backend)
+        gaussians.opacity_logits[found] = FADED_LOGIT
+        return int(found.sum())
 
 
 def floaters(
     gaussians: Gaussians,
     cameras: Sequence[RasterCamera],
-    air: NDArray[np.float64],
+    depths: NDArray[np.float64],
     options: RasterOptions,
     pixel: float = 1.0,
     backend: Backend | None = None,
 ) -> Tensor:
-    """(N,) bool: most of its weight is in one view, or in a hundredth of them, and there it is
-    nearer than ``air``.
+    """(N,) bool: Gaussians with most of their weight in one view, or in a hundredth of the views,
+    and there closer than ``depths``.
 
-    A Gaussian's weight in a view is the sum over pixels of alpha times transmittance: the gradient
-    of the picture's sum by the Gaussian's colour.
+    The weight of a Gaussian in a view is the sum over pixels of alpha times transmittance: the
+    gradient of the sum of the image with respect to the Gaussian's colour.
 
     Args:
-        cameras: of all training views; smaller pictures than they train on will do.
-        air: (V,) camera z (``air_depths``).
-        options: how training draws; harmonics and background have no part in weights.
-        pixel: how many pixels of a view one of these pictures stands for.
-        backend: that draws; None: the default.
+        cameras: of all training views, at a reduced size if need be.
+        depths: (V,) camera z (``empty_depths``).
+        options: as in training; SH degree and background do not matter.
+        pixel: number of pixels of the view in one pixel of the reduced size.
+        backend: None: the default.
     """
     backend = backend or make_backend()
     grey = gaussians.with_sh_degree(0)
     grey = replace(grey, sh=torch.zeros_like(grey.sh))
     options = replace(options, sh_degree=0, background=None)
     total = torch.zeros(len(grey))
-    # The largest weights so far, and of each as much as hangs in the air.
-    few = max(1, round(len(cameras) / ONE_IN))
-    largest, aired = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
-    for camera, depth in zip(cameras, air, strict=True):
-        drawn = backend.forward(*grey.parameters(), camera, options)
-        asked = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
-        weight = backend.backward(drawn, asked, means2d_abs=False).sh[:, 0, 0]
+    # The largest weights so far, and the part of each that is in empty space.
+    few = max(1, round(len(cameras) / VIEWS_PER_FLOATER_VIEW))
+    largest, largest_empty = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
+    for camera, depth in zip(cameras, depths, strict=True):
+        rendered = backend.forward(*grey.parameters(), camera, options)
+        d_color = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
+        weight = backend.backward(rendered, d_color, means2d_abs=False).sh[:, 0, 0]
         total += weight
         x, y, z, shift = camera.world_to_camera[2].to(torch.float32).tolist()
-        # Not a product of matrices: BLAS may round by the number of threads.
-        here = grey.means[:, 0] * x + grey.means[:, 1] * y + grey.means[:, 2] * z + shift
-        hangs = torch.where(here < depth, weight, 0.0)
-        # Insertion: what is smaller moves down a row, the smallest falls out.
+        # Not a matrix product: BLAS may round differently with the number of threads.
+        z_camera = grey.means[:, 0] * x + grey.means[:, 1] * y + grey.means[:, 2] * z + shift
+        empty = torch.where(z_camera < depth, weight, 0.0)
+        # Insertion sort: smaller weights move down a row, the smallest is dropped.
         for row in range(few):
-            more = weight > largest[row]
+            larger = weight > largest[row]
             weight, largest[row] = (
-                torch.where(more, largest[row], weight),
-                torch.where(more, weight, largest[row]),
+                torch.where(larger, largest[row], weight),
+                torch.where(larger, weight, largest[row]),
             )
-            hangs, aired[row] = (
-                torch.where(more, aired[row], hangs),
-                torch.where(more, hangs, aired[row]),
+            empty, largest_empty[row] = (
+                torch.where(larger, largest_empty[row], empty),
+                torch.where(larger, empty, largest_empty[row]),
             )
-    found = aired.sum(0)
-    return (found > LEAST_WEIGHT) & (found > MOST * total)
-
-
-def fade_floaters(
-    gaussians: Gaussians,
-    cameras: Sequence[RasterCamera],
-    air: NDArray[np.float64],
-    options: RasterOptions,
-    pixel: float,
-    backend: Backend,
-) -> int:
-    """Make floaters too faint for density control to keep, in place; how many. See ``floaters``."""
-    found = floaters(gaussians, cameras, air, options, pixel, backend)
-    gaussians.opacity_logits[found] = FAINT
-    return int(found.sum())
+    found = largest_empty.sum(0)
+    return (found > MIN_WEIGHT) & (found > WEIGHT_SHARE * total)

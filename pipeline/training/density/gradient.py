@@ -1,6 +1,7 @@
-"""Adaptive density control after Kerbl et al. 2023, section 5.2, under a budget.
+"""The strategy ``gradient``: density control after Kerbl et al. 2023, section 5.2, with a budget.
 
-Gaussians whose image position the loss pulls at are split or cloned; faint and huge ones go.
+Gaussians with large gradients of their projected centres are split (or cloned), the largest
+gradients first; transparent and large ones are removed.
 """
 
 from __future__ import annotations
@@ -14,60 +15,81 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.config.schema import Density
+from pipeline.config.experiments import GradientExperiments
 from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density.strategy import Changes, not_finite, rotations
+from pipeline.training.density.strategy import Changes, Strategy, not_finite, rotations
+from pipeline.training.density.timeline import Timeline, shrunk
 from pipeline.training.optimisers.adam import Adam
 
-# A sampled split makes two, each this much smaller: 0.8 N with N = 2 (3DGS).
+# A sampled split divides the scales by 0.8 N with N = 2 (3DGS).
 SPLIT_SHRINK = 1.6
-# A split along the longest axis (after Deng et al. 2025): what is left of the scale along it, of
-# the others, and of the opacity. Two stand so far from the middle that the variance along it stays.
+# A split along the longest axis (after Deng et al. 2025): factors of the scale along it, of the
+# other scales and of the opacity. The offset of the halves keeps the variance along the axis.
 LONG_AXIS, OTHER_AXES, HALVES_OPACITY = 0.5, 0.85, 0.8
 LONG_OFFSET = math.sqrt(1 - LONG_AXIS**2)
 RESET_OPACITY = 0.01
-# What shows less than this may make room for others, if it is of this share that is pulled at
-# least: what is faint because it is new is pulled at (docs/explanation/training.md).
-RECYCLED_OPACITY, IDLE_SHARE = 0.1, 0.1
+# Only Gaussians below this opacity are recycled, and only those among this share with the smallest
+# gradients: new Gaussians are transparent as well, but have large gradients.
+RECYCLED_OPACITY, RECYCLED_GRADIENT_SHARE = 0.1, 0.1
 
 
 @dataclass
-class GradientDensity:
-    """Split, and where it is asked for clone the small of, Gaussians whose image position the loss
-    pulls at; remove faint and huge ones.
+class GradientDensity(Strategy):
+    """Split (or clone) Gaussians with large gradients; remove transparent and large ones.
 
     Attributes:
-        config: thresholds and the budget.
-        scale: the scene's size (``training.data.known_depths.scene_scale``), for thresholds on
-            scales.
-        gradient_sum: (N,) float32, summed norms of the gradient of the projected mean, in
-            normalised device coordinates (so that it doesn't depend on the resolution).
+        options: thresholds.
+        steps: length of the schedule.
+        scale: size of the scene (``training.data.known_depths.scene_scale``): the unit of
+            thresholds of scales.
+        reset_interval: steps between opacity resets.
+        gradient_sum: (N,) float32, sum of the norms of the gradients of the projected centres, in
+            normalised device coordinates (independent of the resolution).
         seen: (N,) float32, number of steps in which the Gaussian was visible.
     """
 
-    config: Density
+    options: GradientExperiments
+    steps: int
     scale: float
+    timeline: Timeline = field(init=False)
+    reset_interval: int = field(init=False)
     gradient_sum: Tensor = field(default_factory=lambda: torch.zeros(0))
     seen: Tensor = field(default_factory=lambda: torch.zeros(0))
+
+    def __post_init__(self) -> None:
+        self.timeline = Timeline.of(self.options, self.steps)
+        self.reset_interval = max(1, shrunk(self.options.opacity_reset_interval, self.steps))
+
+    @property
+    def needs_absolute_gradients(self) -> bool:
+        return self.options.absolute_gradient
+
+    def resets_opacity_after(self, step: int) -> bool:
+        """Only if a whole interval of densification follows, in which opacities recover."""
+        interval = self.reset_interval
+        return step % interval == 0 and step + interval <= self.timeline.stop
+
+    def prunes_large_after(self, step: int) -> bool:
+        """After the first opacity reset (3DGS): until then, large Gaussians (a distant background)
+        may not have been split yet. Never in runs too short for a reset."""
+        resets = 2 * self.reset_interval <= self.timeline.stop
+        return resets and self.reset_interval < step and self.timeline.densifies_after(step)
 
     def start(self, count: int) -> None:
         self.gradient_sum, self.seen = torch.zeros(count), torch.zeros(count)
 
-    def regularise(self, gaussians: Gaussians, gradients: Gradients) -> None:
-        """Nothing: the paper has no loss of this kind."""
-
-    def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
-        pull = gradients.means2d
-        if self.config.absolute_gradient:
+    def observe(self, rendered: Forward, gradients: Gradients) -> None:
+        gradient = gradients.means2d
+        if self.options.absolute_gradient:
             assert gradients.means2d_abs is not None
-            pull = gradients.means2d_abs
+            gradient = gradients.means2d_abs
+        height, width = rendered.alpha.shape
         # Pixels to normalised device coordinates: x_ndc = 2 x / width - 1.
-        self.gradient_sum += torch.hypot(pull[:, 0] * (0.5 * width), pull[:, 1] * (0.5 * height))
-        self.seen += forward.radii > 0
-
-    def explore(self, gaussians: Gaussians, pace: float, rng: np.random.Generator) -> None:
-        """Nothing: chance has a part in splits alone."""
+        self.gradient_sum += torch.hypot(
+            gradient[:, 0] * (0.5 * width), gradient[:, 1] * (0.5 * height)
+        )
+        self.seen += rendered.radii > 0
 
     def refine(
         self,
@@ -76,18 +98,33 @@ class GradientDensity:
         rng: np.random.Generator,
         *,
         densify: bool,
-        prune_huge: bool,
+        prune_large: bool,
         budget: int,
     ) -> tuple[Gaussians, Changes]:
         """Prune, then (``densify``) split and clone."""
-        kept = ~self._useless(gaussians, prune_huge)
+        kept = ~self.useless(gaussians, prune_large)
         grow = torch.zeros_like(kept)
         if densify:
-            pull = self.gradient_sum / self.seen.clamp(min=1.0)
-            wanted = kept & (pull > self.config.grad_threshold)
-            kept = kept & ~self._recycled(gaussians, kept, pull, wanted, budget)
+            gradient = self.mean_gradient()
+            candidates = kept & (gradient > self.options.grad_threshold)
+            kept = kept & ~self._recycled(gaussians, kept, gradient, candidates, budget)
             # Each adds one Gaussian, cloned or split.
-            grow = most(pull, wanted & kept, max(0, budget - int(kept.sum())))
+            grow = highest(gradient, candidates & kept, max(0, budget - int(kept.sum())))
+        return self.multiply(gaussians, adam, rng, kept, grow)
+
+    def mean_gradient(self) -> Tensor:
+        """(N,) mean norm of the gradient over the steps in which the Gaussian was visible."""
+        return self.gradient_sum / self.seen.clamp(min=1.0)
+
+    def multiply(
+        self,
+        gaussians: Gaussians,
+        adam: Adam,
+        rng: np.random.Generator,
+        kept: Tensor,
+        grow: Tensor,
+    ) -> tuple[Gaussians, Changes]:
+        """Remove all but ``kept`` and split or clone ``grow`` (N,) bool. Statistics start anew."""
         changes = Changes(pruned=len(gaussians) - int(kept.sum()))
         large = self._large(gaussians)
         cloned = torch.nonzero(grow & ~large)[:, 0]
@@ -101,7 +138,7 @@ class GradientDensity:
         adam.select(rows, fresh)
         if len(split):
             children = slice(len(stay) + len(cloned), None)
-            if self.config.split_kind == "long_axis":
+            if self.options.split_kind == "long_axis":
                 _halve(result, children)
             else:
                 result.means[children] += _offsets(result, children, rng)
@@ -110,7 +147,7 @@ class GradientDensity:
         return result, changes
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        """Cap every opacity at ``RESET_OPACITY``: what is needed comes back, floaters do not."""
+        """Limit every opacity to ``RESET_OPACITY``; those of useful Gaussians recover."""
         gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
         adam.forget("opacity_logits")
 
@@ -121,38 +158,39 @@ class GradientDensity:
         self.gradient_sum = torch.from_numpy(arrays["gradient_sum"])
         self.seen = torch.from_numpy(arrays["seen"])
 
-    def _useless(self, gaussians: Gaussians, prune_huge: bool) -> Tensor:
-        """(N,) bool: too faint, too large (``prune_huge``), or no longer a number."""
-        useless = torch.sigmoid(gaussians.opacity_logits) < self.config.prune_opacity
-        if prune_huge:
-            useless |= self._longest(gaussians) > self.config.prune_scale * self.scale
+    def useless(self, gaussians: Gaussians, prune_large: bool) -> Tensor:
+        """(N,) bool: too transparent, too large (``prune_large``), or not finite."""
+        useless = torch.sigmoid(gaussians.opacity_logits) < self.options.prune_opacity
+        if prune_large:
+            useless |= self._longest(gaussians) > self.options.prune_scale * self.scale
         return useless | not_finite(gaussians)
 
     def _large(self, gaussians: Gaussians) -> Tensor:
-        """(N,) bool: those that split rather than clone, where both are allowed."""
-        if not (self.config.clone and self.config.split):
-            return torch.full((len(gaussians),), self.config.split)
-        return self._longest(gaussians) > self.config.split_scale * self.scale
+        """(N,) bool: Gaussians that are split rather than cloned."""
+        if not (self.options.clone and self.options.split):
+            return torch.full((len(gaussians),), self.options.split)
+        return self._longest(gaussians) > self.options.split_scale * self.scale
 
     def _recycled(
-        self, gaussians: Gaussians, kept: Tensor, pull: Tensor, wanted: Tensor, budget: int
+        self, gaussians: Gaussians, kept: Tensor, gradient: Tensor, candidates: Tensor, budget: int
     ) -> Tensor:
-        """(N,) bool: the faintest of the idle, which make room where more are wanted than the
-        budget has left. Otherwise the first details would keep the budget, and what is bare would
-        stay bare."""
-        short = int(wanted.sum()) - max(0, budget - int(kept.sum()))
-        limit = min(short, round(self.config.recycle * budget))
-        idle = most(-pull, kept, round(IDLE_SHARE * int(kept.sum())))
+        """(N,) bool: Gaussians that make room for candidates beyond the budget: the most
+        transparent of those with the smallest gradients. Without this, the first details would keep
+        the whole budget."""
+        missing = int(candidates.sum()) - max(0, budget - int(kept.sum()))
+        limit = min(missing, round(self.options.recycle_share * budget))
+        count = round(RECYCLED_GRADIENT_SHARE * int(kept.sum()))
+        idle = highest(-gradient, kept, count)
         opacity = torch.sigmoid(gaussians.opacity_logits)
-        return most(-opacity, idle & (opacity < RECYCLED_OPACITY), limit)
+        return highest(-opacity, idle & (opacity < RECYCLED_OPACITY), limit)
 
     @staticmethod
     def _longest(gaussians: Gaussians) -> Tensor:
         return gaussians.log_scales.amax(1).exp()
 
 
-def most(score: Tensor, among: Tensor, count: int) -> Tensor:
-    """(N,) bool: the ``count`` highest scores ``among`` (N,) bool; the first of equal ones."""
+def highest(score: Tensor, among: Tensor, count: int) -> Tensor:
+    """(N,) bool: rows with the ``count`` highest scores ``among`` (N,) bool, the first of ties."""
     if int(among.sum()) <= count:
         return among
     chosen = torch.zeros_like(among)
@@ -164,8 +202,8 @@ def most(score: Tensor, among: Tensor, count: int) -> Tensor:
 
 
 def _halve(gaussians: Gaussians, rows: slice) -> None:
-    """Set ``rows`` (2 M), M Gaussians and the same again, side by side along their longest axes, in
-    place."""
+    """Move and shrink ``rows`` (2 M), M Gaussians and their copies, in place: each pair lies side
+    by side along the longest axis."""
     log_scales = gaussians.log_scales[rows]
     each, longest = torch.arange(len(log_scales)), log_scales.argmax(1)
     axis = rotations(gaussians.quats[rows])[each, :, longest]

@@ -1,9 +1,9 @@
-"""What the trainer asks of a strategy; when it asks, is the schedule's business."""
+"""The interface of density strategies: hooks before and after each optimiser step."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 import torch
@@ -12,6 +12,7 @@ from torch import Tensor
 
 from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density.timeline import Timeline
 from pipeline.training.optimisers.adam import Adam
 
 
@@ -20,9 +21,9 @@ class Changes:
     """Counts of one ``refine``.
 
     Attributes:
-        cloned, split: of which copies and halves were made.
-        relocated: useless ones that were laid onto others.
-        pruned: removed.
+        cloned, split: Gaussians that were cloned or split.
+        relocated: useless Gaussians that were moved onto others.
+        pruned: Gaussians that were removed.
     """
 
     cloned: int = 0
@@ -37,21 +38,91 @@ class Changes:
         self.pruned += other.pruned
 
 
-class Strategy(Protocol):
-    """Watches every step and now and then changes the set of Gaussians, Adam's rows with it."""
+@dataclass(frozen=True)
+class Update:
+    """What a strategy did after a step.
+
+    Attributes:
+        gaussians: the Gaussians after it.
+        changes: None if the set of Gaussians is the same as before.
+        opacity_reset: whether all opacities were reset.
+    """
+
+    gaussians: Gaussians
+    changes: Changes | None
+    opacity_reset: bool
+
+
+class Strategy:
+    """Observes every step and, on its timeline, changes the set of Gaussians and Adam's moments.
+
+    Subclasses implement ``refine``; the other hooks do nothing unless they are overridden.
+
+    Attributes:
+        timeline: when Gaussians are densified and pruned.
+    """
+
+    timeline: Timeline
+
+    @property
+    def needs_absolute_gradients(self) -> bool:
+        """Whether ``observe`` reads ``Gradients.means2d_abs``."""
+        return False
+
+    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
+        """The hook between the backward pass and the optimiser step."""
+        self.observe(rendered, gradients)
+        self.regularise(gaussians, gradients)
+
+    def after_step(
+        self,
+        gaussians: Gaussians,
+        adam: Adam,
+        rng: np.random.Generator,
+        steps: range,
+        *,
+        rate: float,
+        budget: int,
+        prune: bool,
+    ) -> Update:
+        """The hook after an optimiser step: noise, densification, pruning and opacity resets.
+
+        Args:
+            steps: steps of the schedule that the optimiser step covers: one, or any number with a
+                time budget.
+            rate: learning rate of the means over its initial value, times the run's factor.
+            budget: upper limit of the number of Gaussians.
+            prune: prune even if the timeline does not say so.
+        """
+        if steps.stop - 1 <= self.timeline.stop:
+            self.add_noise(gaussians, rate, rng)
+        changes = None
+        densify = any(map(self.timeline.densifies_after, steps))
+        if densify or prune or any(map(self.timeline.prunes_after, steps)):
+            gaussians, changes = self.refine(
+                gaussians,
+                adam,
+                rng,
+                densify=densify,
+                prune_large=any(map(self.prunes_large_after, steps)),
+                budget=budget,
+            )
+        reset = any(map(self.resets_opacity_after, steps))
+        if reset:
+            self.reset_opacity(gaussians, adam)
+        return Update(gaussians, changes, reset)
 
     def start(self, count: int) -> None:
-        """Forget what was observed; ``count`` Gaussians from here on."""
+        """Forget all observations; ``count`` Gaussians from here on."""
+
+    def observe(self, rendered: Forward, gradients: Gradients) -> None:
+        """Accumulate statistics of one step."""
 
     def regularise(self, gaussians: Gaussians, gradients: Gradients) -> None:
         """Add the gradients of the strategy's own losses, in place."""
 
-    def observe(self, forward: Forward, gradients: Gradients, width: int, height: int) -> None:
-        """Take note of one step's view of ``width`` x ``height`` pixels."""
-
-    def explore(self, gaussians: Gaussians, pace: float, rng: np.random.Generator) -> None:
-        """After a step: move Gaussians at random, in place; ``pace`` is what the means' rate of the
-        step is of the first one's, times the run's boost."""
+    def add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+        """Move Gaussians at random, in place; ``rate`` as in ``after_step``."""
 
     def refine(
         self,
@@ -60,24 +131,34 @@ class Strategy(Protocol):
         rng: np.random.Generator,
         *,
         densify: bool,
-        prune_huge: bool,
+        prune_large: bool,
         budget: int,
     ) -> tuple[Gaussians, Changes]:
-        """Remove what is of no use and (``densify``) add where more is wanted. What was observed
-        is forgotten. Never more than ``budget`` come out, unless more came in."""
+        """Remove useless Gaussians and (``densify``) add new ones. Statistics start anew.
+
+        The result has at most ``budget`` Gaussians, or at most as many as before.
+        """
+        raise NotImplementedError
+
+    def resets_opacity_after(self, step: int) -> bool:
+        return False
+
+    def prunes_large_after(self, step: int) -> bool:
+        return False
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
-        """Make all Gaussians faint, if that is a habit of the strategy."""
+        """Lower all opacities, in place."""
 
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """What a checkpoint must hold, sharing memory."""
+        """The arrays of a checkpoint, sharing memory."""
+        return {}
 
     def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
-        """Become what ``arrays()`` described; other keys are ignored."""
+        """Restore the state that ``arrays()`` returned; other keys are ignored."""
 
 
 def not_finite(gaussians: Gaussians) -> Tensor:
-    """(N,) bool: rows with a value that is no number."""
+    """(N,) bool: rows with a value that is not finite."""
     bad = torch.zeros(len(gaussians), dtype=torch.bool)
     for tensor in gaussians.tensors().values():
         bad |= ~torch.isfinite(tensor).reshape(len(tensor), tensor[:1].numel()).all(1)

@@ -1,6 +1,6 @@
-"""How a training goes, second by second, for programs that watch it: ``train.metrics.jsonl``.
+"""The progress of training for programs that show it: ``train.metrics.jsonl``.
 
-Times and memory are in it, so that it is no part of a stage's result and lies beside the log.
+It contains times and memory, so that it is not part of the stage's result and lies beside the log.
 """
 
 from __future__ import annotations
@@ -17,18 +17,17 @@ NAME = "train.metrics.jsonl"
 SECONDS = 1.0
 
 
-class Journal:
-    """A line of JSON a second at most, and one at the end.
+class MetricsLog:
+    """A file with at most one line of JSON a second, and one at the end.
 
-    Each has ``time`` (Unix, s), ``step``, ``share`` (of the schedule, 0 to 1), ``seconds`` (of
+    Fields: ``time`` (Unix, s), ``step``, ``share`` (of the schedule, 0 to 1), ``seconds`` (of
     training so far), ``seconds_left``, ``loss`` and ``psnr`` (dB; of training views, over the last
-    hundredth of the run; null before), ``num_gaussians``, ``sh_degree``, ``resolution`` (1 or a
-    half or a quarter) and ``memory_mb`` (peak, MiB).
-
-    A run that goes on from a checkpoint keeps the lines up to its step.
+    hundredth of the run; null before), ``num_gaussians``, ``sh_degree``, ``resolution`` (1, 1/2 or
+    1/4) and ``memory_mb`` (peak, MiB). A resumed run keeps the lines up to its step.
 
     Args:
-        path: None writes nothing. What cannot be written is left out: it is only a nicety.
+        path: None writes nothing. Errors of writing are ignored.
+        step: steps done.
     """
 
     def __init__(self, path: Path | None, step: int):
@@ -40,7 +39,7 @@ class Journal:
                 path.write_text("".join(f"{line}\n" for line in kept))
 
     def write(self, state: TrainState, steps: int, factor: int, seconds_left: float) -> None:
-        """Write a line if one is due; ``steps`` are the schedule's."""
+        """Write a line if one is due; ``steps`` is the length of the schedule."""
         now = time.monotonic()
         if self._path is None or (now - self._last < SECONDS and state.clock < steps):
             return
@@ -63,8 +62,8 @@ class Journal:
             file.write(json.dumps(record) + "\n")
 
 
-def read_journal(path: Path) -> list[dict[str, float | None]]:
-    """The lines of a journal; what a kill left half-written is passed over."""
+def read_metrics_log(path: Path) -> list[dict[str, float | None]]:
+    """The lines of the file; incomplete lines are skipped."""
     return [json.loads(line) for line in _lines(path) if _step(line) > 0]
 
 
@@ -73,7 +72,7 @@ def _lines(path: Path) -> list[str]:
 
 
 def _step(line: str) -> int:
-    """The step of a line, 0 if it is none."""
+    """The step of a line, 0 if it is incomplete."""
     try:
         return int(json.loads(line)["step"])
     except (ValueError, KeyError, TypeError):

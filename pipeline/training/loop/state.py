@@ -1,4 +1,4 @@
-"""Everything a run must remember to go on after a kill as if nothing had happened."""
+"""The state of training, which checkpoints contain: resumed runs give the same bits."""
 
 from __future__ import annotations
 
@@ -11,23 +11,25 @@ from numpy.typing import NDArray
 
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import morton_order
-from pipeline.training.cameras.refinement import MovingCameras
+from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.density import Changes, Strategy
 from pipeline.training.optimisers.adam import Adam
+
+CURVE_RECORDS = 100  # records of the curve in a run
 
 
 @dataclass
 class Counters:
-    """What happened, summed over the run.
+    """Totals of the run.
 
     Attributes:
         changes: of density control.
-        opacity_resets: how often.
-        max_gaussians: the most there ever were.
-        num_dropped: Gaussians the rasterizer left out for numerical reasons, over all steps.
+        opacity_resets: number of opacity resets.
+        max_gaussians: the largest number of Gaussians.
+        num_dropped: Gaussians that the rasterizer left out for numerical reasons, over all steps.
         blind_steps: steps whose view saw no Gaussian.
-        unseen: Gaussians left out in the end because no training view saw them.
-        floaters: those that hung before one camera and were taken away.
+        unseen: Gaussians removed at the end because no training view saw them.
+        floaters: Gaussians removed because they were close to a single camera.
     """
 
     changes: Changes = field(default_factory=Changes)
@@ -40,7 +42,7 @@ class Counters:
 
 
 @dataclass
-class Window:
+class CurveWindow:
     """Sums since the last record of the curve."""
 
     loss: float = 0.0
@@ -54,56 +56,69 @@ class TrainState:
     """The state after ``step`` steps.
 
     Attributes:
-        cameras: what of the views' moves, too.
-        clock: where the run is in its schedule: ``step``, unless it has minutes instead of steps.
-        order: (V,) int64, this epoch's order of views; ``position`` of them are done.
+        clock: position in the schedule: ``step``, or less or more with a time budget.
+        order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
         curve: records without times; ``curve_seconds`` has the time of each.
-        seconds: training time before this process.
+        seconds: training time so far, in all processes.
     """
 
     gaussians: Gaussians
     adam: Adam
     density: Strategy
-    cameras: MovingCameras
+    cameras: CameraRefinement
     rng: np.random.Generator
     order: NDArray[np.int64]
     position: int = 0
     step: int = 0
     clock: int = 0
     counters: Counters = field(default_factory=Counters)
-    window: Window = field(default_factory=Window)
+    window: CurveWindow = field(default_factory=CurveWindow)
     curve: list[dict[str, float]] = field(default_factory=list)
     curve_seconds: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
     def next_view(self) -> int:
-        """The next view's index: shuffled epochs, each view once in each."""
+        """Index of the next view: each view once in each shuffled epoch."""
         if self.position == len(self.order):
             self.order, self.position = self.rng.permutation(len(self.order)), 0
         self.position += 1
         return int(self.order[self.position - 1])
 
     def reorder(self) -> None:
-        """Lay Gaussians that are near in space next to each other, right after ``refine``, when
-        density control has nothing in mind of any. The rasterizer passes over what a view does
-        not see sixteen at a time."""
+        """Sort Gaussians along a Z-order curve: neighbours in space become neighbours in memory,
+        and the rasterizer skips invisible ones in blocks. Only right after ``refine``, when the
+        strategy has no statistics of single Gaussians."""
         order = morton_order(self.gaussians.means)
         self.gaussians = self.gaussians.select(order)
         self.adam.select(order, torch.zeros(len(order), dtype=torch.bool))
 
     def drop_unseen(self, views: int) -> None:
-        """Leave out, in the end, what none of the ``views`` photographs looked at in an epoch:
-        training made it as it is by chance, and before another camera it would stand as a floater.
-        In photographs that were trained on next to nothing changes."""
-        # A window this long holds an epoch whole, whatever their orders.
+        """At the end, remove Gaussians without a gradient in a whole epoch of ``views`` views: no
+        training view constrains them, and other cameras can see them as floaters."""
+        # So many steps contain a whole epoch, in any order of the views.
         before = self.step - 2 * views + 1
         seen = self.adam.last > before
         if before > 0 and seen.any():
             self.counters.unseen = int((~seen).sum())
             self.gaussians = self.gaussians.select(torch.nonzero(seen)[:, 0])
 
+    def record(self) -> None:
+        """Add a record to the curve and begin a new window."""
+        window = self.window
+        previous = self.curve[-1]["psnr"] if self.curve else 0.0
+        self.curve.append(
+            {
+                "step": self.step,
+                "loss": window.loss / max(1, window.steps),
+                "psnr": window.psnr / window.samples if window.samples else previous,
+                "num_gaussians": len(self.gaussians),
+            }
+        )
+        self.curve_seconds.append(self.seconds)
+        self.window = CurveWindow()
+
     def arrays(self) -> dict[str, NDArray[Any]]:
-        """All arrays, sharing memory."""
+        """The arrays of a checkpoint, sharing memory."""
         result: dict[str, NDArray[Any]] = {"order": self.order}
         for name, tensor in self.gaussians.tensors().items():
             result[f"parameter.{name}"] = tensor.numpy()
@@ -113,7 +128,7 @@ class TrainState:
         return result | {"last": self.adam.last.numpy()}
 
     def values(self) -> dict[str, Any]:
-        """The rest, as JSON; floats survive exactly."""
+        """The rest of a checkpoint, as JSON, which keeps floats exactly."""
         return {
             "rng": self.rng.bit_generator.state,
             "position": self.position,
@@ -126,7 +141,7 @@ class TrainState:
         }
 
     def restore(self, step: int, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
-        """Become what ``arrays()`` and ``values()`` described."""
+        """Restore the state that ``arrays()`` and ``values()`` returned."""
         self.step, self.order = step, arrays["order"]
         self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians, self.adam.beta1, self.adam.own_frames, self.adam.backend)
@@ -140,13 +155,13 @@ class TrainState:
         self.position, self.clock = values["position"], values["clock"]
         counters = dict(values["counters"])
         self.counters = Counters(changes=Changes(**counters.pop("changes")), **counters)
-        self.window = Window(**values["window"])
+        self.window = CurveWindow(**values["window"])
         self.curve, self.curve_seconds = values["curve"], values["curve_seconds"]
         self.seconds = values["seconds"]
 
 
 def gaussians_of(arrays: dict[str, NDArray[Any]]) -> Gaussians:
-    """The Gaussians among a state's arrays."""
+    """The Gaussians in the arrays of a checkpoint."""
     prefix = "parameter."
     found = {k.removeprefix(prefix): v for k, v in arrays.items() if k.startswith(prefix)}
     return Gaussians.from_arrays(found)

@@ -1,6 +1,6 @@
-"""What training runs on, and the measured time of its steps: for the log, no part of a result.
+"""The build of the rasterizer in a run and the measured time of its steps, for the log.
 
-A build is what ``Backend.facts`` says: the instruction set and the compiler, by name.
+A build is what ``Backend.facts`` returns: the instruction set and the compiler, by name.
 """
 
 from __future__ import annotations
@@ -8,7 +8,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-#: Steps of this process before the measurement (first pages of memory, cold caches), and in it.
+#: Steps of this process before the measurement (cold caches), and steps of the measurement.
 WARM_UP, MEASURED = 10, 40
 
 
@@ -16,22 +16,22 @@ class StepTimer:
     """Measures some early steps of one process, once.
 
     Args:
-        steps: that are left to do.
+        steps: remaining steps of the run.
     """
 
     def __init__(self, build: Mapping[str, str], threads: int, steps: int):
         self.build, self.threads = build, threads
         self.done, self.start = 0, 0.0
-        # A short run is measured as well as it can be.
+        # Short runs have shorter measurements.
         self.first = min(WARM_UP, steps // 2)
         self.last = min(WARM_UP + MEASURED, steps)
 
-    def passes(self, seconds: float, factor: int) -> str | None:
-        """A step is over. Returns the line for the log after the last one that is measured.
+    def after_step(self, seconds: float, factor: int) -> str | None:
+        """The line for the log after the last measured step, else None.
 
         Args:
             seconds: of training so far.
-            factor: that the pictures were reduced by.
+            factor: by which the images were reduced.
         """
         self.done += 1
         if self.done == self.first:
@@ -47,8 +47,8 @@ class StepTimer:
 
 
 def other_build(values: dict[str, Any], build: Mapping[str, str]) -> str | None:
-    """A line for the log where a checkpoint was made by another build. It is used all the same:
-    the bits are promised for one build alone, the quality is the same with any."""
+    """A line for the log if a checkpoint was made with another build. It is used: results are
+    equal to the last bit only with one build, but of the same quality with any."""
     before = values.get("built")
     facts = "{instruction_set} ({compiler})"
     if before is None or before == build:

@@ -1,7 +1,7 @@
-"""Depths that are known beforehand: of the sparse points, at the pixels where views see them.
+"""The depth loss, at pixels with known depths.
 
-Where few photographs see a surface, colours alone leave its distance open, and Gaussians that hang
-in front of one camera explain its picture as well as the wall behind them would.
+If few photographs see a surface, colours alone do not determine its distance, and Gaussians close
+to one camera explain its photograph as well as the surface.
 """
 
 from __future__ import annotations
@@ -14,9 +14,9 @@ from pipeline.render import Forward
 from pipeline.scene.views import View
 from pipeline.training.data.known_depths import KnownDepths
 
-#: Where Huber's square ends, in the logarithm: beyond 1 % the pull is constant.
+#: Error of the logarithm at which the Huber loss becomes linear: 1 %.
 TOLERANCE = 0.01
-#: Pixels more transparent than this have no depth yet.
+#: Pixels with less alpha have no depth.
 MIN_ALPHA = 0.1
 
 
@@ -24,10 +24,10 @@ def depth_gradients(
     rendered: Forward, known: KnownDepths, view: View, weight: float
 ) -> tuple[Tensor, Tensor]:
     """Gradients of ``weight`` times the mean Huber loss of log(D / z), D being the rendered depth
-    over alpha: in logarithms, so that near and far count alike.
+    over alpha. In logarithms, relative errors count the same at all depths.
 
     Args:
-        rendered: of ``view`` at any of its sizes.
+        rendered: ``view`` at full or reduced size.
 
     Returns:
         d_alpha, d_depth: (H, W) float32, for ``render.backward``.
@@ -42,8 +42,8 @@ def depth_gradients(
     off = torch.log(depth / alpha / torch.from_numpy(known.z)) * usable
     share = torch.from_numpy(known.weight) * (weight / max(1, len(known)))
     # d log(depth / alpha): 1 / depth and -1 / alpha.
-    pull = (off / TOLERANCE).clamp(-1, 1) * share
+    gradient = (off / TOLERANCE).clamp(-1, 1) * share
     d_alpha, d_depth = torch.zeros_like(rendered.alpha), torch.zeros_like(rendered.alpha)
-    d_alpha.index_put_((row, column), -pull / alpha, accumulate=True)
-    d_depth.index_put_((row, column), pull / depth, accumulate=True)
+    d_alpha.index_put_((row, column), -gradient / alpha, accumulate=True)
+    d_depth.index_put_((row, column), gradient / depth, accumulate=True)
     return d_alpha, d_depth

@@ -1,1 +1,1 @@
-"""Adam over Gaussians, and over the parameters of single cameras."""
+"""Adam for Gaussians and for cameras."""

@@ -1,7 +1,8 @@
-"""Adam over the five arrays of Gaussians, whose rows come and go.
+"""Adam for the five arrays of Gaussians, whose rows change with density control.
 
-The harmonics, four fifths of a Gaussian, are moved inside the backward pass and in view alone.
-Means and rotations move along and about each Gaussian's own axes, or as 3DGS moves them.
+SH coefficients, most of a Gaussian's data, are updated inside the backward pass, and only for
+visible Gaussians. Means and rotations are updated along and about each Gaussian's own axes, or as
+in 3DGS.
 """
 
 from __future__ import annotations
@@ -15,14 +16,14 @@ from pipeline.render import Backend, FrameAdam, Gradients, ShAdam, make_backend
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
-# 3DGS's: gradients of a mean over all pixels are far below the usual 1e-8.
+# As in 3DGS: gradients of a mean over all pixels are far below the usual 1e-8.
 EPSILON = 1e-15
 
 
 @dataclass(frozen=True)
 class Rates:
-    """Learning rates of one step; ``means`` counts in each Gaussian's own scales where Adam has
-    ``own_frames``, else in the world's unit."""
+    """Learning rates of one step. The unit of ``means`` is each Gaussian's scales if Adam uses
+    ``own_frames``, else the world's."""
 
     means: float
     log_scales: float
@@ -33,16 +34,17 @@ class Rates:
 
 
 class Adam:
-    """First and second moments beside a ``Gaussians``, row by row.
+    """First and second moments of each row of ``Gaussians``.
 
     Attributes:
-        beta1: of the first moment.
-        backend: takes the steps.
-        own_frames: means and rotations are moved along and about each Gaussian's own axes.
-        first, second: by the name of the array, of its shape, float32. But with ``own_frames``
-            those of quaternions are (N, 3), about the axes; and without, the second of means and
-            of quaternions (N, 1): a turned world is trained as it was, either way.
-        last: (N,) int32, the last step whose view asked anything of each row.
+        beta1: decay rate of the first moment.
+        backend: performs the updates.
+        own_frames: update means along, and rotations about, each Gaussian's own axes.
+        first, second: moments by the name of the array, of its shape, float32. With ``own_frames``,
+            those of quaternions are (N, 3), about the axes. Without, the second moments of means
+            and quaternions are (N, 1), shared by their components. Either way, results do not
+            depend on the orientation of the world.
+        last: (N,) int32, the last step in which each row had a gradient.
     """
 
     def __init__(
@@ -63,7 +65,7 @@ class Adam:
         self.last = torch.zeros(count, dtype=torch.int32)
 
     def harmonics(self, rates: Rates, step: int) -> ShAdam:
-        """For ``backward``, which moves ``sh``; ``step`` counts from 1."""
+        """Arguments of ``backward``, which updates ``sh``; ``step`` counts from 1."""
         return ShAdam(
             self.first["sh"], self.second["sh"], self.last, rates.sh0, rates.shN, step,
             self.beta1, BETA2, EPSILON,
@@ -72,16 +74,16 @@ class Adam:
     def step(
         self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
     ) -> None:
-        """Move all of ``gaussians`` but ``sh``, in place; ``step`` counts from 1."""
-        moved = {"sh"}
+        """Update all arrays but ``sh``, in place; ``step`` counts from 1."""
+        updated = {"sh"}
         if self.own_frames:
-            moved |= {"means", "quats"}
+            updated |= {"means", "quats"}
             self.backend.frame_adam(
                 gaussians.means, gaussians.quats, gaussians.log_scales, gradients.means,
                 gradients.quats, self.frames(rates, step), threads,
             )  # fmt: skip
         for name, parameter in gaussians.tensors().items():
-            if name in moved:
+            if name in updated:
                 continue
             self.backend.adam_step(
                 parameter, getattr(gradients, name), self.first[name], self.second[name],
@@ -95,7 +97,7 @@ class Adam:
         )  # fmt: skip
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
-        """Follow ``Gaussians.select(rows)``; rows marked in ``fresh`` (M,) start from zero."""
+        """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""
         for moments in (self.first, self.second):
             for name, tensor in moments.items():
                 moments[name] = tensor[rows].contiguous()
@@ -108,6 +110,6 @@ class Adam:
         self.second[name].zero_()
 
     def resize_bands(self, degree: int) -> None:
-        """Follow ``Gaussians.with_sh_degree``."""
+        """Resize the moments as ``Gaussians.with_sh_degree`` does."""
         for moments in (self.first, self.second):
             moments["sh"] = resize_bands(moments["sh"], degree)

@@ -1,4 +1,4 @@
-"""Adam (Kingma and Ba 2015) for a table of few parameters, of which each step moves one row."""
+"""Adam (Kingma and Ba 2015) for the parameters of cameras, one camera in each step."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ BETA1, BETA2, EPSILON = 0.9, 0.999, 1e-15
 
 
 @dataclass
-class RowAdam:
-    """The rows' moments.
+class PerCameraAdam:
+    """The moments of each camera.
 
     Attributes:
-        shape: (rows, parameters).
-        first, second: of that shape.
-        steps: (rows,) int64, of each row.
+        shape: (cameras, parameters).
+        first, second: moments, of that shape.
+        steps: (cameras,) int64, number of steps of each camera.
     """
 
     shape: tuple[int, int]
@@ -32,18 +32,18 @@ class RowAdam:
         self.first, self.second = np.zeros(self.shape), np.zeros(self.shape)
         self.steps = np.zeros(self.shape[0], np.int64)
 
-    def step(self, row: int, gradient: Array, rate: float) -> Array:
-        """(parameters,) what to add to the row; at first ``rate`` for each of them."""
-        self.steps[row] += 1
-        steps = int(self.steps[row])
-        self.first[row] += (1 - BETA1) * (gradient - self.first[row])
-        self.second[row] += (1 - BETA2) * (gradient**2 - self.second[row])
-        mean = self.first[row] / (1 - BETA1**steps)
-        spread = np.sqrt(self.second[row] / (1 - BETA2**steps))
+    def step(self, camera: int, gradient: Array, rate: float) -> Array:
+        """(parameters,) change of one camera's parameters; ``rate`` each in the first step."""
+        self.steps[camera] += 1
+        steps = int(self.steps[camera])
+        self.first[camera] += (1 - BETA1) * (gradient - self.first[camera])
+        self.second[camera] += (1 - BETA2) * (gradient**2 - self.second[camera])
+        mean = self.first[camera] / (1 - BETA1**steps)
+        spread = np.sqrt(self.second[camera] / (1 - BETA2**steps))
         return np.asarray(-rate * mean / (spread + EPSILON))
 
     def arrays(self, prefix: str) -> dict[str, NDArray[Any]]:
-        """What a checkpoint must hold."""
+        """The arrays of a checkpoint."""
         return {
             f"{prefix}.first": self.first,
             f"{prefix}.second": self.second,

@@ -1,4 +1,4 @@
-"""Cameras that are off by a little are brought back, with the scene and without it."""
+"""Refinement recovers inaccurate poses, with and without the Gaussians."""
 
 from __future__ import annotations
 
@@ -13,14 +13,15 @@ from PIL import Image
 from pipeline.render import RasterOptions
 from pipeline.scene.views import View
 from pipeline.training.cameras.fit_pose import fit_pose
-from pipeline.training.cameras.poses import followed, rigid
+from pipeline.training.cameras.poses import rigid, with_common_motion
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop.trainer import TrainResult, train
+from pipeline.training.loop.result import TrainResult
+from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 
 @pytest.mark.parametrize("size", [0.0, 1e-12, 1e-5, 2e-4, 0.3, 3.0])
-def test_a_turn_is_the_matrix_exponential(size: float) -> None:
+def test_a_rotation_is_the_matrix_exponential(size: float) -> None:
     turn = size * np.array([0.6, -0.48, 0.64])
     x, y, z = turn
     skew = torch.tensor([[0, -z, y], [z, 0, -x], [-y, x, 0]], dtype=torch.float64)
@@ -30,21 +31,21 @@ def test_a_turn_is_the_matrix_exponential(size: float) -> None:
 
 
 def off(view: View, seed: int) -> View:
-    """About a degree, and a fiftieth of the way to the middle."""
+    """The view, rotated by about a degree and moved by a fiftieth of its distance."""
     rng = np.random.default_rng(seed)
     change = rigid(0.012 * rng.standard_normal(3), 0.03 * rng.standard_normal(3))
     return replace(view, world_to_camera=change @ view.world_to_camera)
 
 
 def distance(a: View, b: View) -> float:
-    """Radians and extents of the cameras' orbit, together."""
+    """Sum of the rotation, radians, and the translation, extents."""
     cosine = (np.trace(a.world_to_camera[:3, :3] @ b.world_to_camera[:3, :3].T) - 1) / 2
     turned = float(np.arccos(np.clip(cosine, -1, 1)))
     return turned + float(np.linalg.norm(a.centre - b.centre)) / 3.0
 
 
 @pytest.mark.parametrize("index", range(3))
-def test_a_held_out_camera_is_fitted_to_its_photograph(scene: TinyScene, index: int) -> None:
+def test_a_test_view_is_aligned_to_its_photograph(scene: TinyScene, index: int) -> None:
     view = scene.views[index]
     wrong = off(view, index)
     photo = np.asarray(Image.open(view.image))
@@ -58,13 +59,13 @@ def test_a_held_out_camera_is_fitted_to_its_photograph(scene: TinyScene, index: 
     assert distance(found, view) < 0.05 * distance(wrong, view)
 
 
-def test_cameras_that_were_not_moved_follow_the_others(scene: TinyScene) -> None:
-    """The whole scene drifts by one motion: a turn of the world and a shift."""
+def test_test_views_follow_the_common_motion_of_refined_cameras(scene: TinyScene) -> None:
+    """The scene drifts as a whole: a rotation of the world and a translation."""
     drift = rigid(np.array([0.3, -0.2, 0.5]), np.array([5.0, -3.0, 1.0]))
     true = {view.name: view.world_to_camera @ np.linalg.inv(drift) for view in scene.views}
     held_out = {scene.views[0].name, scene.views[4].name}
     moved = {name: pose for name, pose in true.items() if name not in held_out}
-    found = followed(scene.views, moved)
+    found = with_common_motion(scene.views, moved)
     assert list(found) == [view.name for view in scene.views]
     for name, pose in true.items():
         np.testing.assert_allclose(found[name], pose, atol=1e-12)
@@ -79,24 +80,23 @@ def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object)
             scene.truth,
             scene.extent,
         ),
-        tiny_config(300, lr_means=5e-3, **options),
+        *tiny_config(300, means_learning_rate=5e-3, **options),
         seed=3,
         threads=threads,
         checkpoint_dir=folder,
     )
 
 
-def test_training_moves_a_camera_that_disagrees_with_the_others(
-    scene: TinyScene, tmp_path: Path
-) -> None:
-    """All but one are right, and so is the scene, which stays: the one comes back."""
+def test_training_recovers_a_wrong_pose(scene: TinyScene, tmp_path: Path) -> None:
+    """The other poses are correct, and the Gaussians are correct and fixed."""
     views = [off(scene.views[0], 5), *scene.views[1:]]
     still = ("means", "scales", "quats", "opacities", "sh0", "shN")
-    config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, refine_poses=True)
-    config = config.model_copy(update={f"lr_{name}": 0.0 for name in still} | {"pose_reach": 0.05})
+    options: dict[str, object] = {f"{name}_learning_rate": 0.0 for name in still}
+    options |= {"refine_poses": True, "max_pose_change": 0.05}
+    config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, **options)
     result = train(
         Inputs(views, scene.truth, scene.extent),
-        config,
+        *config,
         seed=3,
         threads=1,
         checkpoint_dir=tmp_path,
@@ -107,7 +107,7 @@ def test_training_moves_a_camera_that_disagrees_with_the_others(
         assert distance(found, true) < 0.1 * distance(views[0], scene.views[0])
 
 
-def test_moved_cameras_survive_a_kill_to_the_bit(
+def test_refined_poses_are_the_same_bits_after_a_kill(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     whole = trained(scene, tmp_path / "whole", threads=2, refine_poses=True)

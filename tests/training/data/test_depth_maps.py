@@ -1,4 +1,4 @@
-"""Depth maps of any unit and kind become the scene's depths, or are refused."""
+"""Depth maps of any unit and kind are fitted to the scene, or not used."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ KINDS = {
 
 
 def scene_depth() -> np.ndarray:
-    """(60, 80): a floor that comes nearer, with a box before it."""
+    """(60, 80): a floor with decreasing depth and a box in front of it."""
     z = np.repeat(np.linspace(6.0, 2.0, 60)[:, None], 80, 1)
     z[20:40, 30:50] = 1.5
     return z
@@ -37,7 +37,7 @@ def sparse(z: np.ndarray, wrong: int = 0) -> KnownDepths:
 
 
 @pytest.mark.parametrize("kind", KINDS)
-def test_a_map_of_each_kind_gives_the_depths_though_points_are_wrong(tmp_path, kind):
+def test_maps_of_each_kind_are_fitted_despite_outliers(tmp_path, kind):
     z = scene_depth()
     np.save(tmp_path / "map.npy", KINDS[kind](z))
     samples, fit = map_depths(VIEW, str(tmp_path / "map.npy"), sparse(z, wrong=12))
@@ -63,7 +63,7 @@ def test_millimetres_in_a_png_of_half_the_size_with_holes(tmp_path):
     assert samples.xy[:, 1].min() > 10
 
 
-def test_a_map_of_something_else_and_one_without_points_are_refused(tmp_path):
+def test_maps_that_do_not_fit_or_have_no_points_are_not_used(tmp_path):
     z = scene_depth()
     np.save(tmp_path / "noise.npy", np.random.default_rng(1).uniform(1, 9, z.shape))
     few = KnownDepths(np.zeros((3, 2)), np.ones(3, np.float32), np.ones(3, np.float32))
@@ -75,7 +75,7 @@ def test_a_map_of_something_else_and_one_without_points_are_refused(tmp_path):
     assert [len(k) for k in known] == [60, 3, 3]
 
 
-def test_values_that_are_no_numbers_fit_nothing_and_harm_nothing():
+def test_values_that_are_not_finite_are_ignored():
     z = np.linspace(1.0, 5.0, 40)
     values = 2 * z
     values[::4] = np.nan
@@ -86,7 +86,7 @@ def test_values_that_are_no_numbers_fit_nothing_and_harm_nothing():
 
 
 @pytest.mark.parametrize("shape", [(60, 80, 3), (80, 60)])
-def test_a_map_of_another_shape_is_an_error_that_names_the_file(tmp_path, shape):
+def test_a_map_of_another_aspect_ratio_is_an_error_that_names_the_file(tmp_path, shape):
     np.save(tmp_path / "map.npy", np.ones(shape))
     with pytest.raises(UserError) as error:
         map_depths(VIEW, str(tmp_path / "map.npy"), sparse(scene_depth()))
@@ -94,7 +94,7 @@ def test_a_map_of_another_shape_is_an_error_that_names_the_file(tmp_path, shape)
 
 
 @pytest.mark.parametrize("name", ["map.npy", "map.npz", "map.png", "map.tif"])
-def test_a_file_that_is_none_is_an_error_that_names_it(tmp_path, name):
+def test_a_file_that_is_not_a_depth_map_is_an_error_that_names_it(tmp_path, name):
     (tmp_path / name).write_bytes(b"nothing")
     with pytest.raises(UserError) as error:
         map_depths(VIEW, str(tmp_path / name), sparse(scene_depth()))

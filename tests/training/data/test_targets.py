@@ -1,4 +1,4 @@
-"""Targets: alpha and masks survive the reduction, and the reduced camera sees the same scene."""
+"""Training images: alpha, masks, reduced sizes, and the image stores."""
 
 from __future__ import annotations
 
@@ -10,12 +10,11 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.config.schema import Train
 from pipeline.photos.load import resize_area
 from pipeline.render import RasterOptions, forward
 from pipeline.render.views import raster_camera
 from pipeline.scene.views import View, reduced_size
-from pipeline.training.data.image_store import DiskShelf, MemoryShelf
+from pipeline.training.data.image_store import DiskStore, MemoryStore
 from pipeline.training.data.targets import Targets, usable_factor
 from tests.training.conftest import TinyScene
 
@@ -31,7 +30,7 @@ def view_of(path: Path, picture: np.ndarray, mask: np.ndarray | None = None) -> 
     return View("v", str(path), mask_path, width, height, 50.0, 50.0, 5.0, 5.0, pose, False)
 
 
-def test_hidden_colours_never_show(tmp_path: Path) -> None:
+def test_colours_of_transparent_and_ignored_pixels_have_no_effect(tmp_path: Path) -> None:
     picture = np.full((8, 10, 4), 200, np.uint8)
     picture[:4, :, 3] = 0
     targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
@@ -45,14 +44,14 @@ def test_hidden_colours_never_show(tmp_path: Path) -> None:
         assert np.allclose(over[rows:].numpy(), visible, atol=0.004)
 
 
-def test_opaque_alpha_is_no_alpha(tmp_path: Path) -> None:
+def test_an_opaque_alpha_channel_is_dropped(tmp_path: Path) -> None:
     picture = np.full((8, 10, 4), 255, np.uint8)
     targets = Targets([view_of(tmp_path / "a.png", picture)], threads=1)
     assert not targets.have_alpha
     assert targets.get(0, 1).over((0.3, 0.3, 0.3)).dtype == torch.uint8
 
 
-def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None:
+def test_a_reduced_pixel_is_the_mean_of_pixels_that_are_not_ignored(tmp_path: Path) -> None:
     picture = np.random.default_rng(0).integers(1, 255, (8, 8, 3), np.uint8)
     mask = np.full((8, 8), 255, np.uint8)
     mask[0, 0] = mask[6:, 4:] = 0
@@ -67,32 +66,30 @@ def test_a_reduced_pixel_is_the_mean_of_those_that_count(tmp_path: Path) -> None
     counting = picture[:2, :2].reshape(4, 3)[1:]
     assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
     assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
-    thinning = targets.get(0, 1).thinning(0.5)
-    assert thinning is not None and targets.get(0, 1).thinning(0.0) is None
-    np.testing.assert_allclose(thinning, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+    masked = targets.get(0, 1).mask_gradient(0.5)
+    assert masked is not None and targets.get(0, 1).mask_gradient(0.0) is None
+    np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
 
 
-def test_what_is_asked_of_alpha_is_the_gradient_of_its_error_where_pixels_count(
+def test_alpha_gradient_is_the_gradient_of_its_losses(
     tmp_path: Path,
 ) -> None:
     rng = np.random.default_rng(0)
     picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
     mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
     target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
-    config = Train(alpha_weight=0.4, square_weight=2.5, masked_opacity=0.3)
     alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
     counts = torch.from_numpy(mask > 0)
     error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
     wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
     (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
-    asked = target.alpha_gradient(alpha.detach(), config)
-    assert asked is not None and alpha.grad is not None
-    torch.testing.assert_close(asked, alpha.grad)
-    nothing = Train(alpha_weight=0.0, masked_opacity=0.0)
-    assert target.alpha_gradient(alpha.detach(), nothing) is None
+    gradient = target.alpha_gradient(alpha.detach(), 0.3, 0.4, 2.5)
+    assert gradient is not None and alpha.grad is not None
+    torch.testing.assert_close(gradient, alpha.grad)
+    assert target.alpha_gradient(alpha.detach(), 0.0, 0.0, 2.5) is None
 
 
-def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:
+def test_the_reduced_camera_renders_the_reduced_image(scene: TinyScene) -> None:
     view = replace(scene.views[1], width=39, height=33, cx=18.0, cy=17.5)
     options = RasterOptions(sh_degree=1, threads=1)
     soft = scene.truth.clone()
@@ -107,14 +104,14 @@ def test_the_reduced_camera_sees_the_reduced_picture(scene: TinyScene) -> None:
     assert difference < 0.3 * shifted
 
 
-def test_small_pictures_are_not_reduced() -> None:
+def test_small_images_are_not_reduced() -> None:
     sizes = [(800, 533, 4), (200, 150, 2), (100, 70, 1)]
     for width, height, wanted in sizes:
         view = View("", "", None, width, height, 1.0, 1.0, 0.0, 0.0, np.eye(4), False)
         assert usable_factor([view], 4) == wanted
 
 
-def test_salt_and_pepper_is_the_share_asked_for_and_the_same_for_a_seed(tmp_path: Path) -> None:
+def test_salt_and_pepper_has_its_share_and_depends_on_the_seed(tmp_path: Path) -> None:
     views = [view_of(tmp_path / "a.png", np.full((80, 100, 3), 120, np.uint8))]
     clean = Targets(views, threads=1).get(0, 1).rgb
     assert (clean == 120).all()
@@ -124,16 +121,16 @@ def test_salt_and_pepper_is_the_share_asked_for_and_the_same_for_a_seed(tmp_path
     assert abs((noisy[0] == 255).all(2).mean() - 0.1) < 0.015
 
 
-def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
-    """Of every kind, at every size, read by any thread, as often as they are asked for."""
+def test_both_image_stores_give_the_same_bits(tmp_path: Path) -> None:
+    """With and without alpha and masks, at every size, repeatedly."""
     rng = np.random.default_rng(0)
     views = []
     for number, channels in enumerate((3, 4, 3)):
         picture = rng.integers(0, 255, (140 + number, 150, channels), np.uint8)
         mask = (rng.random(picture.shape[:2]) > 0.4).astype(np.uint8) * 255 if number else None
         views.append(view_of(tmp_path / f"{number}.png", picture, mask))
-    in_memory = Targets(views, 3, shelf=MemoryShelf())
-    on_disk = Targets(views, 3, shelf=DiskShelf())
+    in_memory = Targets(views, 3, store=MemoryStore())
+    on_disk = Targets(views, 3, store=DiskStore())
     assert on_disk.have_alpha and not on_disk.hidden()
     for factor, index in [(4, 0), (4, 2), (4, 0), (2, 1), (2, 2), (1, 2), (1, 1), (1, 0), (1, 2)]:
         wanted, found = in_memory.get(index, factor), on_disk.get(index, factor)
@@ -143,12 +140,12 @@ def test_pictures_on_disk_are_those_in_memory(tmp_path: Path) -> None:
             assert one is None or (one.dtype == other.dtype and torch.equal(one, other)), name
 
 
-def test_a_disk_shelf_holds_nothing_in_memory_and_leaves_no_file(
+def test_a_disk_store_reads_copies_and_leaves_no_file(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path))
-    take = DiskShelf().put((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
-    first, second = take(), take()
+    read = DiskStore().add((torch.arange(200, dtype=torch.uint8).reshape(10, 20), None))
+    first, second = read(), read()
     assert first[0] is not None and second[0] is not None and first[1] is None
     assert torch.equal(first[0], second[0]) and first[0].data_ptr() != second[0].data_ptr()
     assert not list(tmp_path.iterdir())

@@ -1,4 +1,4 @@
-"""Density control: rows, moments and budget stay in order; splits keep where things are."""
+"""Density control: rows, moments and budget are consistent; splits keep positions and extents."""
 
 from __future__ import annotations
 
@@ -11,7 +11,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from pipeline.config.schema import Density
+from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
+from pipeline.config.schema import Gradient, Mcmc, Original
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.density import make_strategy
 from pipeline.training.density.gradient import (
@@ -22,13 +23,14 @@ from pipeline.training.density.gradient import (
     GradientDensity,
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
+from pipeline.training.density.original import OriginalDensity
 from pipeline.training.density.strategy import rotations
 from pipeline.training.optimisers.adam import Adam
 from tests.training.conftest import ball
 
 
 def marked(count: int) -> tuple[Gaussians, Adam]:
-    """Gaussians whose moments name the row they belong to."""
+    """Gaussians with moments that are equal to their row's number, from 1."""
     gaussians = ball(count, 0)
     adam = Adam(gaussians, beta1=0.8, own_frames=True)
     for moments in (adam.first, adam.second):
@@ -38,21 +40,26 @@ def marked(count: int) -> tuple[Gaussians, Adam]:
 
 
 def strategy(count: int, **options: object) -> GradientDensity:
-    """As 3DGS does it, where nothing else is said."""
-    paper: dict[str, object] = {"clone": True, "split_kind": "sampled"}
-    density = GradientDensity(Density(**paper | options), scale=1.0)  # type: ignore[arg-type]
+    """3DGS's way of densification, unless ``options`` differ."""
+    published: dict[str, object] = {"clone": True, "split_kind": "sampled"}
+    density = GradientDensity(GradientExperiments(**published | options), 1000, 1.0)  # type: ignore[arg-type]
     density.start(count)
     density.seen += 1
     return density
 
 
 def refine(
-    density: GradientDensity, gaussians: Gaussians, adam: Adam, *, densify: bool = True
+    density: GradientDensity,
+    gaussians: Gaussians,
+    adam: Adam,
+    *,
+    densify: bool = True,
+    budget: int = 1_000_000,
 ) -> Gaussians:
     rng = np.random.Generator(np.random.PCG64(0))
-    return density.refine(
-        gaussians, adam, rng, densify=densify, prune_huge=False, budget=density.config.max_gaussians
-    )[0]
+    return density.refine(gaussians, adam, rng, densify=densify, prune_large=False, budget=budget)[
+        0
+    ]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -60,14 +67,14 @@ def refine(
 def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
     gaussians, adam = marked(count)
     rng = np.random.default_rng(seed)
-    density = strategy(count, max_gaussians=budget, split_scale=0.13)
+    density = strategy(count, split_scale=0.13)
     density.gradient_sum = torch.from_numpy(rng.uniform(0, 4e-4, count).astype(np.float32))
     gaussians.opacity_logits[torch.from_numpy(rng.random(count) < 0.2)] = -9.0
     rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
 
     rng2 = np.random.Generator(np.random.PCG64(seed))
     result, changes = density.refine(
-        gaussians, adam, rng2, densify=densify, prune_huge=False, budget=budget
+        gaussians, adam, rng2, densify=densify, prune_large=False, budget=budget
     )
 
     assert len(result) == count - changes.pruned + changes.cloned + changes.split
@@ -90,28 +97,28 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
 
 def test_the_budget_goes_to_the_largest_gradients() -> None:
     gaussians, adam = marked(10)
-    density = strategy(10, max_gaussians=13, split_scale=100.0)
+    density = strategy(10, split_scale=100.0)
     density.gradient_sum = torch.arange(10.0)
-    result = refine(density, gaussians, adam)
+    result = refine(density, gaussians, adam, budget=13)
     assert len(result) == 13
     assert torch.equal(result.means[10:], gaussians.means[[7, 8, 9]])
 
 
-def test_room_is_made_by_the_faint_that_nothing_pulls_at() -> None:
-    """What is faint because it is new is pulled at, and stays: without that bonsai lost 0.6 dB."""
+def test_transparent_gaussians_with_small_gradients_are_recycled() -> None:
+    """New Gaussians are transparent, but have large gradients and stay."""
     gaussians, adam = marked(40)
     gaussians.opacity_logits[:] = 2.0
     gaussians.opacity_logits[:2] = -3.0  # 0.05
-    density = strategy(40, max_gaussians=40, split_scale=100.0, recycle=0.1)
-    # All over the threshold; the tenth that is pulled at least are 0 and 2 to 4.
+    density = strategy(40, split_scale=100.0, recycle_share=0.1)
+    # All are above the threshold; the tenth with the smallest gradients are 0 and 2 to 4.
     density.gradient_sum += torch.arange(1.0, 41.0)
     density.gradient_sum[1] = 30.5
-    result = refine(density, gaussians, adam)
+    result = refine(density, gaussians, adam, budget=40)
     assert torch.equal(result.means[:39], gaussians.means[1:])
     assert torch.equal(result.means[39:], gaussians.means[39:])
 
 
-def test_invisible_steps_do_not_thin_the_mean_gradient() -> None:
+def test_steps_without_the_gaussian_do_not_change_its_mean_gradient() -> None:
     gaussians, adam = marked(2)
     density = strategy(2, split_scale=100.0, grad_threshold=1.0)
     density.gradient_sum = torch.tensor([3.0, 3.0])
@@ -139,7 +146,7 @@ def test_a_split_keeps_the_mean_and_shrinks() -> None:
 
 
 def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
-    """Both as they should be, about the middle, and as far out along the axis as before."""
+    """About the old centre, with the old variance along the axis."""
     gaussians, adam = marked(5)
     gaussians.log_scales += torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
     density = strategy(5, clone=False, split_kind="long_axis")
@@ -174,7 +181,7 @@ def test_clones_are_copies() -> None:
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quats", "opacity_logits", "sh"])
-def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
+def test_values_that_are_not_finite_are_removed(name: str) -> None:
     gaussians, adam = marked(6)
     gaussians.tensors()[name].view(6, -1)[2, 0] = math.nan
     result = refine(strategy(6), gaussians, adam, densify=False)
@@ -182,7 +189,7 @@ def test_what_is_no_longer_a_number_is_removed(name: str) -> None:
     assert all(torch.isfinite(tensor).all() for tensor in result.tensors().values())
 
 
-def test_opacity_reset_caps_and_forgets() -> None:
+def test_an_opacity_reset_limits_opacities_and_clears_moments() -> None:
     gaussians, adam = marked(4)
     gaussians.opacity_logits[0] = -7.0
     strategy(4).reset_opacity(gaussians, adam)
@@ -193,20 +200,20 @@ def test_opacity_reset_caps_and_forgets() -> None:
     assert adam.first["means"].all()
 
 
-def test_without_split_or_clone_the_other_is_done_to_all() -> None:
+def test_without_splits_all_are_cloned_and_without_clones_all_are_split() -> None:
     for options, cloned, split in (({"split": False}, 5, 0), ({"clone": False}, 0, 5)):
         gaussians, adam = marked(5)
         density = strategy(5, split_scale=0.13, **options)
         density.gradient_sum += 1.0
         rng = np.random.Generator(np.random.PCG64(0))
         _, changes = density.refine(
-            gaussians, adam, rng, densify=True, prune_huge=False, budget=100
+            gaussians, adam, rng, densify=True, prune_large=False, budget=100
         )
         assert (changes.cloned, changes.split) == (cloned, split)
 
 
 def mcmc(**options: object) -> McmcDensity:
-    return McmcDensity(Density(strategy="mcmc", **options), scale=1.0)  # type: ignore[arg-type]
+    return McmcDensity(McmcExperiments(**options), 1000, 1.0)  # type: ignore[arg-type]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -216,8 +223,8 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
     faint = np.random.default_rng(seed).random(count) < 0.3
     gaussians.opacity_logits[torch.from_numpy(faint)] = -9.0
     rng = np.random.Generator(np.random.PCG64(seed))
-    result, changes = mcmc(growth=0.2).refine(
-        gaussians, adam, rng, densify=densify, prune_huge=False, budget=budget
+    result, changes = mcmc(growth_share=0.2).refine(
+        gaussians, adam, rng, densify=densify, prune_large=False, budget=budget
     )
     alive = count - int(faint.sum())
     if densify and alive:
@@ -238,9 +245,9 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
 
 @pytest.mark.parametrize("parts", [1, 2, 3, 10, 50])
 @pytest.mark.parametrize("opacity", [0.02, 0.5, 0.95])
-def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
-    """As many as ``parts`` in one place look as the one did: the same in the middle, and the same
-    light in all along a line (what equation 9 asks for)."""
+def test_relocation_keeps_the_rendered_image(parts: int, opacity: float) -> None:
+    """``parts`` Gaussians in one place render like the single one: the same maximum and the same
+    integral along a line (equation 9)."""
     logits = torch.logit(torch.tensor([opacity]))
     new, shrink = share_out(logits, torch.tensor([parts]), 1e-6)
     x = torch.linspace(-9, 9, 4001, dtype=torch.float64)
@@ -251,42 +258,50 @@ def test_sharing_out_keeps_the_picture(parts: int, opacity: float) -> None:
     assert many.sum() == pytest.approx(float(one.sum()), rel=1e-3)
 
 
-def test_noise_moves_the_faint_along_their_axes_alone() -> None:
+def test_noise_moves_transparent_gaussians_along_their_axes() -> None:
     gaussians = ball(2000, 0)
     gaussians.opacity_logits[:1000] = -9.0
     gaussians.opacity_logits[1000:] = 3.0
     gaussians.quats[:] = torch.tensor([1.0, 0, 0, 0])
     gaussians.log_scales[:] = torch.tensor([-1.0, -9.0, -9.0])
     before = gaussians.means.clone()
-    mcmc().explore(gaussians, 1e-2, np.random.Generator(np.random.PCG64(0)))
+    mcmc().add_noise(gaussians, 1e-2, np.random.Generator(np.random.PCG64(0)))
     moved = (gaussians.means - before).abs()
     assert not moved[1000:].any()
     assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
 
 
-def test_mcmc_costs_are_the_gradients_of_the_mean_opacity_and_scale() -> None:
+def test_mcmc_regularisers_are_gradients_of_the_mean_opacity_and_scale() -> None:
     gaussians = ball(5, 0)
     logits = gaussians.opacity_logits.clone().requires_grad_()
     scales = gaussians.log_scales.clone().requires_grad_()
     (0.1 * torch.sigmoid(logits).mean() + 0.2 * scales.exp().mean()).backward()
     gradients = SimpleNamespace(opacity_logits=torch.zeros(5), log_scales=torch.zeros(5, 3))
-    mcmc(opacity_cost=0.1, scale_cost=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
+    mcmc(opacity_loss_weight=0.1, scale_loss_weight=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
     assert torch.allclose(gradients.opacity_logits, logits.grad)
     assert torch.allclose(gradients.log_scales, scales.grad)
 
 
 @pytest.mark.parametrize("scale", [2.0**-13, 2.0**13])
-@pytest.mark.parametrize("kind", ["gradient", "mcmc"])
-def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) -> None:
-    """The same scene in another unit: the same is cloned, split, moved and costs the same."""
+@pytest.mark.parametrize("config", [Gradient(), Mcmc(), Original()])
+def test_density_control_does_not_depend_on_the_unit(
+    config: Gradient | Mcmc | Original, scale: float
+) -> None:
+    """The same Gaussians are cloned, split and moved, with the same losses, in another unit."""
     found = []
     for unit in (1.0, scale):
         gaussians, adam = marked(200)
         gaussians.means *= unit
         gaussians.log_scales += math.log(unit)
         gaussians.opacity_logits[:60] = -6.0
-        config = Density(strategy=kind, split_scale=0.13, prune_scale=0.17)  # type: ignore[arg-type]
-        density = make_strategy(config, scale=1.5 * unit)
+        gradient = GradientExperiments(split_scale=0.13, prune_scale=0.17)
+        density = make_strategy(
+            config,
+            TrainExperiments(gradient=gradient),
+            steps=1000,
+            scale=1.5 * unit,
+            extent=9.0 * unit,
+        )
         density.start(200)
         if isinstance(density, GradientDensity):
             density.gradient_sum += torch.linspace(0, 4e-4, 200)
@@ -294,9 +309,9 @@ def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) ->
         costs = SimpleNamespace(opacity_logits=torch.zeros(200), log_scales=torch.zeros(200, 3))
         density.regularise(gaussians, costs)  # type: ignore[arg-type]
         rng = np.random.Generator(np.random.PCG64(0))
-        density.explore(gaussians, 1e-2, rng)
+        density.add_noise(gaussians, 1e-2, rng)
         result, changes = density.refine(
-            gaussians, adam, rng, densify=True, prune_huge=True, budget=300
+            gaussians, adam, rng, densify=True, prune_large=True, budget=300
         )
         log_scales = result.log_scales - math.log(unit)
         found.append((changes, costs.log_scales, result.means / unit, log_scales))
@@ -305,11 +320,31 @@ def test_density_control_does_not_depend_on_the_unit(kind: str, scale: float) ->
         assert torch.allclose(ours, other, rtol=1e-4, atol=1e-5)
 
 
-def test_pulls_are_measured_in_normalised_device_coordinates() -> None:
-    """A pixel is 2 / width of them: by the published threshold, whatever the picture's size."""
+def test_gradients_are_measured_in_normalised_device_coordinates() -> None:
+    """A pixel is 2 / width: thresholds are independent of the size of the image."""
     density = strategy(2)
-    pulls = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
-    gradients = SimpleNamespace(means2d=pulls, means2d_abs=None)
-    forward = SimpleNamespace(radii=torch.ones(2))
-    density.observe(forward, gradients, 200, 100)  # type: ignore[arg-type]
+    means2d = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
+    gradients = SimpleNamespace(means2d=means2d, means2d_abs=None)
+    rendered = SimpleNamespace(radii=torch.ones(2), alpha=torch.zeros(100, 200))
+    density.observe(rendered, gradients)  # type: ignore[arg-type]
     assert torch.allclose(density.gradient_sum, torch.tensor([3e-4, 2e-4]))
+
+
+def test_the_published_strategy_prunes_after_it_densifies() -> None:
+    """A large Gaussian with a large gradient is split, and its halves are pruned if still large; a
+    small one is cloned; a transparent one is removed."""
+    gaussians, adam = marked(4)
+    gaussians.log_scales[:] = torch.log(torch.tensor([0.009, 0.02, 0.9, 0.02]))[:, None]
+    gaussians.opacity_logits[:] = torch.tensor([2.0, 2.0, 2.0, -9.0])
+    density = OriginalDensity(steps=30_000, extent=1.0)
+    density.start(4)
+    density.seen += 1
+    density.gradient_sum = torch.tensor([3e-4, 3e-4, 3e-4, 0.0])
+    rng = np.random.Generator(np.random.PCG64(0))
+    result, changes = density.refine(
+        gaussians, adam, rng, densify=True, prune_large=True, budget=100
+    )
+    assert (changes.cloned, changes.split, changes.pruned) == (1, 2, 3)
+    scales = result.log_scales.exp()[:, 0]
+    assert torch.allclose(scales, torch.tensor([0.009, 0.009, 0.0125, 0.0125]))
+    assert len(density.gradient_sum) == len(adam.first["means"]) == 4

@@ -1,4 +1,4 @@
-"""What hangs in the air before one camera is found, and goes; nothing else does."""
+"""Floaters close to a single camera are found and removed; no other Gaussians are."""
 
 from __future__ import annotations
 
@@ -9,99 +9,100 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.config.schema import Train
 from pipeline.render import RasterOptions
 from pipeline.render.views import raster_camera
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.density import floaters as floaters_module
-from pipeline.training.density.floaters import LEAST_POINTS, air_depths, floaters
-from pipeline.training.loop import trainer
-from pipeline.training.loop.trainer import TrainResult, train
-from tests.training.conftest import TinyScene, killed_in_step, tiny_config
+from pipeline.training.density.floaters import MIN_POINTS, empty_depths, floaters
+from pipeline.training.loop.result import TrainResult
+from pipeline.training.loop.train import train
+from tests.training.conftest import Options, TinyScene, killed_in_step, tiny_config
 
-AIR = 1.0
+EMPTY = 1.0
 
 
 @pytest.fixture(autouse=True)
-def few_looks_will_do(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(trainer, "CLEAR_AIR_LOOKS", 7)
+def removal_in_short_runs(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(floaters_module, "MIN_EPOCHS", 7)
 
 
-def with_speck(scene: TinyScene, distance: float, views: tuple[int, ...] = (0,)) -> Gaussians:
-    """The scene, and last a small Gaussian right before each of these cameras."""
+def with_close(scene: TinyScene, distance: float, views: tuple[int, ...] = (0,)) -> Gaussians:
+    """The scene, followed by a small Gaussian close to each of these cameras."""
     first, all_of = scene.initial, []
     for view in (scene.views[i] for i in views):
-        speck = first.select(torch.tensor([0]))
+        floater = first.select(torch.tensor([0]))
         ahead = view.world_to_camera[2, :3]
-        speck.means[:] = torch.from_numpy(view.centre + distance * ahead)
-        speck.log_scales.fill_(np.log(0.02))
-        speck.opacity_logits.fill_(2.0)
-        all_of.append(speck)
+        floater.means[:] = torch.from_numpy(view.centre + distance * ahead)
+        floater.log_scales.fill_(np.log(0.02))
+        floater.opacity_logits.fill_(2.0)
+        all_of.append(floater)
     parts = [first, *all_of]
     joined = {name: torch.cat([part.tensors()[name] for part in parts]) for name in first.tensors()}
     return Gaussians(**joined)
 
 
-def found(scene: TinyScene, gaussians: Gaussians, air: float) -> list[int]:
+def found(scene: TinyScene, gaussians: Gaussians, depth: float) -> list[int]:
     cameras = [raster_camera(view) for view in scene.views]
-    flags = floaters(gaussians, cameras, np.full(len(cameras), air), RasterOptions(threads=1))
+    flags = floaters(gaussians, cameras, np.full(len(cameras), depth), RasterOptions(threads=1))
     return torch.nonzero(flags)[:, 0].tolist()
 
 
-def test_a_speck_before_one_camera_is_found(scene: TinyScene) -> None:
+def test_a_gaussian_close_to_one_camera_is_a_floater(scene: TinyScene) -> None:
     last = len(scene.initial)
-    assert found(scene, with_speck(scene, 0.4), AIR) == [last]
-    assert found(scene, with_speck(scene, 0.4, (1, 4)), AIR) == [last, last + 1]
+    assert found(scene, with_close(scene, 0.4), EMPTY) == [last]
+    assert found(scene, with_close(scene, 0.4, (1, 4)), EMPTY) == [last, last + 1]
 
 
-def test_what_stands_where_points_are_or_where_none_say_so_is_no_floater(scene: TinyScene) -> None:
-    assert found(scene, with_speck(scene, 1.1), AIR) == []
-    assert found(scene, with_speck(scene, 0.4), 0.0) == []
+def test_gaussians_beyond_the_empty_space_or_without_points_are_no_floaters(
+    scene: TinyScene,
+) -> None:
+    assert found(scene, with_close(scene, 1.1), EMPTY) == []
+    assert found(scene, with_close(scene, 0.4), 0.0) == []
 
 
-def test_what_two_views_see_alike_is_no_floater(scene: TinyScene) -> None:
-    """However near it is: they agree on it."""
+def test_a_gaussian_that_two_views_see_alike_is_no_floater(scene: TinyScene) -> None:
+    """At any distance: the views agree on it."""
     twice = replace(scene, views=[*scene.views, scene.views[0]])
-    assert found(twice, with_speck(scene, 0.4), AIR) == []
+    assert found(twice, with_close(scene, 0.4), EMPTY) == []
 
 
-def test_what_a_hundredth_of_the_views_see_is_a_floater_all_the_same(
+def test_a_gaussian_that_only_a_hundredth_of_the_views_see_is_a_floater(
     scene: TinyScene, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neighbours with the same light agree on a fog."""
-    monkeypatch.setattr(floaters_module, "ONE_IN", len(scene.views) // 2)
+    """Neighbouring views with the same light can agree on it."""
+    monkeypatch.setattr(floaters_module, "VIEWS_PER_FLOATER_VIEW", len(scene.views) // 2)
     last, other = len(scene.initial), scene.views[1:]
     twice = replace(scene, views=[*other, *[scene.views[0]] * 2])
-    assert found(twice, with_speck(scene, 0.4), AIR) == [last]
-    assert found(twice, with_speck(scene, 1.1), AIR) == []
+    assert found(twice, with_close(scene, 0.4), EMPTY) == [last]
+    assert found(twice, with_close(scene, 1.1), EMPTY) == []
     # Two of four have no more than half of it.
     often = replace(scene, views=[*other[2:], *[scene.views[0]] * 4])
-    assert found(often, with_speck(scene, 0.4), AIR) == []
+    assert found(often, with_close(scene, 0.4), EMPTY) == []
 
 
-def test_what_hides_behind_others_and_shows_nowhere_is_left_alone(scene: TinyScene) -> None:
-    faint = with_speck(scene, 0.4)
+def test_an_invisible_gaussian_is_no_floater(scene: TinyScene) -> None:
+    faint = with_close(scene, 0.4)
     faint.opacity_logits[-1] = -9.0
-    assert found(scene, faint, AIR) == []
+    assert found(scene, faint, EMPTY) == []
 
 
-def test_air_ends_at_half_of_the_nearest_points_but_few_may_be_wrong() -> None:
+def test_empty_space_ends_at_half_the_depth_of_the_nearest_points() -> None:
     def known(z: list[float]) -> KnownDepths:
         n = len(z)
         return KnownDepths(np.zeros((n, 2)), np.array(z, np.float32), np.ones(n, np.float32))
 
     many = known([0.1] + [4.0] * 99 + [9.0] * 100)
-    few = known([4.0] * (LEAST_POINTS - 1))
-    np.testing.assert_allclose(air_depths([many, few, known([])]), [2.0, 0.0, 0.0])
+    few = known([4.0] * (MIN_POINTS - 1))
+    np.testing.assert_allclose(empty_depths([many, few, known([])]), [2.0, 0.0, 0.0])
 
 
 def run(
-    scene: TinyScene, folder: Path, config: Train, first: Gaussians, threads: int = 1
+    scene: TinyScene, folder: Path, config: Options, first: Gaussians, threads: int = 1
 ) -> TrainResult:
-    inputs = Inputs(scene.views, first, scene.extent, air=np.full(len(scene.views), AIR))
-    return train(inputs, config, seed=3, threads=threads, checkpoint_dir=folder)
+    inputs = Inputs(scene.views, first, scene.extent, empty_depths=np.full(len(scene.views), EMPTY))
+    return train(inputs, *config, seed=3, threads=threads, checkpoint_dir=folder)
 
 
 def nearest(scene: TinyScene, result: TrainResult) -> float:
@@ -109,27 +110,29 @@ def nearest(scene: TinyScene, result: TrainResult) -> float:
     return float((result.gaussians.means - centre).norm(dim=1).min())
 
 
-def test_training_takes_floaters_away(scene: TinyScene, tmp_path: Path) -> None:
-    still = {"lr_boost": 1e-9, "density": {"grad_threshold": 1e9}}
-    first = with_speck(scene, 0.4)
+def test_training_removes_floaters(scene: TinyScene, tmp_path: Path) -> None:
+    still = {"learning_rate_factor": 1e-9, "density": {"grad_threshold": 1e9}}
+    first = with_close(scene, 0.4)
     result = run(scene, tmp_path / "a", tiny_config(60, **still), first)
     assert result.counters["floaters"] == 1
-    assert nearest(scene, result) > AIR
-    kept = tiny_config(60, **{**still, "density": {"grad_threshold": 1e9, "clear_air": False}})
+    assert nearest(scene, result) > EMPTY
+    kept = tiny_config(
+        60, **{**still, "density": {"grad_threshold": 1e9, "remove_floaters": False}}
+    )
     result = run(scene, tmp_path / "b", kept, first)
     assert result.counters["floaters"] == 0
     assert nearest(scene, result) == pytest.approx(0.4, abs=1e-3)
-    # Too few looks at each photograph to have made any, and to be worth looking at all again.
+    # Runs of few epochs do not remove floaters.
     short = 6 * len(scene.views)
     assert run(scene, tmp_path / "c", tiny_config(short, **still), first).counters["floaters"] == 0
 
 
 @pytest.mark.parametrize("strategy", ["gradient", "mcmc"])
-def test_killed_where_floaters_go_and_resumed_gives_the_same_bits(
+def test_killed_at_the_removal_of_floaters_and_resumed_gives_the_same_bits(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, strategy: str
 ) -> None:
     config = tiny_config(60, density={"strategy": strategy})
-    first = with_speck(scene, 0.4)
+    first = with_close(scene, 0.4)
     whole = run(scene, tmp_path / "whole", config, first)
     assert whole.counters["floaters"]
     for step in (18, 19, 54):  # the first and the last time

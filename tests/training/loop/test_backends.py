@@ -1,4 +1,4 @@
-"""Training knows no more of a backend than its interface: the float64 reference trains as well."""
+"""Training uses only the interface of a backend: the float64 reference trains as well."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from pipeline.render import make_backend
 from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, tiny_config
 
 
@@ -18,7 +18,7 @@ def test_the_reference_trains_what_the_kernels_train(scene: TinyScene, tmp_path:
     kernels, reference = (
         train(
             inputs,
-            tiny_config(4),
+            *tiny_config(4),
             seed=0,
             threads=1,
             checkpoint_dir=tmp_path / name,

@@ -1,4 +1,4 @@
-"""One step, looked at closely: longer runs forgive a wrong rate or gradient."""
+"""The first step in detail: longer runs hide wrong learning rates and gradients."""
 
 from __future__ import annotations
 
@@ -14,63 +14,64 @@ from pipeline.render import l1_ssim, make_backend
 from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.strategy import rotations
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 from tests.training.conftest import TinyScene, tiny_config
 
 RATES = {
-    "lr_means": 1e-3,
-    "lr_scales": 2e-3,
-    "lr_quats": 3e-3,
-    "lr_opacities": 5e-3,
-    "lr_sh0": 7e-3,
-    "lr_boost": 2.0,
-    "lr_final_share": 1.0,
+    "means_learning_rate": 1e-3,
+    "scales_learning_rate": 2e-3,
+    "quats_learning_rate": 3e-3,
+    "opacities_learning_rate": 5e-3,
+    "sh0_learning_rate": 7e-3,
+    "learning_rate_factor": 2.0,
+    "learning_rate_final_factor": 1.0,
 }
 
 
-@pytest.mark.parametrize("unit", ["size", "scene"])
-def test_each_parameter_steps_as_far_as_its_own_rate_says(
+@pytest.mark.parametrize("unit", ["gaussian_scale", "scene_scale", "camera_extent"])
+def test_each_parameter_has_its_own_learning_rate(
     scene: TinyScene, tmp_path: Path, unit: str
 ) -> None:
     """Adam's first step is the rate itself, up or down: along and about each Gaussian's own axes,
     the means' in its scales; or a row's root mean square where the row shares a second moment, the
     means' in the scene's size."""
     scale = 3.0
+    world_unit = scene.extent if unit == "camera_extent" else scale
     result = train(
         Inputs(scene.views, scene.initial, scene.extent, scale),
-        tiny_config(1, **RATES, lr_means_unit=unit),
+        *tiny_config(1, **RATES, means_learning_rate_unit=unit),
         seed=0,
         threads=1,
         checkpoint_dir=tmp_path,
     )
     expected = {
-        "means": RATES["lr_means"],
-        "log_scales": RATES["lr_scales"],
-        "quats": RATES["lr_quats"],
-        "opacity_logits": RATES["lr_opacities"],
-        "sh": RATES["lr_sh0"],
+        "means": RATES["means_learning_rate"],
+        "log_scales": RATES["scales_learning_rate"],
+        "quats": RATES["quats_learning_rate"],
+        "opacity_logits": RATES["opacities_learning_rate"],
+        "sh": RATES["sh0_learning_rate"],
     }
     for name, tensor in result.gaussians.tensors().items():
         first = in_morton_order(scene.initial).with_sh_degree(result.gaussians.sh_degree)
         before = first.tensors()[name]
         steps = tensor - before
-        if name == "means" and unit == "size":
+        if name == "means" and unit == "gaussian_scale":
             axes = rotations(first.quats)
             steps = torch.einsum("nij,ni->nj", axes, steps) / first.log_scales.exp()
         elif name == "means":
-            steps = steps.square().mean(1).sqrt() / scale
+            steps = steps.square().mean(1).sqrt() / world_unit
         elif name == "quats":
             steps = steps.square().mean(1).sqrt()
-            if unit == "size":  # three ways to turn a quaternion of length 1
+            if unit == "gaussian_scale":  # three ways to turn a quaternion of length 1
                 steps *= math.sqrt(4 / 3) / before.norm(dim=1)
         moved = float(steps.abs().max())
         assert moved == pytest.approx(2.0 * expected[name], rel=1e-3), name
 
 
-def test_what_is_differentiated_is_the_loss_that_is_measured(
+def test_the_gradient_is_that_of_the_loss(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Through each photograph's exposure, against finite differences of the picture."""
+    """With exposure gains, against finite differences of the image."""
     seen: dict[str, Any] = {}
     backward, loss = make_backend().backward, make_backend().l1_ssim
 
@@ -87,7 +88,7 @@ def test_what_is_differentiated_is_the_loss_that_is_measured(
     gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
     train(
         Inputs(scene.views, scene.initial, scene.extent, gains=gains),
-        tiny_config(1),
+        *tiny_config(1),
         seed=0,
         threads=1,
         checkpoint_dir=tmp_path,

@@ -1,89 +1,76 @@
-"""Every length of run passes through the same phases, in an order that makes sense."""
+"""The schedule of runs of any length: phases, learning rates, the limit of Gaussians."""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 
-from pipeline.config.schema import Density, Train
-from pipeline.training.loop.schedule import POSE_FALL, Schedule
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Gradient, Train
+from pipeline.training.loop.schedule import CAMERA_DECAY, Schedule
+
+
+def schedule_of(train: Train | None = None, **experiments: Any) -> Schedule:
+    return Schedule.of(train or Train(), TrainExperiments(**experiments))
 
 
 @pytest.mark.parametrize("steps", [1, 10, 60, 600, 2000, 7000, 30_000])
 def test_phases_fit_into_the_run(steps: int) -> None:
-    schedule = Schedule.of(Train(steps=steps))
+    schedule = schedule_of(Train(steps=steps))
     every = range(1, steps + 1)
     factors = [schedule.resolution_factor(step) for step in every]
     assert factors == sorted(factors, reverse=True)
     assert factors[-1] == 1
     degrees = [schedule.sh_degree_at(step) for step in every]
     assert degrees == sorted(degrees)
-    refines = [step for step in every if schedule.refines_after(step)]
-    resets = [step for step in every if schedule.resets_opacity_after(step)]
-    assert all(step <= schedule.refine_stop for step in refines)
-    assert all(step + schedule.reset_interval <= schedule.refine_stop for step in resets)
-    assert not schedule.prunes_after(steps)
     if steps >= 600:
         assert degrees[-1] == 3
-        assert len(refines) >= 10
         assert set(factors) == {1, 2, 4}
 
 
-def test_rates_decay_log_linearly() -> None:
-    schedule = Schedule.of(Train(steps=101, lr_means=1e-2, lr_means_final=1e-4))
-    assert schedule.lr_means_at(1) == pytest.approx(1e-2)
-    assert schedule.lr_means_at(51) == pytest.approx(1e-3)
-    assert schedule.lr_means_at(101) == pytest.approx(1e-4)
+def test_the_means_learning_rate_decays_log_linearly() -> None:
+    rates = {"means_learning_rate": 1e-2, "means_final_learning_rate": 1e-4}
+    schedule = schedule_of(Train(steps=101), **rates, learning_rate_factor=1.0)
+    for step, rate in ((1, 1e-2), (51, 1e-3), (101, 1e-4)):
+        assert schedule.learning_rates(step, 101, unit=2.0).means == pytest.approx(2 * rate)
 
 
-def test_opacity_resets_of_the_papers_protocol() -> None:
-    schedule = Schedule.of(Train(steps=30_000, density=Density(stop_share=0.5)))
-    resets = [step for step in range(1, 30_001) if schedule.resets_opacity_after(step)]
-    assert resets == [3000, 6000, 9000, 12_000]
-    huge = [step for step in range(1, 30_001) if schedule.prunes_huge_after(step)]
-    assert (huge[0], huge[-1]) == (3100, 15_000)
-
-
-def test_short_runs_keep_their_large_backgrounds() -> None:
-    """Without a reset, huge Gaussians are not yet split; pruning them cost 8 dB on a room."""
-    schedule = Schedule.of(Train())
-    assert not any(schedule.prunes_huge_after(step) for step in range(1, Train().steps + 1))
-
-
-def test_rates_are_boosted_in_short_runs_and_fall_at_the_end() -> None:
-    schedule = Schedule.of(Train(steps=3000, lr_decay_from=0.5, lr_final_share=0.1))
-    assert schedule.lr_boost_of(3000) == pytest.approx(10**0.5)
-    decays = [schedule.lr_decay_at(step) for step in range(1, 3001)]
+def test_learning_rates_are_higher_in_short_runs_and_decay_at_the_end() -> None:
+    ends = {"learning_rate_decay_start": 0.5, "learning_rate_final_factor": 0.1}
+    schedule = schedule_of(Train(steps=3000), **ends)
+    assert schedule.learning_rate_factor(3000) == pytest.approx(10**0.5)
+    decays = [schedule.decay_at(step) for step in range(1, 3001)]
     assert decays[0] == decays[1499] == 1.0
     assert decays == sorted(decays, reverse=True)
     assert decays[-1] == pytest.approx(0.1)
-    papers = Schedule.of(Train(steps=30_000, lr_final_share=1.0))
-    assert papers.lr_boost_of(30_000) == papers.lr_boost_of(60_000) == 1.0
-    assert {papers.lr_decay_at(step) for step in (1, 15_000, 30_000)} == {1.0}
-    assert papers.lr_boost_of(10) == 4.0
-    assert Schedule.of(Train(lr_boost=1.5)).lr_boost_of(100) == 1.5
+    papers = schedule_of(Train(steps=30_000), learning_rate_final_factor=1.0)
+    assert papers.learning_rate_factor(30_000) == papers.learning_rate_factor(60_000) == 1.0
+    assert {papers.decay_at(step) for step in (1, 15_000, 30_000)} == {1.0}
+    assert papers.learning_rate_factor(10) == 4.0
+    assert schedule_of(learning_rate_factor=1.5).learning_rate_factor(100) == 1.5
 
 
-def test_the_budget_grows_with_the_pictures() -> None:
-    schedule = Schedule.of(Train(coarse_until=0.5, density=Density(max_gaussians=1000)))
+def test_the_limit_of_gaussians_grows_with_the_resolution() -> None:
+    schedule = schedule_of(Train(density=Gradient(max_gaussians=1000)), coarse_share=0.5)
     budgets = [schedule.budget_at(step) for step in range(1, Train().steps + 1)]
     assert budgets == sorted(budgets)
     assert set(budgets) == {500, 707, 1000}
 
 
-def test_a_run_of_minutes_is_coarse_for_a_share_of_its_time() -> None:
-    """Coarse steps take little of it: a share of the time is a larger one of the steps."""
-    by_steps, by_minutes = Schedule.of(Train(steps=1000)), Schedule.of(Train(budget_minutes=1))
+def test_a_time_budget_is_coarse_for_a_share_of_its_time() -> None:
+    """Coarse steps are fast: a share of the time is a larger share of the steps."""
+    by_steps, by_minutes = schedule_of(Train(steps=1000)), schedule_of(Train(budget_minutes=1))
     assert by_steps.coarse_steps == 150
     assert by_minutes.coarse_steps / by_minutes.steps == pytest.approx(0.1)
-    assert Schedule.of(Train(steps=1000, coarse_until=0.0)).coarse_steps == 0
-    long = Schedule.of(Train(budget_minutes=24))  # many minutes want detail, too
+    assert schedule_of(Train(steps=1000), coarse_share=0.0).coarse_steps == 0
+    long = schedule_of(Train(budget_minutes=24))
     assert long.coarse_steps / long.steps == pytest.approx(0.05, abs=1e-3)
 
 
 @pytest.mark.parametrize(("steps", "views"), [(4000, 50), (1500, 3)])
-def test_a_cameras_steps_add_up_to_its_reach(steps: int, views: int) -> None:
-    schedule = Schedule.of(Train(steps=steps))
-    looks = steps / views
-    shares = [schedule.camera_step_at(step, looks) for step in range(1, steps + 1)]
-    assert sum(shares) / views == pytest.approx(1.0, rel=1e-2)
-    assert shares[-1] == pytest.approx(POSE_FALL * shares[0], rel=1e-2)
+def test_the_learning_rates_of_a_camera_sum_to_its_limit(steps: int, views: int) -> None:
+    schedule = schedule_of(Train(steps=steps))
+    rates = [schedule.camera_rate(step, steps / views) for step in range(1, steps + 1)]
+    assert sum(rates) / views == pytest.approx(1.0, rel=1e-2)
+    assert rates[-1] == pytest.approx(CAMERA_DECAY * rates[0], rel=1e-2)

@@ -1,4 +1,4 @@
-"""How many steps a run by the clock will come to, from how fast it goes."""
+"""The estimate of the number of steps that fit into a time budget."""
 
 from __future__ import annotations
 
@@ -8,55 +8,57 @@ from types import SimpleNamespace
 
 import pytest
 
-from pipeline.training.loop import trainer
-from pipeline.training.loop.step_time_estimator import FULL_STEP, LAP, Pace
+from pipeline.training.loop import clock, session
+from pipeline.training.loop.step_time_estimator import FULL_STEP, INTERVAL, StepTimeEstimator
 from tests.training.conftest import TinyScene, tiny_config
 from tests.training.loop.test_trainer import run
 
 
-def going(found: Pace, each: float, factor: int, steps: int, begin: int, at: float) -> float:
+def measure(
+    found: StepTimeEstimator, each: float, factor: int, steps: int, begin: int, at: float
+) -> float:
     for step in range(begin, begin + steps + 1):
-        found.passes(step, at + (step - begin) * each, factor)
+        found.observe(step, at + (step - begin) * each, factor)
     return at + steps * each
 
 
-def test_nobody_knows_before_the_first_lap() -> None:
-    found = Pace(60.0)
-    going(found, 0.1, 1, LAP - 1, 0, 0.0)
-    assert found.steps(LAP - 1, 1.9, unknown=7000) == 7000
+def test_before_the_first_measurement_the_default_is_returned() -> None:
+    found = StepTimeEstimator(60.0)
+    measure(found, 0.1, 1, INTERVAL - 1, 0, 0.0)
+    assert found.steps(INTERVAL - 1, 1.9, default=7000) == 7000
 
 
-def test_the_rest_goes_on_as_now() -> None:
-    found = Pace(60.0)
-    seconds = going(found, 0.1, 1, 200, 0, 0.0)
+def test_remaining_steps_take_the_recent_time_per_step() -> None:
+    found = StepTimeEstimator(60.0)
+    seconds = measure(found, 0.1, 1, 200, 0, 0.0)
     assert found.steps(200, seconds, 7000) == pytest.approx(600)
-    # Slower for long: what was before is forgotten.
-    seconds = going(found, 0.2, 1, 200, 200, seconds)
+    # Slower for many intervals: older measurements have no weight.
+    seconds = measure(found, 0.2, 1, 200, 200, seconds)
     assert found.steps(400, seconds, 7000) == pytest.approx(400 + 0, abs=2)
     assert found.steps(400, 61.0, 7000) == 400
 
 
 @pytest.mark.parametrize("factor", [2, 4])
-def test_a_small_picture_says_what_a_large_one_will_take(factor: int) -> None:
-    found = Pace(60.0)
-    seconds = going(found, 0.1 / FULL_STEP[factor], factor, 100, 0, 0.0)
+def test_steps_at_reduced_resolution_are_scaled_to_full_resolution(factor: int) -> None:
+    found = StepTimeEstimator(60.0)
+    seconds = measure(found, 0.1 / FULL_STEP[factor], factor, 100, 0, 0.0)
     assert found.steps(100, seconds, 7000) == pytest.approx(100 + (60 - seconds) / 0.1)
 
 
-def test_one_slow_lap_changes_little() -> None:
-    """A checkpoint is written every half minute."""
-    found = Pace(600.0)
-    seconds = going(found, 0.1, 1, 200, 0, 0.0)
-    seconds = going(found, 0.2, 1, LAP, 200, seconds)
-    assert found.steps(200 + LAP, seconds, 7000) > 4500
+def test_one_slow_interval_changes_the_estimate_little() -> None:
+    """Such as one in which a checkpoint is written."""
+    found = StepTimeEstimator(600.0)
+    seconds = measure(found, 0.1, 1, 200, 0, 0.0)
+    seconds = measure(found, 0.2, 1, INTERVAL, 200, seconds)
+    assert found.steps(200 + INTERVAL, seconds, 7000) > 4500
 
 
-def test_a_run_by_the_clock_has_no_more_gaussians_than_its_steps_can_train(
+def test_a_time_budget_limits_the_gaussians_to_what_its_steps_can_train(
     scene: TinyScene, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     looks = itertools.count()
-    monkeypatch.setattr(trainer, "time", SimpleNamespace(monotonic=lambda: 0.01 * next(looks)))
-    monkeypatch.setattr(trainer, "GAUSSIANS_A_STEP", 0.35)  # of 200 steps
+    monkeypatch.setattr(session, "time", SimpleNamespace(monotonic=lambda: 0.01 * next(looks)))
+    monkeypatch.setattr(clock, "GAUSSIANS_PER_STEP", 0.35)  # of 200 steps
     config = tiny_config(budget_minutes=2 / 60, density={"max_gaussians": 120})
     result = run(scene, tmp_path, config)
     assert 65 <= result.counters["max_gaussians"] <= 75

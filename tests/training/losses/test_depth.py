@@ -1,4 +1,4 @@
-"""Known depths: read off the sparse points, and held to by training."""
+"""Known depths of sparse points, and the depth loss."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import pytest
 import torch
 from PIL import Image
 
-from pipeline.config.schema import Density, Train
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Gradient, Train
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view
@@ -21,12 +22,12 @@ from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
-from pipeline.training.loop.trainer import train
+from pipeline.training.loop.train import train
 from pipeline.training.losses.depth import TOLERANCE, depth_gradients
 from tests.training.conftest import HEIGHT, WIDTH, camera_at
 
 
-def test_the_depth_of_a_point_is_known_where_a_view_sees_it_and_nowhere_else():
+def test_depths_are_known_in_the_views_that_see_a_point():
     views = [replace(camera_at(angle), name=f"{i}.png") for i, angle in enumerate((0.0, 0.4))]
     images = {
         7 + i: PosedImage(v.name, 1, v.world_to_camera[:3, :3], v.world_to_camera[:3, 3])
@@ -57,7 +58,7 @@ def depths(*values: float) -> KnownDepths:
 
 
 @pytest.mark.parametrize("unit", [1.0, 1e-4])
-def test_a_street_is_measured_by_what_is_seen_and_a_walk_around_by_the_cameras(unit: float) -> None:
+def test_the_scene_scale_is_the_smaller_of_extent_and_half_the_median_depth(unit: float) -> None:
     """Cameras 100 apart of which none sees farther than 8: steps measured by the 100 went through
     the walls, and each camera got fog of its own."""
     street = [depths(3 * unit, 4 * unit), depths(), depths(8 * unit)]
@@ -66,7 +67,7 @@ def test_a_street_is_measured_by_what_is_seen_and_a_walk_around_by_the_cameras(u
     assert scene_scale(3 * unit, [depths()]) == scene_scale(3 * unit, []) == 3 * unit
 
 
-def test_the_gradients_are_those_of_the_loss_they_are_said_to_be_of():
+def test_gradients_are_those_of_the_documented_loss():
     view = camera_at(0.0)
     known = KnownDepths(
         np.array([[3.2, 4.9], [3.9, 4.1], [39.9, 31.9], [20.0, 8.0]]),
@@ -116,13 +117,19 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
     xy = np.stack([x.ravel(), y.ravel()], 1)
     known = KnownDepths(xy, np.full(len(xy), 3.0, np.float32), np.ones(len(xy), np.float32))
     config = Train(
-        steps=200, sh_degree=0, coarse_until=0.0, depth_weight=weight, lr_means=0.02,
-        lr_means_final=0.02, lr_means_unit="scene", lr_boost=1.0,
-        density=Density(max_gaussians=120),
-    )  # fmt: skip
+        steps=200, sh_degree=0, depth_loss_weight=weight, density=Gradient(max_gaussians=120)
+    )
+    experiments = TrainExperiments(
+        coarse_share=0.0,
+        means_learning_rate=0.02,
+        means_final_learning_rate=0.02,
+        means_learning_rate_unit="scene_scale",
+        learning_rate_factor=1.0,
+    )
     result = train(
         Inputs([view], initial, extent=1.0, depths=[known]),
         config,
+        experiments,
         seed=0,
         threads=1,
         checkpoint_dir=tmp_path / "checkpoints",

@@ -1,4 +1,4 @@
-"""Adam against torch's own, with a learning rate for each group; and against the twin's."""
+"""Adam against torch's own, with a learning rate for each group; and against the reference's."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pipeline.render import FrameAdam, RasterOptions, backward, forward
-from pipeline.render import reference as twin
+from pipeline.render import reference as float64
 from pipeline.render.views import raster_camera
 from pipeline.training.optimisers.adam import Adam, Rates
 from tests.training.conftest import ball, camera_at
@@ -45,14 +45,14 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
         dc.grad, rest.grad = gradients.sh[:, :1], gradients.sh[:, 1:]
         reference.step()
         if own_frames:
-            twin.frame_adam(
+            float64.frame_adam(
                 leaves["means"], leaves["quats"], scales, gradients.means, gradients.quats,
                 replace(frames, step=step),
             )  # fmt: skip
         else:
             for name, second in shared.items():
                 rate, gradient = getattr(RATES, name), getattr(gradients, name)
-                twin.adam_step(leaves[name], gradient, first[name], second, rate, step, 0.8)
+                float64.adam_step(leaves[name], gradient, first[name], second, rate, step, 0.8)
         backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
         adam.step(gaussians, gradients, RATES, step, 1)
     leaves["sh"] = torch.cat([dc, rest], 1)

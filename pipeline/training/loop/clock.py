@@ -1,0 +1,50 @@
+"""The position of a run in its schedule, by steps or by time."""
+
+from __future__ import annotations
+
+from pipeline.training.loop.state import TrainState
+from pipeline.training.loop.step_time_estimator import GAUSSIANS_PER_STEP, StepTimeEstimator
+
+
+class Clock:
+    """Advances ``TrainState.clock``: by one with each step or, with a time budget, by the share of
+    the time that has passed.
+
+    Args:
+        steps: length of the schedule.
+        minutes: the time budget; None for a run of ``steps`` optimiser steps.
+    """
+
+    def __init__(self, steps: int, minutes: float | None):
+        self.steps = steps
+        self.estimator = None if minutes is None else StepTimeEstimator(60 * minutes)
+
+    def advance(self, state: TrainState) -> range:
+        """Begin an optimiser step; returns the steps of the schedule that it covers."""
+        state.step += 1
+        before, state.clock = state.clock, state.step
+        if self.estimator is not None:
+            reached = int(self.steps * state.seconds / self.estimator.budget)
+            state.clock = max(1, before, min(self.steps, reached))
+        return range(before + 1, state.clock + 1)
+
+    def observe(self, state: TrainState, factor: int) -> None:
+        """Measure the time of the step before; ``factor`` reduces the images of the next one."""
+        if self.estimator is not None:
+            self.estimator.observe(state.step - 1, state.seconds, factor)
+
+    def run_length(self, state: TrainState) -> float:
+        """Number of optimiser steps of the run, for learning rates. With a time budget: by the mean
+        time per step so far. The first steps, at reduced resolution, are fast, so that learning
+        rates begin low."""
+        if self.estimator is None:
+            return self.steps
+        return state.step * self.steps / state.clock
+
+    def budget(self, state: TrainState, limit: int) -> int:
+        """Upper limit of the number of Gaussians: ``limit``, or as many as the steps that the time
+        budget allows can train."""
+        if self.estimator is None:
+            return limit
+        steps = self.estimator.steps(state.step, state.seconds, self.run_length(state))
+        return min(limit, round(GAUSSIANS_PER_STEP * steps))

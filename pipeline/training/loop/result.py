@@ -1,0 +1,67 @@
+"""The result of training."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.setup import TrainingScene
+from pipeline.training.loop.state import TrainState
+
+
+@dataclass(frozen=True)
+class TrainResult:
+    """A trained scene.
+
+    Attributes:
+        gaussians: with SH of the configured degree.
+        curve: {step, loss, psnr, num_gaussians} about every hundredth of the run: means since the
+            record before, over training views at the resolution in use. Deterministic.
+        curve_seconds: training time of each record; differs between runs.
+        counters: totals of the run (``state.Counters``).
+        near: near plane of the training, world units; renders need the same.
+        background: of the training: black, white or random.
+        warnings: for the user; deterministic.
+        steps: number of optimiser steps.
+        seconds: training time in all processes of the run.
+        poses: (4, 4) refined world to camera of each view by name, or None.
+        intrinsics: (3,) change of each camera's intrinsics by id
+            (``cameras.intrinsics.IntrinsicsRefinement``), or None.
+    """
+
+    gaussians: Gaussians
+    curve: list[dict[str, float]]
+    curve_seconds: list[float]
+    counters: dict[str, Any]
+    near: float
+    background: str
+    warnings: list[str]
+    steps: int
+    seconds: float
+    poses: dict[str, NDArray[np.float64]] | None
+    intrinsics: dict[int, NDArray[np.float64]] | None
+
+
+def result_of(
+    state: TrainState, scene: TrainingScene, sh_degree: int, warnings: list[str]
+) -> TrainResult:
+    """The result of a finished training."""
+    poses, intrinsics = state.cameras.poses, state.cameras.intrinsics
+    names = [view.name for view in scene.views]
+    return TrainResult(
+        gaussians=state.gaussians.with_sh_degree(sh_degree),
+        curve=state.curve,
+        curve_seconds=state.curve_seconds,
+        counters=asdict(state.counters),
+        near=scene.near,
+        background=scene.background,
+        warnings=warnings,
+        steps=state.step,
+        seconds=state.seconds,
+        poses=None if poses is None else dict(zip(names, poses.poses, strict=True)),
+        intrinsics=None if intrinsics is None else intrinsics.by_id(),
+    )

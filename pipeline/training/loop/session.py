@@ -1,0 +1,95 @@
+"""A run in one process: resuming from a checkpoint, saving checkpoints, logs and progress."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Mapping
+from pathlib import Path
+
+from pipeline.runtime.progress import Progress
+from pipeline.training.checkpoints import checkpoint
+from pipeline.training.checkpoints.checkpoint import Checkpoint
+from pipeline.training.loop.metrics_log import MetricsLog
+from pipeline.training.loop.state import CURVE_RECORDS, TrainState
+from pipeline.training.loop.step_timer import StepTimer, other_build
+
+CHECKPOINT_SECONDS = 30.0
+
+
+class Session:
+    """Everything around the steps of one process that does not change the result.
+
+    Args:
+        steps: length of the schedule.
+        build: ``Backend.facts``.
+        identity: of the run (``checkpoints.identity``).
+        metrics_log: path of the metrics log, or None.
+        log: called with each line for the log.
+        unit: of the progress bar.
+    """
+
+    def __init__(
+        self,
+        state: TrainState,
+        steps: int,
+        *,
+        build: Mapping[str, str],
+        identity: str,
+        checkpoint_dir: Path,
+        metrics_log: Path | None,
+        log: Callable[[str], None],
+        threads: int,
+        unit: str,
+    ):
+        self.state, self.steps, self.log = state, steps, log
+        self.identity, self.checkpoint_dir = identity, checkpoint_dir
+        self.build = dict(build)
+        self._resume()
+        self.started = self.saved = time.monotonic()
+        self.seconds_before = state.seconds
+        self.progress = Progress("training", steps, unit=unit)
+        self.progress.start_at(state.clock)
+        self.metrics_log = MetricsLog(metrics_log, state.step)
+        self.timer = StepTimer(self.build, threads, steps - state.clock)
+
+    def after_step(self, before: int, factor: int) -> None:
+        """Log, record and save what is due after a step.
+
+        Args:
+            before: ``state.clock`` before the step.
+            factor: by which images are reduced.
+        """
+        state, steps = self.state, self.steps
+        now = time.monotonic()
+        state.seconds = self.seconds_before + now - self.started
+        if text := self.timer.after_step(state.seconds, factor):
+            self.log(text)
+        interval = max(1, steps // CURVE_RECORDS)
+        if state.clock // interval > before // interval or state.clock == steps:
+            state.record()
+        if now - self.saved >= CHECKPOINT_SECONDS and state.clock < steps:
+            self._save()
+            self.saved = now
+        self.progress.advance(state.clock - before, note=self._note())
+        self.metrics_log.write(state, steps, factor, self.progress.seconds_left())
+
+    def _resume(self) -> None:
+        # Messages on checkpoints are logged only: they are not part of the result.
+        found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
+        if found is not None:
+            if text := other_build(found.values, self.build):
+                self.log(text)
+            self.state.restore(found.step, found.arrays, found.values)
+
+    def _save(self) -> None:
+        state = self.state
+        values = state.values() | {"built": self.build}
+        saved = Checkpoint(state.step, self.identity, state.arrays(), values)
+        checkpoint.save(self.checkpoint_dir, saved)
+
+    def _note(self) -> str:
+        text = f"{len(self.state.gaussians)} Gaussians"
+        if self.state.curve:
+            last = self.state.curve[-1]
+            text = f"loss {last['loss']:.4f}, PSNR {last['psnr']:.2f} dB, {text}"
+        return text

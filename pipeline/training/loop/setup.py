@@ -1,0 +1,161 @@
+"""What training works on: the views' pixels, cameras and depths, and the state before step 1."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from itertools import islice
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Train
+from pipeline.plan.training_memory import machine_mb, memory_mb
+from pipeline.render import Backend, RasterCamera
+from pipeline.render.views import near_plane, raster_camera
+from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.morton import in_morton_order
+from pipeline.training.cameras.refinement import CameraRefinement
+from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.data.targets import Target, Targets
+from pipeline.training.density import make_strategy
+from pipeline.training.loop.state import TrainState
+from pipeline.training.optimisers.adam import Adam
+
+Warn = Callable[[str], None]
+
+
+@dataclass
+class TrainingScene:
+    """The scene during training; only the cache of cameras changes.
+
+    Attributes:
+        inputs: without views that their masks hide completely.
+        targets: pixels of ``inputs.views``.
+        gains: (V, 3) float32 factors of the renders, or None.
+        background: black, white or random.
+        near: near plane, world units.
+    """
+
+    inputs: Inputs
+    targets: Targets
+    gains: Tensor | None
+    background: str
+    near: float
+    _cameras: dict[tuple[int, int], RasterCamera] = field(default_factory=dict)
+
+    @property
+    def views(self) -> Sequence[View]:
+        return self.inputs.views
+
+    def target(self, index: int, factor: int) -> Target:
+        """The pixels of a view at 1 / ``factor`` of its size."""
+        return self.targets.get(index, factor)
+
+    def camera(self, index: int, factor: int) -> RasterCamera:
+        """The given camera of a view at 1 / ``factor`` of its size."""
+        if (index, factor) not in self._cameras:
+            self._cameras[index, factor] = raster_camera(self.views[index], factor)
+        return self._cameras[index, factor]
+
+
+def load_scene(
+    inputs: Inputs,
+    config: Train,
+    experiments: TrainExperiments,
+    *,
+    seed: int,
+    threads: int,
+    memory_mb: int | None,
+    warn: Warn,
+) -> TrainingScene:
+    """Read the images of the views.
+
+    Raises:
+        UserError: an image cannot be read, or the masks hide all views.
+    """
+    store = choose_image_store(inputs.views, config, memory_mb)
+    noise = experiments.salt_and_pepper_share
+    targets = Targets(inputs.views, threads, noise, seed, store)
+    near = near_plane(inputs.extent)
+    inputs = _without_hidden_views(inputs, targets, warn)
+    background = config.background
+    if background == "auto":
+        background = "white" if targets.have_alpha else "black"
+    gains = None if inputs.gains is None else torch.from_numpy(inputs.gains.astype(np.float32))
+    return TrainingScene(inputs, targets, gains, background, near)
+
+
+def choose_image_store(views: Sequence[View], config: Train, limit_mb: int | None) -> ImageStore:
+    """Memory if the views' pixels fit beside the Gaussians, else a file."""
+    pixels = sum(view.width * view.height for view in views)
+    limit = min(machine_mb(), limit_mb or math.inf)
+    fits = memory_mb(pixels, config.density.max_gaussians) <= limit
+    return MemoryStore() if fits else DiskStore()
+
+
+def initial_state(
+    scene: TrainingScene,
+    config: Train,
+    experiments: TrainExperiments,
+    backend: Backend,
+    *,
+    steps: int,
+    seed: int,
+    warn: Warn,
+) -> TrainState:
+    """The state before the first step of a schedule of ``steps`` steps."""
+    inputs = scene.inputs
+    rng = np.random.Generator(np.random.PCG64(seed))
+    gaussians = inputs.initial.with_sh_degree(0).clone()
+    gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
+    density = make_strategy(
+        config.density, experiments, steps=steps, scale=inputs.size, extent=inputs.extent
+    )
+    density.start(len(gaussians))
+    cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, config, experiments)
+    order = rng.permutation(len(scene.views))
+    own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
+    adam = Adam(gaussians, experiments.adam_beta1, own_frames, backend)
+    return TrainState(gaussians, adam, density, cameras, rng, order)
+
+
+def learning_rate_unit(inputs: Inputs, experiments: TrainExperiments) -> float:
+    """Unit of the means' learning rate, world units; 1 for each Gaussian's own scales."""
+    match experiments.means_learning_rate_unit:
+        case "gaussian_scale":
+            return 1.0
+        case "scene_scale":
+            return inputs.size
+        case "camera_extent":
+            return inputs.extent
+
+
+def _without_hidden_views(inputs: Inputs, targets: Targets, warn: Warn) -> Inputs:
+    """Remove views without a usable pixel, also from ``targets``: their gradients are zero."""
+    hidden = targets.hidden()
+    if len(hidden) == len(inputs.views):
+        raise UserError("the masks leave no pixel of any view to train on", fix="check masks/")
+    if not hidden:
+        return inputs
+    names = ", ".join(inputs.views[index].name for index in islice(hidden, 5))
+    warn(f"views that are completely masked are left out ({len(hidden)}): {names}")
+    targets.drop(hidden)
+    return inputs.without(hidden)
+
+
+def _thinned(gaussians: Gaussians, limit: int, rng: np.random.Generator, warn: Warn) -> Gaussians:
+    if len(gaussians) <= limit:
+        return gaussians
+    warn(
+        f"{len(gaussians)} initial Gaussians are more than the budget: a random {limit} of them "
+        "are used (train.density.max_gaussians)"
+    )
+    chosen = np.sort(rng.permutation(len(gaussians))[:limit])
+    return gaussians.select(torch.from_numpy(chosen))

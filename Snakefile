@@ -1,5 +1,5 @@
-# The DAG and nothing else: a rule for each stage, made from its declaration in stages/. What a scene
-# needs is decided by the plan before any job starts.
+# The DAG: one rule per stage, made from the declarations in stages/. The plan decides which stages a
+# scene needs before any job starts.
 
 import os
 import sys
@@ -23,8 +23,8 @@ RUN = (
 
 
 onstart:
-    # No limit on jobs started a second: Snakemake keeps to its own by looking for work once a second
-    # for each job that has ended while others wait, a fifth of a core after eighty.
+    # No limit on the rate of jobs: Snakemake's limiter uses a considerable share of a core after
+    # some dozens of jobs.
     workflow.scheduler.job_rate_limiter = None
 
 
@@ -50,8 +50,8 @@ rule all:
         "results/benchmark.csv",
 
 
-# All scenes under all configurations and seeds. When some fail, after_failure() writes these files
-# with what there is.
+# All scenes with all configurations and seeds. If some fail, after_failure() writes these files with
+# the others.
 rule benchmark:
     input:
         project.every_run,
@@ -88,7 +88,7 @@ rule plan:
         " --plan {params.plan:q}"
 
 
-# A rule for each stage: what it reads, its key and its outputs follow from its declaration.
+# One rule per stage: inputs, key and outputs follow from its declaration.
 for spec in project.stages:
 
     rule:

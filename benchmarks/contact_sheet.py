@@ -113,7 +113,9 @@ def main() -> int:
     )
     parser.add_argument("batch", type=Path, metavar="benchmark.json")
     parser.add_argument("--scene", required=True)
-    parser.add_argument("--configs", nargs="+", default=[], help="configurations, in order (default: all)")
+    parser.add_argument(
+        "--configs", nargs="+", default=[], help="configurations, in order (default: all)"
+    )
     parser.add_argument("--view", help="name of a test view (default: the median one)")
     parser.add_argument("--photograph", action="store_true", help="put the photograph first")
     parser.add_argument("--width", type=int, default=240, help="of a render, pixels")

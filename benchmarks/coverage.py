@@ -37,7 +37,7 @@ from pipeline.metrics.image import psnr
 from pipeline.photos.load import load_rgb, resize_area
 from pipeline.render import RasterOptions
 from pipeline.render.views import Render, near_plane, render_view
-from pipeline.scene.reconstruction import Points, Posed
+from pipeline.scene.reconstruction import Points, PosedImage
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
@@ -81,7 +81,7 @@ class Studio:
         self.points: dict[str, tuple[Array, NDArray[np.uint8]]] = {}
         shadow_maps()
 
-    def photograph(self, posed: Posed) -> View:
+    def photograph(self, posed: PosedImage) -> View:
         camera: Camera = self.camera
         path = self.folder / posed.name
         seen = render_demo(posed, camera, self.through, OBJECTS)
@@ -110,14 +110,14 @@ class Studio:
         return replace(Points.empty(), xyz=xyz, rgb=rgb)
 
 
-def cameras() -> list[Posed]:
+def cameras() -> list[PosedImage]:
     """The demo's ring, and a smaller ring above it that looks down."""
     posed = orbit([f"ring_{i:02d}.png" for i in range(RING)], 0)
     for i in range(HIGH):
         angle = 2 * np.pi * i / HIGH
         centre = np.array([1.7 * np.cos(angle), 1.7 * np.sin(angle), 2.3])
         rotation = look_at(centre, np.array([0.0, 0.0, 0.4]))
-        posed.append(Posed(f"high_{i:02d}.png", 1, rotation, -rotation @ centre))
+        posed.append(PosedImage(f"high_{i:02d}.png", 1, rotation, -rotation @ centre))
     return posed
 
 
@@ -230,7 +230,7 @@ def draw_random(viewpoints: Sequence[Viewpoint], rng: np.random.Generator) -> li
 
 def photograph(studio: Studio, viewpoint: Viewpoint, name: str) -> View:
     pose = viewpoint.view.world_to_camera
-    return studio.photograph(Posed(name, 1, pose[:3, :3], pose[:3, 3]))
+    return studio.photograph(PosedImage(name, 1, pose[:3, :3], pose[:3, 3]))
 
 
 def nearest(viewpoints: Sequence[Viewpoint], removed: Sequence[View]) -> list[float]:

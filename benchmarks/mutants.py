@@ -332,7 +332,7 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "given_world": Mutant(
         "pipeline/sfm/known_poses.py",
-        "        transform_model(model, fitted[0])",
+        "        transform_model(model, fitted.similarity)",
         "        pass",
         "adjusted poses in a world turned from the given one",
         ("tests/sfm/test_refine.py",),

@@ -1,4 +1,4 @@
-"""The Python API, imported as ``splatmake``: load a result, render its views, measure them."""
+"""The Python API, imported as ``splatmake``: load a result, render views, measure quality."""
 
 from __future__ import annotations
 
@@ -52,9 +52,9 @@ class Quality:
     """Image quality of renders, as in metrics.json.
 
     Attributes:
-        psnr: dB.
-        lpips: None where its weights are not installed.
-        views: the same of each view, by name; empty for a single view.
+        psnr: in dB.
+        lpips: None if its weights are not installed.
+        views: name -> quality of a single view; empty for a single view.
     """
 
     psnr: float
@@ -64,15 +64,15 @@ class Quality:
 
 
 class Scene:
-    """Gaussians together with the views and photographs that they are measured on.
+    """Gaussians with views and photographs of the same scene.
 
     Args:
         gaussians: the model.
         posed: the views, and the settings that the scene was trained with.
-        threads: of rendering; they change no result.
+        threads: threads for rendering; the number does not affect results.
 
     Attributes:
-        gaussians: the model; may be replaced.
+        gaussians: the model; can be replaced.
         views: all views, sorted by name.
     """
 
@@ -90,7 +90,7 @@ class Scene:
         return [view for view in self.views if view.is_test]
 
     def view(self, name: str) -> View:
-        """The view of this name, with or without suffix.
+        """The view with this name, which may omit the suffix.
 
         Raises:
             UserError: there is none.
@@ -98,12 +98,15 @@ class Scene:
         return choose_views(self.views, [name], Path(name))[0]
 
     def render(self, view: View) -> Render:
-        """Colours, opacity and depth as ``view`` sees the scene: one of ``views``, or a changed
-        copy of one (``dataclasses.replace``). Exposure gains are not applied."""
+        """Render colours, opacity and depth of a view, without exposure gains.
+
+        Args:
+            view: one of ``views``, or a modified copy (``dataclasses.replace``).
+        """
         return render_view(self.gaussians, view, self._protocol.options(self._train, self._threads))
 
     def photograph(self, view: View) -> NDArray[np.float32]:
-        """(H, W, 3) the photograph of a view at the view's size, in [0, 1].
+        """The photograph of a view at the view's size, (H, W, 3) float32 in [0, 1].
 
         Raises:
             UserError: its file is missing or cannot be read.
@@ -114,7 +117,7 @@ class Scene:
         ) / np.float32(255)
 
     def measure(self, views: Sequence[View] = ()) -> Quality:
-        """Render views and compare them with their photographs, by the protocol of metrics.json.
+        """Render views and compare them with their photographs, with the protocol of metrics.json.
 
         Args:
             views: those to measure; empty: the test views, or all views if there are no test views.
@@ -150,13 +153,14 @@ def load(
     max_side: int | None = None,
     threads: int | None = None,
 ) -> Scene:
-    """Load a finished scene (``results/NAME``), or photographs with poses and a model of them.
+    """Load a finished scene (``results/NAME``), or a scene folder with poses and a model.
 
     Args:
         folder: the finished scene; or photographs with poses and without lens distortion.
         model: file of Gaussians; None: those of the finished scene.
-        max_side: reduce larger views to it, in pixels; None: the scene's own size.
-        threads: None: one per core.
+        max_side: longer side to which larger views are reduced, in pixels; None: as in the
+            finished scene, else full size.
+        threads: threads for rendering; None: one per core.
 
     Raises:
         UserError: a scene or a file that is missing or cannot be read.
@@ -169,7 +173,7 @@ def load(
 
 
 def read_gaussians(file: str | PathLike[str]) -> Gaussians:
-    """Read a model: .ply, .spz, .splat, .glb, or the pipeline's own .npz.
+    """Read Gaussians from a .ply, .spz, .splat, .glb or .npz file.
 
     Raises:
         UserError: an unknown suffix, or a file that cannot be read.
@@ -181,7 +185,7 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
 
 
 def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
-    """Write a model in the format that the suffix names.
+    """Write Gaussians in the format of the file's suffix.
 
     Raises:
         UserError: an unknown suffix, or Gaussians that the format cannot hold.

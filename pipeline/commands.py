@@ -1,4 +1,4 @@
-"""What ``python -m pipeline`` does: files of Gaussians converted, rendered, measured."""
+"""Commands for files of Gaussians: convert, render, evaluate."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ from pipeline.splats.reduce import prepare
 
 @dataclass(frozen=True)
 class Rendering:
-    """How Gaussians are rendered.
+    """Settings for rendering.
 
     Attributes:
         background: "black" or "white"; None: the scene's, else black.
-        antialias: with Mip-Splatting's opacity compensation; None: as the scene was trained, else
-            without.
-        max_side: views are reduced to this, in pixels; None: as they are.
-        threads: never changes a result.
+        antialias: whether to apply Mip-Splatting's opacity compensation; None: as the scene was
+            trained, else no.
+        max_side: longer side to which larger views are reduced, in pixels; None: full size.
+        threads: number of threads; does not affect results.
     """
 
     background: str | None
@@ -52,14 +52,14 @@ def convert(
     morton_order: bool,
     warnings: list[str],
 ) -> list[str]:
-    """Read Gaussians, leave out what is not wanted, write them in the format of ``target``'s
-    suffix.
+    """Convert a file of Gaussians to the format of ``target``'s suffix.
 
     Args:
-        warnings: what is left out for being no number is added.
+        sh_degree, min_opacity, morton_order: see ``splats.reduce.prepare``.
+        warnings: warnings are added to this list.
 
     Returns:
-        What was done, line by line.
+        Messages.
 
     Raises:
         UserError: a file that cannot be read or written.
@@ -81,26 +81,27 @@ def render(
     how: Rendering,
     warnings: list[str],
 ) -> list[str]:
-    """Render a file of Gaussians as each camera sees it, to 8-bit PNG files named as the views.
+    """Render a file of Gaussians from cameras, to 8-bit PNG files with the views' names.
 
     Args:
         cameras: see ``read_cameras``.
-        names: views to render; empty for all.
-        warnings: what the renders lack is added.
+        names: views to render; empty: all.
+        how: settings for rendering.
+        warnings: warnings are added to this list.
 
     Returns:
-        What was done, line by line.
+        Messages.
 
     Raises:
-        UserError: a file that cannot be read, or no such view.
+        UserError: a file that cannot be read, or no view with one of the names.
     """
     posed = read_cameras(cameras)
     views = camera_views(posed, how.max_side)
     if not views:
-        raise UserError("expected cameras, found none", file=cameras, fix="give another model")
+        raise UserError("expected cameras, found none", file=cameras, fix="use another model")
     if not all(posed.cameras[image.camera_id].is_pinhole for image in posed.images.values()):
-        warnings.append(f"{cameras}: lens distortion is left out of the renders")
-    # The near plane belongs to the scene, not to the views that are asked for.
+        warnings.append(f"{cameras}: lens distortion is not rendered")
+    # The near plane depends on all views, so that it is independent of ``names``.
     options = RasterOptions(
         background=WHITE if how.background == "white" else BLACK,
         antialias=bool(how.antialias),
@@ -121,7 +122,7 @@ def render(
 
 
 def _png(folder: Path, name: str, taken: set[Path]) -> Path:
-    """A file of its own for each view, inside ``folder`` whatever the view's name leads to."""
+    """A unique file for a view, inside ``folder`` even if the name is absolute or contains ".."."""
     inside = [part for part in PurePosixPath(name).parts if part not in ("/", "..")]
     plain = folder.joinpath(*inside)
     short = plain.with_suffix(".png")
@@ -131,14 +132,15 @@ def _png(folder: Path, name: str, taken: set[Path]) -> Path:
 def evaluate(
     model: Path, scene: Path, out: Path | None, every: int | None, how: Rendering
 ) -> dict[str, Any]:
-    """Measure a file of Gaussians, whoever trained it, against a scene's photographs.
+    """Compare renders of a file of Gaussians, from any program, with a scene's photographs.
 
     Args:
         scene, every: see ``posed_scene``.
-        out: folder for ``evaluation.json`` and ``renders/``; None keeps nothing.
+        out: folder for ``evaluation.json`` and ``renders/``; None: nothing is written.
+        how: settings for rendering.
 
     Returns:
-        What ``evaluate_views`` does, and in ``warnings`` what is missing.
+        The result of ``evaluate_views``, with warnings of all steps.
 
     Raises:
         UserError: a file or a scene that cannot be read.

@@ -1,6 +1,6 @@
-"""``python -m pipeline doctor``: what the machine has, what of it is used, and what is missing.
+"""``splatmake doctor``: report what the machine has, what is used, and what is missing.
 
-It imports nothing that could be missing: neither torch nor pydantic nor the stages.
+The module imports nothing that could be missing (torch, pydantic, stages).
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ PYTHON = (3, 11)
 LOW_DISK = 10 << 30
 LOW_MEMORY = 4 << 30
 VULKAN_FOLDERS = ("/usr/share/vulkan/icd.d", "/usr/local/share/vulkan/icd.d", "/etc/vulkan/icd.d")
-# Distribution -> what it is for.
+# Distribution -> purpose.
 NEEDED = {
     "torch": "training",
     "pycolmap": "camera poses",
@@ -42,11 +42,11 @@ OPTIONAL = {
 
 @dataclass(frozen=True)
 class Finding:
-    """One line of the report.
+    """A line of the report.
 
     Attributes:
         state: "used", "there" (not used), "absent" (optional), "missing" (needed).
-        fix: what to do, where there is something to do.
+        fix: what to do, if anything.
     """
 
     topic: str
@@ -82,26 +82,26 @@ def as_text(findings: Sequence[Finding]) -> list[str]:
             lines.append(f"  {'':<{width}}    what to do: {finding.fix}")
     missing = sum(finding.state == "missing" for finding in findings)
     lines.append("")
-    lines.append(f"{missing} needed things are missing" if missing else "ready to run")
+    lines.append(f"{missing} required components are missing" if missing else "ready to run")
     return lines
 
 
 def as_data(findings: Sequence[Finding]) -> dict[str, Any]:
-    """The report for other programs."""
+    """The report as JSON data."""
     return {"ready": is_ready(findings), "findings": [asdict(finding) for finding in findings]}
 
 
 def is_ready(findings: Sequence[Finding]) -> bool:
-    """Whether nothing that is needed is missing."""
+    """Whether everything needed is present."""
     return all(finding.state != "missing" for finding in findings)
 
 
 def _python() -> list[Finding]:
     text = f"{platform.python_version()} ({sys.executable})"
-    wanted = ".".join(map(str, PYTHON))
+    required = ".".join(map(str, PYTHON))
     if sys.version_info[:2] < PYTHON:
-        fix = f"install Python {wanted} or newer"
-        return [Finding("Python", f"{text}, {wanted} or newer is needed", "missing", fix)]
+        fix = f"install Python {required} or newer"
+        return [Finding("Python", f"{text}, {required} or newer is needed", "missing", fix)]
     return [Finding("Python", text)]
 
 
@@ -135,13 +135,13 @@ def _compilers() -> list[Finding]:
 
 
 def _libraries() -> list[Finding]:
-    """The native libraries, built or not. The modules that define them import no torch; the
-    matcher's imports numpy."""
+    """The native libraries. The modules that declare them do not import torch; the matcher's
+    imports numpy."""
     found = []
     for topic, make in (("rasterizer", _rasterizer), ("matcher", _matcher)):
         try:
             variants = targets.usable_variants((library := make()).extensions)
-            # As NativeLibrary.build does: lesser targets only where nothing can be compiled.
+            # As in NativeLibrary.build: other variants only without a compiler.
             if native.find_compiler() is not None:
                 variants = variants[:1]
             built = next(filter(None, map(library.find, variants)), None)
@@ -161,7 +161,7 @@ def _library_finding(topic: str, built: native.Built | None) -> Finding:
         native.compiler()
     except UserError as error:
         return Finding(topic, error.what, "missing", error.fix)
-    return Finding(topic, "not built yet: compiled at its first use, or by make setup")
+    return Finding(topic, "not built: compiled when first used, or by make setup")
 
 
 def _rasterizer() -> native.NativeLibrary:
@@ -179,13 +179,13 @@ def _matcher() -> native.NativeLibrary:
 def _memory() -> list[Finding]:
     physical, usable = machine.physical_memory(), machine.usable_memory()
     text = f"{physical / 2**30:.1f} GiB, {usable / 2**30:.1f} GiB of it usable"
-    few = usable < LOW_MEMORY
-    fix = "lower views.max_long_side_px for large photographs" if few else None
+    low = usable < LOW_MEMORY
+    fix = "decrease views.max_long_side_px for large photographs" if low else None
     return [Finding("memory", text, fix=fix)]
 
 
 def _graphics() -> list[Finding]:
-    """Graphics cards and Vulkan devices: shown, and none is used."""
+    """Graphics cards and Vulkan devices, which are listed but not used."""
     query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     cards = _output(query).splitlines()
     gpu = [Finding("GPU", f"{card.strip()} (NVIDIA)", "there") for card in cards if card.strip()]
@@ -249,7 +249,7 @@ def _lpips() -> Finding:
 def _programs() -> list[Finding]:
     if path := shutil.which("ffmpeg"):
         return [Finding("ffmpeg", f"{path}: videos in H.264")]
-    fix = "install ffmpeg for videos that every player shows"
+    fix = "install ffmpeg for videos that all players support"
     return [Finding("ffmpeg", "not found: videos in VP9", "absent", fix)]
 
 
@@ -271,7 +271,7 @@ def _version(distribution: str) -> str | None:
 
 
 def _output(command: list[str]) -> str:
-    """What a program prints; empty where it is absent, fails or hangs."""
+    """The output of a program; empty if it is missing, fails or hangs."""
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=20)
     except (OSError, subprocess.TimeoutExpired):

@@ -1,5 +1,5 @@
-"""One module a stage: its declaration (``SPEC``) and the adapter between files and ``pipeline/``.
+"""One module per stage: its declaration (``SPEC``) and the adapter from files to ``pipeline/``.
 
-The Snakefile imports every module here, so the imports that cost time (torch, pycolmap, OpenCV)
-stand inside the functions that do the work.
+The Snakefile imports every module, so slow imports (torch, pycolmap, OpenCV) belong inside the
+functions that do the work.
 """

@@ -1,4 +1,4 @@
-"""Run one stage: ``python -m stages STAGE``. Snakemake calls it; by hand it is seldom needed."""
+"""Run one stage: ``python -m stages STAGE``. This is the command of Snakemake's rules."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from pipeline.runtime.machine import usable_cores
 
 def main() -> int:
     parser = argparse.ArgumentParser("stages", description=__doc__)
-    parser.add_argument("stage", help="its name")
+    parser.add_argument("stage", help="name of the stage")
     parser.add_argument("--out", type=Path, required=True, help="the stage's folder")
     parser.add_argument("--key", required=True, help="the stage's key (canonical JSON)")
     parser.add_argument(
@@ -25,7 +25,7 @@ def main() -> int:
     )
     parser.add_argument("--threads", type=int, default=usable_cores(), help="native threads")
     parser.add_argument("--memory-mb", type=int, help="memory that the stage may use, in MB")
-    parser.add_argument("--log", type=Path, help="also write messages here")
+    parser.add_argument("--log", type=Path, help="file that messages are also written to")
     args = parser.parse_args()
     request = Request(
         stage=args.stage,

@@ -1,7 +1,7 @@
-"""Develop RAW files, all photographs of a scene alike.
+"""Develop RAW files, with the same settings for all photographs of a scene.
 
-Outputs: ``images/``, ``images.json``, and where poses are given ``sparse/0`` with the names of the
-developed images, and ``georeference.json`` where the given poses were moved.
+Outputs: ``images/``, ``images.json``; with given poses, ``sparse/0`` with the names of the
+developed images; and ``georeference.json`` if the given poses were translated.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     if scan.num_raw == 0:
-        return StagePlan(run=False, reason="no RAW files: the photographs are read as they are")
+        return StagePlan(run=False, reason="no RAW files")
     config = settled.config.decode
     depth = "16-bit linear" if config.linear else "8-bit sRGB"
     half = ", half size" if config.half_size else ""

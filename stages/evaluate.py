@@ -1,5 +1,5 @@
-"""Renders of the test views against their photographs, and estimated poses against true ones where
-``sparse_gt`` gives them. Outputs: ``evaluation.json`` with ``renders/``."""
+"""Compare renders of the test views with their photographs, and estimated poses with ground truth
+(``sparse_gt``) if there is any. Outputs: ``evaluation.json`` with ``renders/``."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
-# With refined cameras, those of test views are fitted to their photographs before the measurement.
+# With refined cameras, the poses of test views are fitted to their photographs before measuring.
 FIT_OPTIONS = ("train.refine_poses", "train.ssim_loss_weight")
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     every = settled.config.split.test_every
-    truth = ["pose error against the truth in sparse_gt/"] if scan.truth is not None else []
+    truth = ["pose errors with respect to sparse_gt/"] if scan.truth is not None else []
     reason = f"one view in {every}, sorted by name, is a test view"
     if every == 0:
         reason = "no test views: measured on the training views"
@@ -46,7 +46,7 @@ def work(job: Job) -> None:
         gains=inputs.read_json(job.inputs["train"] / "exposure.json"),
         threads=job.threads,
     )
-    job.tell([], evaluation.pop("warnings"))
+    job.add_messages([], evaluation.pop("warnings"))
     evaluation["pose_error"] = None
     truth = job.inputs["inspect"] / "truth"
     if truth.is_dir():

@@ -1,9 +1,9 @@
 """Files for other programs.
 
-Outputs: of the Gaussians ``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``; the sparse points,
-``points.ply``; the cameras, ``sparse/0`` and ``sparse_text`` (COLMAP) and ``transforms.json``; and
-``frame.json`` with the frame, units and up that these files leave open. On demand ``renders/``,
-``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
+Outputs: Gaussians (``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``); sparse points
+(``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP; ``transforms.json``);
+``frame.json`` with axes, unit and up direction. On demand ``renders/``, ``depths/``, ``mesh.ply``
+and ``.glb``, ``video`` and ``path.json``.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
-# Exported cameras are those of the images as they are, at any size of training.
+# Exported cameras are those of the full-size images, whatever the size of training views.
 FULL_SIZE = Views(max_long_side_px=2**31)
 
 

@@ -1,4 +1,4 @@
-"""SIFT keypoints and descriptors. Output: one ``.npz`` a photograph."""
+"""SIFT keypoints and descriptors. Output: one ``.npz`` per photograph."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     config = settled.config.features
     longest = min(max(max(size) for size in scan.sizes), config.max_long_side_px)
     keypoints = (
-        f"up to {config.max_features} SIFT keypoints each ({config.backend}), at {longest} px"
+        f"up to {config.max_features} SIFT keypoints per image ({config.backend}), at {longest} px"
     )
-    return unless_posed(scan, "keypoints to find the poses by", [keypoints])
+    return unless_posed(scan, "keypoints for estimating the poses", [keypoints])
 
 
 def work(job: Job) -> None:
@@ -34,7 +34,7 @@ def work(job: Job) -> None:
         threads=job.threads,
     )
     job.record(report)
-    # How the run went, not what came of it.
+    # Not a counter: it depends on earlier runs.
     job.timings["num_cached"] = job.counters.pop("num_cached")
 
 

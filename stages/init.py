@@ -1,4 +1,4 @@
-"""The first Gaussians, from sparse points or at random. Output: ``gaussians.npz``."""
+"""The initial Gaussians, from sparse points or random. Output: ``gaussians.npz``."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         return StagePlan(run=True, reason="Gaussians from the sparse points of sfm")
     if count := scan.poses.num_points:
         return StagePlan(run=True, reason=f"Gaussians from the given {count} sparse points")
-    reason = "Gaussians from points triangulated at the given poses, which came without any"
-    pairs = "pairs of cameras that stand close and look alike"
+    reason = "Gaussians from points triangulated with the given poses, which have no points"
+    pairs = "pairs of cameras with near positions and similar directions"
     return StagePlan(run=True, reason=reason, decisions=[pairs])
 
 
@@ -42,12 +42,12 @@ def work(job: Job) -> None:
     training = [view for view in inputs.input_views(job) if not view.is_test]
     if not training:
         raise UserError(
-            "no photograph has a pose: there is nothing to train on",
-            fix="check that the poses name the photographs, or set poses: ignore",
+            "expected training views, found no photograph with a pose",
+            fix="check the photographs' names in the pose file, or set poses: ignore",
         )
     points = inputs.input_model(job).points
     if config.method != "random" and len(points) == 0:
-        job.decide("the given poses come without points: triangulating them")
+        job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
         report = triangulate(
             inputs.read_manifest(job, "views"),
@@ -59,12 +59,12 @@ def work(job: Job) -> None:
             seed=job.seed,
             experiments=experiments.matches,
         )
-        job.tell(report.decisions, report.warnings)
+        job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
         job.counters["triangulated_points"] = len(points)
     first = first_gaussians(points, training, config, experiments.init, job.seed)
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
-    job.tell(first.decisions, first.warnings)
+    job.add_messages(first.decisions, first.warnings)
     job.counters |= first.counters
 
 

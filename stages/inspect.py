@@ -1,8 +1,8 @@
-"""Read the scene folder once: which photographs are whole, which poses are given.
+"""Check that all photographs can be decoded, and read the given poses.
 
-Outputs: ``images.json`` (the manifest), ``sparse/0`` where poses are given, ``truth`` where the
-scene has ``sparse_gt``, ``gcp_list.txt`` where it has that, and ``georeference.json`` where given
-poses were moved.
+Outputs: ``images.json`` (the manifest); ``sparse/0`` if poses are given; ``truth`` if the scene has
+``sparse_gt``; ``gcp_list.txt`` if the scene has one; ``georeference.json`` if the given poses were
+translated.
 """
 
 from __future__ import annotations
@@ -41,19 +41,18 @@ def work(job: Job) -> None:
     manifest, warnings = verify_photos(
         found.manifest, threads=job.threads, min_photos=config.inspect.min_images
     )
-    job.tell([], [*found.warnings, *warnings])
+    job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
-    job.counters = {
-        "photos": len(manifest.photos),
-        "left_out": len(found.listed) - len(manifest.photos),
-    }
-    if found.poses is not None:
-        given = load_given(found.model_copy(update={"manifest": manifest}))
-        job.tell(given.write(job.out), [])
+    count = len(manifest.photos)
+    job.counters = {"photos": count, "left_out": len(found.listed) - count}
+    if (poses := found.poses) is not None:
+        where = {"listed": found.listed, "base_folder": found.base_folder}
+        given = load_given(folder / poses.path, poses.kind, manifest.photos, **where)
+        job.add_messages(given.write(job.out), [])
         job.counters["given_poses"] = len(given.model.images)
         job.counters["given_points"] = len(given.model.points)
     if found.ground_control is not None and found.poses is None:
-        # A malformed file is reported now and not after hours.
+        # A malformed file is reported before the hours of later stages.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])
         write_bytes(job.out / GCP_FILE, found.ground_control.read_bytes())
     if found.truth is not None:
@@ -73,6 +72,5 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     options=("poses", "inspect", "views.masks"),
-    memory_mb=2000,
     facts=facts,
 )

@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return unless_posed(scan, "pairs to find poses by", [settled.why["matches.pairs"]])
+    return unless_posed(scan, "matches for estimating the poses", [settled.why["matches.pairs"]])
 
 
 def work(job: Job) -> None:
@@ -34,7 +34,7 @@ def work(job: Job) -> None:
         experiments=job.section(Experiments).matches,
     )
     job.record(report)
-    # How the run went, not what came of it.
+    # Not a counter: it depends on earlier runs.
     job.timings["num_cached"] = job.counters.pop("num_cached")
 
 

@@ -1,12 +1,12 @@
-"""Given poses adjusted to their own tracks. Outputs: ``sparse/0`` (a COLMAP model in the given
-world) and, where the given poses were moved, ``georeference.json``."""
+"""Bundle adjustment of given poses with their own tracks. Outputs: ``sparse/0`` (a COLMAP model in
+the given world) and, if the given poses were translated, ``georeference.json``."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
-from pipeline.io.posefiles import SHARED_BY
+from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
@@ -15,30 +15,36 @@ if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
-# A photograph with fewer known points is left behind when the others are adjusted to theirs.
+# The pose of a photograph with fewer observations is poorly determined, and would not follow the
+# other poses.
 MIN_TRACKED = 20
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     poses, freed = scan.poses, settled.config.sfm.refine_principal_point
     if poses is None:
-        return StagePlan(run=False, reason="no poses are given; sfm adjusts its own")
+        return StagePlan(run=False, reason="no poses are given; sfm adjusts the poses it finds")
     if settled.config.poses == "keep":
-        return StagePlan(run=False, reason="the given poses are kept, as configured (poses: keep)")
+        return StagePlan(
+            run=False, reason="given poses are not adjusted, as configured (poses: keep)"
+        )
     if freed == "no":
-        return StagePlan(run=False, reason="principal points are held, as configured")
+        return StagePlan(run=False, reason="principal points are fixed, as configured")
     if poses.tracked < MIN_TRACKED:
-        few = f"a photograph with {poses.tracked} tracked points" if poses.tracked else "no tracks"
-        return StagePlan(run=False, reason=f"the given poses come with {few} to adjust them to")
+        few = f"an image with only {poses.tracked} tracked points" if poses.tracked else "no tracks"
+        return StagePlan(run=False, reason=f"the given model has {few}, too few for adjustment")
     if not poses.centred and freed != "yes":
-        text = f"no camera of {SHARED_BY} photographs has its principal point exactly in the middle"
+        text = (
+            f"no camera with {MIN_IMAGES_PER_CAMERA} photographs or more has its principal point "
+            "exactly at the image centre"
+        )
         return StagePlan(run=False, reason=text)
     return StagePlan(
         run=True,
-        reason="the given principal points stand in the middle, where nobody looked for them"
+        reason="given principal points are at the image centre, so they were not calibrated"
         if poses.centred
-        else "principal points are freed, as configured",
-        decisions=["poses, points and lenses adjusted to the given tracks, where that pays"],
+        else "principal points are adjusted, as configured",
+        decisions=["bundle adjustment with the given tracks, used if the fit improves enough"],
     )
 
 

@@ -1,4 +1,4 @@
-"""``metrics.json`` and the page that shows all results of a scene, ``report.html``."""
+"""``metrics.json`` and ``report.html``, the page with all results of a scene."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return StagePlan(run=True, reason="metrics.json and one page on the scene")
+    return StagePlan(run=True, reason="metrics.json and report.html")
 
 
 def work(job: Job) -> None:

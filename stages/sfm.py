@@ -1,5 +1,5 @@
 """Camera poses and sparse points. Outputs: ``sparse/0`` (a COLMAP model), ``georeference.json``
-(its frame) and ``other_models`` where there are any."""
+(its frame) and ``other_models`` if there are any."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     config, why = settled.config, settled.why
     reason = "no poses are given"
     if config.poses == "ignore":
-        reason = "poses are found anew, as configured (poses: ignore)"
+        reason = "given poses are ignored, as configured (poses: ignore)"
     choices = [why[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")]
     return unless_posed(scan, reason, [*choices, _frame(scan, config)])
 
@@ -27,11 +27,11 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def _frame(scan: Scan, config: Config) -> str:
     wanted, control = config.sfm.georeference, scan.ground_control is not None
     if wanted in ("auto", "gcp") and control:
-        return "the scene's frame from the ground control points in gcp_list.txt"
+        return "georeferenced by the ground control points in gcp_list.txt"
     if wanted in ("auto", "gps") and scan.num_gps:
-        return f"the scene's frame from GPS in {scan.num_gps} photographs, if it says enough"
-    ignored = ", as configured" if wanted == "none" else ": neither GPS nor ground control points"
-    return f"the scene's frame level and of unit size{ignored}"
+        return f"georeferenced by GPS positions of {scan.num_gps} photographs, if these suffice"
+    why = "as configured" if wanted == "none" else "no GPS or ground control points"
+    return f"not georeferenced ({why}): the scene is levelled and scaled to unit size"
 
 
 def work(job: Job) -> None:

@@ -1,4 +1,4 @@
-"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json`` and ``exposure.json``; and
+"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json``, ``exposure.json``; and
 ``sparse/0`` if poses or intrinsics were refined."""
 
 from __future__ import annotations
@@ -56,12 +56,12 @@ def work(job: Job) -> None:
         write_model(job.out / "sparse" / "0", trained.model)
     write_json(job.out / "curve.json", trained.result.curve)
     write_json(job.out / "exposure.json", trained.gains)
-    job.tell(trained.decisions, trained.warnings)
+    job.add_messages(trained.decisions, trained.warnings)
     job.counters, job.timings = trained.counters, trained.timings
 
 
 def memory_mb(plan: Plan) -> int:
-    """The configured limit, or half more than the plan's rough estimate."""
+    """The configured limit, or 1.5 times the plan's estimate."""
     return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
 
 

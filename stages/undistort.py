@@ -1,4 +1,4 @@
-"""Images and masks as pinhole cameras see them.
+"""Undistort photographs, masks and depth maps to pinhole cameras.
 
 Outputs: ``images/``, ``masks/``, ``depths/``, ``images.json`` and ``sparse/0``.
 """
@@ -21,12 +21,12 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     if scan.poses is not None:
         models = ", ".join(scan.poses.models)
         if scan.poses.pinhole:
-            return StagePlan(run=False, reason=f"the given cameras are pinhole already ({models})")
-        return StagePlan(run=True, reason=f"the given cameras distort ({models})")
+            return StagePlan(run=False, reason=f"the given cameras are pinhole cameras ({models})")
+        return StagePlan(run=True, reason=f"the given cameras have lens distortion ({models})")
     model = settled.config.sfm.camera_model
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
-        return StagePlan(run=False, reason=f"{model} cameras do not distort")
-    return StagePlan(run=True, reason=f"{model} cameras distort")
+        return StagePlan(run=False, reason=f"{model} cameras have no lens distortion")
+    return StagePlan(run=True, reason=f"{model} cameras have lens distortion")
 
 
 def work(job: Job) -> None:

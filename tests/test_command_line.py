@@ -23,7 +23,7 @@ from pipeline.io.transforms import write_transforms
 from pipeline.render import RasterOptions
 from pipeline.render.views import near_plane, render_view, to_bytes
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import camera_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from tests.splats.samples import sample
@@ -34,7 +34,7 @@ PINHOLE = Camera("PINHOLE", SIZE, SIZE, np.array([50.0, 50, 24, 24]))
 
 def cameras(prefix: str = "", camera: Camera = PINHOLE) -> Reconstruction:
     images = {
-        i + 1: Posed(f"{prefix}p{i}.png", 1, np.eye(3), np.array([0.5 * i - 0.5, 0, 8.0]))
+        i + 1: PosedImage(f"{prefix}p{i}.png", 1, np.eye(3), np.array([0.5 * i - 0.5, 0, 8.0]))
         for i in range(3)
     }
     return Reconstruction({1: camera}, images)
@@ -194,7 +194,7 @@ def test_views_are_written_inside_the_folder_whatever_their_names(folder):
     model = cameras()
     names = ["../../a.png", "/abs/b.jpg", "/abs/b.png"]
     images = {
-        i: Posed(name, 1, image.rotation, image.translation)
+        i: PosedImage(name, 1, image.rotation, image.translation)
         for (i, image), name in zip(model.images.items(), names, strict=True)
     }
     write_model(folder / "odd", Reconstruction(model.cameras, images))

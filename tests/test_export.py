@@ -21,7 +21,7 @@ from pipeline.io.transforms import read_frames, read_transforms
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.surface.outputs import RENDERED_FORMATS
 from stages.export import work
 from tests.splats.samples import sample
@@ -35,7 +35,9 @@ def scene(tmp_path: Path) -> Path:
     the poses were given for larger photographs."""
     scene = tmp_path / "results" / "NAME"
     camera = Camera("PINHOLE", 180, 120, np.array([100.0, 100, 90, 60]))
-    images = {i + 1: Posed(f"p{i}.png", 1, np.eye(3), np.array([float(i), 0, 4])) for i in range(9)}
+    images = {
+        i + 1: PosedImage(f"p{i}.png", 1, np.eye(3), np.array([float(i), 0, 4])) for i in range(9)
+    }
     points = Points(
         np.array([[0.0, 1, 2]]),
         np.array([[255, 0, 9]], np.uint8),

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pipeline.demo.cameras import look_at
 from pipeline.geometry.cameras import Camera
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 Array = NDArray[np.float64]
 Triple = Array | tuple[float, float, float]
@@ -195,7 +195,7 @@ def _truth(made: Made, names: Sequence[str], like: Shot) -> Reconstruction:
     for i, shot in enumerate(made.shots, start=1):
         if (shot.scene, shot.mirrored) == (like.scene, like.mirrored):
             rotation = mirror @ shot.rotation @ mirror
-            images[i] = Posed(names[i - 1], 1, rotation, -rotation @ mirror @ shot.centre)
+            images[i] = PosedImage(names[i - 1], 1, rotation, -rotation @ mirror @ shot.centre)
     return Reconstruction({1: Camera("SIMPLE_RADIAL", WIDTH, HEIGHT, params)}, images)
 
 

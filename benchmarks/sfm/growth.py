@@ -23,7 +23,7 @@ from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.sfm.isolate import run_isolated
 
 Array = NDArray[np.float64]
@@ -150,7 +150,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     print("|---" * 8 + "|")
     last: dict[str, tuple[int, float]] = {}
     for count in args.views:
-        images = {i: Posed(name_of(i), 1, *pose) for i, pose in enumerate(street(count))}
+        images = {i: PosedImage(name_of(i), 1, *pose) for i, pose in enumerate(street(count))}
         truth = Reconstruction({1: truth_camera}, images)
         with tempfile.TemporaryDirectory(prefix="benchmark-growth-") as name:
             folder = Path(name)

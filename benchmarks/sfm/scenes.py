@@ -74,7 +74,14 @@ def load_scene(folder: Path, every: int = 1) -> Scene:
                 file=folder,
                 fix="bring them as sparse_gt/, sparse/0 or transforms.json",
             )
-        truth, kind = load_given(given).model, "given poses"
+        model = load_given(
+            folder / given.poses.path,
+            given.poses.kind,
+            given.photos,
+            listed=given.listed,
+            base_folder=given.base_folder,
+        ).model
+        truth, kind = model, "given poses"
     manifest, _ = verify_photos(found.manifest, threads=1, min_photos=2)
     photos = sorted(manifest.photos, key=lambda photo: photo.name)[::every]
     manifest = manifest.model_copy(update={"photos": tuple(photos)})

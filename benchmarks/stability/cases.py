@@ -23,7 +23,7 @@ from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.io.colmap import read_model, write_model
 from pipeline.photos.load import load_rgb
 from pipeline.runtime.atomic import write_json
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Array = NDArray[np.float64]
 Pixels = NDArray[Any]
@@ -182,7 +182,7 @@ def taken(
         images = {}
         for i, (centre, target) in enumerate(zip(centres, targets, strict=True), 1):
             rotation = look_at(centre, target)
-            posed = Posed(f"view_{i:03d}.png", 1, rotation, -rotation @ centre)
+            posed = PosedImage(f"view_{i:03d}.png", 1, rotation, -rotation @ centre)
             light = render(posed, camera, through, OBJECTS, transparent=alone).light
             write(folder / "images" / posed.name, to_bytes(srgb(light)))
             images[i] = posed

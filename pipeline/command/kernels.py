@@ -1,7 +1,7 @@
-"""``python -m pipeline.command.kernels FOLDER``: the native libraries that a wheel holds.
+"""``python -m pipeline.command.kernels FOLDER``: make the native libraries of a wheel.
 
-Compiles both libraries for every instruction-set target of this architecture, unless they are in
-the cache already, and copies them into the folder.
+Compiles both libraries for all instruction-set targets of this architecture, unless they are
+cached, and copies them into the folder.
 """
 
 from __future__ import annotations

@@ -1,5 +1,5 @@
-"""The command ``splatmake``: reconstruct a scene; convert, render, measure and view Gaussians,
-whatever program trained them; compare batches; examine the machine."""
+"""The command ``splatmake``: reconstruct a scene; convert, render, measure and view Gaussians of
+any program; compare batches; examine the machine."""
 
 from __future__ import annotations
 
@@ -29,12 +29,12 @@ EXAMPLES = """examples:
 In a checkout, `python -m pipeline` is the same command, and
 `snakemake --cores all results/NAME/metrics.json` reconstructs data/NAME.
 """
-# Whose further options are Snakemake's.
+# Commands that pass further options to Snakemake.
 WORKFLOW_COMMANDS = ("run", "plan")
 
 
 def main(arguments: list[str] | None = None) -> int:
-    """Run a command and return the process's exit code: 2 where the user must mend something."""
+    """Run a command and return the exit code: 2 after a ``UserError``."""
     options = _parse(sys.argv[1:] if arguments is None else arguments)
     command: Callable[..., int | None] = options.pop("command")
     try:
@@ -52,7 +52,7 @@ def main(arguments: list[str] | None = None) -> int:
 def _parse(arguments: list[str]) -> dict[str, Any]:
     parser = _parser()
     if arguments[:1] and arguments[0] in WORKFLOW_COMMANDS:
-        # "--" may set Snakemake's options apart; they are recognised without it, too.
+        # "--" before Snakemake's options is optional.
         mark = arguments.index("--") if "--" in arguments else len(arguments)
         known, others = parser.parse_known_args(arguments[:mark] + arguments[mark + 1 :])
         return vars(known) | {"options": others}
@@ -64,13 +64,13 @@ def _fail(error: UserError) -> int:
     return EXIT_USER_ERROR
 
 
-# Torch and all that is imported by the commands: --help and wrong options need none of it.
+# Commands import what they need, so that --help and wrong options do not import torch.
 
 
 def _run(**options: Any) -> None:
-    from pipeline.command.workflow import become, snakemake_command
+    from pipeline.command.workflow import replace_process, snakemake_command
 
-    become(snakemake_command(**options))
+    replace_process(snakemake_command(**options))
 
 
 def _plan(options: list[str], **others: Any) -> None:
@@ -80,14 +80,14 @@ def _plan(options: list[str], **others: Any) -> None:
 def _compare(**options: Any) -> None:
     from pipeline.reporting.compare import compare
 
-    _tell(compare(**options), [])
+    _print(compare(**options), [])
 
 
 def _convert(**options: Any) -> None:
     from pipeline.commands import convert
 
     warnings: list[str] = []
-    _tell(convert(**options, warnings=warnings), warnings)
+    _print(convert(**options, warnings=warnings), warnings)
 
 
 def _render(threads: int, background: str, antialias: bool, max_side: int, **options: Any) -> None:
@@ -95,7 +95,7 @@ def _render(threads: int, background: str, antialias: bool, max_side: int, **opt
 
     warnings: list[str] = []
     how = Rendering(background, antialias, max_side, threads)
-    _tell(render(**options, how=how, warnings=warnings), warnings)
+    _print(render(**options, how=how, warnings=warnings), warnings)
 
 
 def _evaluate(
@@ -116,7 +116,7 @@ def _evaluate(
         f"{means}, {protocol['num_views']} views",
         f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)",
     ]
-    _tell(lines, found["warnings"])
+    _print(lines, found["warnings"])
 
 
 def _view(model: Path, cameras: Path | None, **options: Any) -> None:
@@ -129,7 +129,7 @@ def _view(model: Path, cameras: Path | None, **options: Any) -> None:
 def _tensorboard(**options: Any) -> None:
     from pipeline.watching.tensorboard import write_events
 
-    _tell(write_events(**options), [])
+    _print(write_events(**options), [])
 
 
 def _doctor(json_wanted: bool, results: Path) -> int:
@@ -137,11 +137,11 @@ def _doctor(json_wanted: bool, results: Path) -> int:
 
     found = doctor.examine(results)
     text = json.dumps(doctor.as_data(found), indent=2) if json_wanted else None
-    _tell([text] if text else doctor.as_text(found), [])
+    _print([text] if text else doctor.as_text(found), [])
     return 0 if doctor.is_ready(found) else EXIT_USER_ERROR
 
 
-def _tell(lines: list[str], warnings: list[str]) -> None:
+def _print(lines: list[str], warnings: list[str]) -> None:
     for text in warnings:
         print(f"warning: {text}", file=sys.stderr)
     for line in lines:
@@ -152,7 +152,7 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="splatmake",
         description="Reconstruct a scene from photographs; convert, render, measure and view "
-        "Gaussians, whatever program trained them; compare batches; examine the machine.",
+        "Gaussians of any program; compare batches; examine the machine.",
         epilog=EXAMPLES,
         formatter_class=argparse.RawDescriptionHelpFormatter,
     )
@@ -161,7 +161,7 @@ def _parser() -> argparse.ArgumentParser:
 
     for name, command, text in (
         ("run", _run, "reconstruct a scene from a folder of photographs"),
-        ("plan", _plan, "show what run would do: the stages and why, and the jobs"),
+        ("plan", _plan, "show the stages that run would execute, with reasons, and the jobs"),
     ):
         sub = commands.add_parser(
             name,
@@ -175,26 +175,26 @@ def _parser() -> argparse.ArgumentParser:
         _add_workflow(sub)
 
     sub = commands.add_parser(
-        "convert", help="write Gaussians in another format, fewer or simpler ones if asked for"
+        "convert", help="convert Gaussians to another format, optionally with fewer coefficients"
     )
     sub.set_defaults(command=_convert)
     sub.add_argument("source", type=Path, metavar="MODEL", help=MODEL)
     sub.add_argument("target", type=Path, metavar="OUT", help="file to write, by its suffix")
     sub.add_argument(
-        "--sh-degree", type=int, choices=range(4), default=3, help="cut higher bands (default 3)"
+        "--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)"
     )
     sub.add_argument(
         "--min-opacity",
         type=_share,
         default=0.0,
         metavar="SHARE",
-        help="leave fainter Gaussians out, 0 to 1 (default 0)",
+        help="remove Gaussians with a lower opacity, 0 to 1 (default 0)",
     )
     sub.add_argument(
         "--morton-order", action="store_true", help="sort along a Z-order curve: smaller files"
     )
 
-    sub = commands.add_parser("render", help="render Gaussians as given cameras see them, to PNG")
+    sub = commands.add_parser("render", help="render Gaussians from given cameras, to PNG")
     sub.set_defaults(command=_render)
     sub.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
     sub.add_argument(
@@ -205,7 +205,7 @@ def _parser() -> argparse.ArgumentParser:
         help="COLMAP model (its folder, or one with sparse/0), transforms.json, or results/NAME",
     )
     sub.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the pictures"
+        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the images"
     )
     sub.add_argument(
         "--view",
@@ -213,14 +213,14 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         default=[],
         metavar="NAME",
-        help="only this view, with or without suffix; may be given several times",
+        help="only this view, with or without suffix; can be repeated",
     )
     _add_rendering(sub, "black", "without")
 
     sub = commands.add_parser(
         "evaluate",
         help="PSNR and SSIM of each view against its photograph",
-        description="Measure a model on the scene's held-out views: PSNR and SSIM of each view "
+        description="Evaluate a model on the scene's test views: PSNR and SSIM of each view "
         "against its photograph, and their means.",
     )
     sub.set_defaults(command=_evaluate)
@@ -234,22 +234,22 @@ def _parser() -> argparse.ArgumentParser:
         "transforms.json, poses_bounds.npy) without lens distortion",
     )
     sub.add_argument(
-        "-o", "--out", type=Path, metavar="FOLDER", help="keep renders and evaluation.json here"
+        "-o", "--out", type=Path, metavar="FOLDER", help="folder for renders and evaluation.json"
     )
     sub.add_argument(
         "--every",
         type=_every,
         metavar="N",
-        help="held-out views are each N-th, sorted by name; 0 measures on all "
+        help="every N-th view, sorted by name, is a test view; 0: evaluate all views "
         "(default: as the scene was trained, else 8)",
     )
     _add_rendering(sub, "the scene's", "as the scene was trained")
 
     sub = commands.add_parser(
         "view",
-        help="show a scene in the browser, also while it is being trained (needs viser)",
-        description="A page in the browser that shows a scene, rendered by the rasterizer that "
-        "trains it. Of a training under way it shows the newest checkpoint, two a minute.",
+        help="show a scene in the browser, also during training (needs viser)",
+        description="Show a scene in the browser, rendered by the rasterizer of the training. "
+        "During training, the newest checkpoint is shown and updated twice a minute.",
     )
     sub.set_defaults(command=_view)
     sub.add_argument(
@@ -259,33 +259,35 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras", type=Path, metavar="PATH", help="as for render (default: the scene's own)"
     )
     sub.add_argument(
-        "--host", default="127.0.0.1", help="0.0.0.0 lets others in (default: %(default)s)"
+        "--host", default="127.0.0.1", help="0.0.0.0: accessible to others (default: %(default)s)"
     )
     sub.add_argument("--port", type=_positive, default=8080, help="(default: %(default)s)")
     sub.add_argument(
         "--side", type=_positive, default=800, metavar="PIXELS", help="longer side (default: 800)"
     )
     sub.add_argument(
-        "--threads", type=_positive, default=1, help="(default: 1, for a training needs the rest)"
+        "--threads", type=_positive, default=1, help="(default: 1, leaving the others to training)"
     )
 
     sub = commands.add_parser(
         "compare",
         help="tables of a batch (results/benchmark.json), or of two",
-        description="Tables of batches in Markdown: each configuration beside --base, each run, or "
-        "how well a second batch repeats the first.",
+        description="Tables of batches in Markdown: each configuration compared with --base, each "
+        "run, or the differences between two batches of the same runs.",
     )
     sub.set_defaults(command=_compare)
     sub.add_argument("batches", type=Path, nargs="+", metavar="BENCHMARK_JSON", help="one or two")
     sub.add_argument(
         "--base",
         metavar="CONFIG",
-        help="the configuration that others are compared with (default: the default preset)",
+        help="configuration that others are compared with (default: the default preset)",
     )
-    sub.add_argument("--each", action="store_true", help="each run of one batch, without comparing")
+    sub.add_argument(
+        "--each", action="store_true", help="list each run of one batch, without comparison"
+    )
 
     sub = commands.add_parser(
-        "tensorboard", help="write trainings' curves as TensorBoard's files (needs tensorboard)"
+        "tensorboard", help="write training curves for TensorBoard (needs tensorboard)"
     )
     sub.set_defaults(command=_tensorboard)
     sub.add_argument(
@@ -295,15 +297,15 @@ def _parser() -> argparse.ArgumentParser:
         "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the files"
     )
     sub.add_argument(
-        "--follow", action="store_true", help="go on with what trainings add, until Ctrl-C"
+        "--follow", action="store_true", help="continue with running trainings, until Ctrl-C"
     )
 
     sub = commands.add_parser(
         "doctor",
-        help="show what this machine has, what of it is used, and what is missing",
-        description="Processor and instruction set, compilers, memory, graphics cards, packages "
-        "and disk: what is there (+ used, - optional and absent, ! needed and missing) and what "
-        "to do. Exits with 2 where something needed is missing.",
+        help="show what this machine has, what is used, and what is missing",
+        description="Report processor, instruction set, compilers, memory, graphics cards, "
+        "packages and disk (+ used, - optional and absent, ! required and missing), and what to "
+        "do. The exit code is 2 if something required is missing.",
     )
     sub.set_defaults(command=_doctor)
     sub.add_argument("--json", dest="json_wanted", action="store_true", help="print JSON")
@@ -312,7 +314,7 @@ def _parser() -> argparse.ArgumentParser:
         type=Path,
         default=Path("results"),
         metavar="FOLDER",
-        help="where results go: its disk is examined (default: %(default)s)",
+        help="folder of the results, whose disk is examined (default: %(default)s)",
     )
     return parser
 
@@ -338,7 +340,7 @@ def _add_workflow(parser: argparse.ArgumentParser) -> None:
         "--workflow-profile",
         dest="profile",
         metavar="PROFILE",
-        help="Snakemake profile: a folder, or ci or slurm for those of the program",
+        help="Snakemake profile: a folder, or one of the program's: ci, slurm",
     )
 
 

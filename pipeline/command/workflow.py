@@ -1,4 +1,4 @@
-"""``splatmake run`` and ``splatmake plan``: one folder of photographs, handed to Snakemake."""
+"""``splatmake run`` and ``splatmake plan``: run Snakemake for a folder of photographs."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ def snakemake_command(
         scene: folder of photographs; its parent becomes ``data_root``.
         preset: name of a preset; None: the configuration's.
         cores: a number, or "all".
-        config: ``name=value`` entries, which win over ``preset``.
-        profile: a workflow profile's folder, or the name of one that the program brings along.
-        options: Snakemake's own, passed as they are.
+        config: ``name=value`` entries, which override ``preset``.
+        profile: folder of a workflow profile, or the name of one of the program's.
+        options: further options of Snakemake.
 
     Raises:
         UserError: no such folder, or no Snakemake.
@@ -45,7 +45,7 @@ def snakemake_command(
         raise UserError(
             "snakemake is not installed", fix="install splatmake with its dependencies (pip)"
         )
-    # Not resolved: a link to a folder names the scene.
+    # Not resolved: a symbolic link's name is the scene's name.
     folder = Path(os.path.abspath(scene))
     # Snakemake reads values as YAML: a quoted path stays one string. The spaces keep the quotes,
     # which it would strip.
@@ -64,8 +64,8 @@ def snakemake_command(
     ]
 
 
-def become(command: list[str]) -> NoReturn:
-    """Replace this process by Snakemake's, so that signals reach it and its exit code is ours."""
+def replace_process(command: list[str]) -> NoReturn:
+    """Replace this process by Snakemake, which then receives signals and sets the exit code."""
     # Without it, Python looks for packages in the current folder first, which is the user's.
     environment = os.environ | {"PYTHONSAFEPATH": "1"}
     sys.stdout.flush()

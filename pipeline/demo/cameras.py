@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.scene.reconstruction import Posed
+from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
 
@@ -37,7 +37,7 @@ def focal_35mm(width: int, height: int) -> int:
     return round(FOCAL_MM * float(np.hypot(36.0, 24.0)) / sensor_diagonal)
 
 
-def orbit(names: list[str], seed: int) -> list[Posed]:
+def orbit(names: list[str], seed: int) -> list[PosedImage]:
     """Cameras on a wavy ring around the objects, looking at them; neighbours in order."""
     rng = np.random.default_rng([seed, 1])
     step = np.radians(min(360.0 / len(names), MAX_STEP_DEGREES))
@@ -50,7 +50,7 @@ def orbit(names: list[str], seed: int) -> list[Posed]:
         centre = np.array([radius * np.cos(angle), radius * np.sin(angle), height])
         target = np.array([0.0, 0.0, 0.45]) + rng.uniform(-0.1, 0.1, 3)
         rotation = look_at(centre, target, roll=rng.uniform(-0.05, 0.05))
-        posed.append(Posed(name, 1, rotation, -rotation @ centre))
+        posed.append(PosedImage(name, 1, rotation, -rotation @ centre))
     return posed
 
 

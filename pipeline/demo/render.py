@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from pipeline.demo.scene import BACKGROUND, SceneObject, shade, trace
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import normalised
-from pipeline.scene.reconstruction import Posed
+from pipeline.geometry.distortion import unproject
+from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
 
@@ -60,7 +60,7 @@ def rays(camera: Camera) -> Rays:
 
 
 def render(
-    posed: Posed,
+    posed: PosedImage,
     camera: Camera,
     through: Rays,
     objects: tuple[SceneObject, ...],
@@ -106,10 +106,10 @@ def _grid(camera: Camera, samples: int, margin: int) -> Array:
     x = (np.arange((camera.width + 2 * margin) * samples) + 0.5) / samples - margin
     y = (np.arange((camera.height + 2 * margin) * samples) + 0.5) / samples - margin
     xy = np.stack(np.meshgrid(x, y), axis=-1)
-    return np.ascontiguousarray(np.moveaxis(normalised(camera, xy), -1, 0))
+    return np.ascontiguousarray(np.moveaxis(unproject(camera, xy), -1, 0))
 
 
-def _world(posed: Posed, points: Array) -> tuple[Array, Array]:
+def _world(posed: PosedImage, points: Array) -> tuple[Array, Array]:
     """Origin (3, 1) and directions (3, N) of depth 1, so that a hit's t is its z depth.
 
     Written out rather than a matrix product: BLAS may round differently with other threads.

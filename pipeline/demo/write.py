@@ -23,13 +23,13 @@ from pipeline.demo.scene import OBJECTS, VISITOR, SceneObject
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
 from pipeline.demo.shapes import Sphere
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import normalised, pixels
+from pipeline.geometry.distortion import project, unproject
 from pipeline.io.colmap import write_model
 from pipeline.runtime.atomic import replace_folder, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.progress import Progress
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
 Poses = Literal["none", "colmap", "transforms"]
@@ -153,7 +153,7 @@ def _camera(spec: DemoSpec) -> Camera:
     return lens(spec.distortion, spec.width, spec.height)
 
 
-def _views(spec: DemoSpec) -> list[Posed]:
+def _views(spec: DemoSpec) -> list[PosedImage]:
     return orbit([f"view_{i:03d}.{spec.format}" for i in range(spec.views)], spec.seed)
 
 
@@ -194,7 +194,7 @@ def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
     return depth, colour
 
 
-def _visitor(seed: int, number: int, posed: Posed) -> SceneObject:
+def _visitor(seed: int, number: int, posed: PosedImage) -> SceneObject:
     """A ball at a random position in front of the camera, near the image centre."""
     x, y, z = np.random.default_rng([seed, 2, number]).uniform((-0.3, -0.2, 1.0), (0.3, 0.2, 1.3))
     centre = posed.centre + posed.rotation.T @ np.array([x * z, y * z, z])
@@ -218,7 +218,7 @@ def _points(
         row = rng.integers(0, camera.height, POINTS_PER_VIEW)
         z = depth[row, column].astype(np.float64)
         column, row, z = column[z > 0], row[z > 0], z[z > 0]
-        flat = normalised(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
+        flat = unproject(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
         local = np.concatenate([flat, np.ones((len(z), 1))], axis=1) * z[:, None]
         xyz.append((local - posed.translation) @ posed.rotation)
         rgb.append(colour[row, column])
@@ -228,7 +228,7 @@ def _points(
     for i, (posed, depth) in enumerate(zip(truth.images.values(), depths, strict=True)):
         local = points @ posed.rotation.T + posed.translation
         front = local[:, 2] > 0.05
-        xy = pixels(camera, local[:, :2] / np.where(front, local[:, 2], 1.0)[:, None])
+        xy = project(camera, local[:, :2] / np.where(front, local[:, 2], 1.0)[:, None])
         inside = front & np.all((xy >= 0) & (xy < (camera.width, camera.height)), axis=1)
         column, row = np.where(inside[:, None], xy, 0).astype(np.intp).T
         agree = np.abs(depth[row, column] - local[:, 2]) < DEPTH_AGREEMENT * local[:, 2]
@@ -246,7 +246,7 @@ def _points(
     )
 
 
-def _transforms(camera: Camera, views: list[Posed]) -> dict[str, Any]:
+def _transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
     """nerfstudio's transforms.json: camera to world, x right, y up, z backwards."""
     fx, fy, cx, cy = camera.pinhole
     rest = [float(v) for v in camera.params[len(camera.intrinsics_names) :]]

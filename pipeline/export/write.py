@@ -14,7 +14,7 @@ from pipeline.io.frame_json import describe_frame
 from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.splat import write_splat
-from pipeline.io.spz import unfit, write_spz
+from pipeline.io.spz import count_out_of_range, write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.runtime.atomic import write_json
@@ -118,7 +118,7 @@ def export_scene(
 
 def _warnings(files: _Files, config: Export) -> list[str]:
     warnings = []
-    lost = unfit(files.gaussians) if "spz" in config.formats else 0
+    lost = count_out_of_range(files.gaussians) if "spz" in config.formats else 0
     if lost > TOLERATED_SHARE * len(files.gaussians):
         warnings.append(
             f"point_cloud.spz: {lost} of {len(files.gaussians)} Gaussians are too small or too "

@@ -1,1 +1,1 @@
-"""Rotations, similarities, camera models and places on the ground."""
+"""Rotations, similarity transforms, camera models and geodetic coordinates."""

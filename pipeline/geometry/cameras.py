@@ -1,4 +1,4 @@
-"""COLMAP's camera models, and one camera's intrinsics."""
+"""COLMAP's camera models and the intrinsics of a camera."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ CAMERA_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
 
 @dataclass(frozen=True)
 class Camera:
-    """One camera's intrinsics.
+    """The intrinsics of a camera.
 
     Attributes:
-        model: a name in ``CAMERA_MODELS``.
+        model: a key of ``CAMERA_MODELS``.
         width, height: pixels.
         params: float64, in the model's order; focal lengths and principal point in pixels.
     """
@@ -42,7 +42,7 @@ class Camera:
 
     @property
     def is_pinhole(self) -> bool:
-        """True for a perspective camera without any distortion term."""
+        """Whether this is a perspective camera whose distortion coefficients are all zero."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return True
         distortion = self.params[len(self.intrinsics_names) :]
@@ -50,19 +50,23 @@ class Camera:
 
     @property
     def intrinsics_names(self) -> tuple[str, ...]:
+        """The leading parameters' names: focal lengths and principal point, no distortion."""
         names = CAMERA_MODELS[self.model][1]
         return names[:3] if names[0] == "f" else names[:4]
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) in pixels."""
+        """(fx, fy, cx, cy) in pixels, without the distortion."""
         p = [float(v) for v in self.params]
         if self.intrinsics_names[0] == "f":
             return p[0], p[0], p[1], p[2]
         return p[0], p[1], p[2], p[3]
 
     def resized(self, width: int, height: int) -> Camera:
-        """The same camera for its image resized to ``width`` x ``height`` pixels."""
+        """The camera of the same image resized to ``width`` x ``height`` pixels.
+
+        A model with one focal length becomes one with two if the aspect ratio changes.
+        """
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy = self.pinhole
         rest = self.params[len(self.intrinsics_names) :]

@@ -1,7 +1,7 @@
-"""Lens distortion of every COLMAP camera model, forward and inverse, vectorised.
+"""Lens distortion of COLMAP's camera models and its inverse, vectorised.
 
 Formulas: COLMAP's documentation, "Camera Models"; OpenCV's "Camera Calibration" and "Fisheye
-camera model" for FULL_OPENCV and OPENCV_FISHEYE. Normalised points are (x/z, y/z).
+camera model" for FULL_OPENCV and OPENCV_FISHEYE. Normalised coordinates are (x/z, y/z).
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pipeline.geometry.cameras import Camera
 
 Array = NDArray[np.float64]
 
-ITERATIONS = 50
-# Newton's method has converged where the point it finds is this near (normalised units).
-RESIDUAL = 1e-9
+# Newton's method: at most so many steps, and the error of a solution in normalised coordinates.
+MAX_ITERATIONS = 50
+MAX_ERROR = 1e-9
 
 
 def distort(camera: Camera, points: Array) -> Array:
-    """Where the lens puts normalised pinhole points: (..., 2) to (..., 2), both normalised."""
+    """Apply the lens distortion: (..., 2) to (..., 2), both in normalised coordinates."""
     if "FISHEYE" in camera.model:
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
         theta = np.arctan(radius)
@@ -41,9 +41,10 @@ def distort(camera: Camera, points: Array) -> Array:
 
 
 def undistort(camera: Camera, points: Array) -> Array:
-    """The inverse of ``distort``, by Newton's method; NaN where the lens has no inverse.
+    """The inverse of ``distort``, by Newton's method.
 
-    A fisheye's rays at 90 degrees from the axis and beyond have no normalised point: NaN.
+    The result is NaN for points without an inverse: beyond ``fold_radius``, and for fisheye rays
+    at 90 degrees or more from the optical axis, which have no normalised coordinates.
     """
     if "FISHEYE" in camera.model:
         return _undistort_fisheye(camera, points)
@@ -51,7 +52,7 @@ def undistort(camera: Camera, points: Array) -> Array:
     step = 1e-6
     dx, dy = np.array([step, 0.0]), np.array([0.0, step])
     with np.errstate(all="ignore"):
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             error = distort(camera, found) - points
             column_x = distort(camera, found + dx) - distort(camera, found - dx)
             column_y = distort(camera, found + dy) - distort(camera, found - dy)
@@ -62,17 +63,18 @@ def undistort(camera: Camera, points: Array) -> Array:
                 axis=-1,
             )
             found -= move / determinant[..., None]
-            if np.nanmax(np.abs(error), initial=0.0) < RESIDUAL / 100:
+            if np.nanmax(np.abs(error), initial=0.0) < MAX_ERROR / 100:
                 break
         error = np.abs(distort(camera, found) - points).max(axis=-1)
-        # Beyond the fold of a strong lens the mapping turns over: no photograph shows that.
-        good = (error < RESIDUAL) & (np.linalg.norm(found, axis=-1) < fold_radius(camera))
+        # Beyond the fold radius the polynomial decreases, which no real lens does.
+        good = (error < MAX_ERROR) & (np.linalg.norm(found, axis=-1) < fold_radius(camera))
     found[~good] = np.nan
     return found
 
 
 def fold_radius(camera: Camera) -> float:
-    """Normalised radius up to which the radial distortion grows with the radius; may be inf."""
+    """The largest undistorted radius, in normalised coordinates, up to which the distorted radius
+    increases; infinity if it always does."""
     if "FISHEYE" in camera.model:
         theta = _first_descent(lambda t: t * _polynomial(t**2, _radial(camera)), np.pi / 2)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
@@ -84,14 +86,15 @@ def fold_radius(camera: Camera) -> float:
     return radius if radius < limit else np.inf
 
 
-def pixels(camera: Camera, points: Array) -> Array:
-    """Project: normalised pinhole points (..., 2) to pixels (..., 2), through the lens."""
+def project(camera: Camera, points: Array) -> Array:
+    """Undistorted normalised coordinates (..., 2) to distorted pixels (..., 2)."""
     fx, fy, cx, cy = camera.pinhole
     return distort(camera, points) * (fx, fy) + (cx, cy)
 
 
-def normalised(camera: Camera, xy: Array) -> Array:
-    """Unproject: pixels (..., 2) to normalised pinhole points (..., 2); NaN as ``undistort``."""
+def unproject(camera: Camera, xy: Array) -> Array:
+    """Distorted pixels (..., 2) to undistorted normalised coordinates (..., 2); NaN as for
+    ``undistort``."""
     fx, fy, cx, cy = camera.pinhole
     return undistort(camera, (xy - (cx, cy)) / (fx, fy))
 
@@ -102,13 +105,13 @@ def _undistort_fisheye(camera: Camera, points: Array) -> Array:
     distorted = np.linalg.norm(points, axis=-1)
     theta = np.minimum(distorted, np.pi / 2)
     with np.errstate(all="ignore"):
-        for _ in range(ITERATIONS):
+        for _ in range(MAX_ITERATIONS):
             error = theta * _polynomial(theta**2, coefficients) - distorted
             theta = theta - error / _polynomial(theta**2, slopes)
-            if np.nanmax(np.abs(error), initial=0.0) < RESIDUAL / 100:
+            if np.nanmax(np.abs(error), initial=0.0) < MAX_ERROR / 100:
                 break
         error = np.abs(theta * _polynomial(theta**2, coefficients) - distorted)
-        good = (error < RESIDUAL) & (theta >= 0) & (theta < np.arctan(fold_radius(camera)))
+        good = (error < MAX_ERROR) & (theta >= 0) & (theta < np.arctan(fold_radius(camera)))
         good &= theta < np.pi / 2 - 1e-6
         scale = np.where(distorted > 1e-12, np.tan(theta) / np.maximum(distorted, 1e-12), 1.0)
     scale = np.where(good, scale, np.nan)
@@ -128,7 +131,7 @@ def _radial(camera: Camera) -> list[float]:
 
 
 def _perspective(camera: Camera) -> tuple[list[float], list[float], tuple[float, float]]:
-    """Radial numerator and denominator, and the tangential terms."""
+    """Coefficients of the radial numerator and denominator, and the tangential ones (p1, p2)."""
     rest = _radial(camera)
     if camera.model in ("OPENCV", "FULL_OPENCV"):
         k1, k2, p1, p2 = rest[:4]
@@ -138,7 +141,8 @@ def _perspective(camera: Camera) -> tuple[list[float], list[float], tuple[float,
 
 
 def _first_descent(function: Callable[[Array], Array], limit: float) -> float:
-    """Where ``function`` stops growing between 0 and ``limit``, on a fine grid; or ``limit``."""
+    """The first argument in [0, ``limit``] at which ``function`` stops increasing, on a fine grid;
+    ``limit`` if there is none."""
     grid = np.linspace(0.0, limit, 20_001)
     falling = np.flatnonzero(np.diff(function(grid)) <= 0)
     return float(grid[falling[0]]) if len(falling) else limit

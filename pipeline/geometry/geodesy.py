@@ -1,4 +1,4 @@
-"""From latitude, longitude and altitude to metres around a place: WGS84, local east-north-up."""
+"""Geodetic (WGS84) to Earth-centred (ECEF) and local east-north-up (ENU) coordinates."""
 
 from __future__ import annotations
 
@@ -14,17 +14,23 @@ _E2 = FLATTENING * (2 - FLATTENING)
 
 
 def to_ecef(geodetic: Array) -> Array:
-    """(..., 3) latitude and longitude in degrees and height in metres to (..., 3) Earth-centred,
-    Earth-fixed metres."""
+    """Geodetic to Earth-centred, Earth-fixed coordinates.
+
+    Args:
+        geodetic: (..., 3) latitude and longitude in degrees, ellipsoidal height in metres.
+
+    Returns:
+        (..., 3) metres.
+    """
     geodetic = np.asarray(geodetic, np.float64)
     latitude, longitude = np.radians(geodetic[..., 0]), np.radians(geodetic[..., 1])
     height = geodetic[..., 2]
     normal = SEMI_MAJOR_M / np.sqrt(1 - _E2 * np.sin(latitude) ** 2)
-    across = (normal + height) * np.cos(latitude)
+    axis_distance = (normal + height) * np.cos(latitude)
     return np.stack(
         [
-            across * np.cos(longitude),
-            across * np.sin(longitude),
+            axis_distance * np.cos(longitude),
+            axis_distance * np.sin(longitude),
             (normal * (1 - _E2) + height) * np.sin(latitude),
         ],
         axis=-1,
@@ -32,8 +38,15 @@ def to_ecef(geodetic: Array) -> Array:
 
 
 def to_enu(geodetic: Array, origin: Array) -> Array:
-    """(..., 3) metres east, north and up of ``origin`` (both latitude and longitude in degrees,
-    height in metres)."""
+    """Geodetic to local east-north-up coordinates.
+
+    Args:
+        geodetic: (..., 3) latitude and longitude in degrees, ellipsoidal height in metres.
+        origin: (3,) likewise.
+
+    Returns:
+        (..., 3) metres east, north and up of ``origin``.
+    """
     latitude, longitude = np.radians(origin[0]), np.radians(origin[1])
     sin_lat, cos_lat = np.sin(latitude), np.cos(latitude)
     sin_lon, cos_lon = np.sin(longitude), np.cos(longitude)

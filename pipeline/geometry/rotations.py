@@ -21,8 +21,8 @@ def quat_to_rotation(quat: NDArray[np.float64]) -> NDArray[np.float64]:
 def rotation_to_quat(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     """(..., 3, 3) rotations to (..., 4) unit quaternions wxyz with w >= 0.
 
-    Shepperd's method: of the four rows of q q^T (all linear in R) the one with the largest
-    diagonal is normalised, so that nothing small is divided by.
+    Shepperd's method (1978): normalise the row of q q^T (linear in R) that has the largest
+    diagonal element, so that the divisor is never small.
     """
     r = np.asarray(rotation, np.float64)
     m00, m01, m02 = r[..., 0, 0], r[..., 0, 1], r[..., 0, 2]

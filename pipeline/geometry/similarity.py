@@ -1,21 +1,22 @@
-"""Similarities between two sets of points: least squares, and robust to outliers."""
+"""Similarity transforms between two sets of points: least squares and robust estimation."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
-HYPOTHESES = 200
-# Beyond so many deviations a position counts as wrong (GPS in a street canyon, a stale fix).
-OUTLIER = 3.5
+NUM_HYPOTHESES = 200
+# Points with residuals above this many standard deviations are outliers.
+OUTLIER_SIGMAS = 3.5
 
 
 @dataclass(frozen=True)
 class Similarity:
-    """``new = scale * rotation @ old + translation``, points."""
+    """``y = scale * rotation @ x + translation``; call it with (N, 3) points."""
 
     scale: float
     rotation: Array
@@ -25,16 +26,34 @@ class Similarity:
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
 
-Fit = tuple[Similarity, NDArray[np.bool_], float]
-"""A similarity, the positions it rests on, and their standard deviation on the ground."""
+class RobustFit(NamedTuple):
+    """A similarity estimated in the presence of outliers.
+
+    Attributes:
+        similarity: maps source points to target points.
+        inliers: (N,) the points that it was fitted to.
+        sigma: standard deviation of the weighted residuals along one axis of the ground plane,
+            from their median; in the target's unit.
+    """
+
+    similarity: Similarity
+    inliers: NDArray[np.bool_]
+    sigma: float
 
 
-def robust_similarity(source: Array, target: Array, weight: Array, floor: float) -> Fit | None:
-    """The similarity of least median residual over triples (Rousseeuw 1984), then reweighted least
-    squares on the inliers; None where the sources determine none.
+def robust_similarity(
+    source: Array, target: Array, weight: Array, min_sigma: float
+) -> RobustFit | None:
+    """Least median of squares over triples of points (Rousseeuw 1984), then iterated least squares
+    on the inliers.
 
     Args:
+        source, target: (N, 3) corresponding points, N >= 3.
         weight: (3,) of the residuals along the target's axes.
+        min_sigma: lower bound of ``RobustFit.sigma``, by which outliers are recognised.
+
+    Returns:
+        None if the source points are collinear or no triple determines a similarity.
     """
     count = len(source)
     spread = np.linalg.svd(_centred(source), compute_uv=False)
@@ -43,48 +62,49 @@ def robust_similarity(source: Array, target: Array, weight: Array, floor: float)
     rng = np.random.default_rng(0)
     best: tuple[float, Similarity] | None = None
     triples = [np.arange(3)] if count == 3 else None
-    for k in range(HYPOTHESES if triples is None else 1):
+    for k in range(NUM_HYPOTHESES if triples is None else 1):
         chosen = rng.choice(count, 3, replace=False) if triples is None else triples[k]
         proposal = Similarity(*umeyama(source[chosen], target[chosen]))
         if proposal.scale <= 0:
             continue
-        misses = np.linalg.norm((proposal(source) - target) * weight, axis=1)
-        score = float(np.median(misses))
+        residuals = np.linalg.norm((proposal(source) - target) * weight, axis=1)
+        score = float(np.median(residuals))
         if best is None or score < best[0]:
             best = (score, proposal)
     if best is None:
         return None
     similarity = best[1]
-    used = np.ones(count, bool)
-    sigma = floor
+    inliers = np.ones(count, bool)
+    sigma = min_sigma
     for _ in range(10):
-        misses = np.linalg.norm((similarity(source) - target) * weight, axis=1)
-        # 1.1774: the median of a Rayleigh distribution of deviation 1.
-        sigma = max(float(np.median(misses)) / 1.1774, floor)
-        kept = misses <= OUTLIER * sigma
-        if kept.sum() < 3:
+        residuals = np.linalg.norm((similarity(source) - target) * weight, axis=1)
+        # 1.1774 is the median of a Rayleigh distribution with sigma 1.
+        sigma = max(float(np.median(residuals)) / 1.1774, min_sigma)
+        near = residuals <= OUTLIER_SIGMAS * sigma
+        if near.sum() < 3:
             break
-        used = kept
-        refined = _least_squares(source[used], target[used], weight, similarity)
+        inliers = near
+        refined = _least_squares(source[inliers], target[inliers], weight, similarity)
         if np.allclose(refined(source), similarity(source), rtol=0, atol=1e-9):
             break
         similarity = refined
-    return similarity, used, sigma
+    return RobustFit(similarity, inliers, sigma)
 
 
 def _least_squares(source: Array, target: Array, weight: Array, start: Similarity) -> Similarity:
-    """Gauss-Newton over turn, log scale and shift, residuals weighted along the target's axes."""
-    # Not at import time: scipy is heavy.
+    """Gauss-Newton over rotation vector, log scale and translation from ``start``; residuals are
+    weighted along the target's axes."""
+    # Imported here because scipy takes long to import.
     from scipy.spatial.transform import Rotation
 
     scale, rotation, translation = start.scale, start.rotation, start.translation
     for _ in range(20):
-        moved = scale * source @ rotation.T
-        residual = (moved + translation - target) * weight
-        # d(R exp(w) x) = -[Rx]_x w for a turn on the left.
-        x, y, z = moved.T
+        rotated = scale * source @ rotation.T
+        residual = (rotated + translation - target) * weight
+        # d(exp([w]_x) y) / dw = -[y]_x at w = 0, for y = s R x.
+        x, y, z = rotated.T
         zero = np.zeros_like(x)
-        turn = np.stack(
+        by_rotation = np.stack(
             [
                 np.stack([zero, z, -y], -1),
                 np.stack([-z, zero, x], -1),
@@ -92,8 +112,9 @@ def _least_squares(source: Array, target: Array, weight: Array, start: Similarit
             ],
             axis=1,
         )
-        shift = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-        jacobian = np.concatenate([turn, moved[:, :, None], shift], axis=2) * weight[:, None]
+        by_translation = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+        jacobian = np.concatenate([by_rotation, rotated[:, :, None], by_translation], axis=2)
+        jacobian = jacobian * weight[:, None]
         step = np.linalg.lstsq(jacobian.reshape(-1, 7), -residual.ravel(), rcond=1e-12)[0]
         rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
         scale *= float(np.exp(np.clip(step[3], -1, 1)))
@@ -108,11 +129,10 @@ def _centred(points: Array) -> Array:
 
 
 def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:
-    """The similarity with the least squared distances: ``target ~ scale * R @ source + t``.
+    """The similarity ``target ~ scale * R @ source + t`` with the least sum of squared distances.
 
-    Umeyama 1991, equations 38-43. Collinear or coincident points leave the rotation (and, where
-    all sources coincide, the scale) undetermined: then one of the minimisers is returned, and
-    scale 1 for coincident sources.
+    Umeyama 1991, equations 38-43. Collinear points leave the rotation undetermined; one of the
+    minimisers is returned. If all source points coincide, the scale is 1.
 
     Args:
         source, target: (N, 3), N >= 1.

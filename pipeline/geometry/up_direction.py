@@ -1,4 +1,4 @@
-"""The direction that a scene's cameras together hold up."""
+"""Estimation of a scene's up direction from its cameras."""
 
 from __future__ import annotations
 
@@ -7,27 +7,28 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-# How much columns of pictures count beside their rows, where up is sought.
+# Weight of the images' columns relative to their rows.
 COLUMN_WEIGHT = 0.02
 
 
 def up_direction(
     rotations: NDArray[np.float64], orientations: Sequence[int]
 ) -> NDArray[np.float64]:
-    """(3,) unit vector of the world that the cameras together hold up.
+    """The scene's up direction as a (3,) unit vector in the world.
 
-    People tilt cameras up and down and roll them little, so up is what is perpendicular to the
-    rows of all pictures; as far as these leave it open (a camera that does not turn), what the
-    pictures' columns point to on average.
+    Photographers tilt cameras but rarely roll them, so up is the direction most perpendicular to
+    the rows of all images. If the rows leave it open (all cameras have the same heading), the mean
+    direction of the images' columns decides.
 
     Args:
         rotations: (N, 3, 3) world to camera.
-        orientations: the photographs' EXIF orientations, 1 to 8: a camera held upright has its
-            sensor's rows run down the photograph.
+        orientations: N EXIF orientations, 1 to 8. Poses refer to the stored pixels, so the rows
+            and columns of the upright image follow from the orientation.
 
-    Without cameras, or where they disagree entirely, it is -y: up for a camera at the identity.
+    Returns:
+        -y (up for a camera at the identity) without cameras, or if their directions cancel.
     """
-    # Where the picture's top is on the sensor. Source: EXIF 2.3, tag Orientation.
+    # Direction of the upright image's top on the sensor. Source: EXIF 2.3, tag Orientation.
     top = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}
     total, rows, ahead = np.zeros(3), np.zeros((3, 3)), np.zeros(3)
     for rotation, orientation in zip(rotations, orientations, strict=True):
@@ -38,7 +39,7 @@ def up_direction(
         rows += np.outer(row, row) / len(rotations)
         ahead += rotation[2]
     length = float(np.linalg.norm(total))
-    # Cameras that look straight down hold nothing up, but from above.
+    # The sign: cameras that look straight down are above the scene.
     upwards = total - 0.5 * ahead
     if length < 1e-6 or np.linalg.norm(upwards) < 1e-6:
         return np.array([0.0, -1.0, 0.0])

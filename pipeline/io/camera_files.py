@@ -1,4 +1,4 @@
-"""Cameras without photographs, from any file or folder that holds some."""
+"""Reading cameras without photographs from any supported file or folder."""
 
 from __future__ import annotations
 
@@ -17,11 +17,14 @@ STAGES_WITH_MODEL = ("train", "undistort", "sfm", "refine", "decode", "inspect")
 
 
 def read_cameras(path: Path) -> Reconstruction:
-    """The cameras in a COLMAP model's folder, in a scene or results folder that holds one
-    (``sparse/0``), or in a ``transforms.json``; no photograph is needed.
+    """Read cameras; photographs are not needed.
+
+    Args:
+        path: the folder of a COLMAP model, a scene's or results' folder with a model in
+            ``sparse/0``, or a ``transforms.json`` or its folder.
 
     Raises:
-        UserError: none found, or malformed.
+        UserError: no cameras found, or malformed files.
     """
     is_results = (path / "plan.json").is_file()
     roots = [path / name for name in STAGES_WITH_MODEL] if is_results else [path]
@@ -41,10 +44,13 @@ def read_cameras(path: Path) -> Reconstruction:
 
 
 def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[View]:
-    """The views of these names, with or without suffix.
+    """The views with these names, in this order; names may omit the suffix.
+
+    Args:
+        source: the file or folder that error messages name.
 
     Raises:
-        UserError: there is none of a name.
+        UserError: no view has one of the names.
     """
     by_name = {view.name: view for view in views}
     index = NameIndex(by_name)
@@ -56,14 +62,14 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
             raise UserError(
                 f"expected a view named {name!r}, found {len(views)} others ({some}, ...)",
                 file=source,
-                fix="name one of them",
+                fix="choose one of these names",
             )
         chosen.append(by_name[found])
     return chosen
 
 
 def _size(frame: Frame) -> tuple[int, int]:
-    """Pixels of a frame's picture: as the file says, else as its picture, if it is there, says."""
+    """Width and height in pixels from the frame's ``w`` and ``h``, else from its image file."""
     width, height = frame.fields.get("w"), frame.fields.get("h")
     if isinstance(width, int | float) and isinstance(height, int | float):
         return round(width), round(height)
@@ -73,7 +79,7 @@ def _size(frame: Frame) -> tuple[int, int]:
             facts = read_facts(picture)
             return facts.width, facts.height
     raise UserError(
-        f"{frame.source}: expected the picture's size (w and h) or the picture, found neither",
+        f"{frame.source}: expected the image's size (w and h) or the image, found neither",
         file=frame.file,
         fix="add w and h to the file, in pixels",
     )

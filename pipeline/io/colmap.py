@@ -1,8 +1,7 @@
-"""COLMAP sparse models, binary and text, read and written with numpy alone.
+"""Reading and writing COLMAP sparse models, binary and text, without COLMAP.
 
-Layouts: COLMAP's documentation, "Output Format". Only what a ``Reconstruction`` holds is kept:
-keypoints that no point uses, and rigs and frames, are dropped (every image keeps its own pose,
-which is what ``images.bin`` stores in all versions of the format).
+Layouts: COLMAP's documentation, "Output Format". Keypoints without a point, rigs and frames are
+not read: ``images.bin`` stores the pose of every image in all versions of the format.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ __all__ = ["has_model", "quat_to_rotation", "read_model", "rotation_to_quat", "w
 
 
 def has_model(folder: Path) -> bool:
-    """True where ``read_model`` would find a model to read."""
+    """Whether ``folder`` holds a COLMAP model."""
     return _suffix(folder) is not None
 
 
 def read_model(folder: Path) -> Reconstruction:
-    """Read ``cameras``, ``images`` and, where it exists, ``points3D`` from ``folder``.
+    """Read ``cameras``, ``images`` and, if it exists, ``points3D`` from ``folder``.
 
-    Binary files are preferred to text ones, as COLMAP does. Points come sorted by their id.
+    Binary files are preferred to text files, as in COLMAP. Points are sorted by id.
 
     Raises:
         UserError: no model, malformed or truncated files, unknown camera models, poses or
@@ -56,13 +55,13 @@ def read_model(folder: Path) -> Reconstruction:
 def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> None:
     """Write ``model`` as a COLMAP model; the same model gives the same bytes.
 
-    Points get the ids 1, 2, ... in their order; an image's keypoints are those of its tracks.
-    Observations at unknown pixels are left out, as the format cannot say "unknown". Files of
-    another model in ``folder`` are removed. COLMAP's own text reader ends an image's name at the
-    first space: write binary where names may hold one.
+    Points get the ids 1, 2, ... in their order; an image's keypoints are the observations of its
+    points. Observations with unknown pixels are omitted. Files of another model in ``folder`` are
+    removed. COLMAP's text reader ends an image name at the first space: use binary files for
+    names with spaces.
 
     Raises:
-        ValueError: an image name the format cannot hold.
+        ValueError: an image name that the format cannot hold.
     """
     form, suffix = (colmap_text, ".txt") if text else (colmap_binary, ".bin")
     keypoints, tracks = _index_tracks(model)
@@ -89,7 +88,7 @@ def _suffix(folder: Path) -> str | None:
 
 
 def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float64]]) -> Points:
-    """Sort by id and look the observations' pixels up."""
+    """The points sorted by id, with the pixels of their observations."""
     if not np.isfinite(table.xyz).all():
         bad = int(table.ids[~np.isfinite(table.xyz).all(1)][0])
         raise UserError(f"point {bad}: its position is not finite", file=file, fix=REMEDY)
@@ -101,7 +100,7 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
         seen = keypoints.get(int(number))
         if seen is None:
             raise UserError(
-                f"a track names image id {number}, which is not in the model",
+                f"a track refers to image id {number}, which is not in the model",
                 file=file,
                 fix=REMEDY,
             )
@@ -109,7 +108,7 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
         xy[known] = seen[table.index[known]]
     by_id = np.argsort(table.ids, kind="stable")
     if len(by_id) and np.any(np.diff(table.ids[by_id]) == 0):
-        raise UserError("a point id stands there twice", file=file, fix=REMEDY)
+        raise UserError("expected unique point ids, found one twice", file=file, fix=REMEDY)
     length = table.length[by_id]
     old_start = (np.cumsum(table.length) - table.length)[by_id]
     start = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
@@ -120,7 +119,7 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
 
 
 def _index_tracks(model: Reconstruction) -> tuple[Keypoints, Tracks]:
-    """For writing: the images' keypoints and the points' tracks into them."""
+    """The images' keypoints and, as indices of these, the points' tracks."""
     points = model.points
     rows = np.flatnonzero(np.isfinite(points.track_xy).all(axis=1))
     owner = np.repeat(np.arange(len(points)), points.track_length)[rows]

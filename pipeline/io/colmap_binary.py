@@ -1,4 +1,4 @@
-"""COLMAP's binary model files, from and to bytes."""
+"""COLMAP's binary model files: reading from files, encoding to bytes."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ from pipeline.io.colmap_records import (
     Tracks,
     add_image,
     make_camera,
-    make_posed,
+    make_image,
     unknown_model,
 )
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 _MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
 _POINT3D = np.dtype(
@@ -33,16 +33,17 @@ _TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])
 
 
 class _Reader:
-    """Little-endian values from a file's bytes; running out of them is a ``UserError``."""
+    """Reads little-endian values; a ``UserError`` if the file ends too early."""
 
     def __init__(self, file: Path):
         self.file, self.data, self.at = file, file.read_bytes(), 0
 
-    def take(self, layout: str) -> tuple[int | float, ...]:
+    def unpack(self, layout: str) -> tuple[int | float, ...]:
         start = self.skip(struct.calcsize("<" + layout))
         return struct.unpack_from("<" + layout, self.data, start)
 
     def skip(self, size: int) -> int:
+        """Advance by ``size`` bytes; returns the position before."""
         if size > len(self.data) - self.at:
             raise UserError(
                 f"the file ends too early: {len(self.data)} bytes, expected at least "
@@ -54,8 +55,8 @@ class _Reader:
         return self.at - size
 
     def count(self, smallest: int) -> int:
-        """A number of records of at least ``smallest`` bytes each, all still to come."""
-        number = int(self.take("Q")[0])
+        """The number of records that follow, of at least ``smallest`` bytes each."""
+        number = int(self.unpack("Q")[0])
         self.skip(number * smallest)
         self.at -= number * smallest
         return number
@@ -72,7 +73,7 @@ class _Reader:
                 f"an image name at byte {start} is not UTF-8", file=self.file, fix=REMEDY
             ) from None
 
-    def end(self) -> None:
+    def check_end(self) -> None:
         if self.at != len(self.data):
             raise UserError(
                 f"expected {self.at} bytes, found {len(self.data)}: not a COLMAP file, or damaged",
@@ -85,36 +86,36 @@ def read_cameras(file: Path) -> dict[int, Camera]:
     reader = _Reader(file)
     cameras: dict[int, Camera] = {}
     for _ in range(reader.count(48)):
-        number, kind, width, height = (int(v) for v in reader.take("IiQQ"))
+        number, kind, width, height = (int(v) for v in reader.unpack("IiQQ"))
         if kind not in _MODEL_NAMES:
             raise unknown_model(file, number, str(kind))
         name = _MODEL_NAMES[kind]
-        params = [float(v) for v in reader.take(f"{len(CAMERA_MODELS[name][1])}d")]
+        params = [float(v) for v in reader.unpack(f"{len(CAMERA_MODELS[name][1])}d")]
         cameras[number] = make_camera(file, number, name, width, height, params)
-    reader.end()
+    reader.check_end()
     return cameras
 
 
 def read_images(
     file: Path, cameras: dict[int, Camera]
-) -> tuple[dict[int, Posed], dict[int, NDArray[np.float64]]]:
+) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
     reader = _Reader(file)
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     for _ in range(reader.count(73)):
-        number, *pose, camera_id = reader.take("I7dI")
-        posed = make_posed(file, reader.name(), int(camera_id), list(pose[:4]), list(pose[4:]))
+        number, *pose, camera_id = reader.unpack("I7dI")
+        posed = make_image(file, reader.name(), int(camera_id), list(pose[:4]), list(pose[4:]))
         add_image(file, images, cameras, int(number), posed)
         count = reader.count(POINT2D.itemsize)
         start = reader.skip(count * POINT2D.itemsize)
         keypoints[int(number)] = np.frombuffer(reader.data, POINT2D, count, start)["xy"]
-    reader.end()
+    reader.check_end()
     return images, keypoints
 
 
 def read_points(file: Path) -> PointTable:
     reader = _Reader(file)
-    # Records differ in length by their tracks: find where each starts, then gather at once.
+    # Records differ in length because of their tracks: find the starts, then gather all at once.
     count = reader.count(_POINT3D.itemsize)
     starts = np.empty(count, np.int64)
     length_at, here, size = struct.Struct("<Q").unpack_from, reader.at, len(reader.data)
@@ -125,7 +126,7 @@ def read_points(file: Path) -> PointTable:
         if here > size:
             break
     reader.skip(here - reader.at)
-    reader.end()
+    reader.check_end()
     data = np.frombuffer(reader.data, np.uint8)
 
     def gather(at: NDArray[np.int64], dtype: np.dtype[np.void]) -> NDArray[np.void]:
@@ -177,7 +178,7 @@ def points_bytes(points: Points, tracks: Tracks) -> bytes:
     table["error"], table["length"] = points.error, tracks.length
     track = np.zeros(len(tracks.image), _TRACK)
     track["image"], track["index"] = tracks.image, tracks.index
-    # Each record is followed by its track: say for each byte of both where it goes.
+    # Each record is followed by its track: compute the position of every byte of both.
     before = np.cumsum(tracks.length) - tracks.length
     starts = np.arange(len(points)) * _POINT3D.itemsize + before * _TRACK.itemsize
     within = np.arange(len(track)) - np.repeat(before, tracks.length)

@@ -1,4 +1,4 @@
-"""What COLMAP's binary and text files share: records and their checks."""
+"""Records of COLMAP's model files, and checks, for the binary and the text format."""
 
 from __future__ import annotations
 
@@ -12,19 +12,19 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed
+from pipeline.scene.reconstruction import PosedImage
 
 REMEDY = "export the model again from COLMAP (binary or text), or set poses: ignore"
 POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
-"""A keypoint as binary files hold it."""
+"""A keypoint as in binary files."""
 Keypoints = dict[int, NDArray[np.void]]
-"""For writing: each image's keypoints (``POINT2D``), by image id."""
+"""Image id -> keypoints (``POINT2D``), for writing."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """For writing: length (P,) and, one after another, the tracks' image ids and keypoint indices
-    (M,)."""
+    """Tracks, for writing: lengths (P,), and image ids and keypoint indices of all tracks
+    concatenated (M,)."""
 
     length: NDArray[np.int64]
     image: NDArray[np.int64]
@@ -33,8 +33,8 @@ class Tracks:
 
 @dataclass(frozen=True)
 class PointTable:
-    """points3D as stored: ids (P,), xyz (P, 3), rgb (P, 3), error (P,), length (P,) and, one
-    after another, the tracks' image ids and keypoint indices (M,)."""
+    """points3D as stored: ids (P,), xyz (P, 3), rgb (P, 3), error (P,), track lengths (P,), and
+    image ids and keypoint indices of all tracks concatenated (M,)."""
 
     ids: NDArray[np.int64]
     xyz: NDArray[np.float64]
@@ -68,26 +68,27 @@ def make_camera(
     return camera
 
 
-def make_posed(
-    file: Path, name: str, camera_id: int, quat: list[float], shift: list[float]
-) -> Posed:
-    q, t = np.array(quat, np.float64), np.array(shift, np.float64)
+def make_image(
+    file: Path, name: str, camera_id: int, quat: list[float], translation: list[float]
+) -> PosedImage:
+    q, t = np.array(quat, np.float64), np.array(translation, np.float64)
     norm = math.hypot(*quat)
     if not (1e-12 < norm < 1e12) or not np.isfinite(t).all():
         raise UserError(
-            f"image {name}: expected a finite pose, found quaternion {quat}, translation {shift}",
+            f"image {name}: expected a finite pose, found quaternion {quat}, "
+            f"translation {translation}",
             file=file,
             fix=f"remove {name} from the model, or set poses: ignore",
         )
-    return Posed(name, camera_id, quat_to_rotation(q), t)
+    return PosedImage(name, camera_id, quat_to_rotation(q), t)
 
 
 def add_image(
     file: Path,
-    images: dict[int, Posed],
+    images: dict[int, PosedImage],
     cameras: dict[int, Camera],
     number: int,
-    image: Posed,
+    image: PosedImage,
 ) -> None:
     if image.camera_id not in cameras:
         raise UserError(
@@ -96,13 +97,13 @@ def add_image(
             fix=REMEDY,
         )
     if number in images:
-        raise UserError(f"image id {number} stands there twice", file=file, fix=REMEDY)
+        raise UserError(f"expected unique image ids, found {number} twice", file=file, fix=REMEDY)
     images[number] = image
 
 
 def unknown_model(file: Path, number: int, found: str) -> UserError:
     return UserError(
-        f"camera {number}: unknown camera model {found}; known are {', '.join(CAMERA_MODELS)}",
+        f"camera {number}: unknown camera model {found}; expected {', '.join(CAMERA_MODELS)}",
         file=file,
         fix="undistort in COLMAP first (colmap image_undistorter), or set poses: ignore",
     )

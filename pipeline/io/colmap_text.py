@@ -1,4 +1,4 @@
-"""COLMAP's text model files, from and to bytes."""
+"""COLMAP's text model files: reading from files, encoding to bytes."""
 
 from __future__ import annotations
 
@@ -18,15 +18,15 @@ from pipeline.io.colmap_records import (
     Tracks,
     add_image,
     make_camera,
-    make_posed,
+    make_image,
     unknown_model,
 )
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
-    """Numbered lines without comments; empty ones stay, they mean "no keypoints"."""
+    """Numbered lines without comments; an empty line is an image without keypoints."""
     try:
         text = file.read_bytes().decode()
     except UnicodeDecodeError as error:
@@ -37,7 +37,7 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
 
 
 def _fields(file: Path, number: int, line: str, types: list[Callable[[str], Any]]) -> list:
-    """The line's leading fields, converted; the last type takes the rest of the line."""
+    """The line's fields, converted; the last type gets the rest of the line."""
     words = line.split(None, len(types) - 1)
     if len(words) == len(types):
         try:
@@ -45,7 +45,9 @@ def _fields(file: Path, number: int, line: str, types: list[Callable[[str], Any]
         except (ValueError, OverflowError):
             pass
     raise UserError(
-        f"line {number}: not what a COLMAP {file.name} holds: {line[:80]!r}", file=file, fix=REMEDY
+        f"line {number}: expected a line of a COLMAP {file.name}, found {line[:80]!r}",
+        file=file,
+        fix=REMEDY,
     )
 
 
@@ -81,8 +83,8 @@ def read_cameras(file: Path) -> dict[int, Camera]:
 
 def read_images(
     file: Path, cameras: dict[int, Camera]
-) -> tuple[dict[int, Posed], dict[int, NDArray[np.float64]]]:
-    images: dict[int, Posed] = {}
+) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
+    images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     lines = _lines(file)
     types: list[Callable[[str], Any]] = [_id, *[float] * 7, _id, str.strip]
@@ -90,7 +92,7 @@ def read_images(
         if not line.strip():
             continue
         number, *pose, camera_id, name = _fields(file, line_number, line, types)
-        posed = make_posed(file, name, camera_id, pose[:4], pose[4:])
+        posed = make_image(file, name, camera_id, pose[:4], pose[4:])
         add_image(file, images, cameras, number, posed)
         line_number, line = next(lines, (line_number + 1, ""))
         try:
@@ -119,7 +121,8 @@ def read_points(file: Path) -> PointTable:
                 raise ValueError(line)
         except ValueError:
             raise UserError(
-                f"line {line_number}: not what a COLMAP points3D.txt holds: {line[:80]!r}",
+                f"line {line_number}: expected a line of a COLMAP points3D.txt, found "
+                f"{line[:80]!r}",
                 file=file,
                 fix=REMEDY,
             ) from None

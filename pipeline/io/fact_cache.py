@@ -1,4 +1,4 @@
-"""Facts about files, remembered as long as a file's size and times stay the same."""
+"""Cache of facts about files, valid as long as a file's size and times stay the same."""
 
 from __future__ import annotations
 
@@ -10,15 +10,15 @@ from typing import Any
 
 from pipeline.runtime.atomic import write_text
 
-# Raise it when what is remembered about a file changes.
+# Increase it whenever the cached facts change.
 _VERSION = 4
 
 
 class FactCache:
-    """JSON values by file and question. A cache that cannot be read or written is no error.
+    """JSON values by file and kind. A cache file that cannot be read or written is no error.
 
     Args:
-        path: the JSON file; None remembers nothing.
+        path: the JSON file; None: cache in memory only.
     """
 
     def __init__(self, path: Path | None):
@@ -34,19 +34,19 @@ class FactCache:
         except (OSError, ValueError, KeyError, TypeError):
             pass
 
-    def get(self, path: Path, question: str, answer: Callable[[], Any]) -> Any:
-        """``answer()``, or what it gave when the file was last as it is now."""
+    def get(self, path: Path, kind: str, compute: Callable[[], Any]) -> Any:
+        """``compute()``, or its cached value if the file's size and times have not changed."""
         status = os.stat(path)
-        # cp -p and rsync set the time of modification, but nobody can set the time of change.
+        # cp -p and rsync preserve the modification time, but nothing sets the change time.
         state = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
-        return self.remember(f"{question}:{path}", state, answer)
+        return self.get_for_state(f"{kind}:{path}", state, compute)
 
-    def remember(self, key: str, state: Any, answer: Callable[[], Any]) -> Any:
-        """``answer()``, or what it gave when ``state`` was last the same under ``key``."""
+    def get_for_state(self, key: str, state: Any, compute: Callable[[], Any]) -> Any:
+        """``compute()``, or its cached value if ``state`` equals the state cached with it."""
         entry = self._entries.get(key)
         if isinstance(entry, list) and len(entry) == 2 and entry[0] == state:
             return entry[1]
-        value = answer()
+        value = compute()
         self._entries[key] = [state, value]
         self._changed = True
         return value

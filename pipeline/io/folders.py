@@ -1,4 +1,4 @@
-"""Finding pictures in folders, and the masks and depth maps that belong to them."""
+"""Finding photographs in folders, and their masks and depth maps."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 
 from pipeline.io.names import PHOTO_SUFFIXES, PICTURE_SUFFIXES, UNREAD_SUFFIXES, suffix_of
 
-# Folders of a scene that hold pictures which are no photographs, or smaller copies of them.
+# Folders of a scene with images that are not photographs, also with a suffix such as "_2".
 COMPANION_FOLDERS = frozenset({"masks", "depths", "sparse", "sparse_gt", "colmap", "stereo"})
 _DEPTH_SUFFIXES = PICTURE_SUFFIXES | {".npy", ".npz", ".exr", ".pfm"}
 
@@ -20,10 +20,10 @@ class PhotoFolder:
 
     Attributes:
         path: relative to the scene folder, "." for itself.
-        base: the folder of full-size photographs that given poses speak of.
-        reason: why this one.
-        names: its pictures, relative to it, sorted.
-        masks: mask files that the pose file names, relative to the scene folder, by picture.
+        base: the folder that the given poses refer to: that of the full-size photographs.
+        reason: why this folder was chosen.
+        names: its photographs, relative to it, sorted.
+        masks: name -> mask file listed in the pose file, relative to the scene folder.
     """
 
     path: str
@@ -36,8 +36,8 @@ class PhotoFolder:
 def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) -> list[str]:
     """Names of the files with a photograph's suffix, relative to ``folder``, sorted.
 
-    Hidden files and folders, and subfolders of masks, depth maps and models, are passed over.
-    Pictures of a kind this program does not read add one warning for the folder.
+    Hidden files and folders, and subfolders of masks, depth maps and models, are ignored. Images
+    in formats that cannot be read add one warning.
     """
     names: list[str] = []
     unread: list[str] = []
@@ -49,14 +49,14 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
             for name in sorted(subfolders)
             if recursive and real not in seen and name[0] != "." and not _is_companion(name)
         ]
-        if real in seen:  # A link back to a folder above.
+        if real in seen:  # A symbolic link to a folder that was visited.
             continue
         seen.add(real)
         prefix = Path(where).relative_to(folder)
         for name in files:
-            if not _is_text(name):
+            if not _is_utf8(name):
                 shown = os.fsencode(name).decode(errors="replace")
-                warnings.append(f"{where}: {shown} is left out: its name is not UTF-8; rename it")
+                warnings.append(f"{where}: {shown} is not used: its name is not UTF-8; rename it")
                 continue
             suffix = suffix_of(name)
             if name[0] != "." and suffix in PHOTO_SUFFIXES:
@@ -66,14 +66,14 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
     if unread:
         kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
         warnings.append(
-            f"{folder}: {len(unread)} {kinds} pictures are left out (first: {min(unread)}): "
-            "convert them to JPEG or PNG, keeping their EXIF (HEIC is read where pillow-heif is "
+            f"{folder}: {len(unread)} {kinds} images are not used (first: {min(unread)}): "
+            "convert them to JPEG or PNG with their EXIF data (HEIC can be read if pillow-heif is "
             "installed)"
         )
     return sorted(names)
 
 
-def _is_text(name: str) -> bool:
+def _is_utf8(name: str) -> bool:
     try:
         name.encode()
     except UnicodeEncodeError:
@@ -91,9 +91,9 @@ def relative_folders(folder: Path) -> list[str]:
 
 
 def companions(folder: Path, candidates: Sequence[str], names: Sequence[str]) -> dict[str, Path]:
-    """Masks or depth maps by photograph, from the first of the ``candidates`` that exists.
+    """Photograph -> its mask or depth map, from the first folder of ``candidates`` that exists.
 
-    ``a/b.jpg`` has ``a/b.png`` (any suffix) or, as COLMAP has it, ``a/b.jpg.png``.
+    The file of ``a/b.jpg`` is ``a/b.png`` (any suffix) or, as in COLMAP, ``a/b.jpg.png``.
     """
     for candidate in candidates:
         root = folder / candidate

@@ -1,4 +1,5 @@
-"""``frame.json``: what files of Gaussians leave open: axes, unit, up, and how to render them."""
+"""``frame.json``: axes, unit, up direction and render settings of exported Gaussians, which their
+file formats do not store."""
 
 from __future__ import annotations
 
@@ -12,13 +13,13 @@ from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 
 AXES = (
-    "right-handed; the world of the cameras as COLMAP has it: a camera at the identity has x to "
-    "the right and y down in its picture, and looks along z"
+    "right-handed, COLMAP's convention: in a camera at the identity, x is right, y is down and z "
+    "is forward"
 )
-UNIT = "that of the camera poses, as they were given"
+UNIT = "that of the given camera poses"
 OTHER_AXES = {
-    "point_cloud.glb": "turned by 180 degrees about z (x and y negated): glTF is y up",
-    "transforms.json": "this world; the cameras' own axes are OpenGL's (x right, y up, z backward)",
+    "point_cloud.glb": "rotated by 180 degrees about z (x and y negated), because glTF is y up",
+    "transforms.json": "the same world; camera axes are OpenGL's (x right, y up, z backward)",
 }
 
 
@@ -33,33 +34,32 @@ def describe_frame(
     """The content of ``frame.json``.
 
     Args:
-        views: all cameras of the scene.
-        up: (3,) in the world.
-        render: background (RGB in [0, 1]), near plane (world unit), antialias: those that the
-            Gaussians are to be rendered with.
-        files: names of the exported files; those with other axes are named with them.
-        georeference: the content of the reconstruction's ``georeference.json``, None where the
-            poses were given.
+        views: all views of the scene.
+        up: (3,) up direction in the world.
+        render: the settings that the Gaussians must be rendered with: background (RGB in
+            [0, 1]), near plane (world units), antialias.
+        files: names of the exported files.
+        georeference: the content of ``georeference.json``, None if there is none.
     """
-    placed = georeference or {}
+    world = georeference or {}
     centres = np.stack([view.centre for view in views])
     return {
-        "axes": f"{AXES}; {placed['axes']}" if placed else AXES,
+        "axes": f"{AXES}; {world['axes']}" if world else AXES,
         "axes_of": {name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
         "up": np.round(up, 6).tolist(),
-        "unit": placed.get("unit", UNIT),
-        "georeference": {k: placed[k] for k in ("method", "origin", "projection") if k in placed},
+        "unit": world.get("unit", UNIT),
+        "georeference": {k: world[k] for k in ("method", "origin", "projection") if k in world},
         "cameras": {
             "count": len(views),
-            "centre": [_digits(value) for value in centres.mean(0)],
-            "extent": _digits(scene_extent(list(views))),
+            "centre": [_rounded(value) for value in centres.mean(0)],
+            "extent": _rounded(scene_extent(list(views))),
         },
         "gaussians": {"count": len(gaussians), "sh_degree": gaussians.sh_degree},
-        "colour": "display-ready sRGB: 0.5 + spherical harmonics, blended as it is",
+        "colour": "sRGB: 0.5 + spherical harmonics, blended without conversion to linear",
         "render": render,
     }
 
 
-def _digits(value: float) -> float:
-    """Seven significant ones: a unit may be of any size."""
+def _rounded(value: float) -> float:
+    """Seven significant digits."""
     return float(f"{value:.7g}")

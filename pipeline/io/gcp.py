@@ -1,8 +1,8 @@
 """Ground control points: OpenDroneMap's ``gcp_list.txt``.
 
-The first line names the projection, each other one is ``x y z px py image [name]``: the point's
-coordinates, where a photograph shows it (pixels of the stored grid, the first pixel's centre is
-0), and that photograph's name. Source: docs.opendronemap.org/gcp.
+The first line names the projection. Every other line is ``x y z px py image [name]``: the point's
+coordinates, its position in a photograph (stored pixels, the first pixel's centre is 0) and the
+photograph's name. Source: docs.opendronemap.org/gcp.
 """
 
 from __future__ import annotations
@@ -19,29 +19,33 @@ from pipeline.runtime.errors import UserError
 GCP_FILE = "gcp_list.txt"
 _FIX = (
     "write the projection on the first line (WGS84 UTM 32N, EPSG:32632 or a +proj string) and "
-    "'x y z px py image' on each other one"
+    "'x y z px py image' on every other line"
 )
 
 
 @dataclass(frozen=True)
 class GroundPoint:
-    """Attributes:
-    name: the file's, else "gcp1" and so on in the file's order.
-    place: x, y, z in the file's projection (longitude, latitude, height where ``geographic``).
-    seen: photograph's name -> pixel, COLMAP's convention (the first pixel's centre is 0.5).
+    """A ground control point.
+
+    Attributes:
+        name: from the file, else "gcp1" and so on in the file's order.
+        position: x, y, z in the file's projection (longitude, latitude, height if geographic).
+        pixels: photograph's name -> pixel, COLMAP's convention (the first pixel's centre is 0.5).
     """
 
     name: str
-    place: tuple[float, float, float]
-    seen: dict[str, tuple[float, float]]
+    position: tuple[float, float, float]
+    pixels: dict[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
 class GroundControl:
-    """Attributes:
-    projection: the file's first line.
-    geographic: coordinates are longitude and latitude in degrees, and metres.
-    unknown: names of photographs that are not in the scene.
+    """The content of a ``gcp_list.txt``.
+
+    Attributes:
+        projection: the file's first line.
+        geographic: whether coordinates are longitude and latitude in degrees, height in metres.
+        unknown: names of photographs that are not in the scene.
     """
 
     projection: str
@@ -51,10 +55,14 @@ class GroundControl:
 
 
 def read_ground_control(path: Path, photographs: Collection[str]) -> GroundControl:
-    """Read ``gcp_list.txt``; photographs are found by name, with or without folder and suffix.
+    """Read ``gcp_list.txt``.
+
+    Args:
+        photographs: names in the scene, which the file's names match with or without folder and
+            suffix.
 
     Raises:
-        UserError: unreadable, no projection, a malformed line.
+        UserError: the file is unreadable, has no projection or a malformed line.
     """
     try:
         lines = path.read_text(encoding="utf-8-sig").splitlines()
@@ -63,12 +71,12 @@ def read_ground_control(path: Path, photographs: Collection[str]) -> GroundContr
     rows = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
     rows = [(n, line) for n, line in rows if line and not line.startswith("#")]
     if not rows or not re.match(r"(WGS84|EPSG:\d+|\+proj)", rows[0][1], re.IGNORECASE):
-        raise UserError("its first line names no projection", file=path, fix=_FIX)
+        raise UserError("expected a projection on the first line", file=path, fix=_FIX)
     projection = rows[0][1]
     index = NameIndex(photographs)
-    plain = NameIndex({name.rsplit("/", 1)[-1]: name for name in photographs})
-    by_plain = {name.rsplit("/", 1)[-1]: name for name in photographs}
-    seen: dict[tuple[float, float, float], dict[str, tuple[float, float]]] = {}
+    by_file_name = {name.rsplit("/", 1)[-1]: name for name in photographs}
+    file_name_index = NameIndex(by_file_name)
+    pixels: dict[tuple[float, float, float], dict[str, tuple[float, float]]] = {}
     names: dict[tuple[float, float, float], str] = {}
     unknown = set()
     for number, line in rows[1:]:
@@ -81,15 +89,15 @@ def read_ground_control(path: Path, photographs: Collection[str]) -> GroundContr
         if not all(math.isfinite(value) for value in (x, y, z, px, py)):
             raise UserError(f"line {number} is not finite: {line}", file=path, fix=_FIX)
         found = index.find(image)
-        if found is None and (short := plain.find(image)) is not None:
-            found = by_plain[short]
+        if found is None and (file_name := file_name_index.find(image)) is not None:
+            found = by_file_name[file_name]
         if found is None:
             unknown.add(image)
             continue
-        place = (x, y, z)
-        # OpenDroneMap's pixel centres are whole numbers.
-        seen.setdefault(place, {})[found] = (px + 0.5, py + 0.5)
-        names.setdefault(place, fields[6] if len(fields) > 6 else f"gcp{len(names) + 1}")
-    points = tuple(GroundPoint(names[place], place, seen[place]) for place in seen)
+        position = (x, y, z)
+        # OpenDroneMap's pixel centres are integers.
+        pixels.setdefault(position, {})[found] = (px + 0.5, py + 0.5)
+        names.setdefault(position, fields[6] if len(fields) > 6 else f"gcp{len(names) + 1}")
+    points = tuple(GroundPoint(names[at], at, pixels[at]) for at in pixels)
     geographic = bool(re.search(r"EPSG:4326|EPSG:4979|\+proj=longlat", projection, re.IGNORECASE))
     return GroundControl(projection, geographic, points, tuple(sorted(unknown)))

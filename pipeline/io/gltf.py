@@ -1,8 +1,8 @@
-"""Binary glTF (.glb) with KHR_gaussian_splatting: Gaussians as a glTF scene's points.
+"""Binary glTF (.glb) with the extension KHR_gaussian_splatting: Gaussians as point primitives.
 
-Programs that do not know the extension show a coloured point cloud. glTF is y up with its front
-towards +z, so the PLY's frame (y down, z ahead) is turned by half a turn about z, as other
-programs do it. Source: github.com/KhronosGroup/glTF, KHR_gaussian_splatting, README.md.
+Programs without support for the extension show a coloured point cloud. glTF is y up with its front
+towards +z, so the PLY's frame (y down, z forward) is rotated by 180 degrees about z, as other
+programs do. Source: github.com/KhronosGroup/glTF, KHR_gaussian_splatting, README.md.
 """
 
 from __future__ import annotations
@@ -29,24 +29,24 @@ _TYPES = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _COEFFICIENTS = tuple(f"SH_DEGREE_{d}_COEF_{i}" for d in range(4) for i in range(2 * d + 1))
 _FIX = "write the file again as .glb without compression and without node transforms, or use a PLY"
-# Of a Gaussian: float positions and colour, everything else in bytes.
+# Lower bound on the bytes of a Gaussian: float32 position and colour, 8 bits for other values.
 _LEAST_BYTES = 32
-# Float32 opacities this near to 0 and 1 are read as if this far from them.
+# Opacities are clamped this far from 0 and 1, whose logits are infinite.
 _OPACITY_MARGIN = 1e-6
 
 
 def write_gltf(path: Path, gaussians: Gaussians) -> None:
-    """Write a .glb file, which appears whole or not at all.
+    """Write a .glb file atomically.
 
     Raises:
-        UserError: no Gaussians, or more than the format's 4 GiB hold.
+        UserError: no Gaussians, or more than the format's limit of 4 GiB.
     """
     count = len(gaussians)
     if not 0 < count * (192 + 48) < 2**32 - 2**20:
         raise UserError(
-            f"a .glb file holds 1 to 17 million Gaussians, these are {count}",
+            f"a .glb file can hold 1 to 17 million Gaussians, found {count}",
             file=path,
-            fix="leave out fewer, or more, faint ones (min_opacity)",
+            fix="change export.min_opacity to export more or fewer of the faint Gaussians",
         )
     means, log_scales, quats, logits, sh = half_turn(gaussians).arrays().values()
     opacity = sigmoid(logits)
@@ -116,24 +116,24 @@ def read_gltf(path: Path) -> Gaussians:
     """Read the Gaussians of all primitives of a .glb file, in the PLY's frame.
 
     Raises:
-        UserError: the file is missing, cut short, malformed, holds no Gaussians, or holds them
-            compressed or moved by nodes.
+        UserError: the file is missing, truncated or malformed, has no Gaussians, or has
+            compressed Gaussians or nodes with transforms.
     """
     data = read_file(path, "a .glb file")
     try:
         text, body = _chunks(data)
         document = _Document.model_validate_json(text)
-        if any(node.moves for node in document.nodes):
-            raise ValueError("expected Gaussians where they are, found nodes that move them")
+        if any(node.has_transform for node in document.nodes):
+            raise ValueError("expected nodes without transforms, found one with a transform")
         primitives = [p for mesh in document.meshes for p in mesh.primitives if p.is_splats]
         if not primitives:
             raise ValueError(f"expected Gaussians ({_NAME}), found none")
         parts: list[Gaussians] = []
         for primitive in primitives:
             parts.append(_gaussians(document, body, primitive.attributes))
-            # Primitives that share their numbers would make much of a small file.
+            # With shared accessors, a small file could expand to any number of Gaussians.
             if sum(map(len, parts)) * _LEAST_BYTES > len(body):
-                raise ValueError("expected each Gaussian once, found primitives that share them")
+                raise ValueError("expected each Gaussian once, found primitives that share data")
     except ValidationError as error:
         first = error.errors()[0]
         where = ".".join(str(part) for part in first["loc"])
@@ -169,10 +169,13 @@ class _Node(BaseModel):
     scale: list[float] = [1, 1, 1]
 
     @property
-    def moves(self) -> bool:
-        turned = self.rotation[:3] != [0, 0, 0]
-        placed = self.translation != [0, 0, 0] or self.scale != [1, 1, 1]
-        return placed or turned or self.matrix not in (None, np.eye(4).ravel().tolist())
+    def has_transform(self) -> bool:
+        return (
+            self.rotation[:3] != [0, 0, 0]
+            or self.translation != [0, 0, 0]
+            or self.scale != [1, 1, 1]
+            or self.matrix not in (None, np.eye(4).ravel().tolist())
+        )
 
 
 class _Primitive(BaseModel):
@@ -189,7 +192,7 @@ class _Mesh(BaseModel):
 
 
 class _Document(BaseModel):
-    """The parts of a glTF document that place Gaussians."""
+    """The parts of a glTF document that Gaussians depend on."""
 
     nodes: list[_Node] = []
     meshes: list[_Mesh] = []
@@ -231,7 +234,7 @@ def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]
     names = _COEFFICIENTS[: (degree + 1) ** 2]
     scale = column(f"{_NAME}:SCALE", 3)
     if scale.min() < 0:
-        log_scales = scale  # Drafts of the extension had logarithms.
+        log_scales = scale  # Drafts of the extension stored logarithms.
     else:
         with np.errstate(divide="ignore"):
             log_scales = np.log(scale)
@@ -248,7 +251,7 @@ def _gaussians(document: _Document, body: memoryview, attributes: dict[str, int]
 
 
 def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.float32]:
-    """(count, width) values of an accessor, integers normalised where it says so."""
+    """(count, width) values of an accessor; integers are normalised if it is ``normalized``."""
     if not 0 <= index < len(document.accessors):
         raise ValueError(f"expected accessor {index}, found none")
     accessor = document.accessors[index]
@@ -276,10 +279,10 @@ def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.flo
 
 
 def half_turn(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians turned by 180 degrees about z, twice what they were.
+    """The Gaussians rotated by 180 degrees about z; the inverse of itself.
 
-    x and y change their signs, and so does every harmonic of odd order, which is every
-    coefficient of odd index. Turning quaternions is a product with k.
+    x and y change sign, as do the harmonics of odd order, which are the coefficients of odd
+    index. Quaternions are multiplied by k.
     """
     signs = torch.ones(gaussians.sh.shape[1], 1)
     signs[1::2] = -1

@@ -1,7 +1,7 @@
-"""HEIC and HEIF pictures, which phones write, where the package ``pillow-heif`` is installed.
+"""HEIC and HEIF images, read if the package ``pillow-heif`` is installed.
 
-It turns pictures upright and to 8 bits as it decodes, so their stored pixel grid is the upright one
-for everything here; the EXIF orientation it reports is 1.
+pillow-heif applies the EXIF orientation and converts to 8 bits when it decodes; the decoded pixels
+count as the stored ones, with orientation 1.
 """
 
 from __future__ import annotations
@@ -17,13 +17,13 @@ HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 
 
 def installed() -> bool:
-    """Whether HEIF pictures can be read."""
+    """Whether HEIF images can be read."""
     return find_spec("pillow_heif") is not None
 
 
 def register() -> None:
-    """Let PIL open HEIF pictures; as often as one likes."""
-    import pillow_heif  # Only scenes with such pictures pay for it.
+    """Enable PIL to open HEIF images. Repeated calls have no effect."""
+    import pillow_heif  # Optional dependency.
 
     pillow_heif.register_heif_opener()
 

@@ -1,7 +1,7 @@
-"""``poses_bounds.npy`` of LLFF: one row of 17 numbers a photograph, sorted by name.
+"""``poses_bounds.npy`` of LLFF: one row of 17 numbers per photograph, sorted by name.
 
-A row is a 3x5 matrix (camera to world, then height, width and focal length in pixels) followed
-by the nearest and farthest depth. The matrix's axes are down, right, backward.
+A row is a 3x5 matrix (camera to world; the last column is height, width and focal length in
+pixels) followed by the nearest and farthest depth. The camera axes are down, right, backward.
 Source: the LLFF repository's README, "Using your own poses without running COLMAP".
 """
 
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 _FIX = "export the poses again with as many rows as photographs, or set poses: ignore"
 
@@ -27,15 +27,15 @@ def read_poses_bounds(
 
     Args:
         path: the ``.npy`` file.
-        names: the photographs, sorted as LLFF sorts them: row i is photograph i.
+        names: the photographs, sorted by name: row i belongs to photograph i.
 
     Returns:
         The reconstruction (SIMPLE_PINHOLE cameras of the file's size, no points) and (N, 2) near
         and far depths in world units.
 
     Raises:
-        UserError: not such a file, another number of rows, values that are not finite, no
-            rotation.
+        UserError: not a ``poses_bounds.npy``, another number of rows than photographs, values
+            that are not finite, a matrix that is not a rotation.
     """
     rows = read_rows(path)
     if len(rows) != len(names):
@@ -46,13 +46,15 @@ def read_poses_bounds(
         )
     cameras: dict[int, Camera] = {}
     numbers: dict[tuple, int] = {}
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     for i, name in enumerate(names):
         matrix = rows[i, :15].reshape(3, 5)
         down, right, backward, centre, (height, width, focal) = matrix.T
         rotation = np.stack([right, down, -backward])
         if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
-            raise UserError(f"row {i} ({name}): not a rotation", file=path, fix=_FIX)
+            raise UserError(
+                f"row {i} ({name}): expected a rotation, found another matrix", file=path, fix=_FIX
+            )
         if min(height, width) < 1 or focal <= 0:
             raise UserError(
                 f"row {i} ({name}): expected positive height, width and focal length, found "
@@ -63,15 +65,15 @@ def read_poses_bounds(
         camera_id = numbers.setdefault((width, height, focal), len(numbers) + 1)
         params = np.array([focal, width / 2, height / 2])
         cameras[camera_id] = Camera("SIMPLE_PINHOLE", round(width), round(height), params)
-        images[i + 1] = Posed(name, camera_id, rotation, -rotation @ centre)
+        images[i + 1] = PosedImage(name, camera_id, rotation, -rotation @ centre)
     return Reconstruction(cameras, images), rows[:, 15:]
 
 
 def read_rows(path: Path) -> NDArray[np.float64]:
-    """The file's (N, 17) numbers, checked to be finite.
+    """The file's (N, 17) finite numbers.
 
     Raises:
-        UserError: not such a file.
+        UserError: not a ``poses_bounds.npy``, or values that are not finite.
     """
     try:
         rows = np.load(path, allow_pickle=False)

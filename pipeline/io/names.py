@@ -1,4 +1,4 @@
-"""Photographs' file names: known kinds, and matching names that differ only in suffix."""
+"""File names of photographs: supported suffixes, and matching of names without suffix."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from pathlib import PurePosixPath
 from pipeline.io import heif
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
-# Camera makers' RAW formats that LibRaw reads.
+# RAW formats that LibRaw reads.
 RAW_SUFFIXES = frozenset(
     """
     .3fr .ari .arw .bay .cap .cr2 .cr3 .crw .dcr .dcs .dng .drf .eip .erf .fff .gpr .iiq .k25 .kdc
     .mdc .mef .mos .mrw .nef .nrw .orf .pef .ptx .raf .raw .rw2 .rwl .rwz .sr2 .srf .srw .x3f
     """.split()  # noqa: SIM905
 )
-# Pictures this program does not read; named in a warning.
 _HEIF = heif.HEIF_SUFFIXES if heif.installed() else frozenset[str]()
+# Image formats that cannot be read; they are reported in a warning.
 UNREAD_SUFFIXES = (heif.HEIF_SUFFIXES | {".avif", ".jxl", ".jp2", ".gif"}) - _HEIF
 PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES | _HEIF
 
@@ -27,9 +27,9 @@ def suffix_of(name: str) -> str:
 
 
 def stem_key(name: str) -> str:
-    """The name without folder prefix "./" and photograph's suffix, case folded.
+    """The name without a leading "./" and a photograph's suffix, in lower case.
 
-    Other dots stay: "./train/r_0.5" and "train/R_0.5.png" are the same photograph.
+    Only photographs' suffixes are removed: "./train/r_0.5" and "train/R_0.5.png" are equal.
     """
     path = PurePosixPath(name)
     stem = path.with_suffix("") if path.suffix.lower() in PHOTO_SUFFIXES else path
@@ -37,7 +37,7 @@ def stem_key(name: str) -> str:
 
 
 class NameIndex:
-    """Finds a photograph by its name, or else by the name without suffix."""
+    """Finds a photograph by its exact name, else by its name without suffix."""
 
     def __init__(self, names: Iterable[str]):
         self._exact = set(names)

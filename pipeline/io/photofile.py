@@ -1,4 +1,4 @@
-"""What a picture file says about itself: size, depth, EXIF; without decoding its pixels."""
+"""Metadata of image files: size, bit depth, EXIF; read without decoding all pixels."""
 
 from __future__ import annotations
 
@@ -19,22 +19,24 @@ from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 
-Image.MAX_IMAGE_PIXELS = None  # The user's own photographs: 200 megapixels are no attack.
+# PIL's limit protects servers from malicious files; large photographs are legitimate here.
+Image.MAX_IMAGE_PIXELS = None
 
 _BASE, _GPS, _IFD = ExifTags.Base, ExifTags.GPS, ExifTags.IFD
 FULL_FRAME_DIAGONAL_MM = 43.27
-# Focal lengths over the longer side: from a 180 degree lens to a 35 mm equivalent of 700 mm.
+# Accepted focal lengths divided by the longer side: from a 180 degree lens to a 35 mm equivalent
+# of 700 mm.
 _FOCAL_RANGE = (0.25, 20.0)
-# Difference of aspect ratios above which a picture counts as cropped; rounding stays below.
+# Relative difference of aspect ratios above which an image was cropped; rounding causes less.
 CROPPED = 0.02
-# Resized pictures often keep a focal plane resolution that is no longer true; beyond this it is
-# more likely wrong than a tele lens.
+# The same for focal lengths from the focal plane resolution, which programs often leave unchanged
+# when they resize an image.
 _FOCAL_PLANE_RANGE = (0.3, 4.0)
 _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
 class FileFacts(BaseModel):
-    """A picture file's own account of itself; see ``manifest.Photo`` for the fields."""
+    """Metadata of an image file; see ``manifest.Photo`` for the fields."""
 
     model_config = ConfigDict(frozen=True)
 
@@ -62,10 +64,10 @@ class FileFacts(BaseModel):
 
 
 def read_facts(path: Path) -> FileFacts:
-    """Look at a photograph's header, and at its alpha where it has one.
+    """Read a photograph's header and, if it has one, its alpha channel.
 
     Raises:
-        UserError: the file cannot be read, or is no picture of a kind this program reads.
+        UserError: the file cannot be read, or is not an image in a supported format.
     """
     try:
         digest = digest_of(path)
@@ -82,23 +84,23 @@ def read_facts(path: Path) -> FileFacts:
                 digest=digest,
                 width=width,
                 height=height,
-                alpha=_sees_through(image),
+                alpha=_has_transparency(image),
                 bits=_bits(image),
                 **_exif_facts(exif, width, height),
             )
     except OSError as error:
-        reason = error.strerror or "no picture header found"
+        reason = error.strerror or "no image header found"
     except (ValueError, SyntaxError, OverflowError) as error:
         reason = str(error)
     raise UserError(
         f"cannot be read as a photograph: {reason}",
         file=path,
-        fix="replace the file by a whole one, or remove it from the folder",
+        fix="replace the file by an intact copy, or remove it from the folder",
     )
 
 
 def _raw_facts(path: Path, digest: str) -> FileFacts:
-    import rawpy  # Only scenes with RAW files pay for it.
+    import rawpy  # Slow to import.
 
     try:
         with rawpy.imread(str(path)) as raw:
@@ -106,8 +108,8 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
             focal_mm, stamp = float(raw.other.focal_length), raw.other.timestamp
             lens = str(raw.lens.model).strip()
     except rawpy.LibRawError as error:
-        words = [a.decode() if isinstance(a, bytes) else str(a) for a in error.args]
-        raise ValueError(f"LibRaw says {' '.join(words)}") from None
+        details = [a.decode() if isinstance(a, bytes) else str(a) for a in error.args]
+        raise ValueError(f"LibRaw: {' '.join(details)}") from None
 
     def load() -> Image.Exif:
         exif = Image.Exif()
@@ -116,7 +118,7 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
         return exif
 
     facts = _exif_facts(_exif_of(load), width, height)
-    # Not every maker's format is a TIFF; LibRaw knows the rest.
+    # LibRaw also parses formats that are not TIFF, which PIL cannot.
     if facts["focal_mm"] is None and _plausible(focal_mm):
         facts["focal_mm"] = focal_mm
     if facts["taken"] is None and stamp.year > 1980:
@@ -125,18 +127,18 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
     return FileFacts(digest=digest, width=width, height=height, raw=True, bits=16, **facts)
 
 
-def _sees_through(image: Image.Image) -> bool:
-    """Whether a pixel is less than opaque: a channel for it alone says nothing."""
+def _has_transparency(image: Image.Image) -> bool:
+    """Whether any pixel is not opaque. Many files have an alpha channel that is 255 everywhere."""
     if "A" not in image.mode:
         return "transparency" in image.info
     try:
         return bool(np.asarray(image.getchannel("A")).min() < 255)
     except (OSError, SyntaxError, ValueError):
-        return True  # what reads the pixels will say what is wrong with them
+        return True  # Damaged pixels are reported when they are decoded.
 
 
 def _bits(image: Image.Image) -> int:
-    """Bits a channel as stored (PIL opens 16-bit RGB as 8-bit)."""
+    """Bits per channel as stored (PIL opens 16-bit RGB as 8-bit)."""
     tags = getattr(image, "tag_v2", None)
     if tags is not None:
         return int(max(tags.get(258, (8,))))
@@ -151,14 +153,14 @@ def _bits(image: Image.Image) -> int:
 
 @contextlib.contextmanager
 def _quiet() -> Iterator[None]:
-    """PIL warns of damaged EXIF; what is damaged is simply missing here."""
+    """Suppress PIL's warnings about damaged EXIF data, which is treated as missing."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
 
 
 def _header_exif(image: Image.Image) -> Image.Exif:
-    """EXIF before the pixels: PIL would decode a whole PNG to look for it behind them."""
+    """EXIF data stored before the pixels; PIL's ``getexif`` would decode a whole PNG."""
     if image.format != "PNG":
         return image.getexif()
     exif = Image.Exif()
@@ -167,10 +169,9 @@ def _header_exif(image: Image.Image) -> Image.Exif:
 
 
 def _exif_of(load: Any) -> Mapping[int, Any]:
-    """All tags, the EXIF and GPS folders' among them; what is damaged is missing."""
+    """All tags, with those of the Exif and GPS directories; damaged data is omitted."""
     tags: dict[int, Any] = {}
-    # A damaged EXIF block is no reason to lose the photograph, and PIL's readers raise nearly
-    # anything on one.
+    # PIL raises exceptions of many types on damaged EXIF data; the photograph is still usable.
     with contextlib.suppress(Exception), _quiet():
         exif = load()
         tags.update(exif)
@@ -195,11 +196,11 @@ def _exif_facts(tags: Mapping[int, Any], width: int, height: int) -> dict[str, A
 
 
 def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | None:
-    """Focal length in pixels of a ``width`` x ``height`` picture, or None if EXIF won't tell.
+    """Focal length in pixels at ``width`` x ``height``, or None if EXIF does not give it.
 
-    The 35 mm equivalent compares diagonals (CIPA DCG-001); else the focal length in mm over the
-    pixel pitch that FocalPlaneXResolution gives at the size EXIF says the picture had. A picture
-    of another shape than EXIF says was cropped since, and nobody knows by how much: None.
+    It follows from the 35 mm equivalent, which compares diagonals (CIPA DCG-001), else from the
+    focal length in mm and the pixel pitch (FocalPlaneXResolution) at the size stored in EXIF. If
+    the aspect ratio differs from EXIF's, the image was cropped by an unknown amount: None.
     """
     longer = max(width, height)
     taken_width = _float(tags.get(_BASE.ExifImageWidth))
@@ -229,7 +230,7 @@ def _plausible(value: float) -> bool:
 
 
 def _float(value: Any) -> float:
-    """A number, NaN where there is none."""
+    """``value`` as a float, NaN if it is not a number."""
     try:
         return float(value)
     except (TypeError, ValueError, ZeroDivisionError):
@@ -237,7 +238,8 @@ def _float(value: Any) -> float:
 
 
 def _body(make: str, model: str) -> str:
-    """Make and model, the make once: "NIKON CORPORATION", "NIKON D60" is a NIKON D60."""
+    """Make and model without repeating the make: "NIKON CORPORATION" and "NIKON D60" give
+    "NIKON D60"."""
     brand = make.split(" ")[0].casefold()
     return model if model.casefold().startswith(brand) else f"{make} {model}".strip()
 
@@ -263,7 +265,7 @@ def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
         if not isinstance(value, tuple | list) or len(value) != 3:
             return math.nan
         d, m, s = (_float(part) for part in value)
-        # Some writers leave the seconds 0/0.
+        # Some programs write 0/0 for the seconds.
         total = d + (m if math.isfinite(m) else 0.0) / 60 + (s if math.isfinite(s) else 0.0) / 3600
         return -total if _text(reference).upper().startswith(negative) else total
 

@@ -1,10 +1,10 @@
-"""PLY files: Gaussians in INRIA's layout, and coloured point clouds for mesh programs.
+"""PLY files: Gaussians in 3DGS's layout, and coloured point clouds for mesh programs.
 
-INRIA's layout is one ``vertex`` element of little-endian float32 properties: ``x y z nx ny nz
-f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``. Scales are natural logarithms, opacity is a
-logit, rotation is wxyz; ``f_rest`` goes channel by channel (all red coefficients of the higher
-bands, then green, then blue). Normals are zero. Other programs drop or reorder properties, so
-they are read by name.
+3DGS's layout (Kerbl et al. 2023, reference code) is one ``vertex`` element of little-endian float32
+properties: ``x y z nx ny nz f_dc_0..2 f_rest_0.. opacity scale_0..2 rot_0..3``. Scales are natural
+logarithms, opacity is a logit, rotation is wxyz; ``f_rest`` is ordered by channel (all red
+coefficients of the higher bands, then green, then blue). Normals are zero. Other programs omit or
+reorder properties, so they are read by name.
 """
 
 from __future__ import annotations
@@ -37,18 +37,15 @@ _TYPES = {
     **dict.fromkeys(("float", "float32"), "f4"),
     **dict.fromkeys(("double", "float64"), "f8"),
 }
-_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-# A header has under a hundred lines; a longer one is another kind of file.
+_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
+# Bytes. Headers have fewer than a hundred lines; a longer one belongs to another kind of file.
 _MAX_HEADER = 1 << 16
-_FIX = "write the file again, or get a whole copy of it"
+_FIX = "write the file again, or get an intact copy of it"
 
 
 def write_splat_ply(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians in INRIA's layout: 62 floats each at SH degree 3, fewer at lower ones.
-
-    Args:
-        path: appears whole or not at all.
-    """
+    """Write Gaussians in 3DGS's layout atomically: 62 floats each at SH degree 3, fewer at lower
+    degrees."""
     means, log_scales, quats, logits, sh = gaussians.arrays().values()
     count, bands = sh.shape[:2]
     rest = [f"f_rest_{i}" for i in range(3 * (bands - 1))]
@@ -72,19 +69,19 @@ def write_points_ply(
     rgb: NDArray[np.uint8],
     normals: NDArray[Any] | None = None,
 ) -> None:
-    """Write a coloured point cloud that mesh programs open: float32 positions (and normals),
+    """Write a coloured point cloud for mesh programs atomically: float32 positions (and normals),
     uchar red, green, blue.
 
     Args:
-        path: appears whole or not at all.
-        xyz, rgb: (P, 3). normals: (P, 3) or None.
+        xyz, rgb: (P, 3).
+        normals: (P, 3) or None.
     """
     columns = [("float", "f4", _POSITION, xyz)]
     if normals is not None:
         columns.append(("float", "f4", _NORMAL, normals))
     columns.append(("uchar", "u1", ("red", "green", "blue"), rgb))
     if any(np.shape(values) != (len(xyz), 3) for *_, values in columns):
-        raise ValueError(f"arrays that do not belong together: {[np.shape(c[3]) for c in columns]}")
+        raise ValueError(f"expected arrays of equal shape, got {[np.shape(c[3]) for c in columns]}")
     fields = [(n, f"<{code}") for _, code, names, _ in columns for n in names]
     table = np.zeros(len(xyz), np.dtype(fields))
     for _, _, names, values in columns:
@@ -101,12 +98,14 @@ def _write(path: Path, count: int, properties: list[tuple[str, str]], body: byte
 
 
 def read_splat_ply(path: Path) -> Gaussians:
-    """Read Gaussians by property name: any order, normals optional, SH degree 0 to 3, any
-    number type; binary of either byte order, or ASCII.
+    """Read Gaussians of SH degree 0 to 3 by property name.
+
+    Properties may be in any order and of any number type, normals are optional; the file may be
+    ASCII or binary with either byte order.
 
     Raises:
-        UserError: the file is missing, is no PLY of Gaussians, is cut short, or holds more than
-            its header says.
+        UserError: the file is missing, has no Gaussians, or is shorter or longer than its header
+            implies.
     """
     try:
         with open(path, "rb") as file:
@@ -151,12 +150,18 @@ def read_splat_ply(path: Path) -> Gaussians:
 
 @dataclass(frozen=True)
 class _Header:
-    """Its ``vertex`` element, which comes first: rows, type of each property, byte order
-    ("" for ASCII); and whether other elements follow."""
+    """The header of a PLY file whose first element is ``vertex``.
+
+    Attributes:
+        count: number of vertices.
+        fields: property name -> numpy type code.
+        byte_order: "<", ">", or "" for ASCII.
+        more: whether other elements follow.
+    """
 
     count: int
     fields: dict[str, str]
-    order: str
+    byte_order: str
     more: bool
 
 
@@ -175,15 +180,15 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
         if not line.endswith(b"\n") or size > _MAX_HEADER:
             raise _wrong(path, "expected a PLY header, found no end of it (end_header)")
         lines.append(line.decode("ascii", "replace").split())
-    order = None
+    byte_order = None
     elements: list[tuple[str, str]] = []
     fields: dict[str, str] = {}
     for words in lines[1:-1]:
         match words:
             case [] | ["comment" | "obj_info", *_]:
                 pass
-            case ["format", kind, "1.0"] if kind in _ORDERS:
-                order = _ORDERS[kind]
+            case ["format", kind, "1.0"] if kind in _BYTE_ORDERS:
+                byte_order = _BYTE_ORDERS[kind]
             case ["element", name, count]:
                 elements.append((name, count))
             case ["property", kind, name] if kind in _TYPES and elements:
@@ -195,18 +200,18 @@ def _read_header(file: BinaryIO, path: Path) -> _Header:
                 pass
             case _:
                 raise _wrong(path, f"expected a PLY header line, found {' '.join(words)[:80]!r}")
-    if order is None:
+    if byte_order is None:
         raise _wrong(path, "expected a format line in the PLY header, found none")
     if not elements or elements[0][0] != "vertex" or not elements[0][1].isdecimal():
         raise _wrong(path, "expected 'element vertex COUNT' as the first element, found none")
-    return _Header(int(elements[0][1]), fields, order, len(elements) > 1)
+    return _Header(int(elements[0][1]), fields, byte_order, len(elements) > 1)
 
 
 def _read_body(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray[Any]]:
     """(count,) values of each property."""
-    if not header.order:
+    if not header.byte_order:
         return _read_ascii(file, header, path)
-    dtype = np.dtype([(name, header.order + code) for name, code in header.fields.items()])
+    dtype = np.dtype([(name, header.byte_order + code) for name, code in header.fields.items()])
     start = file.tell()
     found, expected = file.seek(0, 2) - start, header.count * dtype.itemsize
     if found < expected or (found > expected and not header.more):

@@ -1,4 +1,4 @@
-"""Camera poses that come with the photographs: which files, and what they hold."""
+"""Finding and summarising the camera poses that a scene folder holds."""
 
 from __future__ import annotations
 
@@ -25,25 +25,31 @@ from pipeline.scene.reconstruction import Reconstruction
 _COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 _MODEL_FILES = [(stem, end) for stem in ("cameras", "images") for end in ("bin", "txt")]
 _LLFF_FILE = "poses_bounds.npy"
-# A camera of fewer photographs cannot carry more than a focal length and one radial term.
-SHARED_BY = 5
+# A camera with fewer images determines no more than a focal length and one radial coefficient.
+MIN_IMAGES_PER_CAMERA = 5
+
+
+PoseKind = Literal["colmap", "transforms", "llff"]
 
 
 class GivenPoses(BaseModel):
-    """Poses found in a scene folder.
+    """Summary of the poses in a scene folder.
 
-    ``path`` is relative to the scene folder: the model's folder, the json or npy file, or "."
-    for several transforms files. ``names`` are the photographs as the pose files name them
-    (empty for LLFF, which goes by order). ``models`` are the camera models in use; ``pinhole``
-    says that none of the cameras distorts. ``num_points`` counts sparse points, ``tracked`` the
-    points of the photograph that sees the fewest, where the pixels that it sees them at are known.
-    ``centred`` says that a camera of ``SHARED_BY`` photographs or more has its principal point
-    exactly in the middle, where programs put it that do not look for it.
+    Attributes:
+        path: relative to the scene folder: the model's folder, the json or npy file, or "." for
+            several transforms files.
+        names: photographs' names in the pose files; empty for LLFF, which goes by order.
+        models: camera models in use.
+        pinhole: whether no camera has lens distortion.
+        num_points: number of sparse points.
+        tracked: number of observations with known pixels in the image that has the fewest.
+        centred: whether a camera of ``MIN_IMAGES_PER_CAMERA`` or more images has its principal
+            point exactly at the image centre, as if it had not been estimated.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: Literal["colmap", "transforms", "llff"]
+    kind: PoseKind
     path: str
     names: tuple[str, ...]
     num_images: int
@@ -55,27 +61,28 @@ class GivenPoses(BaseModel):
 
 
 def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
-    """The poses a scene brings. A COLMAP model, which may hold points, goes before the others.
+    """The poses in a scene folder: a COLMAP model, else transforms, else LLFF; None without any.
 
     Raises:
         UserError: the pose files are malformed.
     """
     for path in _COLMAP_FOLDERS:
         if has_model(folder / path):
-            return _remembered(folder, "colmap", path, cache)
+            return _summary(folder, "colmap", path, cache)
     files = find_transforms(folder)
     if files:
         path = files[0].name if len(files) == 1 else "."
-        return _remembered(folder, "transforms", path, cache)
+        return _summary(folder, "transforms", path, cache)
     if (folder / _LLFF_FILE).is_file():
-        return _remembered(folder, "llff", _LLFF_FILE, cache)
+        return _summary(folder, "llff", _LLFF_FILE, cache)
     return None
 
 
-def half_models(folder: Path) -> list[str]:
-    """A warning for each COLMAP folder that holds cameras or images but not both."""
+def incomplete_models(folder: Path) -> list[str]:
+    """A warning for each COLMAP folder that has cameras or images but not both."""
     return [
-        f"{folder / path}: not used as poses: a COLMAP model needs both cameras and images"
+        f"{folder / path}: not used: expected a COLMAP model with cameras and images, found only "
+        "one of them"
         for path in _COLMAP_FOLDERS
         if not has_model(folder / path)
         and any((folder / path / f"{stem}.{end}").is_file() for stem, end in _MODEL_FILES)
@@ -83,7 +90,7 @@ def half_models(folder: Path) -> list[str]:
 
 
 def pose_files(path: Path) -> list[Path]:
-    """The files that poses at ``path`` (folder or file) are read from."""
+    """The files that the poses at ``path`` (folder or file) consist of."""
     if path.is_file():
         return [path]
     for suffix in (".bin", ".txt"):
@@ -94,15 +101,16 @@ def pose_files(path: Path) -> list[Path]:
 
 
 def truth_folder(folder: Path) -> Path | None:
-    """Ground truth poses to measure against, never an input."""
+    """The folder of ground truth poses, if any. They are for evaluation only, never an input."""
     truth = folder / "sparse_gt"
     return truth if has_model(truth) else None
 
 
 def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder | None:
-    """The photographs that transforms*.json lists and that exist; None where it lists none.
+    """The existing photographs that transforms*.json lists, or None if there are none.
 
-    Without ``warnings`` the poses are not wanted, so a malformed file counts as none.
+    Args:
+        warnings: None if the poses are not used; then a malformed file is no error.
     """
     if not find_transforms(folder) or (warnings is None and has_any_model(folder)):
         return None
@@ -139,15 +147,17 @@ def has_any_model(folder: Path) -> bool:
     return any(has_model(folder / path) for path in _COLMAP_FOLDERS)
 
 
-def _remembered(folder: Path, kind: str, path: str, cache: FactCache) -> GivenPoses:
-    """Reading a large model takes seconds: remember what it held by its files' contents."""
+def _summary(folder: Path, kind: str, path: str, cache: FactCache) -> GivenPoses:
+    """Summarise the poses; cached by the files' digests, because large models take seconds."""
     digests = [
         [file.name, cache.get(file, "digest", partial(digest_of, file))]
         for file in pose_files(folder / path)
     ]
     read = {"colmap": _colmap, "transforms": _transforms, "llff": _llff}[kind]
     key = f"poses:{folder / path}"
-    facts = cache.remember(key, digests, lambda: {"kind": kind, "path": path, **read(folder, path)})
+    facts = cache.get_for_state(
+        key, digests, lambda: {"kind": kind, "path": path, **read(folder, path)}
+    )
     return GivenPoses.model_validate(facts)
 
 
@@ -172,9 +182,9 @@ def _tracked(model: Reconstruction) -> int:
 
 
 def _shared(model: Reconstruction) -> list[int]:
-    """Ids of the cameras of ``SHARED_BY`` images or more."""
+    """Ids of the cameras with ``MIN_IMAGES_PER_CAMERA`` images or more."""
     used = Counter(image.camera_id for image in model.images.values())
-    return [number for number, count in used.items() if count >= SHARED_BY]
+    return [number for number, count in used.items() if count >= MIN_IMAGES_PER_CAMERA]
 
 
 def _is_centred(camera: Camera) -> bool:

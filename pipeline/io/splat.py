@@ -1,7 +1,8 @@
-""".splat files: 32 bytes a Gaussian and no header, what the first browser viewers load.
+""".splat files: 32 bytes per Gaussian without a header.
 
-Position and scale (linear) are float32, colour and opacity 8 bits each, rotation wxyz in steps of
-1/128. Higher spherical harmonics have no place. Source: github.com/antimatter15/splat, README.md.
+Position and linear scale are float32, colour and opacity 8 bits each, rotation wxyz in steps of
+1/128. Spherical harmonics above degree 0 are not stored. Source: github.com/antimatter15/splat,
+README.md.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ _ROW = np.dtype(
 
 
 def write_splat(path: Path, gaussians: Gaussians) -> None:
-    """Write a .splat file, which appears whole or not at all; colours outside [0, 1] are cut."""
+    """Write a .splat file atomically; colours are clamped to [0, 1]."""
     means, log_scales, quats, logits, sh = gaussians.arrays().values()
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     table = np.zeros(len(gaussians), _ROW)
@@ -37,20 +38,20 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
 def read_splat(path: Path) -> Gaussians:
     """Read a .splat file as Gaussians of SH degree 0.
 
-    The format has no header to check: other bytes are known by their number, or by values that
-    cannot be.
+    The format has no header, so only the file's size and the range of values can be checked.
 
     Raises:
-        UserError: the file is missing, is cut short, or holds something else.
+        UserError: the file is missing, has a size that is not a multiple of 32, or has values
+            that are not finite or negative scales.
     """
     data = read_file(path, "a .splat file")
-    fix = "write the file again, or get a whole copy of it"
+    fix = "write the file again, or get an intact copy of it"
     if len(data) % _ROW.itemsize:
-        what = f"expected {_ROW.itemsize} bytes for each Gaussian, found {len(data)} in all"
+        what = f"expected a multiple of {_ROW.itemsize} bytes, found {len(data)}"
         raise UserError(what, file=path, fix=fix)
     table = np.frombuffer(data, _ROW)
     if not np.isfinite(table["mean"]).all() or not (np.float64(table["scale"]) >= 0).all():
-        what = "expected a .splat file, found positions or scales that cannot be"
+        what = "expected a .splat file, found impossible positions or scales"
         raise UserError(what, file=path, fix=fix)
     with np.errstate(divide="ignore"):
         log_scales = np.log(table["scale"])

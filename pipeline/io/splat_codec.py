@@ -1,4 +1,4 @@
-"""What the file formats of Gaussians share: whole files in memory, and values as bytes."""
+"""Helpers for the file formats of Gaussians: reading files and encoding values in bytes."""
 
 from __future__ import annotations
 
@@ -12,10 +12,13 @@ from pipeline.runtime.errors import UserError
 
 
 def read_file(path: Path, kind: str) -> bytes:
-    """A file's bytes.
+    """The bytes of a file.
+
+    Args:
+        kind: what the error message expects ("an SPZ file").
 
     Raises:
-        UserError: it cannot be read; ``kind`` ("an SPZ file") says what was expected.
+        UserError: the file cannot be read.
     """
     try:
         return path.read_bytes()
@@ -28,7 +31,7 @@ def read_file(path: Path, kind: str) -> bytes:
 
 
 def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
-    """Rounded to whole numbers and cut to 0..255."""
+    """Round and clamp to 0..255."""
     return np.rint(values).clip(0, 255).astype(np.uint8)
 
 
@@ -38,12 +41,11 @@ def sigmoid(logits: NDArray[Any]) -> NDArray[np.float64]:
 
 
 def logit(opacities: NDArray[Any], margin: float) -> NDArray[np.float64]:
-    """The inverse of the sigmoid; opacities within ``margin`` of 0 and 1, whose logits are huge or
-    infinite, count as that far inside."""
+    """The inverse of the sigmoid, of opacities clamped to [``margin``, 1 - ``margin``]."""
     p = np.float64(opacities).clip(margin, 1 - margin)
     return np.log(p / (1 - p))
 
 
 def logit_of_byte(opacities: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """Logits of opacities in 255ths; 0 and 1 count as a quarter of a step inside."""
+    """Logits of opacities in 8 bits, clamped to a quarter of a step from 0 and 1."""
     return logit(opacities / 255, 0.25 / 255)

@@ -1,4 +1,4 @@
-"""Files of Gaussians by their suffix."""
+"""Reading and writing files of Gaussians; the suffix decides the format."""
 
 from __future__ import annotations
 
@@ -31,57 +31,56 @@ _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
 }
 T = TypeVar("T")
 SUFFIXES = tuple(_READERS)
-# Of infinite logarithms and logits: e^30 and e^-30 are as good as infinite and nothing.
-_HUGE = 30.0
+# Replaces infinite logarithms and logits by finite ones; exp(-30) is negligible.
+_LARGE = 30.0
 
 
 def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
-    """Read Gaussians from a file of any known format, ready to be rendered.
+    """Read Gaussians from a file in any supported format, ready for rendering.
 
-    Flat Gaussians (log scale minus infinity) and full opacity (logit infinity) are made finite.
-    Gaussians with values that are no numbers, or without a rotation, are left out and add a
-    warning.
+    Infinite log scales (flat Gaussians) and opacity logits (full opacity) are made finite.
+    Gaussians with NaN values or a zero quaternion are omitted with a warning.
 
     Raises:
-        UserError: an unknown suffix, a file that cannot be read, or nothing in it to render.
+        UserError: an unknown suffix, a file that cannot be read, or no valid Gaussians.
     """
     gaussians = _by_suffix(_READERS, path)(path)
-    tamed = {
-        name: tensor.nan_to_num(nan=torch.nan, posinf=_HUGE, neginf=-_HUGE)
+    finite = {
+        name: tensor.nan_to_num(nan=torch.nan, posinf=_LARGE, neginf=-_LARGE)
         for name, tensor in gaussians.tensors().items()
         if name in ("log_scales", "opacity_logits")
     }
-    gaussians = Gaussians(**(gaussians.tensors() | tamed))
-    whole = (gaussians.quats != 0).any(1)
+    gaussians = Gaussians(**(gaussians.tensors() | finite))
+    valid = (gaussians.quats != 0).any(1)
     for tensor in gaussians.tensors().values():
-        whole &= tensor.flatten(1).isfinite().all(1) if tensor.ndim > 1 else tensor.isfinite()
-    if not whole.any():
+        valid &= tensor.flatten(1).isfinite().all(1) if tensor.ndim > 1 else tensor.isfinite()
+    if not valid.any():
         raise UserError(
             f"expected Gaussians, found none that can be rendered (of {len(gaussians)})",
             file=path,
             fix="export the model again",
         )
-    if not whole.all():
-        left_out = int((~whole).sum())
+    if not valid.all():
+        omitted = int((~valid).sum())
         warnings.append(
-            f"{path}: {left_out} of {len(whole)} Gaussians hold values that are no numbers, or no "
-            "rotation; they are left out"
+            f"{path}: {omitted} of {len(valid)} Gaussians have values that are not finite or a "
+            "zero quaternion, and are left out"
         )
-        gaussians = gaussians.select(whole)
+        gaussians = gaussians.select(valid)
     return gaussians
 
 
 def write_gaussians(path: Path, gaussians: Gaussians) -> None:
-    """Write Gaussians in the format that the suffix names; the file appears whole or not at all.
+    """Write Gaussians atomically, in the format of the suffix.
 
     Raises:
-        UserError: an unknown suffix, or Gaussians the format cannot hold.
+        UserError: an unknown suffix, or Gaussians that the format cannot hold.
     """
     _by_suffix(_WRITERS, path)(path, gaussians)
 
 
 def check_suffix(path: Path) -> None:
-    """Raise a ``UserError`` where ``path`` has no suffix of a known format."""
+    """Raise a ``UserError`` if ``path`` has no suffix of a supported format."""
     _by_suffix(_WRITERS, path)
 
 

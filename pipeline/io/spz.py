@@ -1,9 +1,9 @@
-"""SPZ files, Niantic's compressed Gaussians: a fraction of a PLY, and what browser viewers load.
+"""SPZ files: Niantic's compressed format for Gaussians.
 
-One gzip stream: a header of 16 bytes, then one section an attribute, all Gaussians in each.
-Coordinates are written unconverted, in the PLY's frame, as programs that turn PLY into SPZ do.
-Source of the layout: github.com/nianticlabs/spz, README.md. docs/reference/formats.md states what
-quantisation leaves.
+One gzip stream: a header of 16 bytes, then one section per attribute with the values of all
+Gaussians. Coordinates are in the PLY's frame, as in programs that convert PLY to SPZ. Source of
+the layout: github.com/nianticlabs/spz, README.md. Quantisation errors:
+docs/reference/formats.md.
 """
 
 from __future__ import annotations
@@ -24,34 +24,35 @@ from pipeline.splats.gaussians import Gaussians
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, 0
 _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
-# Bytes of the DC coefficient a unit: less than a colour's, so that they reach beyond [0, 1].
+# Quantisation steps per unit of the DC coefficient, as in Niantic's encoder; 8 bits then cover
+# colours beyond [0, 1].
 _DC_STEPS = 0.15 * 255
-# Higher coefficients keep all 8 bits. With 5 and 4, as other encoders have it, renders agree with
-# the unquantised Gaussians' at 35 to 39 dB instead of 53 to 57, for half of the bytes.
-_HIGHER = (0, 3, 8, 15, 24)  # SH coefficients above DC by degree; ours end at 3
-# Positions have 24 bits; more of them than this behind the point tell nothing.
+# SH coefficients above DC by degree; ours end at 3. They are written with all 8 bits, where other
+# encoders keep 5 or 4 to compress better.
+_HIGHER = (0, 3, 8, 15, 24)
+# Positions have 24 bits, of which at most so many are fractional.
 _MAX_FRACTION_BITS = 20
-# Gaussians farther than this many times the usual distance are strays: they are drawn nearer, so
-# that the rest keeps its resolution.
-_FAR = 512.0
-# Of sizes: a byte, in sixteenths.
+# Gaussians farther from the origin than this many median distances are outliers: they are moved
+# nearer, so that the other positions keep their resolution.
+_OUTLIER_DISTANCE = 512.0
+# The range of log scales: 8 bits in steps of 1/16.
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
-_QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller parts lie within 1 / sqrt(2).
-# Niantic's own reader refuses more.
+_QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller components are at most 1 / sqrt(2).
+# The limit of Niantic's reader.
 MAX_GAUSSIANS = 10_000_000
-_FIX = "write the file again as SPZ version 3, or get a whole copy of it"
+_FIX = "write the file again as SPZ version 3, or get an intact copy of it"
 
 
 def write_spz(path: Path, gaussians: Gaussians, *, antialias: bool = False) -> None:
-    """Write ``encode_spz`` to a file that appears whole or not at all."""
+    """Write an SPZ file atomically; see ``encode_spz``."""
     write_bytes(path, encode_spz(gaussians, antialias=antialias))
 
 
 def read_spz(path: Path) -> Gaussians:
-    """Read a file by ``decode_spz``.
+    """Read an SPZ file; see ``decode_spz``.
 
     Raises:
-        UserError: also where it cannot be read.
+        UserError: the file cannot be read or is not a valid SPZ file.
     """
     return decode_spz(read_file(path, "an SPZ file"), file=path)
 
@@ -60,17 +61,17 @@ def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
     """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
 
     Args:
-        antialias: the Gaussians were trained with Mip-Splatting's opacity compensation, and
-            viewers should render them so.
+        antialias: whether the Gaussians were trained with Mip-Splatting's opacity compensation,
+            with which viewers should render them.
 
     Raises:
-        UserError: more Gaussians than readers of the format take.
+        UserError: more than ``MAX_GAUSSIANS``.
     """
     count = len(gaussians)
     if count > MAX_GAUSSIANS:
         raise UserError(
-            f"an SPZ file holds up to {MAX_GAUSSIANS} Gaussians, these are {count}",
-            fix="leave faint ones out (min_opacity), or write a PLY",
+            f"an SPZ file can hold up to {MAX_GAUSSIANS} Gaussians, found {count}",
+            fix="export fewer of the faint Gaussians (export.min_opacity), or write a PLY",
         )
     means, log_scales, quats, logits, sh = (
         array.astype(np.float64) for array in gaussians.arrays().values()
@@ -89,9 +90,9 @@ def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
     return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
 
 
-def unfit(gaussians: Gaussians) -> int:
-    """How many Gaussians SPZ cannot hold in this unit: larger or smaller than its range of sizes,
-    or smaller than half a step of its places."""
+def count_out_of_range(gaussians: Gaussians) -> int:
+    """The number of Gaussians whose largest scale is outside SPZ's range, or smaller than half a
+    quantisation step of the positions."""
     means, log_scales = (a.astype(np.float64) for a in list(gaussians.arrays().values())[:2])
     bits, shrink = _grid(means)
     longest = log_scales.max(axis=1, initial=-np.inf) + np.log(shrink[:, 0])
@@ -100,16 +101,16 @@ def unfit(gaussians: Gaussians) -> int:
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
-    """The Gaussians in the bytes of an SPZ file, version 2 or 3, axes unconverted.
+    """The Gaussians in the bytes of an SPZ file, version 2 or 3, in the file's axes.
 
-    SH degree 4 is cut to 3, and extensions are passed over. Opacities of exactly 0 and 1, whose
-    logits are infinite, are read a quarter of a step inside.
+    SH degree 4 is reduced to 3, and extensions are ignored. Opacities of exactly 0 and 1, whose
+    logits are infinite, are clamped by a quarter of a quantisation step.
 
     Args:
-        file: named in errors.
+        file: for error messages.
 
     Raises:
-        UserError: no SPZ file, of another version, cut short, or not what its header says.
+        UserError: not an SPZ file, another version, truncated, or inconsistent with its header.
     """
 
     def wrong(what: str) -> UserError:
@@ -124,7 +125,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
             raise wrong(f"expected an SPZ header of {_HEADER.size} bytes, found {len(head)}")
         magic, version, count, degree, bits, flags, _ = _HEADER.unpack(head)
         if magic != _MAGIC:
-            raise wrong("expected an SPZ file, found gzip of something else")
+            raise wrong("expected an SPZ file, found another gzip file")
         if version not in (2, 3):
             raise wrong(f"expected SPZ version 2 or 3, found version {version}")
         if count > MAX_GAUSSIANS or degree >= len(_HIGHER) or bits > 24:
@@ -135,7 +136,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
         higher = _HIGHER[degree]
         widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * higher)
         expected = count * sum(widths)
-        # One byte more than expected: no more memory than the header asks for, whatever follows.
+        # At most one byte more than expected, so that a malicious file cannot exhaust the memory.
         body = stream.decompress(stream.unconsumed_tail, expected + 1)
     except zlib.error as error:
         raise wrong(f"expected an SPZ file (gzip), could not read it: {error}") from None
@@ -145,7 +146,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
         if len(body) > expected:
             raise wrong(f"expected {expected} bytes of {count} Gaussians, found more")
         if not stream.eof:  # The checksum is at the end.
-            raise wrong("expected a whole gzip stream, found its end missing")
+            raise wrong("expected a complete gzip stream, found one without its end")
 
     table = np.frombuffer(body, np.uint8, expected)
     ends = count * np.cumsum(widths)
@@ -159,7 +160,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
     arrays = {
         "means": _unpack_positions(fixed) * 2.0**-bits,
         "log_scales": scales / 16.0 - 10,
-        "quats": _unpack_three(quats) if version == 2 else _unpack_quats(quats),
+        "quats": _unpack_quats_v2(quats) if version == 2 else _unpack_quats(quats),
         "opacity_logits": logit_of_byte(alphas[:, 0]),
         "sh": sh,
     }
@@ -167,32 +168,34 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
 
 
 def _grid(means: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
-    """Bits behind the point, as many as leave room for the scene; and (N, 1) what each Gaussian
-    is shrunk by towards the origin, 1 but for strays. Mean and size shrink alike, so that a stray
-    looks the same from the origin."""
+    """The fixed-point format of the positions: the number of fractional bits, as many as the
+    scene's size allows; and (N, 1) factors of positions and scales, 1 except for outliers. Scaling
+    both leaves an outlier's appearance from the origin unchanged."""
     distance = np.abs(means).max(axis=1, initial=0.0)
-    reach = min(distance.max(initial=0.0), _FAR * float(np.median(distance))) if len(means) else 0.0
-    whole = int(np.ceil(np.log2(reach))) if reach > 0 else 0
-    bits = int(np.clip(23 - whole, 0, _MAX_FRACTION_BITS))
+    reach = 0.0
+    if len(means):
+        reach = min(distance.max(), _OUTLIER_DISTANCE * float(np.median(distance)))
+    integer_bits = int(np.ceil(np.log2(reach))) if reach > 0 else 0
+    bits = int(np.clip(23 - integer_bits, 0, _MAX_FRACTION_BITS))
     limit = (2**23 - 1) * 2.0**-bits
     return bits, (limit / np.maximum(distance, limit))[:, None]
 
 
 def _unpack_positions(fixed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """(N, 9) bytes to (N, 3) integers of 24 bits, signed."""
+    """(N, 9) bytes to (N, 3) signed 24-bit integers."""
     padded = np.zeros((len(fixed), 3, 4), np.uint8)
     padded[:, :, 1:] = fixed.reshape(-1, 3, 3)
     return (padded.view("<i4")[:, :, 0] >> 8).astype(np.float64)
 
 
 def _pack_quats(quats: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """(N, 4) wxyz to (N, 4) bytes: 2 bits name the largest part, of the other three (in the order
-    xyzw, from the top) a sign bit and 9 bits of magnitude each follow."""
+    """(N, 4) wxyz to (N, 4) bytes: 2 bits with the index of the largest component, then a sign bit
+    and 9 bits of magnitude for each of the other three (in the order xyzw, highest bits first)."""
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     q = np.where(norm > 0, quats / np.where(norm > 0, norm, 1), (1.0, 0, 0, 0))[:, [1, 2, 3, 0]]
     largest = np.abs(q).argmax(1)
     rows = np.arange(len(q))
-    # q and -q are one rotation: the part left out is taken as positive.
+    # q and -q are the same rotation: the omitted component is made positive.
     q = np.where(q[rows, largest, None] < 0, -q, q)
     magnitude = np.rint(np.abs(q) * _QUAT_STEPS).clip(0, 511).astype(np.uint32)
     code = magnitude | ((q < 0).astype(np.uint32) << np.uint32(9))
@@ -216,8 +219,8 @@ def _unpack_quats(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
     return q[:, [3, 0, 1, 2]]
 
 
-def _unpack_three(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
-    """(N, 3) bytes of xyz, as version 2 has them, to (N, 4) wxyz."""
+def _unpack_quats_v2(packed: NDArray[np.uint8]) -> NDArray[np.float64]:
+    """(N, 3) bytes of xyz (SPZ version 2) to (N, 4) wxyz."""
     xyz = packed / 127.5 - 1
     w = np.sqrt(np.maximum(0, 1 - (xyz * xyz).sum(1, keepdims=True)))
     return np.concatenate([w, xyz], 1)

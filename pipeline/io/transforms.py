@@ -1,9 +1,8 @@
-"""``transforms.json``: cameras as instant-ngp, nerfstudio and the NeRF-synthetic scenes keep them.
+"""``transforms.json``: the camera format of instant-ngp, nerfstudio and NeRF-synthetic.
 
-``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z backward); turning y
-and z over gives COLMAP's. nerfstudio may have moved the world by ``applied_transform`` and
-scaled it by ``applied_scale`` after COLMAP; both are undone, so that poses are in the world the
-camera solver worked in. Source: nerfstudio's documentation, "Data conventions".
+``transform_matrix`` is camera to world with OpenGL axes (x right, y up, z backward); negating y
+and z gives COLMAP's. nerfstudio may have transformed COLMAP's world by ``applied_transform`` and
+``applied_scale``; both are undone. Source: nerfstudio's documentation, "Data conventions".
 """
 
 from __future__ import annotations
@@ -24,27 +23,28 @@ from pipeline.geometry.cameras import Camera
 from pipeline.io.names import NameIndex
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import View
 
 SPLITS = ("train", "test", "val")
 _FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FIX = "correct the file, export it again, or set poses: ignore"
-# Largest deviation from a rotation that printing with few digits explains.
+# Matrices printed with few digits deviate this much from a rotation.
 _ROTATION_TOLERANCE = 1e-2
 
 
 @dataclass(frozen=True)
 class Frame:
-    """One frame as written.
+    """A frame of the file.
 
     Attributes:
-        path: relative to the folder of the json, often without suffix.
+        path: photograph, relative to the folder of the json, often without suffix.
         mask: likewise, or None.
         rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
-        fields: the frame's and the file's intrinsics, the frame's winning.
-        source: "FILE: frames[i]", for messages.
+        fields: the file's fields, overridden by the frame's.
+        file: the json.
+        source: "frames[i] (PATH)", for messages.
     """
 
     path: str
@@ -57,7 +57,7 @@ class Frame:
 
 
 def find_transforms(folder: Path) -> list[Path]:
-    """The pose files of a scene: transforms.json, else those of the splits; may be empty."""
+    """The pose files of a scene: transforms.json, else transforms_{train,test,val}.json."""
     single = folder / "transforms.json"
     if single.is_file():
         return [single]
@@ -66,10 +66,10 @@ def find_transforms(folder: Path) -> list[Path]:
 
 
 def read_frames(path: Path) -> list[Frame]:
-    """All frames of a scene folder's (or one file's) transforms, each path once.
+    """All frames of a file or of the files in a scene folder, each photograph once.
 
     Raises:
-        UserError: no or malformed JSON, missing fields, matrices that are not finite poses.
+        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses.
     """
     files = [path] if path.is_file() else find_transforms(path)
     if not files:
@@ -85,11 +85,10 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     """Poses of the frames whose photographs exist.
 
     Args:
-        path: a scene folder or one file.
-        sizes: width and height of each photograph by its path relative to the folder of the
-            json. Frames of other photographs are left out; a suffix missing in the file, or
-            another than the photograph's, does not matter. Where the file does not say what
-            size its intrinsics are for, they are for the photograph's.
+        path: a scene folder or a file.
+        sizes: photograph (relative to the folder of the json) -> width and height. Frames of
+            other photographs are omitted; suffixes may differ. The sizes are those of the
+            intrinsics if the file has no ``w`` and ``h``.
 
     Returns:
         Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
@@ -100,31 +99,30 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     index = NameIndex(sizes)
     cameras: dict[tuple, int] = {}
     by_id: dict[int, Camera] = {}
-    images: dict[int, Posed] = {}
+    images: dict[int, PosedImage] = {}
     found = {name: frame for frame in read_frames(path) if (name := index.find(frame.path))}
     for number, (name, frame) in enumerate(sorted(found.items()), 1):
         camera = _camera(frame, *sizes[name])
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         camera_id = cameras.setdefault(key, len(cameras) + 1)
         by_id[camera_id] = camera
-        images[number] = Posed(name, camera_id, frame.rotation, frame.translation)
+        images[number] = PosedImage(name, camera_id, frame.rotation, frame.translation)
     return Reconstruction(by_id, images)
 
 
 def write_transforms(
     path: Path, views: Sequence[View], folder: Path, *, points: str | None = None
 ) -> None:
-    """Write pinhole cameras as nerfstudio and instant-ngp read them, held-out views as test and
-    validation; ``read_transforms`` reads the same poses and intrinsics back.
+    """Write pinhole cameras for nerfstudio and instant-ngp atomically; test views become both
+    test and validation views.
 
     Args:
-        path: the json; it appears whole or not at all.
-        folder: where the json will be in the end; pictures are named relative to it.
-        points: a point cloud to start from, relative to ``folder``.
+        folder: the json's final folder, to which paths of photographs are relative.
+        points: the initial point cloud, relative to ``folder``.
     """
 
     def relative(file: str) -> str:
-        # Folders that are links are resolved: ".." leads out of what they point to.
+        # Symbolic links are resolved, because ".." refers to the parent of their target.
         parent, name = os.path.split(file)
         inside = os.path.relpath(os.path.realpath(parent), os.path.realpath(folder))
         return (Path(inside) / name).as_posix()
@@ -139,7 +137,7 @@ def write_transforms(
             {"file_path": relative(view.image), "transform_matrix": to_world.tolist()}
             | ({"mask_path": relative(view.mask)} if view.mask else {})
         )
-        # OPENCV without distortion is a pinhole that every reader knows.
+        # OPENCV with zero distortion: the pinhole camera that all readers support.
         intrinsics.append(
             {"camera_model": "OPENCV", "w": view.width, "h": view.height}
             | {"fl_x": view.fx, "fl_y": view.fy, "cx": view.cx, "cy": view.cy}
@@ -151,19 +149,23 @@ def write_transforms(
     else:
         for frame, entry in zip(frames, intrinsics, strict=True):
             frame |= entry
-    held_out = [f["file_path"] for f, view in zip(frames, views, strict=True) if view.is_test]
-    if held_out:
+    test_files = [f["file_path"] for f, view in zip(frames, views, strict=True) if view.is_test]
+    if test_files:
         content["train_filenames"] = [
             f["file_path"] for f, view in zip(frames, views, strict=True) if not view.is_test
         ]
-        content["val_filenames"] = content["test_filenames"] = held_out
+        content["val_filenames"] = content["test_filenames"] = test_files
     if points is not None:
         content["ply_file_path"] = points
     write_json(path, content)
 
 
 def frame_camera_model(frame: Frame) -> str:
-    """The COLMAP camera model the frame's intrinsics need."""
+    """The COLMAP camera model of the frame's intrinsics.
+
+    Raises:
+        UserError: a ``camera_model`` that is not supported.
+    """
     names = frame.fields
     model = str(names.get("camera_model", "")).upper()
     if model == "OPENCV_FISHEYE" or names.get("is_fisheye"):
@@ -198,13 +200,13 @@ def _frames_of(file: Path) -> list[Frame]:
     listed = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(listed, list):
         raise UserError("expected an object with a list 'frames'", file=file, fix=_FIX)
-    moved = _applied_transform(file, content)
+    applied = _applied_transform(file, content)
     shared = {key: value for key, value in content.items() if key != "frames"}
-    return [_frame(file, i, entry, shared, moved) for i, entry in enumerate(listed)]
+    return [_frame(file, i, entry, shared, applied) for i, entry in enumerate(listed)]
 
 
 def _frame(
-    file: Path, i: int, entry: Any, shared: Mapping[str, Any], moved: NDArray[np.float64]
+    file: Path, i: int, entry: Any, shared: Mapping[str, Any], applied: NDArray[np.float64]
 ) -> Frame:
     source = f"frames[{i}]"
     path = entry.get("file_path") if isinstance(entry, dict) else None
@@ -212,19 +214,19 @@ def _frame(
         raise UserError(f"{source}.file_path: expected a file name", file=file, fix=_FIX)
     source = f"{source} ({path})"
     matrix = _matrix(file, f"{source}.transform_matrix", entry.get("transform_matrix"))
-    scale = np.cbrt(max(np.linalg.det(moved[:3, :3]), 1e-300))
-    to_world = np.linalg.inv(moved) @ matrix
-    # Of the inverse of a similarity only its turn may touch the camera's axes.
+    scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
+    to_world = np.linalg.inv(applied) @ matrix
+    # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
     axes = to_world[:3, :3] * scale
     u, _, vt = np.linalg.svd(axes)
-    turn = u @ vt
-    if np.abs(turn - axes).max() > _ROTATION_TOLERANCE or np.linalg.det(turn) < 0:
+    nearest = u @ vt
+    if np.abs(nearest - axes).max() > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
         raise UserError(
             f"{source}.transform_matrix: its upper left 3x3 part is not a rotation",
             file=file,
             fix=_FIX,
         )
-    rotation = _FLIP_YZ @ turn.T
+    rotation = _FLIP_YZ @ nearest.T
     mask = entry.get("mask_path")
     return Frame(
         path=_relative(file, path),
@@ -238,8 +240,8 @@ def _frame(
 
 
 def _relative(file: Path, path: str) -> str:
-    """``path`` relative to the folder of ``file``, "./" and "x/.." taken out; absolute, or
-    beginning with "..", only where it leads outside."""
+    """``path`` normalised and relative to the folder of ``file``; absolute or with leading ".."
+    only if it is outside of that folder."""
     plain = posixpath.normpath(path.replace("\\", "/"))
     if not posixpath.isabs(plain):
         return plain
@@ -248,7 +250,7 @@ def _relative(file: Path, path: str) -> str:
 
 
 def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
-    """A finite 4x4 (or 3x4, completed) matrix."""
+    """``value`` as a finite 4x4 matrix; a 3x4 matrix gets the last row of the identity."""
     try:
         matrix = np.array(value, np.float64)
     except (TypeError, ValueError, OverflowError):
@@ -263,23 +265,23 @@ def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
 
 
 def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.float64]:
-    """(4, 4) similarity that took the solver's world to the file's."""
-    moved = np.eye(4)
+    """(4, 4) similarity from COLMAP's world to the file's."""
+    applied = np.eye(4)
     if "applied_transform" in content:
-        moved = _matrix(file, "applied_transform", content["applied_transform"])
+        applied = _matrix(file, "applied_transform", content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
     if not _is_number(scale) or scale <= 0:
         raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
-    moved[:3] *= scale
-    # A volume: a millionth of the axes' cube is flat, whatever their unit.
-    size = float(np.abs(moved[:3, :3]).max())
-    if not np.linalg.det(moved[:3, :3]) > 1e-6 * size**3:
+    applied[:3] *= scale
+    # The determinant is a volume, so it is compared with the axes' length cubed.
+    size = float(np.abs(applied[:3, :3]).max())
+    if not np.linalg.det(applied[:3, :3]) > 1e-6 * size**3:
         raise UserError("applied_transform: expected a similarity", file=file, fix=_FIX)
-    return moved
+    return applied
 
 
 def _is_number(value: Any) -> bool:
-    """A finite number; JSON's integers may be larger than any float."""
+    """Whether ``value`` is a finite number; integers in JSON may exceed the range of floats."""
     if isinstance(value, bool) or not isinstance(value, int | float):
         return False
     return abs(value) < 1e300  # False for NaN.
@@ -297,7 +299,7 @@ def _number(frame: Frame, name: str, default: float) -> float:
 
 
 def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
-    """The frame's camera, of the photograph's size where it does not give its own."""
+    """The frame's camera, with the photograph's size if the frame has none."""
     width = round(_number(frame, "w", photo_width))
     height = round(_number(frame, "h", photo_height))
     if width <= 0 or height <= 0:
@@ -325,7 +327,7 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
 
 
 def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:
-    """Focal length in pixels from itself or from the field of view in radians."""
+    """Focal length in pixels from field ``length`` or from field of view ``angle`` in radians."""
     if length in frame.fields:
         focal = _number(frame, length, 0.0)
         if focal <= 0:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import schema
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import fold_radius, normalised, pixels
+from pipeline.geometry.distortion import fold_radius, project, unproject
 from pipeline.io.colmap import write_model
 from pipeline.io.recorded import digest_of
 from pipeline.photos.load import (
@@ -30,7 +30,7 @@ from pipeline.photos.naming import rename
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import view_size
 
 # Number of rows of the undistortion map that are computed at a time.
@@ -158,7 +158,7 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
     )
     extents = []  # pixels from the principal point to the left, right, top and bottom
     for border, axis, focal, distorted in sides:
-        undistorted = normalised(camera, border)[:, axis] * focal
+        undistorted = unproject(camera, border)[:, axis] * focal
         finite = undistorted[np.isfinite(undistorted)]
         inner = finite.min(initial=np.inf)
         outer = finite.max(initial=-np.inf) if len(finite) == len(undistorted) else np.inf
@@ -203,7 +203,7 @@ def _lens(source: Camera, blank_pixels: float, max_long_side: int) -> _Lens:
         part = slice(start, min(start + BATCH_ROWS, size[1]))
         rows = (np.arange(part.start, part.stop) + 0.5 - cy) / fy
         points = np.stack(np.meshgrid(columns, rows), axis=-1)
-        xy = pixels(source, points)
+        xy = project(source, points)
         inside = (xy >= 0) & (xy <= (source.width, source.height))
         valid[part] = inside.all(axis=-1) & (np.hypot(*np.moveaxis(points, -1, 0)) < fold)
         map_x[part], map_y[part] = xy[..., 0] - 0.5, xy[..., 1] - 0.5
@@ -351,7 +351,7 @@ def _undistorted_model(
 ) -> Reconstruction:
     """The model with pinhole cameras, new names and undistorted observations."""
     images = {
-        number: Posed(names[i.name], camera_of[i.name], i.rotation, i.translation)
+        number: PosedImage(names[i.name], camera_of[i.name], i.rotation, i.translation)
         for number, i in model.images.items()
         if i.name in names
     }
@@ -363,7 +363,7 @@ def _undistorted_model(
     for number, image in images.items():
         own = order[slice(*np.searchsorted(ids, [number, number + 1], sorter=order))]
         target = cameras[image.camera_id]
-        new = pixels(target, normalised(model.cameras[model.images[number].camera_id], xy[own]))
+        new = project(target, unproject(model.cameras[model.images[number].camera_id], xy[own]))
         outside = np.any(~((new >= 0) & (new <= (target.width, target.height))), axis=1)
         new[outside] = np.nan
         xy[own] = new

@@ -1,1 +1,1 @@
-"""What a folder of photographs holds, and which stages and budgets it needs."""
+"""The scan of a scene folder and the plan: stages, settled options, budgets."""

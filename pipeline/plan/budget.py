@@ -1,4 +1,4 @@
-"""How many Gaussians a scene gets, and what memory training them takes: settled by the plan."""
+"""The number of Gaussians and the memory of training, as settled by the plan."""
 
 from __future__ import annotations
 
@@ -10,32 +10,35 @@ from pipeline.plan.training_memory import gaussians_in, memory_mb
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import view_size
 
-# Of a view. Twice as many give bonsai 0.5 dB in the steps of the default, at 1.3 times the time,
-# and twice as many again 0.3 dB in 9000 steps: for those who say how long they will wait.
-PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_BY_CLOCK = 2.0, 0.5
-# Fewer Gaussians than this make no picture; and each wants to be seen in so many pixels of all
-# photographs together, or it learns single pictures by heart.
+# Pixels of a view per Gaussian, for training by steps and with a time budget. Fewer pixels improve
+# quality but cost time; a time budget limits the time by itself.
+PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET = 2.0, 0.5
+# Lower bound on the budget, and training pixels of all photographs per Gaussian: fewer overfit.
 MIN_GAUSSIANS = 20_000
-PIXELS_SEEN_PER_GAUSSIAN = 40
-# And each wants its share of a run by the clock: fox in one minute on two cores, 28.9 dB with
-# 205 000, 30.9 dB with 50 000; on faster ones, views kept back, 33.1 with 100 000 and 33.9 with
-# 50 000. Where that are too many for the machine at hand, training sees it
-# (``training.loop.step_time_estimator``).
-GAUSSIANS_A_MINUTE = 50_000
+TRAINING_PIXELS_PER_GAUSSIAN = 40
+# More Gaussians do not converge within a time budget. Training lowers the number further on slow
+# machines (``training.loop.step_time_estimator``).
+GAUSSIANS_PER_MINUTE = 50_000
 
 
 def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
-    """How many Gaussians the scene gets: as many as its pictures can tell apart and its minutes
-    can train."""
+    """The maximum number of Gaussians, and the sentence that gives the reason.
+
+    The smallest of the bounds by the size of a view, by the training pixels, by
+    ``train.budget_minutes``, by ``train.memory_mb`` and ``density.max_gaussians``.
+
+    Raises:
+        UserError: ``train.memory_mb`` is too small.
+    """
     density = config.train.density
     width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
     minutes, pixels = config.train.budget_minutes, density.pixels_per_gaussian
     if pixels == "auto":
-        pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_BY_CLOCK
+        pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET
     by_view = width * height / pixels
-    by_scene = width * height * len(scan.photos) / PIXELS_SEEN_PER_GAUSSIAN
-    by_clock = math.inf if minutes is None else GAUSSIANS_A_MINUTE * minutes
-    wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_clock)))
+    by_scene = width * height * len(scan.photos) / TRAINING_PIXELS_PER_GAUSSIAN
+    by_time = math.inf if minutes is None else GAUSSIANS_PER_MINUTE * minutes
+    wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_time)))
     if density.strategy == "original" and density.pixels_per_gaussian == "auto":
         wanted = density.max_gaussians
     limited = _by_memory(config, min(wanted, density.max_gaussians))
@@ -43,19 +46,19 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
         return limited
     if wanted >= density.max_gaussians:
         return density.max_gaussians, f"at most {density.max_gaussians} Gaussians, as configured"
-    why = f"one for {pixels:g} px of a view"
+    why = f"one per {pixels:g} pixels of a view"
     if by_scene < by_view:
-        why = f"one for each {PIXELS_SEEN_PER_GAUSSIAN} pixels of these few photographs"
-    if by_clock < min(by_view, by_scene):
-        why = f"{GAUSSIANS_A_MINUTE} for each of {minutes:g} minutes"
+        why = f"one per {TRAINING_PIXELS_PER_GAUSSIAN} pixels of all photographs"
+    if by_time < min(by_view, by_scene):
+        why = f"{GAUSSIANS_PER_MINUTE} per minute of {minutes:g} minutes"
     if wanted == MIN_GAUSSIANS:
-        why = "the least"
+        why = "the minimum"
     return wanted, f"at most {wanted} Gaussians: {why}"
 
 
 def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:
-    """What ``train.memory_mb`` leaves of the Gaussians wanted; None: all. Pictures that do not fit
-    beside them are read from disk, so they take nothing here."""
+    """The number of Gaussians that fit into ``train.memory_mb`` and the reason; None if ``wanted``
+    fit. Photographs count nothing, since those that do not fit are read from disk."""
     limit = config.train.memory_mb
     if limit is None or memory_mb(0, wanted) <= limit:
         return None
@@ -63,17 +66,17 @@ def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:
     if budget < min(MIN_GAUSSIANS, wanted):
         least = memory_mb(0, min(MIN_GAUSSIANS, wanted))
         raise UserError(
-            f"train.memory_mb: {limit} MB are too few to train in; at least {least} are needed",
-            fix="raise train.memory_mb, or leave it out",
+            f"train.memory_mb: {limit} MB is not enough for training; at least {least} are needed",
+            fix="increase or remove train.memory_mb",
         )
-    return budget, f"at most {budget} Gaussians: what {limit} MB of memory hold"
+    return budget, f"at most {budget} Gaussians: as many as fit into {limit} MB of memory"
 
 
 def training_memory_mb(scan: Scan, config: Config) -> int:
-    """What training takes at most, roughly: ``memory_mb`` of the scene's views and its budget, of
-    which a given ``train.memory_mb`` has the pictures read from disk."""
-    taken = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
-    return min(taken, config.train.memory_mb or taken)
+    """Estimated peak memory of training in MB, at most ``train.memory_mb``: photographs that do
+    not fit are read from disk."""
+    needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
+    return min(needed, config.train.memory_mb or needed)
 
 
 def _pixels(scan: Scan, config: Config) -> int:
@@ -82,29 +85,29 @@ def _pixels(scan: Scan, config: Config) -> int:
 
 
 def resolution_line(scan: Scan, config: Config) -> str:
-    """What the plan says of the size of the views."""
+    """The plan's sentence about the size of the views."""
     (width, height), *others = scan.sizes
     cap = config.views.max_long_side_px
     small_width, small_height = view_size(width, height, cap)
     share = small_width / width
-    text = f"views of {small_width}x{small_height} pixels, {share:.3g} of the photographs"
+    text = f"views of {small_width}x{small_height} pixels, {share:.3g} times the photographs' size"
     if (small_width, small_height) == (width, height):
-        text = f"views of {width}x{height} pixels, as photographed"
+        text = f"views of {width}x{height} pixels, the photographs' size"
     if others:
-        text += f" (the commonest of {len(others) + 1} sizes; none above {cap} px)"
+        text += f" (the most frequent of {len(others) + 1} sizes; all at most {cap} px)"
     return text
 
 
 def length_line(config: Config) -> str:
-    """What the plan says of the length of training."""
+    """The plan's sentence about the length of training."""
     minutes = config.train.budget_minutes
     return f"{config.train.steps} steps" if minutes is None else f"{minutes:g} minutes"
 
 
 def memory_line(scan: Scan, config: Config) -> str:
-    """What the plan says of ``training_memory_mb``."""
+    """The plan's sentence about ``training_memory_mb``."""
     limit = config.train.memory_mb
-    taken = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
-    if limit is None or taken <= limit:
-        return f"about {taken / 1000:.1f} GB of memory"
-    return f"{limit / 1000:.1f} GB of memory, as configured: pictures are read from disk"
+    needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
+    if limit is None or needed <= limit:
+        return f"about {needed / 1000:.1f} GB of memory"
+    return f"{limit / 1000:.1f} GB of memory, as configured: photographs are read from disk"

@@ -1,4 +1,4 @@
-"""The key of a stage: it changes exactly where the stage's result may."""
+"""The key of a stage, which changes whenever the stage's result may change."""
 
 from __future__ import annotations
 
@@ -12,18 +12,18 @@ from pipeline.plan.stage import StageSpec
 from pipeline.runtime.record import canonical
 from pipeline.runtime.source import stage_source_hash
 
-# Asked again for every run of a batch.
+# Computed once for all runs of a batch.
 _version = cache(version)
 _source_hash = cache(stage_source_hash)
 
 
 def stage_key(spec: StageSpec, plan: Plan) -> str:
-    """The stage's key as one canonical JSON string.
+    """The stage's key as a canonical JSON string.
 
-    Snakemake compares parameters as a set of ``repr(value)``, so only a single canonical string
-    notices every change. The key holds the declared options as the plan settled them, a hash of the
-    code that the stage can reach, the versions of the declared packages, the seed where the stage
-    draws, and the declared facts. Time, memory, threads and hosts are in no key.
+    The key consists of the declared options as settled by the plan, a hash of the code that the
+    stage can reach, the versions of the declared packages, the seed if the stage is seeded, and the
+    declared facts. Time, memory, threads and hosts are not part of it. It is a single string
+    because Snakemake compares parameters as a set of ``repr(value)``, which would miss changes.
     """
     key: dict[str, Any] = {
         "stage": spec.name,

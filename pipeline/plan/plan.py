@@ -1,7 +1,7 @@
-"""What a scene needs and what it does not.
+"""The plan of a scene: which stages run, why, and with which settings.
 
-``make_plan`` is pure: the same scan, config and stages give the same plan. Snakemake's jobs are the
-stages that run; their settings are ``Plan.config``.
+``make_plan`` is pure: the same scan, config and stages give the same plan. Each stage that runs is
+a job of Snakemake; ``Plan.config`` are its settings.
 """
 
 from __future__ import annotations
@@ -19,15 +19,19 @@ from pipeline.plan.settle import gps_extent_m, settle
 from pipeline.plan.stage import StagePlan, StageSpec
 from pipeline.scene.views import view_size
 
-# A plan is for people, and travels on a command line.
-FACTS_SHOWN = 20
+# Limits the length of lists in the plan, which is passed on command lines.
+MAX_LISTED = 20
 
 
 class Plan(BaseModel):
-    """A scene's stages in the order of the DAG, its settled config and what they rest on.
+    """The plan of a scene.
 
     Attributes:
-        folder: the scene's, as seen from the working directory.
+        scene: name of the scene or run.
+        stages: name -> plan of the stage, in the order of the DAG.
+        config: the settled options.
+        facts: facts about the scene that the plan depends on.
+        folder: the scene folder, relative to the working directory or absolute.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -46,8 +50,7 @@ class Plan(BaseModel):
 def make_plan(
     scan: Scan, config: Config, stages: Mapping[str, StageSpec], folder: str = ""
 ) -> Plan:
-    """Decide which of ``stages`` the scene needs. ``Plan.config`` has no "auto" left that can be
-    settled now.
+    """Decide which of ``stages`` a scene needs, and settle its options.
 
     Raises:
         UserError: see ``settle``.
@@ -61,7 +64,7 @@ def make_plan(
     return Plan(
         scene=scan.manifest.scene,
         stages=decided,
-        warnings=_some(scan.warnings),
+        warnings=_shortened(scan.warnings),
         config=settled.config,
         facts=_facts(scan, settled.config),
         folder=folder,
@@ -69,7 +72,7 @@ def make_plan(
 
 
 def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:
-    """Role -> the stage that fills it, for a scene with this plan."""
+    """Role of the stage's input -> the stage that provides it, according to the plan."""
     return _upstream(spec, {name for name, stage in plan.stages.items() if stage.run})
 
 
@@ -81,8 +84,8 @@ def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
 
 
 def public_plan(plan: Plan) -> dict[str, Any]:
-    """The content of ``plan.json``: every stage with run or skip, the reasons, the stages that it
-    reads, facts, warnings; and ``order``, the stages in the order of the DAG."""
+    """The content of ``plan.json``: for every stage whether it runs, why and what it reads; facts;
+    warnings; and ``order``, the stages in the order of the DAG."""
     shown = plan.model_dump(mode="json", exclude={"config", "folder"})
     return shown | {"order": list(plan.stages)}
 
@@ -98,17 +101,18 @@ def describe(plan: Plan) -> str:
     return "\n".join(lines)
 
 
-def _some(warnings: Sequence[str]) -> list[str]:
-    """The first warnings, and how many more there are; the inspect stage keeps them all."""
-    rest = len(warnings) - FACTS_SHOWN
-    return [*warnings[:FACTS_SHOWN], *([f"and {rest} more like these"] if rest > 0 else [])]
+def _shortened(warnings: Sequence[str]) -> list[str]:
+    """The first warnings and the number of further ones; the inspect stage reports all."""
+    rest = len(warnings) - MAX_LISTED
+    further = [f"and {rest} further warnings"] if rest > 0 else []
+    return [*warnings[:MAX_LISTED], *further]
 
 
-def _commonest(counts: Counter[str]) -> dict[str, int]:
-    """The commonest and their counts; the rest together."""
+def _most_frequent(counts: Counter[str]) -> dict[str, int]:
+    """The most frequent values with their counts; "others" counts the rest."""
     ordered = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
-    rest = sum(count for _, count in ordered[FACTS_SHOWN:])
-    return dict(ordered[:FACTS_SHOWN]) | ({"others": rest} if rest else {})
+    rest = sum(count for _, count in ordered[MAX_LISTED:])
+    return dict(ordered[:MAX_LISTED]) | ({"others": rest} if rest else {})
 
 
 def _facts(scan: Scan, config: Config) -> dict[str, Any]:
@@ -128,8 +132,8 @@ def _facts(scan: Scan, config: Config) -> dict[str, Any]:
         "focal_priors": scan.num_focal,
         "turned_by_exif": sum(photo.orientation != 1 for photo in photos),
         "bits": max(photo.bits for photo in photos),
-        "sizes": _commonest(sizes),
-        "camera_groups": _commonest(groups),
+        "sizes": _most_frequent(sizes),
+        "camera_groups": _most_frequent(groups),
         "ordered": scan.ordered,
         "image_folder": scan.image_folder,
         "view_size": [width, height],

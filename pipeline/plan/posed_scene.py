@@ -1,4 +1,4 @@
-"""Cameras from wherever they stand, for rendering and evaluating outside the pipeline's DAG."""
+"""Views of a finished scene or of a scene folder, for evaluation outside of the DAG."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
-# Folders of a finished scene, those nearest to training first.
-_WITH_PHOTOS = ("undistort", "decode", "inspect")
+# Stages with photographs, in the order of preference.
+_STAGES_WITH_PHOTOS = ("undistort", "decode", "inspect")
 
 
 @dataclass(frozen=True)
 class PosedScene:
-    """Views with photographs, and the settings they were, or are to be, used with.
+    """Views with their photographs, and the settings for rendering them.
 
     Attributes:
-        gains: file of each photograph's exposure gains (``exposure.json``), None without one.
-        warnings: what its photographs or poses lack.
+        gains: file of the photographs' exposure gains (``exposure.json``), or None.
+        warnings: of the scan.
     """
 
     views: list[View]
@@ -37,14 +37,15 @@ class PosedScene:
 
 
 def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
-    """The views to measure a model on.
+    """The views to evaluate a model on.
 
     Args:
-        folder: a finished scene (``results/NAME``), whose settings hold; or photographs with
-            poses, as the pipeline takes them as input.
-        max_long_side: of views, pixels; None: the finished scene's, else the photographs' own.
-        every: each this-many-th view counts as held out, 0 none; None: the finished scene's
-            setting, else the default.
+        folder: a finished scene (``results/NAME``), whose settings apply, or a scene folder with
+            given poses.
+        max_long_side: of views, in pixels; None: as in the finished scene, else that of the
+            photographs.
+        every: every this-many-th view is a test view, 0: none; None: as in the finished scene,
+            else the default.
 
     Raises:
         UserError: no such scene, no poses, cameras with lens distortion.
@@ -61,7 +62,13 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             file=folder,
             fix="add them, or give a finished scene's results folder",
         )
-    model = load_given(found).model
+    model = load_given(
+        folder / found.poses.path,
+        found.poses.kind,
+        found.photos,
+        listed=found.listed,
+        base_folder=found.base_folder,
+    ).model
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
     train = Train(background="white" if found.num_alpha else "black")
@@ -85,22 +92,23 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
         views = views.model_copy(update={"max_long_side_px": max_long_side})
     if every is not None:
         split = split.model_copy(update={"test_every": every})
-    photos = _first(folder, _WITH_PHOTOS, "images.json")
-    model = read_model(_first(folder, STAGES_WITH_MODEL, "sparse/0"))
+    photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
+    model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"))
     _check_pinhole(model, folder)
-    # Photographs that no stage copied are named as seen from where Snakemake ran.
+    # Paths of photographs may be relative to the folder in which Snakemake ran.
     root = folder.absolute().parent.parent
     found = [
-        replace(view, image=_from(root, view.image), mask=view.mask and _from(root, view.mask))
+        replace(
+            view, image=_resolved(root, view.image), mask=view.mask and _resolved(root, view.mask)
+        )
         for view in load_views(Manifest.read(photos), model, views, split)
     ]
     gains = folder / "train" / "exposure.json"
     return PosedScene(found, split, train, gains if gains.is_file() else None, ())
 
 
-def _first(folder: Path, stages: tuple[str, ...], name: str) -> Path:
-    """The file or folder ``name`` of the first of the stages that the scene's plan runs and that
-    made one."""
+def _output(folder: Path, stages: tuple[str, ...], name: str) -> Path:
+    """The output ``name`` of the first of ``stages`` that the scene's plan runs and that has it."""
     planned = json.loads((folder / "plan.json").read_text())["stages"]
     for stage in stages:
         path = folder / stage / name
@@ -113,7 +121,7 @@ def _first(folder: Path, stages: tuple[str, ...], name: str) -> Path:
     )
 
 
-def _from(root: Path, file: str) -> str:
+def _resolved(root: Path, file: str) -> str:
     return file if Path(file).exists() else str(root / file)
 
 
@@ -122,9 +130,8 @@ def _check_pinhole(model: Reconstruction, source: Path) -> None:
         camera = model.cameras[image.camera_id]
         if not camera.is_pinhole:
             raise UserError(
-                f"{image.name}: its {camera.model} camera has lens distortion, which renders have "
-                "not",
+                f"{image.name}: expected a pinhole camera, found lens distortion ({camera.model})",
                 file=source,
-                fix="undistort the photographs first: run the pipeline on them and give its "
+                fix="undistort the photographs first: run the pipeline on them and use its "
                 "results folder",
             )

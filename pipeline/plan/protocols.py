@@ -1,11 +1,11 @@
-"""Scenes of published benchmarks, known by their folder's name, and how papers use them."""
+"""Scenes of published benchmarks, recognised by folder name, and the image sizes papers use."""
 
 from __future__ import annotations
 
 import re
 
-# Mip-NeRF 360 (Barron et al. 2022) evaluates outdoor scenes at a quarter and indoor scenes at half
-# of the size; 3DGS and what follows it do the same (its full_eval.py).
+# Mip-NeRF 360 (Barron et al. 2022) evaluates outdoor scenes at 1/4 and indoor scenes at 1/2 of the
+# size, as do 3DGS (its full_eval.py) and later papers.
 MIP_NERF_360 = {
     "bicycle": "images_4",
     "flowers": "images_4",
@@ -18,12 +18,12 @@ MIP_NERF_360 = {
     "room": "images_2",
 }
 
-# What people put before a scene's name in a folder's name.
+# Common prefixes of scene names.
 _PREFIX = re.compile(
     r"^(mip[_-]?(nerf)?[_-]?360|m?360(_v2)?|nerf([_-]synthetic)?|blender|tandt|tnt|t2|db)[_-]"
 )
 
 
 def benchmark_scene(folder: str) -> str:
-    """The scene's name without case and the data set's prefix: mip360_Bonsai -> bonsai."""
+    """The scene's name in lower case without the data set's prefix: mip360_Bonsai -> bonsai."""
     return _PREFIX.sub("", folder.casefold())

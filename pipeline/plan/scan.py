@@ -1,57 +1,57 @@
-"""A cheap look at a scene folder: headers and names, no pixels.
+"""Scanning a scene folder: file names and headers, without decoding pixels.
 
-Everything the plan decides on comes from here. The Snakefile calls it for every scene while it
-builds its jobs, so facts about files are remembered between calls.
+All facts that the plan depends on are collected here. The Snakefile scans every scene whenever it
+builds the DAG, so facts about files are cached.
 """
 
 from __future__ import annotations
 
 import hashlib
-import posixpath
-import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
-from pathlib import Path, PurePosixPath
+from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
-from pipeline.io.folders import PhotoFolder, companions, pictures_in, relative_folders
+from pipeline.io.folders import PhotoFolder, companions
 from pipeline.io.gcp import GCP_FILE
 from pipeline.io.names import RAW_SUFFIXES, NameIndex, stem_key, suffix_of
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
     GivenPoses,
     find_poses,
-    half_models,
+    incomplete_models,
     pose_files,
-    transforms_photos,
     truth_folder,
 )
 from pipeline.io.recorded import digest_of
-from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
+from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.sequence import why_ordered
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 
-_STEPS = ("", "_2", "_4", "_8")
 _ADD_PHOTOS = "put the photographs into images/ inside the scene folder"
 
 
 class Scan(BaseModel):
-    """What a scene folder holds.
+    """The content of a scene folder.
 
-    ``folder`` is as given. ``image_folder`` is relative to it ("." for itself); photographs'
-    names in the manifest are relative to the image folder. ``base_folder`` is the folder the
-    given poses name photographs in (images for images_4). ``listed`` holds the names of all
-    picture files found, those left out of the manifest among them. ``poses`` is None where no
-    poses are given or ``poses: ignore`` is set. ``ordered`` says why the photographs count as
-    a sequence. ``ground_control`` is the scene's ``gcp_list.txt``. ``truth`` and
-    ``truth_digest`` are ground truth poses, never an input.
-    ``fingerprint`` changes with names and contents of photographs, masks, depth maps, pose files
-    and ground control points; not with times or places.
+    Attributes:
+        folder: the scene folder.
+        manifest: the photographs that are used; names are relative to ``image_folder``.
+        image_folder: relative to ``folder``, "." for itself.
+        base_folder: the folder that the given poses refer to ("images" for "images_4").
+        image_folder_reason: why it was chosen.
+        listed: names of all photographs found, with those left out of the manifest.
+        poses: None without given poses, or if they are ignored (``poses: ignore``).
+        ordered: the reason to treat the photographs as a sequence, or None.
+        ground_control: the scene's ``gcp_list.txt``, if any.
+        truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
+        fingerprint: digest of the names and contents of photographs, masks, depth maps, pose files
+            and ground control points; independent of times and of the folder's location.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -78,7 +78,7 @@ class Scan(BaseModel):
         return self.manifest.warnings
 
     def check_unchanged(self, fingerprint: str, folder: Path) -> None:
-        """Compare with the fingerprint of an earlier scan of ``folder``.
+        """Compare with the fingerprint of an earlier scan.
 
         Raises:
             UserError: they differ.
@@ -117,24 +117,24 @@ class Scan(BaseModel):
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
-        """Widths and heights, the commonest first."""
+        """Distinct (width, height), the most frequent first."""
         counts = Counter((photo.width, photo.height) for photo in self.photos)
         return [size for size, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
 
 
 def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Scan:
-    """Look at ``folder``, the scene named ``scene``.
+    """Scan a scene folder.
 
     Args:
-        folder: photographs, and whatever comes with them.
+        folder: the scene folder: photographs, and optionally poses, masks, depth maps.
         scene: the scene's name.
-        config: ``inspect``, ``views`` and ``poses`` matter.
-        cache: a JSON file for what was seen, so that the next look is quick; None for no such
-            file. One that cannot be written is no error.
+        config: of which ``inspect``, ``views``, ``features`` and ``poses`` are used.
+        cache: JSON file that caches facts about files; None for no cache. A file that cannot be
+            written is no error.
 
     Raises:
-        UserError: no such folder, too few photographs, malformed pose files, cameras without
-            photographs, masks of another size.
+        UserError: no such folder, too few photographs, malformed pose files, poses of other
+            photographs, masks of another size than their photographs.
     """
     _check_folder(folder)
     facts_cache = FactCache(cache)
@@ -142,11 +142,11 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     poses = None
     if config.poses != "ignore":
         poses = find_poses(folder, facts_cache)
-        warnings += half_models(folder)
+        warnings += incomplete_models(folder)
 
-    chosen = _choose_folder(folder, config, poses, facts_cache, warnings)
-    facts = _read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
-    facts = {name: facts[name] for name in _without_twins(sorted(facts), poses, warnings)}
+    chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
+    facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
+    facts = {name: facts[name] for name in _without_raw_pairs(sorted(facts), poses, warnings)}
     if not facts:
         raise UserError("no photograph found", file=folder, fix=_ADD_PHOTOS)
     if len(facts) < config.inspect.min_images:
@@ -157,13 +157,13 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
             fix="add photographs, or lower inspect.min_images",
         )
     if poses is not None:
-        _check_posed(folder, poses, chosen, sorted(facts), warnings)
+        _check_pose_names(folder, poses, chosen, sorted(facts), warnings)
 
-    step = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
-    masks = _masks(folder, step, config, chosen, facts, facts_cache)
+    suffix = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
+    masks = _masks(folder, suffix, config, chosen, facts, facts_cache)
     if masks and len(masks) < len(facts):
         warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
-    depths = companions(folder, [f"depths{step}", "depths"], sorted(facts))
+    depths = companions(folder, [f"depths{suffix}", "depths"], sorted(facts))
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
@@ -200,187 +200,48 @@ def _check_folder(folder: Path) -> None:
             file=root,
             fix="set data_root to the folder that holds the scene folders",
         )
-    there = sorted(path.name for path in root.iterdir() if path.is_dir() and path.name[0] != ".")
+    scenes = sorted(path.name for path in root.iterdir() if path.is_dir() and path.name[0] != ".")
     raise UserError(
         "no such scene folder" if not folder.exists() else "expected a scene folder, found a file",
         file=folder,
-        fix=f"scenes in {root}: {', '.join(there) or 'none'}",
+        fix=f"choose one of the scenes in {root}: {', '.join(scenes) or 'none'}",
     )
 
 
-# --- which photographs --------------------------------------------------------------------
-
-
-def _choose_folder(
-    folder: Path,
-    config: Config,
-    poses: GivenPoses | None,
-    cache: FactCache,
-    warnings: list[str],
-) -> PhotoFolder:
-    wanted = config.inspect.image_folder
-    if wanted != "auto":
-        wanted = PurePosixPath(wanted).as_posix()
-        inside = not wanted.startswith("/") and ".." not in wanted.split("/")
-        if not inside or not (folder / wanted).is_dir():
-            raise UserError(
-                "inspect.image_folder does not name a folder inside the scene folder",
-                file=folder / wanted,
-                fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
-            )
-    if poses is None or poses.kind == "transforms":
-        listed = transforms_photos(folder, warnings if poses is not None else None)
-        if listed is not None and wanted in ("auto", listed.path):
-            return listed
-    if wanted not in ("auto", "."):
-        names = pictures_in(folder / wanted, warnings)
-        base = "images" if re.fullmatch(r"images_[248]", wanted) else wanted
-        return PhotoFolder(wanted, base, "as configured", names)
-    sized = [f"images{step}" for step in _STEPS if (folder / f"images{step}").is_dir()]
-    if wanted == "auto" and sized:
-        return _choose_size(folder, sized, config, poses, cache, warnings)
-    return _plain_folder(folder, warnings)
-
-
-def _plain_folder(folder: Path, warnings: list[str]) -> PhotoFolder:
-    """Photographs that lie in the scene folder itself, or in subfolders of any name."""
-    top = pictures_in(folder, warnings, recursive=False)
-    if top:
-        below = [name for name in relative_folders(folder) if pictures_in(folder / name, [])]
-        if below:
-            warnings.append(
-                f"{folder}: photographs lie in the scene folder itself, so those in "
-                f"{', '.join(below)} are not used"
-            )
-        return PhotoFolder(".", ".", "no images/; photographs lie in the scene folder", top)
-    names = pictures_in(folder, warnings)
-    parents = [posixpath.dirname(name) for name in names]
-    base = posixpath.commonpath(parents) if parents else ""
-    names = [posixpath.relpath(name, base or ".") for name in names]
-    where = f"{base}/" if base else "subfolders"
-    return PhotoFolder(base or ".", base or ".", f"no images/; photographs lie in {where}", names)
-
-
-def _choose_size(
-    folder: Path,
-    sized: Sequence[str],
-    config: Config,
-    poses: GivenPoses | None,
-    cache: FactCache,
-    warnings: list[str],
-) -> PhotoFolder:
-    """Of images/ and its smaller copies, the smallest that is still large enough; for scenes of
-    Mip-NeRF 360 the one that papers use."""
-    need = config.views.max_long_side_px
-    if poses is None:
-        need = max(need, config.features.max_long_side_px)
-    found: list[tuple[int, PhotoFolder]] = []
-    for path in sized:
-        names = pictures_in(folder / path, warnings)
-        if names:
-            facts = _read_all(folder, path, names[:1], cache, [])
-            longest = max((max(f.width, f.height) for f in facts.values()), default=0)
-            found.append((longest, PhotoFolder(path, "images", "", names)))
-    if not found:
-        return PhotoFolder("images", "images", "images/ holds no photograph", [])
-    longest, full = found[0]
-    usable = [entry for entry in found if _same_photographs(folder, entry[1], full, poses, config)]
-    enough = [entry for entry in usable if entry[0] >= need]
-    habit = MIP_NERF_360.get(benchmark_scene(folder.name))
-    customary = [entry for entry in usable if entry[1].path == habit]
-    if customary:
-        longest, best = customary[0]
-    elif enough:
-        longest, best = min(enough, key=lambda entry: entry[0])
-    else:
-        longest, best = max(usable, key=lambda entry: entry[0])
-    others = [f"{entry.path}/ ({size} px)" for size, entry in found if entry is not best]
-    reason = f"{best.path}/ ({longest} px long side)"
-    if customary:
-        reason += f": the copy that papers use of {benchmark_scene(folder.name)} of Mip-NeRF 360"
-    elif others:
-        is_enough = "the smallest not below" if longest >= need else "the largest; none reaches"
-        reason += f": {is_enough} {need} px; others: {', '.join(others)}"
-    return PhotoFolder(best.path, "images", reason, best.names)
-
-
-def _same_photographs(
-    folder: Path, other: PhotoFolder, full: PhotoFolder, poses: GivenPoses | None, config: Config
-) -> bool:
-    """Whether ``other`` can stand for ``full``: nothing that is used gets lost."""
-    if other is full:
-        return True
-    step = other.path[len("images") :]
-    for kind in ("masks", "depths"):
-        used = kind == "depths" or config.views.masks == "auto"
-        if used and (folder / kind).is_dir() and not (folder / f"{kind}{step}").is_dir():
-            return False
-    if poses is not None and poses.kind == "transforms":
-        return False  # Their focal length may refer to the full size without saying so.
-    if poses is not None and poses.kind == "llff":
-        return len(other.names) == poses.num_images
-    wanted = poses.names if poses is not None else full.names
-    mine, its = NameIndex(other.names), NameIndex(full.names)
-    return all(mine.find(name) for name in wanted if its.find(name))
-
-
-def _without_twins(
+def _without_raw_pairs(
     names: Sequence[str], poses: GivenPoses | None, warnings: list[str]
 ) -> list[str]:
-    """Of a RAW file and a picture of the same name, the RAW file; unless poses name the other."""
+    """If a photograph exists both as RAW and as another file, keep the RAW file, unless the poses
+    name the other one."""
     posed = set(poses.names) if poses is not None else set()
     raw = {stem_key(name): name for name in names if suffix_of(name) in RAW_SUFFIXES}
     dropped = set()
     for name in names:
-        twin = raw.get(stem_key(name))
-        if twin is not None and name != twin and suffix_of(name) not in RAW_SUFFIXES:
-            dropped.add(twin if name in posed else name)
+        raw_name = raw.get(stem_key(name))
+        if raw_name is not None and suffix_of(name) not in RAW_SUFFIXES:
+            dropped.add(raw_name if name in posed else name)
     if dropped:
         first = sorted(dropped)[0]
         warnings.append(
-            f"{len(dropped)} photographs come both as RAW and as a picture; one of each pair is "
-            f"left out (first: {first})"
+            f"{len(dropped)} photographs exist both as RAW and as another file; one of each pair "
+            f"is left out (first: {first})"
         )
     return [name for name in names if name not in dropped]
 
 
-def _read_all(
-    folder: Path, image_folder: str, names: Sequence[str], cache: FactCache, warnings: list[str]
-) -> dict[str, FileFacts]:
-    """Facts of the readable photographs; the others get a warning."""
-    facts: dict[str, FileFacts] = {}
-    for name in names:
-        path = folder / image_folder / name
-
-        def look(path: Path = path) -> dict:
-            try:
-                return read_facts(path).model_dump()
-            except UserError as error:
-                return {"unreadable": error.what}
-
-        try:
-            seen = cache.get(path, "photo", look)
-        except OSError as error:
-            seen = {"unreadable": f"cannot be read: {error.strerror}"}
-        if "unreadable" in seen:
-            warnings.append(f"{path}: left out: {seen['unreadable']}")
-        else:
-            facts[name] = FileFacts.model_validate(seen)
-    return facts
-
-
-def _check_posed(
+def _check_pose_names(
     folder: Path,
     poses: GivenPoses,
     chosen: PhotoFolder,
     names: Sequence[str],
     warnings: list[str],
 ) -> None:
+    """Check that poses and photographs belong together; warn of those without a counterpart."""
     if poses.kind == "llff":
         if len(chosen.names) != poses.num_images:
             raise UserError(
-                f"holds {poses.num_images} poses, but {chosen.path}/ holds {len(chosen.names)} "
-                "photographs",
+                f"expected as many poses as photographs, found {poses.num_images} poses and "
+                f"{len(chosen.names)} photographs in {chosen.path}/",
                 file=folder / poses.path,
                 fix="restore the missing photographs, or set poses: ignore",
             )
@@ -391,32 +252,32 @@ def _check_posed(
     missing = [name for name, match in zip(poses.names, matched, strict=True) if match is None]
     if len(missing) == len(poses.names):
         raise UserError(
-            f"none of its {len(poses.names)} cameras has a photograph in "
-            f"{folder / chosen.path} (the first one's is {poses.names[0]})"
+            f"none of its {len(poses.names)} images is a photograph in "
+            f"{folder / chosen.path} (first: {poses.names[0]})"
             if missing
-            else "holds no camera poses",
+            else "expected camera poses, found none",
             file=folder / poses.path,
-            fix="put the photographs there under the names the poses use, or set poses: ignore",
+            fix="rename the photographs to the names in the pose file, or set poses: ignore",
         )
     if missing:
         warnings.append(
-            f"{folder / poses.path}: {len(missing)} of {len(poses.names)} cameras have no "
+            f"{folder / poses.path}: {len(missing)} of {len(poses.names)} poses have no "
             f"photograph and are left out (first: {missing[0]})"
         )
     without = sorted({prefix + name for name in names} - {match for match in matched if match})
     if without:
         warnings.append(
-            f"{len(without)} of {len(names)} photographs have no given pose and stay unused "
+            f"{len(without)} of {len(names)} photographs have no given pose and are not used "
             f"(first: {without[0]})"
         )
 
 
-# --- what comes with them -----------------------------------------------------------------
+# --- masks and photographs ----------------------------------------------------------------
 
 
 def _masks(
     folder: Path,
-    step: str,
+    suffix: str,
     config: Config,
     chosen: PhotoFolder,
     facts: Mapping[str, FileFacts],
@@ -424,7 +285,7 @@ def _masks(
 ) -> dict[str, Path]:
     if config.views.masks == "ignore":
         return {}
-    masks = companions(folder, [f"masks{step}", "masks"], sorted(facts))
+    masks = companions(folder, [f"masks{suffix}", "masks"], sorted(facts))
     for name, listed in chosen.masks.items():
         if name in facts and (folder / listed).is_file():
             masks.setdefault(name, folder / listed)
@@ -504,6 +365,6 @@ def _fingerprint(
     if control is not None:
         others.append(control)
     lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in photos]
-    # Files that could not be read count by name: a warning names them.
+    # Unreadable files are included by name, because warnings mention them.
     lines += [*listed, _digest_files(folder, others, cache)]
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()

@@ -1,7 +1,7 @@
-"""Settles every option that is "auto" from what the scan found, and says why.
+"""Replacing options that are "auto" by values that suit the scene, with reasons.
 
-``settle`` is pure and idempotent: the same scan and config give the same ``Settled``, and a settled
-config settles to itself.
+``settle`` is pure and idempotent: the same scan and config give the same ``Settled``, and settling
+a settled config changes nothing.
 """
 
 from __future__ import annotations
@@ -15,27 +15,29 @@ from pipeline.config.schema import Config
 from pipeline.plan.budget import gaussian_budget
 from pipeline.plan.scan import Scan
 
-# 40 photographs are 780 pairs: two minutes on two cores, and no pair is missed. Above it the
-# neighbours that the scene's own descriptors propose give the same poses in a fraction of that.
-EXHAUSTIVE_PHOTOS = 40
-# GPS errs by some metres: only a capture much larger than that can be sorted by it.
-SPATIAL_METRES = 50.0
-SPATIAL_SHARE = 0.9
-# A collection by many people: photographs of one size need not share a lens.
+# Up to this many photographs (780 pairs), all pairs are matched. For more, retrieval takes a
+# fraction of the time.
+MAX_EXHAUSTIVE_PHOTOS = 40
+# GPS errors are several metres, so spatial matching needs a much larger scene (diagonal in metres)
+# and positions of most photographs.
+MIN_SPATIAL_EXTENT_M = 50.0
+MIN_SPATIAL_SHARE = 0.9
+# Collections of photographs by many people, in which photographs of the same size need not share a
+# camera: at least so many bodies, or so many camera groups per photograph.
 MIXED_BODIES = 3
 MIXED_GROUP_SHARE = 0.5
-# Up to so many photographs, supervision by the depths of sparse points improves test views.
-FEW_PHOTOS, DEPTH_WEIGHT = 30, 0.03
-MAP_WEIGHT = 0.3
+# Up to this many photographs, a loss on the depths of sparse points improves test views.
+FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
+DEPTH_MAP_WEIGHT = 0.3
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
-"""A setting's value and the sentence that says why."""
+"""An option's value, and the sentence that gives the value and the reason."""
 
 
 @dataclass(frozen=True)
 class Settled:
-    """A config without an "auto" that the scan can settle.
+    """A config whose options are no longer "auto", as far as the scan decides them.
 
     Attributes:
         why: dotted path of an option -> the sentence that gives its value and the reason.
@@ -46,10 +48,10 @@ class Settled:
 
 
 def settle(scan: Scan, config: Config) -> Settled:
-    """The options of the scene that ``scan`` describes.
+    """Settle the options for a scene.
 
     Raises:
-        UserError: an option asks for what the scene or ``train.memory_mb`` does not allow.
+        UserError: ``train.memory_mb`` is too small.
     """
     chosen = {
         "matches.pairs": _pairs(scan, config),
@@ -89,34 +91,36 @@ def _pairs(scan: Scan, config: Config) -> Choice:
     count, wanted = len(scan.photos), config.matches.pairs
     if wanted != "auto":
         return wanted, f"{wanted} pairs, as configured"
-    if count <= EXHAUSTIVE_PHOTOS:
+    if count <= MAX_EXHAUSTIVE_PHOTOS:
         return (
             "exhaustive",
             f"exhaustive pairs: all {count * (count - 1) // 2} of {count} photographs",
         )
     metres = gps_extent_m(scan)
-    if scan.num_gps >= SPATIAL_SHARE * count and metres >= SPATIAL_METRES:
+    if scan.num_gps >= MIN_SPATIAL_SHARE * count and metres >= MIN_SPATIAL_EXTENT_M:
         return "spatial", f"spatial pairs: GPS in {scan.num_gps} of {count}, {metres:.0f} m across"
     if scan.ordered is not None:
         return "sequential", f"sequential pairs: {count} photographs, {scan.ordered}"
     return (
         "retrieval",
-        f"retrieval pairs: {count} photographs are too many for all pairs, and neither order nor "
-        "GPS sorts them",
+        f"retrieval pairs: {count} photographs are too many for all pairs, and neither a sequence "
+        "nor GPS positions give neighbours",
     )
 
 
 def gps_extent_m(scan: Scan) -> float:
-    """Diagonal of the GPS positions' box in metres; 0 without positions."""
-    places = [photo.gps for photo in scan.photos if photo.gps is not None]
-    if not places:
+    """Diagonal of the GPS positions' bounding box in metres; 0 without positions."""
+    positions = [photo.gps for photo in scan.photos if photo.gps is not None]
+    if not positions:
         return 0.0
-    north = [math.radians(place[0]) * _EARTH_RADIUS_M for place in places]
-    # Longitudes relative to the first, so that the date line does not tear a scene apart.
-    shrink = math.cos(math.radians(places[0][0]))
+    north = [math.radians(position[0]) * _EARTH_RADIUS_M for position in positions]
+    # Longitudes relative to the first: a scene may lie on both sides of the date line.
+    cos_latitude = math.cos(math.radians(positions[0][0]))
     east = [
-        math.radians((place[1] - places[0][1] + 180) % 360 - 180) * shrink * _EARTH_RADIUS_M
-        for place in places
+        math.radians((position[1] - positions[0][1] + 180) % 360 - 180)
+        * cos_latitude
+        * _EARTH_RADIUS_M
+        for position in positions
     ]
     return math.hypot(max(north) - min(north), max(east) - min(east))
 
@@ -125,8 +129,8 @@ def _mapper(config: Config) -> Choice:
     wanted = config.sfm.mapper
     if wanted != "auto":
         return wanted, f"{wanted} mapper, as configured"
-    # Its time grows in proportion to the photographs, the global one's with their square.
-    return "incremental", "incremental mapper; the global one where its model is not good"
+    # Its time is linear in the number of photographs, the global mapper's quadratic.
+    return "incremental", "incremental mapper; the global mapper if its model is not good"
 
 
 def _camera_model(scan: Scan, config: Config) -> Choice:
@@ -147,9 +151,9 @@ def _share_cameras(scan: Scan, config: Config) -> Choice:
     bodies = {group.split(" | ")[0] for group in groups if " | " in group}
     count = len(scan.photos)
     if len(bodies) >= MIXED_BODIES:
-        return "image", f"a camera for each image: photographs of {len(bodies)} different cameras"
+        return "image", f"one camera per image: photographs by {len(bodies)} different cameras"
     if count > 2 and len(groups) > MIXED_GROUP_SHARE * count:
-        return "image", f"a camera for each image: {len(groups)} kinds in {count} photographs"
+        return "image", f"one camera per image: {len(groups)} groups in {count} photographs"
     each = "one camera" if len(groups) == 1 else f"{len(groups)} cameras"
     return "group", f"{each}, shared by body, lens, focal length and size"
 
@@ -167,19 +171,21 @@ def _background(scan: Scan, config: Config) -> Choice:
 def _masks(scan: Scan, config: Config) -> str:
     if config.views.masks == "ignore":
         return "masks ignored, as configured"
-    return f"masks in {scan.num_masks} photographs" if scan.num_masks else ""
+    return f"{scan.num_masks} photographs have masks" if scan.num_masks else ""
 
 
 def _depth_loss_weight(scan: Scan, config: Config) -> tuple[float, str]:
-    """Whether renders are held to sparse points' depths: many photographs settle them alone."""
+    """The weight of the depth loss; with many photographs it is not needed."""
     wanted = config.train.depth_loss_weight
     if wanted != "auto":
-        return wanted, f"sparse points' depths have weight {wanted:g}, as configured"
+        return wanted, f"the loss on depths has weight {wanted:g}, as configured"
     if scan.num_depths:
-        return MAP_WEIGHT, f"{scan.num_depths} depth maps: depths have weight {MAP_WEIGHT:g}"
+        text = f"{scan.num_depths} depth maps: the loss on depths has weight {DEPTH_MAP_WEIGHT:g}"
+        return DEPTH_MAP_WEIGHT, text
     if len(scan.photos) > FEW_PHOTOS:
         return 0.0, ""
-    return DEPTH_WEIGHT, f"few photographs: sparse points' depths have weight {DEPTH_WEIGHT:g}"
+    weight = SPARSE_DEPTH_WEIGHT
+    return weight, f"few photographs: the loss on sparse points' depths has weight {weight:g}"
 
 
 def _updated(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:

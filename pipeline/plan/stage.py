@@ -1,4 +1,4 @@
-"""The declaration of a stage, from which its rule, its key and its line in the plan follow."""
+"""The declaration of a stage, which its Snakemake rule, key and plan are made from."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
 
 
 class StagePlan(BaseModel):
-    """Whether a stage runs for a scene, why, and what was settled for it."""
+    """Whether a stage runs for a scene, the reason, and decisions about its options."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -24,14 +24,14 @@ class StagePlan(BaseModel):
     reason: str
     decisions: list[str] = []
     inputs: list[str] = []
-    """Stages whose output it reads."""
+    """The stages whose output it reads."""
 
 
 _POSE_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}
 
 
 def unless_posed(scan: Scan, reason: str, decisions: list[str]) -> StagePlan:
-    """The plan of a stage that a scene needs only where no poses are given."""
+    """The plan of a stage that runs only if no poses are given."""
     poses = scan.poses
     if poses is None:
         return StagePlan(run=True, reason=reason, decisions=decisions)
@@ -46,24 +46,25 @@ def _none(plan: Plan) -> dict[str, Any]:
 
 @dataclass(frozen=True)
 class StageSpec:
-    """A stage as ``stages/<name>.py`` declares it.
+    """The declaration of a stage, in ``stages/<name>.py``.
 
     Attributes:
-        name: of the rule, of the module in ``stages/`` and of the folder in ``results/<scene>/``.
-        work: does the work in ``Job.out``. Heavy imports belong inside it: the Snakefile imports
-            every declaration.
+        name: name of the rule, of the module in ``stages/`` and of the folder in
+            ``results/<scene>/``.
+        work: writes the stage's output into ``Job.out``. It must import heavy modules itself,
+            because the Snakefile imports every declaration.
         decide: whether a scene needs the stage, and why. Pure.
-        inputs: role -> the stages that can fill it; the first that the plan runs does.
-        options: dotted paths of the options or sections that the stage reads; no other can be
+        inputs: role -> the stages that can provide this input; the first that the plan runs does.
+        options: dotted paths of the options or sections that the stage reads; others cannot be
             read (see ``pipeline.config.options``).
-        packages: those whose version decides the result.
-        seeded: whether the stage draws random numbers. The seed is in the keys of these only, so
-            that runs with other seeds share the other stages' work.
-        memory_mb: what a cluster reserves, MB; a function where it depends on the plan.
-        publishes: outputs that are copied to ``results/<scene>/``, and their captions in
-            Snakemake's report.
-        shows_plan: whether the stage reads the plan (``Job.key["plan"]``: that of plan.json).
-        facts: what else decides the result, beside code, options, packages, seed and inputs.
+        packages: packages whose version affects the result.
+        seeded: whether the stage draws random numbers. Only these keys contain the seed, so that
+            runs with different seeds share the results of the other stages.
+        memory_mb: memory that a cluster reserves, in MB, or a function of the plan.
+        publishes: output that is copied to ``results/<scene>/`` -> its caption in Snakemake's
+            report.
+        shows_plan: whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
+        facts: facts that affect the result besides code, options, packages, seed and inputs.
     """
 
     name: str

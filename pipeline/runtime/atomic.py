@@ -1,4 +1,4 @@
-"""Files and folders that are either whole or not there."""
+"""Atomic writing of files and replacement of folders."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def write_json(path: Path, value: Any) -> None:
 
 
 def replace_folder(source: Path, target: Path) -> None:
-    """Put folder ``source`` in the place of ``target``; what was there is removed."""
+    """Rename folder ``source`` to ``target``, whose former content is removed."""
     old = target.with_name(f".{target.name}.old")
     if old.exists():
         shutil.rmtree(old)

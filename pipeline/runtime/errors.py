@@ -1,4 +1,4 @@
-"""The one exception a user can cause."""
+"""Errors that the user can correct."""
 
 from __future__ import annotations
 
@@ -9,14 +9,14 @@ EXIT_USER_ERROR = 2
 
 
 class UserError(Exception):
-    """Something in the user's input or surroundings that only the user can mend.
+    """An error in the user's input or environment.
 
-    A stage that raises it ends with one clear message and exit code 2; never a traceback.
+    A stage that raises it ends with its message and exit code 2, without a traceback.
 
     Args:
-        what: what is wrong, one sentence, naming what was expected and what was found.
-        file: the file or folder it is about, if there is one.
-        fix: what to do about it, one sentence.
+        what: what is wrong, in one sentence: what was expected and what was found.
+        file: the file or folder concerned, if any.
+        fix: what to do, in one sentence.
     """
 
     def __init__(self, what: str, *, file: str | Path | None = None, fix: str | None = None):
@@ -29,7 +29,7 @@ class UserError(Exception):
 
 
 def as_user_error(error: OSError) -> UserError | None:
-    """Failures of disk and permissions are the surroundings' fault, not the program's."""
+    """The ``UserError`` for a full disk or missing permissions; None for other errors."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):
         fix = "free some space, or run in a folder on a larger disk (snakemake --directory)"
         return UserError("the disk is full", file=error.filename, fix=fix)

@@ -1,4 +1,4 @@
-"""How a run of a stage went (``run.json``)."""
+"""The record of a stage's run (``run.json``)."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from pipeline.runtime.record import RunRecord
 def run_record(
     wall: float, *, threads: int, seed: int | None, timings: Mapping[str, Any]
 ) -> RunRecord:
-    """The record of a run that took ``wall`` seconds: memory, versions, commit, machine,
-    instruction set, and the stage's own ``timings``."""
+    """The record of a run of ``wall`` seconds: time, memory, versions, commit, machine, instruction
+    set, and the stage's ``timings``."""
     own = resource.getrusage(resource.RUSAGE_SELF)
     children = resource.getrusage(resource.RUSAGE_CHILDREN)
     facts = {
@@ -41,7 +41,7 @@ def run_record(
 
 
 def versions() -> dict[str, str]:
-    """Versions of Python and of the packages whose results we depend on."""
+    """Versions of Python and of the packages that affect results."""
     found = {"python": platform.python_version()}
     for name in (
         "torch",
@@ -51,7 +51,7 @@ def versions() -> dict[str, str]:
         "scipy",
         "rawpy",
         "snakemake",
-        # A checkout has a commit instead.
+        # A checkout is identified by its commit instead.
         *(() if IS_CHECKOUT else ("splatmake",)),
     ):
         try:
@@ -62,7 +62,7 @@ def versions() -> dict[str, str]:
 
 
 def _commit() -> str | None:
-    """The checkout's commit. An installed package may lie in someone else's repository."""
+    """The checkout's commit. An installed package may be inside another repository, hence None."""
     if not IS_CHECKOUT:
         return None
     git = ["git", "-C", str(PACKAGES), "rev-parse", "HEAD"]

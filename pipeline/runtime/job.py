@@ -1,14 +1,13 @@
-"""What every stage needs around its work: identity, lock, atomic outputs, records, errors.
+"""Running a stage: lock, scratch folder, atomic outputs, records, reuse of results, errors.
 
-A stage owns one folder. Its work is written to a scratch folder and put in place by a rename when
-all is done, so that what exists is whole. Its records (``pipeline.runtime.record``) stand beside
-its outputs.
+A stage has one folder. Its output is written to a scratch folder, which is renamed when the stage
+has finished. Records (``pipeline.runtime.record``) are stored with the outputs.
 
-A stage whose key and inputs are those of its finished folder is not run again: Snakemake deletes a
-job's declared outputs before it runs the job, so a hidden copy of ``stage.json`` lets the stage see
-that the work is there, check the digests, and put the declared file back. Finished work of the same
-identity in a neighbouring folder (another configuration of the scene) is taken over by hard links
-in the same way. Before a stage works, the files of its inputs are compared with their records.
+A stage does no work if its folder holds results for the same key and inputs. Snakemake deletes a
+job's declared outputs before it runs the job, so the stage recognises this by a hidden copy of
+``stage.json``, checks the digests of its files, and restores the declared output. Equal results of
+another run (another configuration of the scene) are reused by hard links. Before a stage works, the
+files of its inputs are compared with their records.
 """
 
 from __future__ import annotations
@@ -55,21 +54,21 @@ S = TypeVar("S", bound=BaseModel)
 
 @dataclass
 class Job:
-    """One stage's work on one scene.
+    """The interface of a running stage.
 
     Attributes:
         stage, scene: names.
         key: the stage's key as a parsed JSON object (see ``pipeline.plan.keys``).
-        inputs: folder of each input role ("photos", "model", ...).
-        out: write outputs here; it becomes the stage's folder when ``run`` returns.
-        scratch: survives a kill and is found again by a run with the same identity.
-        shared_cache: survives changed options; for content-addressed per-image results.
-        threads: native threads to use; never changes a result.
-        memory_mb: that the stage may use, None where nothing was said; never changes a result.
-        counters, decisions, warnings: recorded in ``stage.json``; fill them in.
-        published: extra declared outputs: file in ``out`` -> path where it is wanted as well.
-        timings: recorded in ``run.json``.
-        logs: folder for what tells how a run went; not part of the result.
+        inputs: role ("photos", "model", ...) -> folder.
+        out: folder for the outputs, which becomes the stage's folder when the stage has finished.
+        scratch: folder that a later run with the same key and inputs finds if this one is killed.
+        shared_cache: folder for per-image results that are addressed by content and independent
+            of the key.
+        threads: number of native threads; does not affect results.
+        memory_mb: memory limit, or None; does not affect results.
+        counters, decisions, warnings: written to ``stage.json``.
+        timings: written to ``run.json``.
+        logs: folder for logs, which are not part of the result.
     """
 
     stage: str
@@ -85,12 +84,11 @@ class Job:
     counters: dict[str, Any] = field(default_factory=dict)
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
-    published: dict[str, Path] = field(default_factory=dict)
     timings: dict[str, Any] = field(default_factory=dict)
 
     @property
     def seed(self) -> int:
-        """The run's seed; only stages that have it in their key may ask."""
+        """The run's seed; only for stages whose key contains it."""
         return int(self.key["seed"])
 
     def section(self, model: type[S]) -> S:
@@ -98,35 +96,38 @@ class Job:
         return read_section(model, self.key["config"][model.__name__.lower()])
 
     def record(self, report: Any) -> None:
-        """Take over a report (a dataclass): its ``decisions`` and ``warnings`` are told and kept,
-        its other fields become counters."""
-        facts = asdict(report)
-        self.tell(facts.pop("decisions", []), facts.pop("warnings", []))
-        self.counters |= facts
+        """Record a report (a dataclass): ``decisions`` and ``warnings`` are messages, other fields
+        become counters."""
+        counters = asdict(report)
+        self.add_messages(counters.pop("decisions", []), counters.pop("warnings", []))
+        self.counters |= counters
 
     def run_record(self, wall: float) -> RunRecord:
-        """How the run has gone for ``wall`` seconds."""
+        """The record of the run after ``wall`` seconds."""
         seed = self.key["seed"]
         return run_record(wall, threads=self.threads, seed=seed, timings=self.timings)
 
-    def tell(self, decisions: Sequence[str], warnings: Sequence[str]) -> None:
+    def add_messages(self, decisions: Sequence[str], warnings: Sequence[str]) -> None:
+        """Print and record decisions and warnings."""
         for text in decisions:
             self.decide(text)
         for text in warnings:
             self.warn(text)
 
     def warn(self, text: str) -> None:
+        """Print and record a warning."""
         print(f"warning: {text}", file=sys.stderr, flush=True)
         self.warnings.append(text)
 
     def decide(self, text: str) -> None:
+        """Print and record a decision."""
         print(text, file=sys.stderr, flush=True)
         self.decisions.append(text)
 
 
 @dataclass(frozen=True)
 class Request:
-    """What a stage's command line asks for."""
+    """The arguments of a stage's command line."""
 
     stage: str
     key: dict[str, Any]
@@ -139,14 +140,14 @@ class Request:
 
 
 def run_stage(request: Request, work: Callable[[Job], None]) -> int:
-    """Run ``work`` as a stage and return the process's exit code.
+    """Run ``work`` as a stage and return the exit code.
 
-    0: done, or there already. 2: the user must mend something (one clear message). Any other
-    exception is a bug of the program: exit code 1, with a traceback.
+    0: finished, or up to date. 2: a ``UserError``, with its message. 1: another exception, which is
+    a bug of the program, with a traceback.
     """
     with logging_to(request.log, request.out.parent.name):
         try:
-            targets.usable()  # a wrong $SPLATMAKE_TARGET ends the run before any work
+            targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work)
         except UserError as error:
             _say_error(request, error)
@@ -193,7 +194,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
         if out.exists():
             shutil.rmtree(out)
         out.mkdir(parents=True)
-        if _taken_over(request, digests, out):
+        if _reuse_other_run(request, digests, out):
             shutil.rmtree(stage_scratch, ignore_errors=True)
             return 0
         check_outputs(request.inputs.values(), request.threads)
@@ -209,7 +210,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
             memory_mb=request.memory_mb,
             logs=scene_folder / "logs" if request.log is None else request.log.parent,
         )
-        # Temporary files belong on the results' disk, where a kill leaves them to be found.
+        # Temporary files belong to the scratch folder, which the next run removes after a kill.
         os.environ["TMPDIR"] = str(scratch / "tmp")
         (scratch / "tmp").mkdir(exist_ok=True)
         tempfile.tempdir = None
@@ -237,38 +238,37 @@ def _is_done(request: Request, inputs: dict[str, str]) -> bool:
 
 
 def _finished(folder: Path) -> StageRecord | None:
-    """The hidden record of a finished stage. A damaged one is as good as none: the work is done
-    again."""
+    """The hidden record of a finished stage; None if it is missing or damaged."""
     try:
         return read_record(folder / HIDDEN_STAGE, StageRecord)
     except (UserError, OSError):
         return None
 
 
-def _taken_over(request: Request, inputs: dict[str, str], out: Path) -> bool:
-    """Put a neighbour's finished work in place, if one has done exactly what is asked for.
+def _reuse_other_run(request: Request, inputs: dict[str, str], out: Path) -> bool:
+    """Link the results of another run with the same key and inputs, if there is one.
 
-    Its files are hard links where the file system has them. Stages replace files and never write
-    into them, so that neither folder can change the other; the digests are those of the links.
+    Files are hard links if the file system supports them. This is safe, because stages replace
+    files instead of writing into them.
     """
-    wanted = identity(request.key, inputs)
+    required = identity(request.key, inputs)
     for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/{HIDDEN_STAGE}")):
         source = hidden.parent
         record = _finished(source)
-        if source == request.out or record is None or record.identity != wanted:
+        if source == request.out or record is None or record.identity != required:
             continue
         try:
             run = read_record(source / RUN, RunRecord)
         except (UserError, OSError):
             continue
-        with contextlib.suppress(OSError):  # It may be replaced at this moment.
+        with contextlib.suppress(OSError):  # The folder may just be replaced.
             shutil.copytree(source, out, copy_function=_link, dirs_exist_ok=True)
         if output_digests(out, request.threads) == record.outputs:
-            taken = run.model_copy(update={"taken_from": source.parent.name})
-            _write(out, record.model_copy(update={"scene": request.out.parent.name}), taken)
+            reused = run.model_copy(update={"taken_from": source.parent.name})
+            _write(out, record.model_copy(update={"scene": request.out.parent.name}), reused)
             replace_folder(out, request.out)
             _publish(request)
-            print(f"{request.stage}: taken over from {source.parent.name}", file=sys.stderr)
+            print(f"{request.stage}: reused from {source.parent.name}", file=sys.stderr)
             return True
         shutil.rmtree(out)
         out.mkdir()
@@ -283,7 +283,7 @@ def _link(source: str, target: str) -> None:
 
 
 def _recover(out: Path) -> None:
-    """A kill between the two renames of ``replace_folder`` leaves the former folder aside."""
+    """Restore the former folder after a kill between the two renames of ``replace_folder``."""
     old = out.with_name(f".{out.name}.old")
     if old.exists():
         if (out / HIDDEN_STAGE).exists():

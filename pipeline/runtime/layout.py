@@ -1,4 +1,4 @@
-"""Where the program's own files are, in a checkout and where it is installed."""
+"""Locations of the program's own files, in a checkout and in an installation."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 """The folder of the Snakefile and of ``profiles/``; setup.py copies them there."""
 
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
-"""Native libraries that a package brings along."""
+"""Native libraries in wheels."""
 
 
 def user_cache() -> Path:
-    """The folder for files of this user that can be made again."""
+    """The user's cache folder."""
     if sys.platform == "darwin":
         return Path.home() / "Library" / "Caches" / "splatmake"
-    # The XDG specification: an unset, empty or relative value means the default.
+    # By the XDG specification, an unset, empty or relative value means the default.
     chosen = Path(os.environ.get("XDG_CACHE_HOME") or ".")
     return (chosen if chosen.is_absolute() else Path.home() / ".cache") / "splatmake"

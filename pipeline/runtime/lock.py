@@ -1,4 +1,4 @@
-"""What is held while a stage runs: its lock and its log."""
+"""A running stage's lock and log."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from pipeline.runtime.progress import Console
 
 @contextmanager
 def locked(path: Path, stage: str, out: Path) -> Iterator[None]:
-    """Hold a stage's lock: a job orphaned by a killed Snakemake may still be writing to its
-    folder ``out``."""
+    """Hold a stage's lock. A job that was orphaned by a killed Snakemake may still be writing to
+    the stage's folder ``out``."""
     with open(path, "w") as file:
         try:
             fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
         except OSError:
             print(
-                f"{stage}: another run is at work on {out}; waiting for it",
+                f"{stage}: waiting for another run that writes to {out}",
                 file=sys.stderr,
                 flush=True,
             )
@@ -30,8 +30,7 @@ def locked(path: Path, stage: str, out: Path) -> Iterator[None]:
 
 @contextmanager
 def logging_to(path: Path | None, name: str) -> Iterator[None]:
-    """Write what goes to stderr into the file ``path`` too, with ``name`` before each line on the
-    terminal."""
+    """Copy stderr to the file ``path``; progress lines on the terminal begin with ``name``."""
     if path is None:
         yield
         return
@@ -40,7 +39,7 @@ def logging_to(path: Path | None, name: str) -> Iterator[None]:
         path.parent.mkdir(parents=True, exist_ok=True)
         log = open(path, "w")  # noqa: SIM115  (closed below)
     except OSError:
-        # The work itself fails for the same reason, with the full message.
+        # The stage will fail for the same reason, with a complete message.
         yield
         return
     with log:

@@ -1,4 +1,4 @@
-"""Which machine this is, and what of it this process may use: cores and memory."""
+"""Facts about the machine, and the cores and memory that this process may use."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from pipeline.runtime.processor import processor_name, sysctl_value
 
 
 def machine_facts() -> dict[str, Any]:
-    """Host, processor, logical cores, memory in MiB, and the load average of the last minute (1 is
-    one busy core, this process among them; None where the system counts none)."""
+    """Host, processor, logical cores, memory in MiB, and the load average of the last minute (None
+    if the system does not provide it)."""
     try:
         load = round(os.getloadavg()[0], 2)
     except (AttributeError, OSError):
@@ -30,26 +30,26 @@ def machine_facts() -> dict[str, Any]:
 
 
 def usable_cores() -> int:
-    """Logical cores that this process may run on; a batch system or taskset may allow fewer than
-    there are."""
+    """The number of logical cores that this process may run on; batch systems and taskset can
+    restrict it."""
     if hasattr(os, "sched_getaffinity"):  # not on macOS
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1
 
 
 def physical_memory() -> int:
-    """Bytes that the machine has."""
+    """The machine's memory in bytes."""
     if sys.platform == "darwin":
         return int(sysctl_value("hw.memsize"))
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
 
 
 def usable_memory(root: Path = Path("/")) -> int:
-    """Bytes that this process may use: the machine's, or less where a container, a batch system or
-    a service manager sets a limit (Linux control groups, versions 1 and 2, and their parents).
+    """The memory in bytes that this process may use: the machine's, or the limit of a Linux control
+    group (version 1 or 2, or a parent) set by a container, batch system or service manager.
 
     Args:
-        root: where /proc and /sys are.
+        root: the folder of /proc and /sys.
     """
     limits = [physical_memory()]
     try:
@@ -66,6 +66,6 @@ def usable_memory(root: Path = Path("/")) -> int:
             continue
         inside = PurePosixPath(path.lstrip("/"))
         for place in (inside, *inside.parents):
-            with suppress(OSError, ValueError):  # not there, or "max"
+            with suppress(OSError, ValueError):  # missing, or "max"
                 limits.append(int((folder / place / name).read_text()))
     return min(limits)

@@ -1,11 +1,10 @@
-"""C++ libraries: found where they are built already for this processor, else compiled.
+"""C++ libraries: an existing one for this processor is used, otherwise it is compiled.
 
-A library lies in ``<root>/<file>-<variant>-<digest>/`` beside ``library.json``, which records the
+A library is in ``<root>/<file>-<variant>-<digest>/`` with ``library.json``, which records the
 sources' hash, the variant (``pipeline.runtime.targets``), flags, compiler and versions. Variants
-lie side by side, so that the nodes of a mixed cluster can share a folder, and a library is found by
-its record without a compiler. The roots are ``pipeline/prebuilt`` (for packages that bring their
-libraries) and $SPLATMAKE_CACHE, by default ``build/native`` of the repository, or a folder in the
-user's cache where the program is installed.
+have separate folders, so that the nodes of a mixed cluster can share a root, and libraries are
+found without a compiler. The roots are ``pipeline/prebuilt`` (wheels) and $SPLATMAKE_CACHE, by
+default ``build/native`` of the repository or, in an installation, the user's cache.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ from pipeline.runtime.processor import processor
 from pipeline.runtime.targets import Extensions, Target, Variant
 
 RECORD = "library.json"
-# In order of preference where $CXX is not set. macOS's g++ is clang under another name.
+# In order of preference if $CXX is not set. On macOS, g++ is clang.
 COMPILERS = ("c++", "clang++") if sys.platform == "darwin" else ("g++", "clang++")
 
 _used: dict[str, Built] = {}
@@ -40,11 +39,11 @@ _used: dict[str, Built] = {}
 
 @dataclass(frozen=True)
 class Built:
-    """A library that is there.
+    """A compiled library.
 
     Attributes:
-        target: the variant it is compiled for.
-        compiler: the first line of its ``--version``.
+        target: the variant that it was compiled for.
+        compiler: the first line of the compiler's ``--version``.
     """
 
     path: Path
@@ -53,8 +52,8 @@ class Built:
 
 
 def native_facts() -> dict[str, str | None]:
-    """The instruction set and the compiler of the libraries that this process used; where it used
-    none, the instruction set that one would be looked for, and no compiler."""
+    """Instruction set and compiler of the libraries that this process has used. If it has used
+    none, the instruction set of this processor's best target, and no compiler."""
     if not _used:
         return {"instruction_set": targets.usable()[0].name, "compiler": None}
     built = _used.values()
@@ -69,12 +68,12 @@ class NativeLibrary:
     """A shared library of all ``.cpp`` files of a folder.
 
     Attributes:
-        name: what it is, for messages.
+        name: for messages.
         file: the library's file name.
         sources: folder of the sources and headers.
-        flags: the compiler's, beside the variant's.
-        compile_only, link_only: more of them for one of the two steps; not recorded.
-        facts: whatever else decides its bits, by name.
+        flags: compiler flags besides the variant's.
+        compile_only, link_only: further flags of one of the two steps; not recorded.
+        facts: name -> value of anything else that the library depends on.
         extensions: see ``targets.usable_variants``.
     """
 
@@ -92,33 +91,34 @@ class NativeLibrary:
         return sorted(p for p in self.sources.iterdir() if p.suffix in (".cpp", ".h"))
 
     def source_hash(self) -> str:
-        """Hex digest of the sources. Cheap, and needs no compiler."""
+        """Hex digest of the sources."""
         digest = hashlib.sha256()
         for path in self.source_files():
             digest.update(path.name.encode() + b"\0" + path.read_bytes() + b"\0")
         return digest.hexdigest()
 
     def build(self) -> Built:
-        """The library for this processor, compiled if it is not there yet.
+        """The library for this processor, compiled if it does not exist.
 
         Raises:
-            UserError: no library and no compiler, or it fails; see also ``targets.usable``.
+            UserError: there is no library and no compiler, or compiling fails; see also
+                ``targets.usable``.
         """
         variants = targets.usable_variants(self.extensions)
         built = self.find(variants[0])
         if built is None and find_compiler() is None:
-            # A lesser one is better than none where nothing can be compiled.
+            # Without a compiler, use a library for an older processor if there is one.
             built = next(filter(None, map(self.find, variants[1:])), None)
         _used[self.name] = built or self.compile(variants[0])
         return _used[self.name]
 
     def find(self, variant: Variant) -> Built | None:
-        """A library of this variant that is there already.
+        """An existing library of this variant, or None.
 
-        By the compiler that $CXX names. Where $CXX is not set: a prebuilt one, else the newest by
-        the default compiler. Where there is no compiler at all: any.
+        It must be compiled by $CXX, if that is set. Otherwise a prebuilt library is preferred, then
+        the newest by the default compiler. Without a compiler, any library is accepted.
         """
-        wanted, command = self._identity(variant), find_compiler()
+        identity, command = self._identity(variant), find_compiler()
         chosen = bool(os.environ.get("CXX"))
         found: list[tuple[bool, float, Built]] = []
         for root in _roots():
@@ -130,7 +130,7 @@ class NativeLibrary:
                 except (OSError, ValueError):  # being replaced, or not ours
                     continue
                 path = file.with_name(self.file)
-                if any(record.get(name) != value for name, value in wanted.items()):
+                if any(record.get(name) != value for name, value in identity.items()):
                     continue
                 if chosen and command is not None:
                     same = record["compiler"] == compiler_identity(command)
@@ -145,11 +145,11 @@ class NativeLibrary:
     def compile(self, variant: Variant) -> Built:
         """Compile this variant, whether or not this processor can run it.
 
-        It is built in a folder beside and renamed, so that what exists is whole and two builds at
-        once are harmless.
+        It is built in a temporary folder, which is then renamed, so that concurrent builds do not
+        interfere.
 
         Raises:
-            UserError: no compiler, or it fails.
+            UserError: no compiler, or compiling fails.
         """
         command = compiler()
         identity = compiler_identity(command)
@@ -162,11 +162,11 @@ class NativeLibrary:
         try:
             self._compile_into(work, [*command, *self.flags_for(variant)])
             (work / RECORD).write_text(json.dumps(record, indent=2) + "\n")
-            work.chmod(0o755)  # mkdtemp's own is for one user alone
+            work.chmod(0o755)  # mkdtemp makes it accessible to this user only.
             try:
                 os.rename(work, library.parent)
             except OSError:
-                if not library.exists():  # otherwise another build was first: theirs is as good
+                if not library.exists():  # Otherwise a concurrent build was first.
                     raise
         finally:
             shutil.rmtree(work, ignore_errors=True)
@@ -181,7 +181,7 @@ class NativeLibrary:
         return self.file.partition(".")[0]
 
     def _identity(self, variant: Variant) -> dict[str, Any]:
-        """What decides a library's bits beside the compiler."""
+        """What a library depends on besides the compiler."""
         identity: dict[str, Any] = {
             "name": self.name,
             "target": variant.name,
@@ -213,12 +213,12 @@ class NativeLibrary:
             errors = [line for line in done.stderr.splitlines() if "error" in line] or [done.stderr]
             raise UserError(
                 f"compiling the {self.name} failed: {errors[0].strip()[:500]}",
-                fix=f"run this to see all of it: {' '.join(command)}",
+                fix=f"run this to see all messages: {' '.join(command)}",
             )
 
 
 def cache_folder() -> Path:
-    """Where libraries are built."""
+    """The folder in which libraries are built."""
     chosen = os.environ.get("SPLATMAKE_CACHE")
     if chosen:
         return Path(chosen)
@@ -239,36 +239,40 @@ def find_compiler() -> list[str] | None:
 
 
 def compiler() -> list[str]:
-    """The C++ compiler's command. Raises UserError where there is none."""
+    """The C++ compiler's command.
+
+    Raises:
+        UserError: there is none.
+    """
     found = find_compiler()
     if found is None:
         raise UserError(
             f"no C++ compiler found ({os.environ.get('CXX') or ', '.join(COMPILERS)}), and no "
-            "library that is built already",
+            "compiled library",
             fix="install g++ (e.g. apt-get install g++) or clang++, or set CXX",
         )
     return found
 
 
 def compiler_identity(command: Sequence[str]) -> str:
-    """All that a compiler says of its version."""
+    """The output of the compiler's ``--version``."""
     done = subprocess.run([*command, "--version"], capture_output=True, text=True)
     return done.stdout.strip() or " ".join(command)
 
 
 def build_main(make: Callable[[], NativeLibrary], arguments: Sequence[str] | None = None) -> int:
-    """The command line that builds a library: its exit code."""
+    """The command line that builds a library; returns the exit code."""
     parser = argparse.ArgumentParser(
-        description="Build a native library and print its path. Without --target: for this "
-        "processor, if it is not there yet."
+        description="Build a native library, unless it exists, and print its path. Without "
+        "--target: for this processor."
     )
     parser.add_argument(
         "--target",
         nargs="+",
         default=[],
         metavar="NAME",
-        help="build for these targets, whatever this processor has: "
-        f"{', '.join(t.name for t in targets.TARGETS)}, native; or all of this architecture",
+        help="build for these targets, also if this processor cannot run them: "
+        f"{', '.join(t.name for t in targets.TARGETS)}, native; all: all of this architecture",
     )
     names = parser.parse_args(arguments).target
     try:
@@ -282,22 +286,22 @@ def build_main(make: Callable[[], NativeLibrary], arguments: Sequence[str] | Non
 
 
 def build_targets(library: NativeLibrary, names: Sequence[str]) -> list[Built]:
-    """A library for each variant of the targets named, compiled where it is not there yet.
+    """A library for each variant of the named targets, compiled if it does not exist.
 
     Raises:
-        UserError: an unknown name, another architecture's without $CXX, or as ``build``.
+        UserError: an unknown name, another architecture without $CXX, or as ``build``.
     """
-    wanted: list[Target] = []
+    chosen: list[Target] = []
     for name in names:
-        wanted += targets.of_this_architecture() if name == "all" else [targets.named(name)]
+        chosen += targets.of_this_architecture() if name == "all" else [targets.named(name)]
     here = targets.processor.architecture()
-    for target in wanted:
+    for target in chosen:
         if target.architecture != here and not os.environ.get("CXX"):
             raise UserError(
                 f"target {target.name} is of another architecture than this machine's ({here})",
                 fix="set CXX to a compiler for it",
             )
     variants = [
-        v for t in dict.fromkeys(wanted) for v in targets.all_variants(t, library.extensions)
+        v for t in dict.fromkeys(chosen) for v in targets.all_variants(t, library.extensions)
     ]
     return [library.find(variant) or library.compile(variant) for variant in variants]

@@ -1,7 +1,7 @@
-"""The processor: its name, its architecture and the instruction sets that it offers to programs.
+"""The processor's name, architecture and instruction-set features.
 
-Features have Linux's names (the flags of /proc/cpuinfo) on every system. Linux and macOS leave out
-what the operating system does not support, so a feature in the list can be used.
+Features have Linux's names (the flags of /proc/cpuinfo) on every system. Linux and macOS omit
+features that the operating system does not support.
 """
 
 from __future__ import annotations
@@ -15,13 +15,13 @@ from pathlib import Path
 CPUINFO = Path("/proc/cpuinfo")
 ARCHITECTURES = {"x86_64": "x86-64", "amd64": "x86-64", "aarch64": "aarch64", "arm64": "aarch64"}
 
-# Every x86-64 processor since 2009 has the first, every 64-bit Arm processor the second.
+# x86-64-v2 (all processors since 2009); all 64-bit Arm processors.
 BASELINE = {
     "x86-64": frozenset({"cx16", "lahf_lm", "popcnt", "pni", "ssse3", "sse4_1", "sse4_2"}),
     "aarch64": frozenset({"asimd"}),
 }
 
-# macOS's names where they differ from Linux's by more than case and dots.
+# macOS's names that differ from Linux's by more than case and dots.
 _DARWIN = {
     "sse3": "pni",
     "avx1_0": "avx",
@@ -35,14 +35,14 @@ _DARWIN_X86 = [f"machdep.cpu.{part}" for part in ("features", "leaf7_features", 
 
 
 def architecture() -> str:
-    """``x86-64``, ``aarch64``, or what the system calls another one."""
+    """``x86-64``, ``aarch64``, or the system's name of another architecture."""
     name = platform.machine()
     return ARCHITECTURES.get(name.lower(), name)
 
 
 def features() -> frozenset[str]:
-    """Instruction-set features that a program may use; the architecture's baseline where the
-    system does not say."""
+    """Instruction-set features that a program may use; the architecture's baseline if the system
+    lists none."""
     found: frozenset[str] = frozenset()
     if sys.platform == "darwin":
         found = darwin_features(
@@ -51,12 +51,12 @@ def features() -> frozenset[str]:
     elif CPUINFO.exists():
         found = linux_features(_first_core())
     baseline = BASELINE.get(architecture(), frozenset())
-    # An Arm system that names no features at all (an emulator) still has the baseline.
+    # Emulated Arm systems may list no features.
     return found | baseline if architecture() == "aarch64" or not found else found
 
 
 def linux_features(lines: Iterable[str]) -> frozenset[str]:
-    """The features in one core's lines of /proc/cpuinfo."""
+    """The features in the lines of a core in /proc/cpuinfo."""
     for line in lines:
         name, _, value = line.partition(":")
         if name.strip() in ("flags", "Features"):
@@ -65,11 +65,11 @@ def linux_features(lines: Iterable[str]) -> frozenset[str]:
 
 
 def darwin_features(intel: Iterable[str], arm: str) -> frozenset[str]:
-    """The features in sysctl's answers, under Linux's names.
+    """The features in macOS's sysctl values, with Linux's names.
 
     Args:
-        intel: values of machdep.cpu.features, leaf7_features and extfeatures, maybe empty.
-        arm: all of hw.optional.arm, a ``name: value`` a line, maybe empty.
+        intel: values of machdep.cpu.features, leaf7_features and extfeatures; may be empty.
+        arm: the values below hw.optional.arm, one ``name: value`` per line; may be empty.
     """
     names = " ".join(intel).split()
     for line in arm.splitlines():
@@ -81,7 +81,7 @@ def darwin_features(intel: Iterable[str], arm: str) -> frozenset[str]:
 
 
 def processor() -> list[str]:
-    """What the system says of its first core: model and instruction sets, a line each."""
+    """Lines that describe the first core: model and instruction sets."""
     kept = ("model name", "flags", "Features", "CPU part")
     lines = [line for line in _first_core() if line.startswith(kept)]
     if not lines:
@@ -90,7 +90,7 @@ def processor() -> list[str]:
 
 
 def processor_name() -> str:
-    """The model's name, else the architecture's."""
+    """The name of the model, else of the architecture."""
     for line in _first_core():
         if line.startswith("model name"):
             return line.partition(":")[2].strip()
@@ -100,7 +100,7 @@ def processor_name() -> str:
 
 
 def sysctl(name: str) -> str:
-    """macOS's answer, ``name: value`` a line; empty where it does not know the name."""
+    """The values of macOS's sysctl, one ``name: value`` per line; empty for unknown names."""
     try:
         done = subprocess.run(["/usr/sbin/sysctl", name], capture_output=True, text=True)
     except OSError:
@@ -109,12 +109,12 @@ def sysctl(name: str) -> str:
 
 
 def sysctl_value(name: str) -> str:
-    """The value alone, of a name that has one."""
+    """A single value of macOS's sysctl, without its name."""
     return sysctl(name).partition(":")[2].strip()
 
 
 def _first_core() -> list[str]:
-    """Its lines of /proc/cpuinfo: one core speaks for all. Empty where there is no such file."""
+    """The first core's lines of /proc/cpuinfo; empty if there is no such file."""
     lines: list[str] = []
     try:
         with open(CPUINFO, encoding="utf-8") as file:

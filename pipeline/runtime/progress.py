@@ -1,8 +1,7 @@
-"""Progress of long work: a line on stderr and a small JSON file beside it.
+"""Progress of long work: a line on stderr and a small JSON file.
 
-In a stage the line stays in its place at the foot of the terminal while a person watches (see
-``Console``), and the log gets one now and then. Elsewhere stderr does. No carriage returns where
-there is no terminal, so that log files stay readable.
+In a stage (see ``Console``) the line is updated in place on an interactive terminal, and appended
+to the log every few seconds. Without a terminal, lines are appended to stderr.
 """
 
 from __future__ import annotations
@@ -20,11 +19,12 @@ from typing import TextIO, TypeVar
 
 T = TypeVar("T")
 
-# A line every few seconds is enough for a person; a log of an hour stays under 1000 lines.
+# Intervals between lines of a log (an hour's log has less than 1000 lines), updates of the JSON
+# file, and updates of the terminal.
 LINE_SECONDS = 5.0
 FILE_SECONDS = 1.0
 LIVE_SECONDS = 0.5
-# Training slows down while the scene grows: the rate is that of the last seconds.
+# The rate is averaged over this time, because training slows down as the number of Gaussians grows.
 RATE_SECONDS = 20.0
 
 _ERASE = "\r\x1b[K"
@@ -33,29 +33,28 @@ _file: Path | None = None
 
 
 def write_progress_to(path: Path | None) -> None:
-    """Let every later ``Progress`` also write its state to ``path`` (atomically)."""
+    """Set the file that all ``Progress`` objects write their state to (atomically); None: none."""
     global _file
     _file = path
 
 
 class Console:
-    """Stands for stderr in a stage.
+    """Replacement of stderr in a stage, which writes to the terminal and to a log.
 
-    What is printed goes to the terminal and to the log. Progress is one line that is replaced in
-    its place while a person watches, and otherwise (no terminal, or CI) shown nowhere; the log has
-    it in any case. The terminal may go away: the work does not end with it.
+    On an interactive terminal the progress is a single line that is updated in place; otherwise
+    (no terminal, or CI) it is only written to the log. Errors of a closed terminal are ignored.
 
     Args:
-        terminal: the true stderr.
-        log: an open file; or None for no log.
-        name: whose progress it is, said before it.
+        terminal: the original stderr.
+        log: an open file, or None.
+        name: prefix of progress lines on the terminal.
     """
 
     def __init__(self, terminal: TextIO, log: TextIO | None, name: str = ""):
         self._terminal: TextIO | None = terminal
         self._log = log
         self._name = name
-        self._live = is_watched(terminal)
+        self._live = is_interactive(terminal)
         self._shows_line = False
         self._last = 0.0
 
@@ -67,7 +66,7 @@ class Console:
         return len(text)
 
     def progress(self, line: str, *, keep: bool) -> None:
-        """Show ``line`` in place of the last one; ``keep`` it in the log."""
+        """Show ``line`` instead of the last one; with ``keep``, append it to the log."""
         if keep and self._log is not None:
             self._log.write(f"{line}\n")
             self._log.flush()
@@ -80,7 +79,7 @@ class Console:
             self.flush()
 
     def clear(self) -> None:
-        """Take the line of progress away."""
+        """Erase the progress line."""
         if self._shows_line:
             self._shows_line = False
             self._to_terminal(_ERASE)
@@ -105,44 +104,44 @@ class Console:
                 self._terminal = None
 
 
-def is_watched(stream: TextIO) -> bool:
-    """Whether a person looks at ``stream``: a terminal that can move its cursor, not CI."""
-    able = os.environ.get("TERM", "dumb") != "dumb"
-    return stream.isatty() and able and not os.environ.get("CI")
+def is_interactive(stream: TextIO) -> bool:
+    """Whether ``stream`` is a terminal with cursor control, and not one of CI."""
+    has_cursor = os.environ.get("TERM", "dumb") != "dumb"
+    return stream.isatty() and has_cursor and not os.environ.get("CI")
 
 
 class Progress:
-    """Counts work and says how fast it goes and how long it still takes.
+    """Counts units of work and shows the rate and the remaining time.
 
     Args:
-        label: what is being done ("extracting features").
+        label: the work ("extracting features").
         total: number of units.
-        unit: the name of one unit, for the rate ("images").
+        unit: name of a unit ("images").
     """
 
     def __init__(self, label: str, total: int, unit: str = "it"):
         self.label, self.total, self.unit = label, total, unit
         self.done = 0
         now = time.monotonic()
-        self._marks = deque([(now, 0)])
+        self._samples = deque([(now, 0)])
         self._last_line = now
         self._last_file = 0.0
 
     def start_at(self, done: int) -> None:
-        """Begin at ``done`` units (resumed work), so that the rate stays true."""
+        """Resume at ``done`` units, which do not count for the rate."""
         self.done = done
-        self._marks = deque([(time.monotonic(), done)])
+        self._samples = deque([(time.monotonic(), done)])
         if done:
-            print(f"{self.label}: going on from {done}/{self.total} {self.unit}", file=sys.stderr)
+            print(f"{self.label}: resuming at {done}/{self.total} {self.unit}", file=sys.stderr)
 
     def advance(self, count: int = 1, note: str = "") -> None:
-        """Count ``count`` more units done; ``note`` is shown at the line's end."""
+        """Add ``count`` finished units; ``note`` is shown at the end of the line."""
         self.done += count
         now = time.monotonic()
-        if now - self._marks[-1][0] >= 1.0:
-            self._marks.append((now, self.done))
-            while len(self._marks) > 2 and now - self._marks[1][0] > RATE_SECONDS:
-                self._marks.popleft()
+        if now - self._samples[-1][0] >= 1.0:
+            self._samples.append((now, self.done))
+            while len(self._samples) > 2 and now - self._samples[1][0] > RATE_SECONDS:
+                self._samples.popleft()
         if now - self._last_file >= FILE_SECONDS and _file is not None:
             self._last_file = now
             self._write(note)
@@ -155,8 +154,8 @@ class Progress:
             print(self.line(note), file=sys.stderr, flush=True)
 
     def rate(self) -> float:
-        """Units a second of late."""
-        since, done = self._marks[0]
+        """Units per second, averaged over ``RATE_SECONDS``."""
+        since, done = self._samples[0]
         return (self.done - done) / max(time.monotonic() - since, 1e-9)
 
     def seconds_left(self) -> float:
@@ -183,7 +182,7 @@ class Progress:
             "seconds_left": self.seconds_left(),
             "note": note,
         }
-        # Only a nicety: neither a full disk nor another run's file may end the work.
+        # Progress is optional: a full disk or another run's file is no error.
         temporary = _file.with_suffix(f".{os.getpid()}.tmp")
         with contextlib.suppress(OSError):
             temporary.write_text(json.dumps(state))

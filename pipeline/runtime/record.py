@@ -1,12 +1,12 @@
-"""What a finished stage records about itself, and whether its files are still those.
+"""The records of a finished stage, and checks of its files against them.
 
-Two records stand beside a stage's outputs:
+A stage's folder has two records besides its outputs:
 
-- ``stage.json`` (``StageRecord``): the same for the same work. Key, digests of inputs and outputs,
-  counters, decisions, warnings. ``.stage.json`` is a copy: Snakemake deletes a job's declared
-  outputs before it runs the job.
-- ``run.json`` (``RunRecord``): how this run went. Versions, commit, machine, instruction set, wall
-  and CPU time, peak memory.
+- ``stage.json`` (``StageRecord``): reproducible. Key, digests of inputs and outputs, counters,
+  decisions, warnings. ``.stage.json`` is a copy, because Snakemake deletes a job's declared outputs
+  before it runs the job.
+- ``run.json`` (``RunRecord``): differs between runs. Versions, commit, machine, instruction set,
+  wall and CPU time, peak memory.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ M = TypeVar("M", bound=BaseModel)
 
 
 class StageRecord(BaseModel):
-    """``stage.json``: what a stage was asked for and what it made."""
+    """``stage.json``: a stage's key, inputs and results."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, ser_json_inf_nan="constants")
 
@@ -50,15 +50,15 @@ class StageRecord(BaseModel):
 
     @property
     def identity(self) -> str:
-        """Digest of what was asked for; the same for the same work."""
+        """Digest of key and inputs; equal for the same work."""
         return identity(self.key, self.inputs)
 
     @property
     def content(self) -> str:
-        """Digest of what was made, not of how or from what.
+        """Digest of the results: outputs, counters and warnings.
 
-        Ground truth (below ``truth/``) is left out: no stage's result may depend on it, and those
-        that measure against it have it in their keys.
+        Ground truth (``truth/``) is excluded. No results depend on it except evaluations, whose
+        keys contain its digest.
         """
         content = {
             "outputs": {k: v for k, v in self.outputs.items() if not k.startswith("truth/")},
@@ -69,9 +69,9 @@ class StageRecord(BaseModel):
 
 
 class RunRecord(BaseModel):
-    """``run.json``: how a stage's run went; differs between runs of the same work.
+    """``run.json``: facts about a stage's run, which differ between runs of the same work.
 
-    Other fields are free: the machine's facts, and timings of the stage's own.
+    Further fields are facts about the machine, and timings specific to the stage.
     """
 
     model_config = ConfigDict(extra="allow", frozen=True, ser_json_inf_nan="constants")
@@ -110,7 +110,7 @@ def file_digest(path: Path) -> str:
 
 
 def output_digests(folder: Path, threads: int = 1) -> dict[str, str]:
-    """Digest of every file of a stage's folder but its records, by path within the folder."""
+    """Path -> digest of every file in a stage's folder except its records."""
     files = sorted(p for p in folder.rglob("*") if p.is_file() and p.name not in RECORDS)
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         digests = list(pool.map(file_digest, files))
@@ -129,7 +129,7 @@ def read_stage(folder: Path) -> StageRecord:
     """The record of a finished stage.
 
     Raises:
-        UserError: there is none, or it is not this stage's.
+        UserError: it is missing, damaged, or belongs to another stage.
     """
     record = read_record(folder / STAGE, StageRecord)
     if record.stage != folder.name:
@@ -142,7 +142,7 @@ def read_stage(folder: Path) -> StageRecord:
 
 
 def read_run(folder: Path) -> RunRecord:
-    """How the run of a finished stage went.
+    """The record of a finished stage's run.
 
     Raises:
         UserError: its record is missing or damaged.
@@ -151,10 +151,10 @@ def read_run(folder: Path) -> RunRecord:
 
 
 def read_record(path: Path, model: type[M]) -> M:
-    """A JSON file that a stage wrote into its folder, as ``model``.
+    """A JSON file in a stage's folder, as ``model``.
 
     Raises:
-        UserError: it is missing, cut off, or something else.
+        UserError: it is missing, truncated, or not valid for ``model``.
     """
     try:
         return model.model_validate_json(path.read_bytes())
@@ -167,20 +167,20 @@ def read_record(path: Path, model: type[M]) -> M:
         where = ".".join(map(str, first["loc"]))
         found = f"{where}: {first['msg']}" if where else first["msg"]
         raise UserError(
-            f"cannot be read, it is damaged or of another version of the program ({found})",
+            f"cannot be read: it is damaged or from another version of the program ({found})",
             file=path,
             fix=rerun(path.parent),
         ) from None
 
 
 def content_digest(folder: Path) -> str:
-    """Digest of what a finished stage made (see ``StageRecord.content``)."""
+    """Digest of a finished stage's results (see ``StageRecord.content``)."""
     return read_stage(folder).content
 
 
 def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
-    """Whether the stage that owns ``folder`` has finished with this key and with what its inputs
-    (folder by role) now contain."""
+    """Whether the stage with this folder has finished with this key and the present content of its
+    inputs (role -> folder)."""
     try:
         record = read_stage(folder)
         digests = {role: content_digest(path) for role, path in inputs.items()}
@@ -193,9 +193,9 @@ def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
 
 
 def check_outputs(folders: Iterable[Path], threads: int) -> None:
-    """Compare the files of finished stages with what their records say of them.
+    """Compare the files of finished stages with the digests in their records.
 
-    Hidden files that no record names (a file manager's, a file server's) are nobody's input.
+    Hidden files without a record, as written by file managers and file servers, are ignored.
 
     Raises:
         UserError: a file has changed, is missing, or was not written by the stage.
@@ -221,17 +221,17 @@ def _is_hidden(name: str) -> bool:
 
 
 def owner_of(path: Path) -> Path | None:
-    """The folder of the finished stage that a file belongs to; None for a file of no stage."""
+    """The folder of the finished stage that a file belongs to, or None."""
     return next((folder for folder in path.parents if (folder / HIDDEN_STAGE).is_file()), None)
 
 
 def changed(folder: Path) -> str:
-    """What is wrong with a file that is not as the stage that owns ``folder`` wrote it."""
+    """The error message for a file of the stage with this folder that has changed."""
     return f"has changed since stage {folder.name} wrote it"
 
 
 def rerun(folder: Path) -> str:
-    """What to do to have the stage that owns ``folder`` make its outputs again."""
+    """The advice to rerun the stage with this folder."""
     target = shlex.quote(str(folder.parent / "metrics.json"))
     return (
         f"add --forcerun {folder.name} to the end of the snakemake command that you use, as in: "

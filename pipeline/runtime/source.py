@@ -1,4 +1,4 @@
-"""A hash of the code a stage runs, so that changed code reruns it and a comment does not."""
+"""A hash of the code that a stage can reach, so that changes of code rerun the stage."""
 
 from __future__ import annotations
 
@@ -18,8 +18,7 @@ from pipeline.runtime.native import cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# These decide how work is run and described, never what comes out of it; the values of the
-# options themselves stand in the stage's key.
+# Modules that do not affect results; values of options are in the stage's key anyway.
 NEUTRAL = (
     "pipeline.runtime",
     "pipeline.config",
@@ -28,14 +27,14 @@ NEUTRAL = (
     "pipeline.plan.stage",
 )
 
-# Modules whose C++ is compiled where it runs, and its folder.
+# Modules with C++ code -> the folder of its sources.
 NATIVE = {
     "pipeline.render": "pipeline/render/cpu/csrc",
     "pipeline.sfm.nearest": "pipeline/sfm/csrc",
 }
 
-# Module -> the digest of its file, the names that it imports, the hash of its syntax tree. Parsing
-# all modules takes longer than the rest of Snakemake's start.
+# Cache: module -> digest of its file, names that it imports, hash of its syntax tree. Parsing all
+# modules takes longer than the rest of Snakemake's start.
 RECORD = "sources.json"
 _unsaved: set[str] = set()
 
@@ -43,16 +42,16 @@ _COMMENT = re.compile(r'//[^\n]*|/\*.*?\*/|("(?:\\.|[^"\\])*")', re.S)
 
 
 def stage_source_hash(module: str) -> str:
-    """Hash of ``module`` and of all modules of the project that it imports, at any depth.
+    """Hash of ``module`` and of all modules of the project that it imports, directly or not.
 
-    Python counts by its syntax tree without docstrings, C++ by its text without comments and
-    spacing, so that neither comments nor formatting change the hash; the pages' viewer by its
-    bytes. What is parsed is kept beside the compiled libraries, for the next process.
+    Python files are hashed by their syntax trees without docstrings, C++ files by their text
+    without comments and whitespace, so that comments and formatting do not change the hash; the
+    report's viewer by its bytes. Hashes of modules are cached beside the compiled libraries.
     """
     digest = hashlib.sha256()
     for name in sorted(_reachable(module)):
         digest.update(f"{name}={_module_hash(name)}\n".encode())
-    _keep_parsed()
+    _save_cache()
     return digest.hexdigest()[:16]
 
 
@@ -80,7 +79,7 @@ def _file_of(module: str) -> Path | None:
 def _imports(module: str) -> tuple[str, ...]:
     ours = [n for n in _parsed(module)[0] if n.split(".")[0] in ("pipeline", "stages")]
     ours = [n for n in ours if _file_of(n)]
-    # A package's __init__ runs before its modules do.
+    # Importing a module also imports the __init__ of its package.
     parents = [n.rpartition(".")[0] for n in ours if "." in n]
     return tuple(sorted({*ours, *(p for p in parents if _file_of(p))}))
 
@@ -138,8 +137,7 @@ def _without_docstrings(tree: ast.Module) -> ast.Module:
 
 
 def _statements(node: ast.AST) -> Iterator[ast.AST]:
-    """A module or statement and all statements inside it, at any depth, but what is imported for
-    type checkers alone."""
+    """A node and all statements inside it, at any depth, except those under TYPE_CHECKING."""
     yield node
     only_types = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
     for name in ("body", "handlers", "orelse", "finalbody", "cases"):
@@ -158,7 +156,7 @@ def _is_string(node: ast.stmt) -> bool:
 
 @cache
 def _record() -> dict[str, list[Any]]:
-    """What earlier processes have parsed in the same way; ``_parsed`` adds to it."""
+    """The cache of earlier processes with the same parser; ``_parsed`` adds to it."""
     try:
         stored = json.loads((cache_folder() / RECORD).read_text())
         return dict(stored["modules"]) if stored["parser"] == _parser() else {}
@@ -166,14 +164,14 @@ def _record() -> dict[str, list[Any]]:
         return {}
 
 
-def _keep_parsed() -> None:
+def _save_cache() -> None:
     if _unsaved:
-        with contextlib.suppress(OSError):  # it only saves time
+        with contextlib.suppress(OSError):  # The cache is optional.
             write_json(cache_folder() / RECORD, {"parser": _parser(), "modules": _record()})
         _unsaved.clear()
 
 
 def _parser() -> str:
-    """What decides the hash of a syntax tree: Python's version and this file."""
+    """Python's version and the hash of this file, on which hashes of syntax trees depend."""
     own = hashlib.sha256(Path(__file__).read_bytes()).hexdigest()
     return f"{sys.version_info[:3]} {own}"

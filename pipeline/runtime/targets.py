@@ -1,6 +1,6 @@
-"""Instruction-set targets: what native libraries are compiled for, and which one runs here.
+"""Instruction-set targets that native libraries are compiled for.
 
-``SPLATMAKE_TARGET`` forces one by name. Otherwise the processor's best is used.
+The best target of the processor is used, or the one that ``SPLATMAKE_TARGET`` names.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Target:
     """A named instruction set.
 
     Attributes:
-        flags: the compiler's (g++ 11 and clang++ 12 or newer know them).
-        features: what a processor must have, by Linux's names.
+        flags: compiler flags (g++ 11, clang++ 12 or newer).
+        features: features that a processor must have, with Linux's names.
     """
 
     name: str
@@ -31,7 +31,7 @@ class Target:
 
     @property
     def missing(self) -> list[str]:
-        """What this machine lacks of it."""
+        """The features that this machine does not have."""
         if self.architecture != processor.architecture():
             return [f"the {self.architecture} architecture"]
         return sorted(self.features - processor.features())
@@ -41,7 +41,7 @@ _V2 = processor.BASELINE["x86-64"]
 _V3 = _V2 | {"avx", "avx2", "bmi1", "bmi2", "f16c", "fma", "abm", "movbe"}
 _V4 = _V3 | {"avx512f", "avx512bw", "avx512cd", "avx512dq", "avx512vl"}
 
-# Of each architecture, from the least to the best.
+# In ascending order within each architecture.
 TARGETS = (
     Target("x86-64-v2", "x86-64", ("-march=x86-64-v2",), _V2),
     Target("x86-64-v3", "x86-64", ("-march=x86-64-v3",), _V3),
@@ -51,34 +51,39 @@ TARGETS = (
 
 
 def native_target() -> Target:
-    """Whatever the compiler finds on this very processor. Its libraries serve no other model."""
+    """All features of this processor. The library cannot be used on other models."""
     architecture = processor.architecture()
     option = "-march=native" if architecture == "x86-64" else "-mcpu=native"
     return Target("native", architecture, (option,))
 
 
 def named(name: str) -> Target:
-    """The target of this name. Raises UserError where there is none."""
+    """The target with this name.
+
+    Raises:
+        UserError: there is none.
+    """
     known = {target.name: target for target in (*TARGETS, native_target())}
     if name not in known:
         raise UserError(
             f"unknown instruction-set target {name!r}; expected one of {', '.join(known)}",
-            fix=f"correct {VARIABLE} or --target, or leave it out for the processor's best",
+            fix=f"correct or omit {VARIABLE} or --target",
         )
     return known[name]
 
 
 def of_this_architecture() -> list[Target]:
-    """All targets a compiler here can build for, best first."""
+    """The targets of this architecture, best first."""
     here = processor.architecture()
     return [target for target in reversed(TARGETS) if target.architecture == here]
 
 
 def usable() -> list[Target]:
-    """The targets to look for, best first: the forced one alone, else all the processor has.
+    """The targets that this processor can run, best first; only the one that ``SPLATMAKE_TARGET``
+    names, if it is set.
 
     Raises:
-        UserError: the forced one is unknown or not what the processor has, or it has none.
+        UserError: that target is unknown or not supported by the processor, or no target is.
     """
     if forced := os.environ.get(VARIABLE):
         target = named(forced)
@@ -86,13 +91,13 @@ def usable() -> list[Target]:
             raise UserError(
                 f"{VARIABLE}={forced}: this processor ({processor.processor_name()}) lacks "
                 f"{', '.join(target.missing)}",
-                fix=f"unset {VARIABLE} for the best that it has",
+                fix=f"unset {VARIABLE} to use the processor's best target",
             )
         return [target]
     found = [target for target in of_this_architecture() if not target.missing]
     if not found:
         lacks = [target.missing for target in of_this_architecture()[-1:]]
-        why = f"lacks {', '.join(lacks[0])}" if lacks else "has no target of its own"
+        why = f"lacks {', '.join(lacks[0])}" if lacks else "is of an unsupported architecture"
         raise UserError(
             f"this processor ({processor.processor_name()}) {why}",
             fix=f"set {VARIABLE}=native, which is not tested, or use another machine",
@@ -102,7 +107,7 @@ def usable() -> list[Target]:
 
 @dataclass(frozen=True)
 class Extension:
-    """A feature beyond a target's own that a library has a use for."""
+    """A feature beyond those of a target, with the compiler flags for it."""
 
     feature: str
     flags: tuple[str, ...]
@@ -110,7 +115,7 @@ class Extension:
 
 @dataclass(frozen=True)
 class Variant:
-    """What a library is compiled for: a target, perhaps with extensions."""
+    """A target with optional extensions, for which a library is compiled."""
 
     target: Target
     extensions: tuple[Extension, ...] = ()
@@ -121,7 +126,7 @@ class Variant:
 
     @property
     def flags(self) -> list[str]:
-        """The compiler's; an extension's -march replaces the target's."""
+        """Compiler flags; an extension's -march overrides the target's."""
         return [*self.target.flags, *(flag for e in self.extensions for flag in e.flags)]
 
 
@@ -129,11 +134,11 @@ Extensions = Mapping[str, Sequence[Extension]]
 
 
 def usable_variants(extensions: Extensions) -> list[Variant]:
-    """What to look for, best first: of each usable target the variant with all extensions that
-    the processor has, then the one without.
+    """The variants that this processor can run, best first: for each usable target the one with
+    all extensions that the processor has, then the one without.
 
     Args:
-        extensions: what a library has a use for, by the target's name.
+        extensions: target's name -> extensions that the library uses.
     """
     available = processor.features()
     found: list[Variant] = []
@@ -145,6 +150,6 @@ def usable_variants(extensions: Extensions) -> list[Variant]:
 
 
 def all_variants(target: Target, extensions: Extensions) -> list[Variant]:
-    """What to build of a target for any processor that has it."""
+    """The variants of a target for all processors that can run it."""
     more = tuple(extensions.get(target.name, ()))
     return [Variant(target), *([Variant(target, more)] if more else [])]

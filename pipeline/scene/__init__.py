@@ -1,1 +1,1 @@
-"""A scene as plain values: photographs, cameras, poses, points, views."""
+"""Data types of a scene: photographs, cameras, poses, sparse points and views."""

@@ -1,4 +1,4 @@
-"""The list of a scene's photographs that stages hand to one another (``images.json``)."""
+"""The list of a scene's photographs that stages exchange (``images.json``)."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from pipeline.runtime.record import read_record
 
 
 class Photo(BaseModel):
-    """One photograph, all facts known without decoding its pixels.
+    """A photograph and its metadata, read without decoding pixels.
 
-    Sizes and coordinates refer to the stored pixel grid: EXIF orientation is never applied to
-    pixels (COLMAP's habit; cv2 must be told), only carried along for pages that show pictures.
+    Sizes and coordinates refer to the stored pixels. As in COLMAP, the EXIF orientation is not
+    applied to them (cv2 needs ``IMREAD_IGNORE_ORIENTATION``); it only decides how the report
+    displays photographs.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -23,7 +24,7 @@ class Photo(BaseModel):
     name: str
     """Relative to the image folder, "/" between folders; unique."""
     path: str
-    """File to read, as seen from the working directory."""
+    """The file, relative to the working directory or absolute."""
     width: int
     height: int
     digest: str
@@ -34,19 +35,19 @@ class Photo(BaseModel):
     orientation: int = 1
     """EXIF orientation, 1 to 8."""
     mask: str | None = None
-    """Mask file; non-zero pixels count, zero ones are ignored."""
+    """Mask file; pixels with mask value 0 are ignored."""
     mask_digest: str | None = None
     depth: str | None = None
     """Depth map file."""
     depth_digest: str | None = None
     focal_px: float | None = None
-    """Focal length prior from EXIF in pixels of this size."""
+    """Focal length from EXIF, in pixels at ``width`` x ``height``."""
     camera_group: str = ""
-    """Photographs with the same group were taken with the same body, lens, focal and size."""
+    """Equal for photographs with the same camera body, lens, focal length and size."""
     gps: tuple[float, float, float] | None = None
     """Latitude and longitude in degrees, altitude in metres."""
     taken: str | None = None
-    """EXIF time, ISO 8601."""
+    """Time of exposure from EXIF, ISO 8601."""
 
     @model_validator(mode="after")
     def _files_have_digests(self) -> Photo:
@@ -65,8 +66,8 @@ class Manifest(BaseModel):
     warnings: tuple[str, ...] = ()
 
     def write(self, path: Path) -> None:
-        """Files inside the manifest's own folder are written as "./..." from there: the folder
-        may be moved as a whole."""
+        """Write ``path``. Paths of files below its folder become relative to it ("./..."), so that
+        the folder can be moved."""
         folder = path.parent
 
         def inside(file: str) -> str:

@@ -1,7 +1,7 @@
-"""Cameras, posed images and points, as plain values: what COLMAP calls a reconstruction.
+"""Cameras, posed images and sparse points: COLMAP's reconstruction.
 
-One convention everywhere (COLMAP's): world to camera, x right, y down, z forward, pixel
-centres at half integers. Other conventions are converted where files are read and written.
+All code uses COLMAP's convention: world to camera, x right, y down, z forward, pixel centres at
+half integers. ``pipeline.io`` converts other conventions when it reads and writes files.
 """
 
 from __future__ import annotations
@@ -16,14 +16,14 @@ from pipeline.geometry.cameras import Camera
 
 
 @dataclass(frozen=True)
-class Posed:
-    """One image with its pose.
+class PosedImage:
+    """An image with its pose.
 
     Attributes:
         name: file name relative to the image folder, with "/" between folders.
         camera_id: key into ``Reconstruction.cameras``.
         rotation: (3, 3) float64, world to camera.
-        translation: (3,) float64, world to camera, in the world's unit.
+        translation: (3,) float64, world to camera, in world units.
     """
 
     name: str
@@ -86,21 +86,25 @@ class Points:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Cameras and images by COLMAP id, and points."""
+    """Cameras and images by COLMAP id, and sparse points."""
 
     cameras: dict[int, Camera]
-    images: dict[int, Posed]
+    images: dict[int, PosedImage]
     points: Points = field(default_factory=Points.empty)
 
-    def by_name(self) -> dict[str, Posed]:
+    def by_name(self) -> dict[str, PosedImage]:
         return {image.name: image for image in self.images.values()}
 
 
 def with_poses(model: Reconstruction, poses: Mapping[str, NDArray[np.float64]]) -> Reconstruction:
-    """The model with other poses, (4, 4) world to camera by name; those not named stay."""
+    """A copy of ``model`` with the poses of some images replaced.
 
-    def moved(image: Posed) -> Posed:
+    Args:
+        poses: image name -> (4, 4) world to camera.
+    """
+
+    def updated(image: PosedImage) -> PosedImage:
         pose = poses.get(image.name, image.world_to_camera)
         return replace(image, rotation=pose[:3, :3], translation=pose[:3, 3])
 
-    return replace(model, images={key: moved(image) for key, image in model.images.items()})
+    return replace(model, images={key: updated(image) for key, image in model.images.items()})

@@ -1,4 +1,4 @@
-"""The pinhole views that training and evaluation look at."""
+"""Views: pinhole cameras with their photographs, for training and evaluation."""
 
 from __future__ import annotations
 
@@ -17,17 +17,18 @@ from pipeline.scene.reconstruction import Reconstruction
 
 @dataclass(frozen=True)
 class View:
-    """A pinhole view ready for training or evaluation.
+    """A pinhole camera with its photograph.
 
     Attributes:
         name: the photograph's name.
-        image, mask: files; the mask's non-zero pixels count; None where there is none.
-        width, height: pixels of the target resolution (the file may be larger).
-        fx, fy, cx, cy: pixels, at the target resolution.
+        image: file of the photograph.
+        mask: file of its mask (pixels with value 0 are ignored), or None.
+        width, height: size of the view in pixels (the file may be larger).
+        fx, fy, cx, cy: intrinsics in pixels at that size.
         world_to_camera: (4, 4) float64.
-        is_test: held out.
-        camera_id: key into ``Reconstruction.cameras``; views of one camera share its lens.
-        image_digest, mask_digest: of the files (``recorded.digest_of``); readers compare them.
+        is_test: whether this is a test view, which is not trained on.
+        camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
+        image_digest, mask_digest: digests of the files (``recorded.digest_of``), checked when read.
     """
 
     name: str
@@ -51,15 +52,15 @@ class View:
         return -self.world_to_camera[:3, :3].T @ self.world_to_camera[:3, 3]
 
 
-def is_held_out(index: int, every: int) -> bool:
-    """The field's split (Mip-NeRF360): of the views sorted by name, each ``every``-th from the
-    first is held out; 0 holds out none."""
+def is_test_view(index: int, every: int) -> bool:
+    """Whether view ``index`` of the views sorted by name is a test view: every ``every``-th is,
+    from the first, as in Mip-NeRF 360 and 3DGS. 0: none is."""
     return every > 0 and index % every == 0
 
 
 def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
-    """Width and height in pixels, reduced so that neither exceeds ``max_long_side``; the shape
-    stays, but for rounding."""
+    """Width and height in pixels, reduced so that neither exceeds ``max_long_side``; the aspect
+    ratio stays the same up to rounding."""
     longest = max(width, height)
     if longest <= max_long_side:
         return width, height
@@ -72,23 +73,27 @@ def view_size(width: int, height: int, max_long_side: int) -> tuple[int, int]:
 def load_views(
     manifest: Manifest, model: Reconstruction, views: schema.Views, split: schema.Split
 ) -> list[View]:
-    """The photographs that have a pose, sorted by name, at the size ``views`` asks for.
+    """The photographs that have a pose, as views sorted by name.
 
-    Intrinsics are scaled by the exact ratios of widths and of heights.
+    Intrinsics are scaled by the exact ratios of the widths and of the heights.
+
+    Args:
+        views: the largest side of a view, and whether masks are used.
+        split: which views are test views.
 
     Raises:
-        ValueError: a camera distorts; such pictures must be undistorted first.
+        ValueError: a camera has lens distortion; undistort the photographs first.
     """
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
-    # A single view is trained on: there is nothing to learn from none.
+    # A single view is a training view.
     every = split.test_every if len(photos) > 1 else 0
     result = []
     for index, photo in enumerate(photos):
         image = posed[photo.name]
         camera = model.cameras[image.camera_id]
         if not camera.is_pinhole:
-            raise ValueError(f"{photo.name}: its {camera.model} camera distorts")
+            raise ValueError(f"{photo.name}: its {camera.model} camera has lens distortion")
         width, height = view_size(photo.width, photo.height, views.max_long_side_px)
         fx, fy, cx, cy = camera.resized(width, height).pinhole
         result.append(
@@ -103,7 +108,7 @@ def load_views(
                 cx=cx,
                 cy=cy,
                 world_to_camera=image.world_to_camera,
-                is_test=is_held_out(index, every),
+                is_test=is_test_view(index, every),
                 camera_id=image.camera_id,
                 image_digest=photo.digest,
                 mask_digest=photo.mask_digest if views.masks == "auto" else None,
@@ -115,33 +120,35 @@ def load_views(
 def scene_extent(views: list[View]) -> float:
     """1.1 times the largest distance of a training camera from their mean, in world units.
 
-    3DGS's measure of a scene's size (Kerbl et al. 2023, reference code), by which learning rates
-    and thresholds scale. Where the training cameras stand in one place all views count, and
-    where these do too the extent is 1.
+    This is ``cameras_extent`` of 3DGS (Kerbl et al. 2023, reference code); learning rates and
+    thresholds are proportional to it. If all training cameras have the same position, all views
+    are used; if these have too, the extent is 1.
     """
     for chosen in ([view for view in views if not view.is_test], views):
         if chosen:
             centres = np.stack([view.centre for view in chosen])
             radius = float(np.linalg.norm(centres - centres.mean(0), axis=1).max())
-            # What is left of a distance by the rounding of poses is none.
+            # Smaller distances are rounding errors of the poses.
             if radius > 1e-9 * float(np.abs(centres).max()):
                 return 1.1 * radius
     return 1.0
 
 
 def scene_up(views: Sequence[View], manifest: Manifest) -> NDArray[np.float64]:
-    """(3,) ``up_direction`` of these views' cameras as their photographs were held."""
+    """(3,) ``up_direction`` of the views' cameras and their photographs' EXIF orientations."""
     orientation = {photo.name: photo.orientation for photo in manifest.photos}
     rotations = np.stack([view.world_to_camera[:3, :3] for view in views])
     return up_direction(rotations, [orientation[view.name] for view in views])
 
 
 def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]:
-    """The model's images as views without photographs, sorted by name, lens distortion left out;
-    a folder that they all lie in is left out of their names.
+    """The images of a model as views without photographs, sorted by name.
+
+    Lens distortion is ignored. A parent folder that all images have in common is removed from
+    the names.
 
     Args:
-        max_long_side: pixels; larger views are reduced to it.
+        max_long_side: in pixels; larger views are reduced to it.
     """
     folders = {posixpath.dirname(image.name) for image in model.images.values()}
     mixed = len({posixpath.isabs(folder) for folder in folders}) != 1
@@ -158,5 +165,5 @@ def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]
 
 
 def reduced_size(view: View, factor: int) -> tuple[int, int]:
-    """(width, height) of a view at 1 / ``factor``, rounded."""
+    """(width, height) of the view divided by ``factor``, rounded, at least 1."""
     return max(1, round(view.width / factor)), max(1, round(view.height / factor))

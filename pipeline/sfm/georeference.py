@@ -16,7 +16,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.geodesy import to_enu
-from pipeline.geometry.similarity import OUTLIER, Fit, Similarity, robust_similarity
+from pipeline.geometry.similarity import (
+    OUTLIER_SIGMAS,
+    RobustFit,
+    Similarity,
+    robust_similarity,
+)
 from pipeline.io.gcp import GroundControl
 
 Array = NDArray[np.float64]
@@ -187,14 +192,14 @@ def from_gcp(
         triangulate: photograph name -> pixel to the (3,) point in the mapper's world, None if it
             cannot be triangulated.
     """
-    found = [(point, triangulate(point.seen)) for point in control.points]
+    found = [(point, triangulate(point.pixels)) for point in control.points]
     placed = [(point, at) for point, at in found if at is not None]
     if len(placed) < MIN_POSITIONS:
         return (
             f"only {len(placed)} of {len(control.points)} ground control points are seen by two "
             "photographs with a pose"
         )
-    places = np.array([point.place for point, _ in placed], np.float64)
+    places = np.array([point.position for point, _ in placed], np.float64)
     if control.geographic:
         origin = np.median(places, axis=0)[[1, 0, 2]]
         target = to_enu(places[:, [1, 0, 2]], origin)
@@ -260,7 +265,7 @@ def _tilt(target: Array, used: NDArray[np.bool_], sigma: float) -> float:
     return float(ALTITUDE_RATIO * sigma / max(float(flat[1]), 1e-12))
 
 
-def _along_line(up: Array, centres: Array, enu: Array) -> Fit | str:
+def _along_line(up: Array, centres: Array, enu: Array) -> RobustFit | str:
     """Similarity for positions on a line, or the reason why there is none.
 
     The up direction is taken from the cameras; heading, scale and horizontal translation from the
@@ -286,14 +291,17 @@ def _along_line(up: Array, centres: Array, enu: Array) -> Fit | str:
                 best = (score, proposal)
     assert best is not None
     sigma = max(best[0] / 1.1774, GPS_FLOOR_M)
-    used = np.linalg.norm(best[1](flat_on_ground)[:, :2] - enu[:, :2], axis=1) <= OUTLIER * sigma
+    used = (
+        np.linalg.norm(best[1](flat_on_ground)[:, :2] - enu[:, :2], axis=1)
+        <= OUTLIER_SIGMAS * sigma
+    )
     fitted = _flat_similarity(flat_on_ground[used], ground[used])
     errors = np.linalg.norm(fitted(flat_on_ground)[:, :2] - enu[:, :2], axis=1)
     # 1.1774 is the median of the Rayleigh distribution.
     sigma = max(float(np.median(errors[used])) / 1.1774, GPS_FLOOR_M)
     height = float(np.median(enu[used, 2] - fitted.scale * flat[used, 2]))
     shift = fitted.translation + np.array([0.0, 0.0, height])
-    return Similarity(fitted.scale, fitted.rotation @ upright, shift), used, sigma
+    return RobustFit(Similarity(fitted.scale, fitted.rotation @ upright, shift), used, sigma)
 
 
 def _flat_similarity(source: Array, target: Array) -> Similarity:

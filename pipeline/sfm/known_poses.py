@@ -163,7 +163,7 @@ def _align(model: pycolmap.Reconstruction, anchors: list[int], before: NDArray[n
     floor = 1e-6 * float(np.median(np.linalg.norm(before - np.median(before, axis=0), axis=1)))
     fitted = robust_similarity(now, before, np.ones(3), floor)
     if fitted is not None:
-        transform_model(model, fitted[0])
+        transform_model(model, fitted.similarity)
 
 
 def _is_finite(model: pycolmap.Reconstruction) -> bool:

@@ -10,7 +10,7 @@ from typing import cast
 import numpy as np
 import pycolmap
 
-from pipeline.io.posefiles import SHARED_BY
+from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 
 # Smallest relative decrease of the robust cost for which a freed parameter is accepted. Parameters
 # that the camera has lower the cost by at least 0.5%, others by at most 0.1%.
@@ -71,8 +71,8 @@ def refine(
             shared = set(model.cameras)
         else:
             text = (
-                f"no camera has {SHARED_BY} photographs: distortion models and principal points "
-                "are unchanged"
+                f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and "
+                "principal points are unchanged"
             )
             return Refined(best, False, set(), [text])
     if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
@@ -213,7 +213,7 @@ def _block_order_is_unique(model: pycolmap.Reconstruction) -> bool:
 def _shared_cameras(model: pycolmap.Reconstruction) -> set[int]:
     """Ids of the cameras with enough registered images."""
     used = [model.image(i).camera_id for i in model.reg_image_ids()]
-    return {camera_id for camera_id in used if used.count(camera_id) >= SHARED_BY}
+    return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES_PER_CAMERA}
 
 
 def _make_radial(camera: pycolmap.Camera) -> None:

@@ -1,1 +1,1 @@
-"""What binds the stages to Snakemake."""
+"""The connection between the stages and Snakemake."""

@@ -1,4 +1,4 @@
-"""What a batch of runs gave: ``benchmark.csv``, ``benchmark.json`` and the page that shows them."""
+"""The tables of a batch of runs: ``benchmark.csv``, ``benchmark.json``, and their page."""
 
 import argparse
 import json
@@ -27,8 +27,8 @@ def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
     """Write the three files into the folder ``results``.
 
     Args:
-        outcomes: for each run ``run`` (scene, config, seed) and ``status``; where that is not ok,
-            ``stage`` and ``message`` as well (see ``pipeline.reporting.batch.Result``).
+        outcomes: for each run ``run`` (scene, config, seed) and ``status``; unless that is "ok",
+            also ``stage`` and ``message`` (see ``pipeline.reporting.batch.Result``).
         results: the folder of the runs.
     """
     found = [result_of(outcome, results) for outcome in outcomes]
@@ -38,7 +38,7 @@ def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
 
 
 def result_of(outcome: dict[str, Any], results: Path) -> Result:
-    """A run's outcome together with what its folder holds."""
+    """A run's outcome with the measurements in its folder."""
     run = Run(*outcome["run"])
     if outcome["status"] != "ok":
         return Result(run, outcome["status"], outcome["stage"], outcome["message"])
@@ -56,8 +56,7 @@ def result_of(outcome: dict[str, Any], results: Path) -> Result:
 
 
 def batch_of(found: list[Result], results: Path) -> Batch:
-    """The page's content; the pictures of a scene all show the view that is its first run's
-    median."""
+    """The page's content. All images of a scene show the same view: the first run's median."""
     renders: dict[str, Thumbnail] = {}
     photos: dict[str, Thumbnail] = {}
     plans: dict[str, dict[str, Any]] = {}

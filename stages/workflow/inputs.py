@@ -1,4 +1,4 @@
-"""The roles that stages' inputs have, and reading what earlier stages made."""
+"""Roles of stages' inputs, and reading the outputs of earlier stages."""
 
 from __future__ import annotations
 
@@ -18,16 +18,16 @@ from pipeline.scene.views import View, load_views
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians
 
-# Stages that can fill a role, the latest in the DAG first.
+# The stages that can provide an input, the latest in the DAG first.
 PHOTOS = ("decode", "inspect")
 VIEWS = ("undistort", *PHOTOS)
 GIVEN = ("decode", "inspect")
 POSES = ("sfm", "refine", *GIVEN)
 MODEL = ("undistort", *POSES)
-# What stages after training read.
+# Inputs of the stages after training.
 TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
-# How Gaussians are drawn outside training.
+# Options that rendering outside of training depends on.
 DRAWING_OPTIONS = ("train.sh_degree", "train.antialias", "train.background")
 
 
@@ -40,14 +40,13 @@ def input_model(job: Job, role: str = "model") -> Reconstruction:
 
 
 def georeference(job: Job) -> dict[str, Any] | None:
-    """The frame of the poses (``georeference.json``); None where the stage that gave them recorded
-    none."""
+    """The frame of the poses (``georeference.json``), None if their stage has none."""
     file = job.inputs["poses"] / GEOREFERENCE
     return read_json(file) if file.is_file() else None
 
 
 def copy_georeference(job: Job, role: str) -> None:
-    """Hand on the frame of the poses, where the input of this role has one."""
+    """Copy the frame of the poses from the input of this role, if it has one."""
     if (job.inputs[role] / GEOREFERENCE).is_file():
         shutil.copy(job.inputs[role] / GEOREFERENCE, job.out)
 
@@ -57,14 +56,14 @@ def read_json(file: Path) -> Any:
 
 
 def trained_model(job: Job) -> Reconstruction:
-    """The views' model, with its cameras as training refined them (``train.refine_poses``,
+    """The model with cameras as refined by training (``train.refine_poses``,
     ``train.refine_intrinsics``)."""
     refined = job.inputs["train"] / "sparse" / "0"
     return read_model(refined) if has_model(refined) else input_model(job)
 
 
 def input_views(job: Job) -> list[View]:
-    """All views, with the cameras that training starts from."""
+    """All views, with the cameras before training."""
     return _views(job, input_model(job))
 
 

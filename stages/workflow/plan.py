@@ -1,4 +1,4 @@
-"""Write the plan that the DAG was built from.
+"""Write a scene's plan.
 
 Outputs: ``results/<scene>/plan.json`` and a picture of it, ``plan.svg``.
 """

@@ -1,4 +1,4 @@
-"""The face the Snakefile sees: scenes, their plans, and each rule's inputs and key."""
+"""The interface of the Snakefile: scenes, their plans, and the inputs and key of each rule."""
 
 from __future__ import annotations
 
@@ -26,8 +26,8 @@ from pipeline.runtime.source import stage_source_hash
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
-# Written when a batch ends with failures and an input of the next one's tables from then on, so
-# that tables made by half a batch are made again.
+# Written when runs of a batch failed. From then on it is an input of the tables, so that these are
+# made again after the next batch.
 FAILURES = RESULTS / ".failures.json"
 
 
@@ -58,7 +58,7 @@ class SnakemakeProject:
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
         self._described: dict[str, str] = {}
-        # Set here and not in the rules' text, which counts as code: moving the project or its
+        # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
             filter(None, [basedir, os.environ.get("PYTHONPATH", "")])
@@ -66,7 +66,7 @@ class SnakemakeProject:
         os.environ["PATH"] = os.pathsep.join(
             [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
         )
-        # Libraries' OpenMP threads that spin slow whatever runs beside them.
+        # OpenMP threads that wait actively slow down other processes.
         os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
     # --- one scene ------------------------------------------------------------------------
@@ -77,13 +77,13 @@ class SnakemakeProject:
         return STAGES.values()
 
     def packaged(self, file: str) -> str:
-        """The absolute path of a file that is named from the folder of the packages, which is not
-        the Snakefile's where the program is installed."""
+        """The absolute path of a file of the packages, which are not in the Snakefile's folder if
+        the program is installed."""
         return str(PACKAGES / file)
 
     def inputs(self, spec: StageSpec) -> Callable[[Any], dict[str, str]]:
-        """Input function: role -> the ``stage.json`` that fills it, and ``plan.json`` for a stage
-        that shows the plan."""
+        """Input function: role -> ``stage.json`` of the stage that provides it, and ``plan.json``
+        for stages that read the plan."""
 
         def files(wildcards: Any) -> dict[str, str]:
             sources = self._inputs(spec, wildcards.scene)
@@ -101,7 +101,7 @@ class SnakemakeProject:
         ]
 
     def published(self, spec: StageSpec) -> Callable[[Any], list[str]]:
-        """Params function: outputs of a stage that stand in the scene's own folder as well."""
+        """Params function: "file=path" for outputs that are copied to the scene's folder."""
         return lambda wildcards: [
             f"{name}={RESULTS / wildcards.scene / name}" for name in spec.publishes
         ]
@@ -111,7 +111,7 @@ class SnakemakeProject:
         return lambda wildcards: stage_key(spec, self._plan(wildcards.scene))
 
     def memory_mb(self, spec: StageSpec) -> Callable[[Any], int]:
-        """Resources function: MB that the stage may use and a cluster reserves."""
+        """Resources function: memory in MB that the stage may use and a cluster reserves."""
         declared = spec.memory_mb
         if isinstance(declared, int):
             return lambda wildcards: declared
@@ -143,7 +143,7 @@ class SnakemakeProject:
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
         return plan
 
-    # --- all of them ----------------------------------------------------------------------
+    # --- batches --------------------------------------------------------------------------
 
     @cached_property
     def _scenes(self) -> list[str]:
@@ -152,8 +152,8 @@ class SnakemakeProject:
 
     @cached_property
     def _batch(self) -> tuple[list[Run], dict[Run, str]]:
-        """The runs of all scenes under all configurations and seeds, and those of them that
-        cannot be planned with the reason: a folder that is no scene is left out."""
+        """All runs (scenes x configurations x seeds), and run -> reason for those that cannot be
+        planned, because their folder is not a scene."""
         left_out: dict[Run, str] = {}
         runs = all_runs(self._scenes, self._project.configs, self._project.seeds)
         for run in runs:
@@ -165,17 +165,17 @@ class SnakemakeProject:
             print(f"left out: {message}", file=sys.stderr)
         if len(left_out) == len(runs):
             fix = "set data_root to the folder whose subfolders are scenes"
-            _exit(UserError("no scene here", file=self._root, fix=fix))
+            _exit(UserError("expected scene folders, found none", file=self._root, fix=fix))
         return runs, left_out
 
     def every_run(self, wildcards: Any) -> list[str]:
-        """Input function: the metrics of the whole batch."""
+        """Input function: ``metrics.json`` of all runs."""
         runs, left_out = self._batch
         targets = [RESULTS / run.name / "metrics.json" for run in runs if run not in left_out]
         return [str(path) for path in (*targets, FAILURES) if path in targets or path.exists()]
 
     def outcomes(self, wildcards: Any) -> str:
-        """Params function: how each run ended, once all have ended well."""
+        """Params function: the outcomes of all runs, when none has failed."""
         runs, left_out = self._batch
         return canonical(
             {
@@ -188,8 +188,8 @@ class SnakemakeProject:
     # --- failures -------------------------------------------------------------------------
 
     def after_failure(self) -> None:
-        """Say again, last of all, what stopped the stages that failed in this run. A batch's
-        tables are made all the same, with what there is."""
+        """Print the messages of the stages that failed, and write a batch's tables with the runs
+        that succeeded."""
         for log in sorted(RESULTS.glob("*/logs/*.log")):
             message = self._error_in(log)
             if message:
@@ -210,25 +210,25 @@ class SnakemakeProject:
             print(said, file=sys.stderr)
 
     def _ended(self, run: Run) -> dict[str, Any]:
-        """How a run of the batch ended."""
+        """The outcome of a run of the batch."""
         plan = self._make_plan(run.name)
         for stage in filter(plan.runs, plan.stages):
             folder = RESULTS / run.name
             key = stage_key(STAGES[stage], plan)
             if not is_current(folder / stage, key, self._inputs(STAGES[stage], run.name)):
                 log = folder / "logs" / f"{stage}.log"
-                if not self._began(log):
+                if not self._has_run(log):
                     return _outcome(run, "another failure stopped the batch", "not run", stage)
-                silent = f"it ended without a message, killed perhaps: see {log}"
-                return _outcome(run, self._error_in(log) or silent, "failed", stage)
+                unknown = f"it ended without a message (it may have been killed): see {log}"
+                return _outcome(run, self._error_in(log) or unknown, "failed", stage)
         return _outcome(run, None)
 
-    def _began(self, log: Path) -> bool:
+    def _has_run(self, log: Path) -> bool:
         return log.is_file() and log.stat().st_mtime >= self._started
 
     def _error_in(self, log: Path) -> str:
-        """The message of a stage that ended in this run with a user's error; else empty."""
-        if not self._began(log):
+        """The message of a stage that ended with a UserError in this run; else empty."""
+        if not self._has_run(log):
             return ""
         _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
         return message.partition(": ")[2].rstrip() if found else ""
@@ -237,7 +237,7 @@ class SnakemakeProject:
 def _outcome(
     run: Run, message: str | None, status: str = "left out", stage: str = ""
 ) -> dict[str, Any]:
-    """See ``stages.batch``."""
+    """See ``stages.workflow.batch.write_batch``."""
     named = {"run": [run.scene, run.config, run.seed]}
     if message is None:
         return named | {"status": "ok"}
@@ -245,6 +245,6 @@ def _outcome(
 
 
 def _exit(error: UserError) -> NoReturn:
-    """A user's error while the DAG is built ends Snakemake with its message alone."""
+    """End Snakemake with the error's message, without a traceback."""
     print(f"error: {error}", file=sys.stderr, flush=True)
     raise SystemExit(2) from None

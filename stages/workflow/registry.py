@@ -19,7 +19,7 @@ def _declared() -> dict[str, StageSpec]:
 
 
 def _in_order(specs: dict[str, StageSpec]) -> dict[str, StageSpec]:
-    """Each stage after all that can feed it; among those that are ready, by name."""
+    """Topological order: each stage after all its possible inputs; otherwise by name."""
     ordered: dict[str, StageSpec] = {}
     while len(ordered) < len(specs):
         ready = [
@@ -28,7 +28,7 @@ def _in_order(specs: dict[str, StageSpec]) -> dict[str, StageSpec]:
             if name not in ordered and all(ordered.keys() >= set(r) for r in spec.inputs.values())
         ]
         if not ready:
-            raise ValueError(f"stages feed each other in a circle: {specs.keys() - ordered.keys()}")
+            raise ValueError(f"stages depend on each other: {specs.keys() - ordered.keys()}")
         ordered[min(ready)] = specs[min(ready)]
     return ordered
 

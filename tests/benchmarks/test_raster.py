@@ -16,7 +16,7 @@ from benchmarks.raster.scenes import synthetic, trained
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.io.ply import write_splat_ply
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.splats.gaussians import Gaussians
 
 
@@ -63,7 +63,8 @@ def test_a_trained_scene_is_drawn_from_its_views_at_any_size(tmp_path: Path) -> 
     write_splat_ply(tmp_path / "point_cloud.ply", Gaussians(*scene.gaussians))
     camera = Camera("PINHOLE", 96, 54, np.array([115.2, 115.2, 48.0, 27.0]))
     images = {
-        i: Posed(f"{i:03}.png", 1, np.eye(3), np.array([0.01 * i, 0.0, 0.0])) for i in range(1, 41)
+        i: PosedImage(f"{i:03}.png", 1, np.eye(3), np.array([0.01 * i, 0.0, 0.0]))
+        for i in range(1, 41)
     }
     write_model(tmp_path / "sparse" / "0", Reconstruction({1: camera}, images))
     own = trained(tmp_path)

@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.stability.__main__ import Outcome, table
 from benchmarks.stability.cases import CASES, TURN, exposed, similar
 from pipeline.geometry.cameras import Camera
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 
 def test_every_reference_is_a_case_before_its_own() -> None:
@@ -20,7 +20,7 @@ def test_every_reference_is_a_case_before_its_own() -> None:
 def test_another_world_shows_the_same() -> None:
     rng = np.random.default_rng(0)
     camera = Camera("PINHOLE", 20, 10, np.array([15.0, 15, 10, 5]))
-    pose = Posed("a.png", 1, TURN, np.array([0.1, -0.2, 4.0]))
+    pose = PosedImage("a.png", 1, TURN, np.array([0.1, -0.2, 4.0]))
     empty = Points.empty()
     xyz = rng.normal(size=(5, 3))
     points = Points(

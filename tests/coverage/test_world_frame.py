@@ -6,12 +6,12 @@ import numpy as np
 import pytest
 
 from pipeline.coverage.measure import world_frame
-from pipeline.plan.given_poses import Given
+from pipeline.plan.given_poses import GivenModel
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-MOVED = Given(Reconstruction({}, {}), np.array([1e5, 0.0, 0.0])).sidecar()
+MOVED = GivenModel(Reconstruction({}, {}), np.array([1e5, 0.0, 0.0])).georeference()
 LEVEL = {"method": "level", "unit": "90% of the cameras lie within 1 of their mean"}
 
 

@@ -20,14 +20,14 @@ from pipeline.demo.scene import OBJECTS
 from pipeline.demo.shapes import Box, Cylinder, Shape, Sphere
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import normalised, pixels
+from pipeline.geometry.distortion import project, unproject
 from pipeline.io.colmap import read_model
 from pipeline.io.recorded import digest_of
 from pipeline.photos.load import load_mask, load_rgb, load_rgba
 from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 SPEC = DemoSpec(
     views=4, width=160, height=120, format="png", distortion="opencv", poses="colmap", seed=3
@@ -41,7 +41,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
-def load(folder: Path) -> tuple[Camera, list[Posed], list[np.ndarray], list[np.ndarray]]:
+def load(folder: Path) -> tuple[Camera, list[PosedImage], list[np.ndarray], list[np.ndarray]]:
     """The camera, poses, pictures and depth maps."""
     model = read_model(folder / "sparse_gt")
     views = sorted(model.images.values(), key=lambda image: image.name)
@@ -50,15 +50,15 @@ def load(folder: Path) -> tuple[Camera, list[Posed], list[np.ndarray], list[np.n
     return model.cameras[1], views, pictures, depths
 
 
-def to_world(camera: Camera, view: Posed, xy: np.ndarray, z: np.ndarray) -> np.ndarray:
-    flat = normalised(camera, xy)
+def to_world(camera: Camera, view: PosedImage, xy: np.ndarray, z: np.ndarray) -> np.ndarray:
+    flat = unproject(camera, xy)
     local = np.concatenate([flat, np.ones((*flat.shape[:-1], 1))], axis=-1) * z[..., None]
     return np.asarray((local - view.translation) @ view.rotation)
 
 
-def to_view(camera: Camera, view: Posed, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def to_view(camera: Camera, view: PosedImage, xyz: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     local = xyz @ view.rotation.T + view.translation
-    return pixels(camera, local[..., :2] / local[..., 2:]), local[..., 2]
+    return project(camera, local[..., :2] / local[..., 2:]), local[..., 2]
 
 
 def test_depth_reprojects_one_view_onto_another(folder: Path) -> None:
@@ -174,7 +174,7 @@ def test_transforms_equal_the_ground_truth(tmp_path: Path, distortion: str) -> N
     )
     same = Camera(told["camera_model"], 32, 24, np.array([told[name] for name in names]))
     flat = np.array([[0.1, 0.2], [-0.3, 0.25], [0.4, -0.3]])
-    np.testing.assert_allclose(pixels(same, flat), pixels(truth.cameras[1], flat), atol=1e-9)
+    np.testing.assert_allclose(project(same, flat), project(truth.cameras[1], flat), atol=1e-9)
 
 
 def test_masks_hide_the_visitor_and_nothing_else(folder: Path, tmp_path: Path) -> None:

@@ -156,7 +156,7 @@ def test_all_scenes_leave_out_a_folder_that_is_none(finished, tmp_path):
     assert rules_run(done) == {"benchmark", "all"}
     lost = snakemake(project, config=TINY | {"data_root": "dta"}, check=False)
     assert lost.returncode != 0
-    assert "dta: no scene here" in lost.stdout
+    assert "dta: expected scene folders, found none" in lost.stdout
 
 
 def test_results_that_cannot_be_written(finished, tmp_path):

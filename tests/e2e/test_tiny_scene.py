@@ -176,7 +176,7 @@ def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
         assert not (folder / stage / "stage.json").exists()
         unlock(project)
     snakemake(project, TARGET, config=TINY, cores=1)
-    assert "going on from" in (folder / "logs/train.log").read_text()
+    assert "resuming at" in (folder / "logs/train.log").read_text()
     assert not (project / scratch / "train").exists()
     assert metrics(project, "tiny") == metrics(finished, "tiny")
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")

@@ -1,4 +1,4 @@
-"""Every camera model agrees with pycolmap, and its inverse with itself."""
+"""Projection and unprojection of every camera model agree with pycolmap's."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
-from pipeline.geometry.distortion import distort, fold_radius, normalised, pixels, undistort
+from pipeline.geometry.distortion import distort, fold_radius, project, undistort, unproject
 
 PARAMS = {
     "SIMPLE_PINHOLE": [400, 320, 240],
@@ -35,7 +35,7 @@ def grid() -> np.ndarray:
 
 
 def test_all_models_project_and_unproject_as_pycolmap_does() -> None:
-    # A process of its own: pycolmap's libpng must not meet cv2's.
+    # In another process: pycolmap and cv2 bring conflicting versions of libpng.
     script = """
 import json, sys, numpy as np, pycolmap
 data = json.load(sys.stdin)
@@ -48,24 +48,24 @@ for model, params in data["params"].items():
 json.dump(out, sys.stdout)
 """
     points = grid()
-    answer = subprocess.run(
+    process = subprocess.run(
         [sys.executable, "-c", script],
         input=json.dumps({"params": PARAMS, "points": points.tolist()}),
         capture_output=True,
         text=True,
         check=True,
     )
-    truth = json.loads(answer.stdout)
-    assert set(truth) == set(CAMERA_MODELS)
-    for model, (xy, back) in truth.items():
-        np.testing.assert_allclose(pixels(camera(model), points), xy, atol=1e-8, err_msg=model)
-        ours = normalised(camera(model), np.array(xy))
+    expected = json.loads(process.stdout)
+    assert set(expected) == set(CAMERA_MODELS)
+    for model, (xy, back) in expected.items():
+        np.testing.assert_allclose(project(camera(model), points), xy, atol=1e-8, err_msg=model)
+        ours = unproject(camera(model), np.array(xy))
         np.testing.assert_allclose(ours, np.array(back)[:, :2], atol=1e-6, err_msg=model)
         np.testing.assert_allclose(ours, points, atol=1e-8, err_msg=model)
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE"])
-def test_points_beyond_the_fold_have_no_inverse(model: str) -> None:
+def test_points_beyond_the_fold_radius_have_no_inverse(model: str) -> None:
     start = [400.0, 320, 240] if model == "SIMPLE_RADIAL" else [300.0, 300, 320, 240]
     rest = [-0.3] if model == "SIMPLE_RADIAL" else [-0.3, 0, 0, 0]
     params = [*start, *rest]
@@ -77,8 +77,8 @@ def test_points_beyond_the_fold_have_no_inverse(model: str) -> None:
     assert np.isnan(undistort(strong, np.array([[edge * 1.02, 0.0]]))).all()
 
 
-def test_fisheye_has_no_normalised_point_at_ninety_degrees() -> None:
+def test_fisheye_rays_at_ninety_degrees_have_no_normalised_coordinates() -> None:
     lens = Camera("OPENCV_FISHEYE", 640, 480, np.array([200.0, 200, 320, 240, 0, 0, 0, 0]))
-    points = normalised(lens, np.array([[320 + 200 * 1.5, 240.0], [320 + 200 * 1.58, 240.0]]))
+    points = unproject(lens, np.array([[320 + 200 * 1.5, 240.0], [320 + 200 * 1.58, 240.0]]))
     np.testing.assert_allclose(points[0], [np.tan(1.5), 0], rtol=1e-9)
     assert np.isnan(points[1]).all()

@@ -1,4 +1,4 @@
-"""COLMAP models: what is written is read back, by us and by pycolmap; damage is one clear error."""
+"""COLMAP models: round trips, exchange with pycolmap, and errors on damaged files."""
 
 import json
 import subprocess
@@ -14,7 +14,7 @@ from hypothesis import strategies as st
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.colmap import quat_to_rotation, read_model, rotation_to_quat, write_model
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 FILES = ("cameras", "images", "points3D")
 FORMATS = pytest.mark.parametrize("text", [False, True], ids=["binary", "text"])
@@ -29,7 +29,7 @@ BOUNDED = settings(
 def make_model(
     seed: int, num_images: int = 4, num_points: int = 9, names: list[str] | None = None
 ) -> Reconstruction:
-    """A model whose observations are the points' true projections."""
+    """A model whose observations are the exact projections of its points."""
     rng = np.random.default_rng(seed)
     cameras = {
         7: Camera("PINHOLE", 640, 480, np.array([500.0, 510.0, 321.5, 239.25])),
@@ -39,7 +39,9 @@ def make_model(
     images = {}
     for i, name in enumerate(names):
         turn = quat_to_rotation(np.array([1.0, *(0.2 * rng.normal(size=3))]))
-        images[11 + 5 * i] = Posed(name, (7, 3)[i % 2], turn, np.array([0, 0, 6.0]) + rng.random(3))
+        images[11 + 5 * i] = PosedImage(
+            name, (7, 3)[i % 2], turn, np.array([0, 0, 6.0]) + rng.random(3)
+        )
     xyz = rng.normal(size=(num_points, 3))
     start, ids, pixels = [0], [], []
     for point in xyz:
@@ -123,7 +125,7 @@ def test_empty_model(tmp_path):
         assert (model.cameras, model.images, len(model.points)) == ({}, {}, 0)
 
 
-def test_same_model_same_bytes_and_other_models_files_go(tmp_path):
+def test_same_model_same_bytes_and_files_of_other_models_are_removed(tmp_path):
     a, b = tmp_path / "a", tmp_path / "b"
     b.mkdir()
     for stale in ("cameras.txt", "images.txt", "points3D.txt", "rigs.bin", "frames.bin"):
@@ -133,7 +135,7 @@ def test_same_model_same_bytes_and_other_models_files_go(tmp_path):
     assert contents(a) == contents(b)
 
 
-def test_points_come_sorted_by_id_whatever_the_files_order(tmp_path):
+def test_points_are_sorted_by_id(tmp_path):
     write_model(tmp_path, make_model(2), text=True)
     before = read_model(tmp_path)
     file = tmp_path / "points3D.txt"
@@ -152,7 +154,7 @@ def test_unknown_observations_are_left_out(tmp_path):
 
 
 def test_points_without_keypoints_in_images_have_unknown_pixels(tmp_path):
-    """Models stripped of keypoints still tell which images see a point."""
+    """Tracks of models without keypoints still give the images that see a point."""
     write_model(tmp_path, make_model(4), text=True)
     before = read_model(tmp_path).points
     file = tmp_path / "images.txt"
@@ -202,7 +204,7 @@ print(json.dumps({
 
 
 @pytest.mark.parametrize("stem", FILES)
-def test_binary_cut_anywhere_is_one_clear_error(tmp_path, stem):
+def test_truncated_binary_files_are_user_errors(tmp_path, stem):
     write_model(tmp_path, make_model(6, num_images=2, num_points=2))
     file = tmp_path / f"{stem}.bin"
     whole = file.read_bytes()
@@ -217,8 +219,8 @@ def test_binary_cut_anywhere_is_one_clear_error(tmp_path, stem):
 
 
 @pytest.mark.parametrize("stem", FILES)
-def test_text_cut_anywhere_is_read_or_one_clear_error(tmp_path, stem):
-    """A text cut inside a number or after a line is text all the same."""
+def test_truncated_text_files_are_read_or_user_errors(tmp_path, stem):
+    """A text file that is truncated within a number or after a line can still be valid."""
     write_model(tmp_path, make_model(6, num_images=2, num_points=2), text=True)
     file = tmp_path / f"{stem}.txt"
     whole = file.read_bytes()
@@ -240,7 +242,7 @@ def test_text_cut_anywhere_is_read_or_one_clear_error(tmp_path, stem):
     where=st.floats(0, 1, exclude_max=True),
     data=st.binary(min_size=1, max_size=9),
 )
-def test_garbage_never_is_more_than_an_error(tmp_path, text, stem, where, data):
+def test_damaged_files_are_read_or_user_errors(tmp_path, text, stem, where, data):
     write_model(tmp_path, make_model(7, num_images=2, num_points=3), text=text)
     file = tmp_path / f"{stem}.{'txt' if text else 'bin'}"
     whole = file.read_bytes()
@@ -258,7 +260,7 @@ def edit(file: Path, old: str, new: str) -> None:
     file.write_text(text.replace(old, new, 1))
 
 
-def test_messages_name_what_is_wrong(tmp_path):
+def test_messages_name_the_fault(tmp_path):
     def broken(stem: str, old: str, new: str) -> str:
         write_model(tmp_path, make_model(8), text=True)
         edit(tmp_path / f"{stem}.txt", old, new)

@@ -1,4 +1,4 @@
-"""HEIC pictures, where pillow-heif is installed: seen, described and read as JPEGs are."""
+"""HEIC images are found, described and decoded like JPEGs if pillow-heif is installed."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ pytestmark = pytest.mark.skipif(
 
 
 def write(path: Path, orientation: int = 1, blue: int = 255) -> np.ndarray:
-    """A picture that changes slowly (60, 80, 3), and with EXIF."""
+    """Write a smooth image with EXIF data; returns its pixels (60, 80, 3)."""
     heif.register()
     y, x = np.mgrid[:60, :80]
     rgb = np.stack([3 * x, 4 * y, blue - 2 * x], 2).astype(np.uint8)
@@ -34,8 +34,8 @@ def write(path: Path, orientation: int = 1, blue: int = 255) -> np.ndarray:
     return rgb
 
 
-def test_a_scene_of_heic_pictures_is_seen_described_and_read(tmp_path: Path) -> None:
-    pictures = [write(tmp_path / "a.heic"), write(tmp_path / "b.HEIC", blue=200)]
+def test_heic_photographs_are_found_described_and_decoded(tmp_path: Path) -> None:
+    written = [write(tmp_path / "a.heic"), write(tmp_path / "b.HEIC", blue=200)]
     found = scan(tmp_path, "s", Config(), cache=None)
     assert [photo.name for photo in found.photos] == ["a.heic", "b.HEIC"]
     photo = found.photos[0]
@@ -43,11 +43,11 @@ def test_a_scene_of_heic_pictures_is_seen_described_and_read(tmp_path: Path) -> 
     assert "PHONE 7" in photo.camera_group and photo.focal_px is not None
     assert verify_photos(found.manifest, threads=1)[1] == []
     rgb, alpha = load_rgba(photo.path)
-    assert alpha is None and np.abs(rgb.astype(int) - pictures[0]).mean() < 3
+    assert alpha is None and np.abs(rgb.astype(int) - written[0]).mean() < 3
     assert np.array_equal(Picture(photo, 1000).rgb, rgb)
 
 
-def test_size_and_pixels_agree_where_the_phone_was_held_upright(tmp_path: Path) -> None:
+def test_size_and_pixels_agree_for_rotated_images(tmp_path: Path) -> None:
     write(tmp_path / "a.heic", orientation=6)
     write(tmp_path / "b.heic", orientation=6)
     photo = scan(tmp_path, "s", Config(), cache=None).photos[0]
@@ -55,7 +55,7 @@ def test_size_and_pixels_agree_where_the_phone_was_held_upright(tmp_path: Path) 
     assert Picture(photo, 1000).rgb.shape == (photo.height, photo.width, 3)
 
 
-def test_a_file_of_a_phone_is_read() -> None:
+def test_a_file_from_a_phone_is_read() -> None:
     path = need_data("raw/heic/iphone_7.heic")
     one = Config.model_validate({"inspect": {"min_images": 1}})
     photo = scan(path.parent, "s", one, cache=None).photos[0]
@@ -63,7 +63,7 @@ def test_a_file_of_a_phone_is_read() -> None:
     assert load_rgba(photo.path)[0].shape == (photo.height, photo.width, 3)
 
 
-def test_a_broken_one_is_told(tmp_path: Path) -> None:
+def test_a_damaged_file_is_a_user_error(tmp_path: Path) -> None:
     write(tmp_path / "a.heic")
     (tmp_path / "a.heic").write_bytes((tmp_path / "a.heic").read_bytes()[:300])
     with pytest.raises(UserError) as error:

@@ -1,6 +1,6 @@
-"""What is written is what other programs read: Niantic's and Adobe's SPZ library, PlayCanvas's
-splat-transform, gsply, Khronos's glTF validator, glTF Transform. `make test-packages` installs
-them; each is skipped where it is missing."""
+"""Other programs read our files: Niantic's and Adobe's SPZ library, PlayCanvas's splat-transform,
+gsply, Khronos's glTF validator, glTF Transform. `make test-packages` installs them; tests of
+missing ones are skipped."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ HERE = Path(__file__).parent / "independent"
 PACKAGES = json.loads((HERE / "package.json").read_text())["dependencies"]
 GSPLY = "0.4.6"
 EXACT = Within(1e-6, 1e-6, 1e-6, 0.05, 1e-6, 1e-6)
-#: splat-transform reads .splat rotations in 127.5ths, where the first viewer has 128ths.
+#: splat-transform reads .splat rotations in steps of 1/127.5, the original viewer of 1/128.
 SPLAT = Within(0, 2e-6, 0.5001 / 255, 1.8, 0.5001 / 255 / 0.28209, 0)
 
 
@@ -46,7 +46,7 @@ def node(*arguments: str | Path) -> str:
 
 
 def gaussians_of(columns: dict[str, Any]) -> Gaussians:
-    """From another program's arrays: xyz, log scales, wxyz, logits, DC and higher coefficients."""
+    """From arrays of another program, with SH coefficients in ``dc`` and ``higher``."""
     dc, higher = np.asarray(columns["dc"]), np.asarray(columns["higher"])
     sh = np.concatenate([dc[:, None], higher.reshape(len(dc), -1, 3)], axis=1)
     names = ("means", "log_scales", "quats", "opacity_logits")
@@ -55,7 +55,7 @@ def gaussians_of(columns: dict[str, Any]) -> Gaussians:
 
 
 def splat_transform(source: Path) -> Gaussians:
-    """splat-transform's table of a file's columns."""
+    """Read a file with splat-transform."""
     needs_node("@playcanvas/splat-transform")
     table = source.with_suffix(".csv")
     script = HERE / "node_modules/@playcanvas/splat-transform/bin/cli.mjs"
@@ -111,8 +111,8 @@ def test_splat_transform_reads_our_splat(tmp_path) -> None:
     SPLAT.check(splat_transform(tmp_path / "a.splat"), sample(300).with_sh_degree(0))
 
 
-def test_khronos_finds_our_glb_valid(tmp_path) -> None:
-    """But for the names of the extension's attributes, which the validator does not know."""
+def test_khronos_validator_accepts_our_glb(tmp_path) -> None:
+    """It does not support the extension, so its attribute names are the only findings."""
     needs_node("gltf-validator")
     write_gaussians(tmp_path / "a.glb", sample(50))
     found = json.loads(node(HERE / "read.mjs", "validate", tmp_path / "a.glb"))
@@ -124,7 +124,7 @@ def test_khronos_finds_our_glb_valid(tmp_path) -> None:
 
 @pytest.mark.parametrize("degree", range(4))
 def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
-    """The attributes as KHR_gaussian_splatting names and encodes them."""
+    """Attributes have the names and encodings of KHR_gaussian_splatting."""
     needs_node("@gltf-transform/core")
     write_gaussians(tmp_path / "a.glb", sample(50, degree))
     found = json.loads(node(HERE / "read.mjs", "attributes", tmp_path / "a.glb"))
@@ -145,7 +145,7 @@ def test_gltf_transform_reads_our_glb(tmp_path, degree) -> None:
             "higher": np.concatenate([sh[0][:, :0], *sh[1:]], axis=1),
         }
     )
-    # glTF's frame: y up, half a turn about z from ours.
+    # glTF is y up: rotated by 180 degrees about z.
     Within(1e-6, 2e-6, 2e-6, 0.05, 1e-6, 1e-6).check(half_turn(decoded), sample(50, degree))
 
 

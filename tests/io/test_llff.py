@@ -15,7 +15,7 @@ def llff_row(rotation, centre, height, width, focal, near=1.0, far=9.0) -> np.nd
     return np.concatenate([matrix.ravel(), [near, far]])
 
 
-def test_a_known_point_lands_on_its_pixel(tmp_path):
+def test_a_known_point_projects_to_its_pixel(tmp_path):
     rng = np.random.default_rng(0)
     rotation, centre = quat_to_rotation(rng.normal(size=4)), rng.normal(size=3)
     np.save(tmp_path / "p.npy", [llff_row(rotation, centre, 300, 400, 350.0, 2.0, 7.0)])
@@ -37,7 +37,7 @@ def test_a_known_point_lands_on_its_pixel(tmp_path):
         (np.zeros((1, 16)), "N x 17"),
         (np.zeros((2, 17)), "holds 2 poses, but there are 1"),
         (np.full((1, 17), np.nan), "row 0"),
-        (np.ones((1, 17)), "not a rotation"),
+        (np.ones((1, 17)), "expected a rotation"),
         (llff_row(np.eye(3), np.zeros(3), 300, 400, -1)[None], "positive"),
         (np.array([["text"] * 17]), "not a NumPy array of numbers"),
     ],

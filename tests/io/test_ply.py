@@ -1,4 +1,4 @@
-"""PLY files hold exactly what was put in, are read by name, and never lie about being whole."""
+"""PLY files: exact round trips, reading by property name, and errors on damaged files."""
 
 from pathlib import Path
 
@@ -34,7 +34,7 @@ def header_and_body(path: Path) -> tuple[list[str], bytes]:
 
 
 def columns_of(path: Path) -> dict[str, np.ndarray]:
-    """An independent reading: the header's floats as columns."""
+    """Columns by property name, read independently of the code under test."""
     lines, body = header_and_body(path)
     names = [line.split()[2] for line in lines if line.startswith("property")]
     table = np.frombuffer(body, "<f4").reshape(-1, len(names))
@@ -51,7 +51,7 @@ def test_round_trip_is_exact(tmp_path: Path, degree: int, count: int) -> None:
     assert len(found) == count and found.sh_degree == degree
 
 
-def test_layout_is_inrias(tmp_path: Path) -> None:
+def test_layout_is_that_of_3dgs(tmp_path: Path) -> None:
     gaussians = splats()
     data = gaussians.arrays()
     write_splat_ply(tmp_path / "a.ply", gaussians)
@@ -78,8 +78,8 @@ def test_layout_is_inrias(tmp_path: Path) -> None:
 
 
 def rewrite(path: Path, form: str, seed: int) -> None:
-    """The same Gaussians as another program might write them: shuffled, without normals, with
-    a comment and a property nobody knows, in another number format."""
+    """The same Gaussians with shuffled properties, without normals, with a comment and an unknown
+    property, in another number format."""
     column = columns_of(path)
     names = [n for n in column if n not in ("nx", "ny", "nz")]
     np.random.default_rng(seed).shuffle(names)
@@ -147,7 +147,7 @@ def test_every_truncation_is_an_error_that_names_the_file(tmp_path: Path) -> Non
         (b"ply\n", b"\x89PNG\n", "begins with"),
     ],
 )
-def test_a_lying_header_is_an_error(tmp_path: Path, old, new, message) -> None:
+def test_an_inconsistent_header_is_an_error(tmp_path: Path, old, new, message) -> None:
     path = tmp_path / "a.ply"
     write_splat_ply(path, splats(2, 0))
     changed = path.read_bytes().replace(old, new, 1)
@@ -159,7 +159,7 @@ def test_a_lying_header_is_an_error(tmp_path: Path, old, new, message) -> None:
 
 @settings(max_examples=150, derandomize=True, deadline=None)
 @given(st.data())
-def test_damage_is_read_or_refused_but_never_crashes(tmp_path_factory, data) -> None:
+def test_damaged_files_are_read_or_user_errors(tmp_path_factory, data) -> None:
     path = tmp_path_factory.mktemp("ply") / "a.ply"
     write_splat_ply(path, splats(1, 0))
     content = bytearray(path.read_bytes())
@@ -197,7 +197,7 @@ def test_missing_file_is_an_error(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize("with_normals", [False, True])
-def test_point_cloud_has_the_layout_mesh_programs_read(tmp_path: Path, with_normals) -> None:
+def test_point_cloud_layout(tmp_path: Path, with_normals) -> None:
     rng = np.random.default_rng(0)
     xyz, rgb = rng.normal(size=(6, 3)), rng.integers(0, 256, (6, 3), dtype=np.uint8)
     normals = rng.normal(size=(6, 3)) if with_normals else None

@@ -1,4 +1,4 @@
-"""Files of Gaussians by suffix, made fit to render; what export does before it writes."""
+"""Files of Gaussians by suffix, handling of values that are not finite, and export filters."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def test_an_unknown_suffix_is_an_error(tmp_path) -> None:
         read_gaussians(tmp_path / "a", [])
 
 
-def test_gaussians_that_are_no_numbers_are_left_out_and_told(tmp_path) -> None:
+def test_gaussians_that_are_not_finite_are_left_out_with_a_warning(tmp_path) -> None:
     gaussians = sample(10, 1)
     gaussians.means[2, 1] = np.nan
     gaussians.sh[3, 1, 0] = np.inf
@@ -78,7 +78,7 @@ def test_faint_gaussians_and_high_bands_are_left_out() -> None:
         prepare(gaussians, 3, 1.0, False)
 
 
-def test_morton_order_is_a_permutation_that_brings_neighbours_together() -> None:
+def test_morton_order_is_a_permutation_with_neighbours_close_together() -> None:
     gaussians = sample(4000, 0)
     found = in_morton_order(gaussians)
     assert sorted(map(tuple, found.means.tolist())) == sorted(map(tuple, gaussians.means.tolist()))

@@ -1,4 +1,4 @@
-"""SPZ files: within the stated quantisation, of the same bits every time, and never lying."""
+"""SPZ files: quantisation errors, reproducible bytes, and errors on damaged files."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.io.ply import read_splat_ply
-from pipeline.io.spz import decode_spz, encode_spz, read_spz, unfit, write_spz
+from pipeline.io.spz import count_out_of_range, decode_spz, encode_spz, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from tests.splats.samples import Within, rotation_angle, sample
@@ -52,14 +52,14 @@ def test_resolution_follows_the_scenes_size(size) -> None:
 
 
 @pytest.mark.parametrize(("unit", "few"), [(1e-4, False), (1.0, True), (20.0, True), (1e4, False)])
-def test_a_unit_that_the_format_has_no_numbers_for_is_noticed(unit, few) -> None:
+def test_gaussians_out_of_range_are_counted(unit, few) -> None:
     gaussians = sample(200)
     gaussians.means *= unit
     gaussians.log_scales[:] = np.log(0.05 * unit)
-    assert (unfit(gaussians) == 0) == few
+    assert (count_out_of_range(gaussians) == 0) == few
 
 
-def test_a_stray_far_away_costs_the_others_no_resolution_and_looks_the_same() -> None:
+def test_a_distant_outlier_keeps_its_appearance_and_the_others_resolution() -> None:
     gaussians = sample(200)
     gaussians.means[7] = gaussians.means[7] * 1e6
     found = decode_spz(encode_spz(gaussians))
@@ -73,7 +73,7 @@ def test_a_stray_far_away_costs_the_others_no_resolution_and_looks_the_same() ->
     assert np.abs(found.log_scales[7].numpy() - expected).max() <= 1 / 32 + 1e-5
 
 
-def test_what_lies_beyond_the_formats_range_is_cut_not_wrapped() -> None:
+def test_values_beyond_the_range_are_clamped() -> None:
     gaussians = sample(5)
     gaussians.log_scales[:] = np.log(1e-9)
     gaussians.opacity_logits[:] = 1000.0
@@ -86,7 +86,7 @@ def test_what_lies_beyond_the_formats_range_is_cut_not_wrapped() -> None:
     assert (found.sh[:, 1:] == -1).all()
 
 
-def test_every_rotation_survives_whichever_part_is_largest() -> None:
+def test_rotations_survive_whichever_component_is_largest() -> None:
     gaussians = sample(2000, 0)
     edge = np.array([[1, 0, 0, 0], [0, -1, 0, 0], [1, 1, 1, -1], [0, 0, 1, -1], [-3, 0, 0, 0]])
     gaussians.quats[: len(edge)] = gaussians.quats.new_tensor(edge)
@@ -95,7 +95,7 @@ def test_every_rotation_survives_whichever_part_is_largest() -> None:
     assert np.allclose(found.quats.norm(dim=1), 1, atol=1e-6)
 
 
-def test_the_header_says_how_it_was_trained() -> None:
+def test_the_header_stores_antialiasing() -> None:
     flags = [gzip.decompress(encode_spz(sample(), antialias=flag))[14] for flag in (False, True)]
     assert flags == [0, 1]
 
@@ -105,7 +105,7 @@ def test_reads_what_gsply_wrote() -> None:
 
 
 def test_reads_what_splat_transform_wrote() -> None:
-    """Its version 2.7.1 turns y and z over; what stands in the file is read."""
+    """Its version 2.7.1 negates y and z; axes are read unconverted."""
     found = read_spz(DATA / "splat-transform-v3.spz")
     expected = read_splat_ply(DATA / "source.ply")
     flip = np.array([1, -1, -1], np.float32)
@@ -132,7 +132,7 @@ def test_version_2_is_read_from_its_specification() -> None:
     assert found.quats[0].tolist() == pytest.approx([0, 1, 0, 0], abs=0.01)
 
 
-def test_degree_4_is_cut_and_extensions_are_passed_over() -> None:
+def test_degree_4_is_reduced_and_extensions_are_ignored() -> None:
     body = bytes(9) + bytes([128, 128, 128, 128, 160, 160, 160, 0, 0, 0, 192]) + bytes(72)
     found = decode_spz(raw(3, 1, 4, 12, 2, body + b"an extension"))
     assert found.sh_degree == 3 and len(found) == 1
@@ -156,7 +156,7 @@ def test_every_truncation_is_an_error_that_names_the_file(tmp_path, length) -> N
     [
         ((DATA / "splat-transform-v4.spz").read_bytes(), "version 4"),
         (b"ply\nformat ascii 1.0\n", "gzip"),
-        (gzip.compress(b"something else altogether", mtime=0), "something else"),
+        (gzip.compress(b"something else altogether", mtime=0), "another gzip file"),
         (gzip.compress(b"short", mtime=0), "16 bytes, found 5"),
         (raw(1, 1, 0, 12, 0, bytes(20)), "version 1"),
         (raw(3, 2, 0, 12, 0, bytes(20)), "expected 40 bytes of 2 Gaussians, found 20"),
@@ -166,13 +166,13 @@ def test_every_truncation_is_an_error_that_names_the_file(tmp_path, length) -> N
         (raw(3, 2**32 - 1, 3, 12, 0, bytes(20)), "up to"),
     ],
 )
-def test_a_lying_header_is_an_error(data, message) -> None:
+def test_an_inconsistent_header_is_an_error(data, message) -> None:
     with pytest.raises(UserError, match=message):
         decode_spz(data)
 
 
-def test_a_small_file_that_promises_much_takes_no_memory() -> None:
-    """Neither the promised Gaussians nor a bomb's endless zeros are unpacked."""
+def test_a_small_file_cannot_exhaust_the_memory() -> None:
+    """A header with a large count, and a stream of zeros that decompresses to gigabytes."""
     liar = raw(3, 9_000_000, 3, 12, 0, bytes(100))
     bomb = raw(3, 1, 0, 12, 0, bytes(50_000_000))
     for data in (liar, bomb):
@@ -186,8 +186,8 @@ def test_a_small_file_that_promises_much_takes_no_memory() -> None:
 
 @settings(max_examples=150, derandomize=True, deadline=None)
 @given(st.data())
-def test_damage_is_read_or_refused_but_never_crashes(data) -> None:
-    """Damage under the compression and to it."""
+def test_damaged_files_are_read_or_user_errors(data) -> None:
+    """Damage to the compressed and to the decompressed data."""
     content = bytearray(BODY if data.draw(st.booleans()) else WHOLE)
     packed = len(content) == len(WHOLE)
     for _ in range(data.draw(st.integers(1, 4))):
@@ -203,7 +203,7 @@ def test_damage_is_read_or_refused_but_never_crashes(data) -> None:
 
 @settings(max_examples=60, derandomize=True, deadline=None)
 @given(st.binary(max_size=300))
-def test_anything_at_all_is_refused(data) -> None:
+def test_arbitrary_bytes_are_user_errors(data) -> None:
     with pytest.raises(UserError):
         decode_spz(data)
     with pytest.raises(UserError):

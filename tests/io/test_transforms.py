@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.geometry.distortion import pixels
+from pipeline.geometry.distortion import project
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.io.transforms import find_transforms, read_frames, read_transforms, write_transforms
 from pipeline.runtime.errors import UserError
@@ -28,11 +28,11 @@ def frame(matrix: np.ndarray | None = None, path: str = "images/a.png", **fields
     return {"file_path": path, "transform_matrix": matrix.tolist(), **fields}
 
 
-def project(model: Reconstruction, point: np.ndarray) -> np.ndarray:
+def project_point(model: Reconstruction, point: np.ndarray) -> np.ndarray:
     (image,) = model.images.values()
     local = image.rotation @ point + image.translation
     assert local[2] > 0, "behind the camera"
-    return pixels(model.cameras[image.camera_id], local[:2] / local[2])
+    return project(model.cameras[image.camera_id], local[:2] / local[2])
 
 
 def opengl_camera(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -47,13 +47,13 @@ def opengl_camera(seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return matrix, point, np.array([right, up, ahead])
 
 
-def test_a_known_point_lands_on_its_pixel(tmp_path):
+def test_a_known_point_projects_to_its_pixel(tmp_path):
     matrix, point, (right, up, ahead) = opengl_camera(0)
     write(tmp_path, {"fl_x": 120, "fl_y": 110, "cx": 101, "cy": 52, "frames": [frame(matrix)]})
     model = read_transforms(tmp_path, SIZES)
     # Up in OpenGL's axes is towards smaller y in the picture.
     expected = [101 + 120 * right / ahead, 52 - 110 * up / ahead]
-    np.testing.assert_allclose(project(model, point), expected, atol=1e-9)
+    np.testing.assert_allclose(project_point(model, point), expected, atol=1e-9)
 
 
 def test_nerf_synthetic_splits_angle_and_missing_suffix(tmp_path):
@@ -71,7 +71,7 @@ def test_nerf_synthetic_splits_angle_and_missing_suffix(tmp_path):
     model.images.popitem()
     focal = 100 / math.tan(0.35)
     expected = [100 + focal * right / ahead, 50 - focal * up / ahead]
-    np.testing.assert_allclose(project(model, point), expected, atol=1e-9)
+    np.testing.assert_allclose(project_point(model, point), expected, atol=1e-9)
 
 
 @pytest.mark.parametrize("scale", [1e-6, 1e-4, 1e6])
@@ -95,7 +95,7 @@ def test_applied_transform_and_scale_are_undone(tmp_path):
     np.testing.assert_allclose(image.rotation.T, matrix[:3, :3] @ np.diag([1, -1, -1]), atol=1e-12)
 
 
-def test_intrinsics_are_each_frames_own(tmp_path):
+def test_each_frame_has_its_own_intrinsics(tmp_path):
     frames = [
         frame(path="images/a.png"),
         frame(path="images/b.png", fl_x=150, w=200, h=100, cx=90, cy=40, k1=0.1),
@@ -168,7 +168,7 @@ NAN[0, 3] = np.nan
         ({"applied_scale": 0, "frames": [frame()]}, "applied_scale"),
     ],
 )
-def test_malformed_files_name_the_place(tmp_path, content, message):
+def test_messages_name_the_malformed_field(tmp_path, content, message):
     file = tmp_path / "transforms.json"
     if isinstance(content, dict):
         content = json.dumps(content)
@@ -198,7 +198,7 @@ def views(folder: Path, count: int, same: bool) -> list[View]:
 
 
 @pytest.mark.parametrize("same", [True, False])
-def test_written_cameras_are_read_back_as_they_were(tmp_path, same):
+def test_written_cameras_are_read_back_unchanged(tmp_path, same):
     written = views(tmp_path, 3, same)
     file = tmp_path / "results" / "export" / "transforms.json"
     write_transforms(file, written, file.parent, points="points.ply")
@@ -233,7 +233,7 @@ def test_written_axes_split_and_points_are_nerfstudios(tmp_path):
     assert content["ply_file_path"] == "points.ply"
 
 
-def test_relative_names_hold_where_a_folder_is_a_link(tmp_path):
+def test_relative_names_are_valid_if_a_folder_is_a_symbolic_link(tmp_path):
     (tmp_path / "disk" / "deep" / "export").mkdir(parents=True)
     (tmp_path / "results").symlink_to(tmp_path / "disk" / "deep")
     (tmp_path / "data").mkdir()

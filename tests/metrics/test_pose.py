@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.similarity import umeyama
 from pipeline.metrics.pose import auc_of_errors, pose_error
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray:
@@ -32,7 +32,7 @@ def turned(axis: int, degrees: float) -> np.ndarray:
 def scene(seed: int, count: int = 8) -> Reconstruction:
     rng = np.random.default_rng(seed)
     images = {
-        i: Posed(f"{i}.jpg", 1, random_rotation(rng), rng.normal(size=3)) for i in range(count)
+        i: PosedImage(f"{i}.jpg", 1, random_rotation(rng), rng.normal(size=3)) for i in range(count)
     }
     return Reconstruction({}, images)
 
@@ -42,7 +42,7 @@ def moved(model: Reconstruction, scale: float, rotation, shift) -> Reconstructio
     images = {}
     for i, image in model.images.items():
         r = image.rotation @ rotation.T
-        images[i] = Posed(image.name, 1, r, scale * image.translation - r @ shift)
+        images[i] = PosedImage(image.name, 1, r, scale * image.translation - r @ shift)
     return Reconstruction({}, images)
 
 
@@ -105,7 +105,7 @@ def test_collinear_cameras_are_aligned_by_their_rotations():
     images = {}
     for i in range(6):
         r = random_rotation(rng)
-        images[i] = Posed(f"{i}.jpg", 1, r, -r @ np.array([i, 0.0, 0.0]))
+        images[i] = PosedImage(f"{i}.jpg", 1, r, -r @ np.array([i, 0.0, 0.0]))
     truth = Reconstruction({}, images)
     error = pose_error(moved(truth, 2.0, random_rotation(rng), np.ones(3)), truth)
     assert error.rotation_median_deg == pytest.approx(0, abs=1e-6)
@@ -117,7 +117,7 @@ def test_one_camera_turned_in_place_by_two_degrees():
     images = dict(truth.images)
     first = images[0]
     rotation = turned(2, 2.0) @ first.rotation
-    images[0] = Posed(first.name, 1, rotation, -rotation @ first.centre)
+    images[0] = PosedImage(first.name, 1, rotation, -rotation @ first.centre)
     error = pose_error(Reconstruction({}, images), truth)
     assert error.rotation_mean_deg == pytest.approx(2.0 / 4)
     assert error.rotation_median_deg == pytest.approx(0, abs=1e-9)

@@ -8,7 +8,7 @@ from PIL import Image
 
 from pipeline.geometry.cameras import Camera
 from pipeline.photos.exposure import measure_exposures, sample_views
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 
 SIZE, POINTS = 64, 400
@@ -32,7 +32,7 @@ def wall(folder, gains, seed=0):
         name, half = f"{index}.png", SIZE / 2
         pose = np.eye(4)
         views.append(View(name, str(path), None, SIZE, SIZE, SIZE, SIZE, half, half, pose, False))
-        images[index + 1] = Posed(name, 1, np.eye(3), np.zeros(3))
+        images[index + 1] = PosedImage(name, 1, np.eye(3), np.zeros(3))
         seen = np.arange(POINTS) if index % 2 else np.arange(POINTS // 2)
         owner.append(seen)
         number.append(np.full(len(seen), index + 1))

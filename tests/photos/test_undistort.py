@@ -14,19 +14,19 @@ from pipeline.demo.render import rays, render
 from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import srgb, to_bytes
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import pixels
+from pipeline.geometry.distortion import project
 from pipeline.io.colmap import read_model
 from pipeline.io.recorded import digest_of
 from pipeline.photos.load import load_mask, load_rgb, load_rgba, resize_area
 from pipeline.photos.undistort import pinhole_camera, undistort
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 SIZE = (160, 120)
 
 
-def posed(name: str) -> Posed:
+def posed(name: str) -> PosedImage:
     return orbit([name] * 8, 0)[0]
 
 
@@ -143,7 +143,7 @@ def test_observations_are_undistorted_and_unregistered_photographs_are_left_out(
     flat = np.array([[0.05, -0.02], [0.1, 0.12], [-0.2, 0.1]])
     local = np.concatenate([flat, np.ones((3, 1))], axis=1) * 2.0
     pose = posed("a")
-    seen = pixels(camera, flat)
+    seen = project(camera, flat)
     points = Points(
         xyz=(local - pose.translation) @ pose.rotation,
         rgb=np.zeros((3, 3), np.uint8),

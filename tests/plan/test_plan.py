@@ -1,4 +1,4 @@
-"""The plan: what runs, what is skipped, what is settled; for each kind of scene."""
+"""The plan: which stages run, which are skipped and which options are settled, by kind of scene."""
 
 import subprocess
 import sys
@@ -34,8 +34,8 @@ def skipped(plan: Plan) -> list[str]:
 
 
 def many(folder: Path, count: int, **changes) -> Scan:
-    """A scan of ``count`` photographs without as many files: ``changes`` map a field of Photo
-    to a function of the index."""
+    """A scan of ``count`` photographs made from two files; ``changes`` map a field of Photo to a
+    function of the index."""
     photos(folder / "images", 2)
     few = look(folder)
     pictures = tuple(
@@ -78,7 +78,8 @@ def test_given_colmap_poses(tmp_path, model, undistort):
 
 
 def posed(folder: Path, *, tracks: int, size: tuple[int, int] = (64, 48), count: int = 5) -> Path:
-    """Photographs of 64 x 48 pixels, and a model for ``size`` with so many points in each."""
+    """Photographs of 64 x 48 pixels, and a model of ``size`` with ``tracks`` points, each observed
+    in all images."""
     names = [path.name for path in photos(folder / "images", count)]
     sparse = folder / "sparse" / "0"
     write_sparse(sparse, names, size)
@@ -95,8 +96,8 @@ def posed(folder: Path, *, tracks: int, size: tuple[int, int] = (64, 48), count:
     return folder
 
 
-def moved_centre(folder: Path) -> Path:
-    """A principal point that somebody looked for."""
+def with_principal_point_off_centre(folder: Path) -> Path:
+    """A calibrated principal point."""
     sparse = folder / "sparse" / "0"
     model = read_model(sparse)
     model.cameras[1].params[2] += 0.25
@@ -104,20 +105,20 @@ def moved_centre(folder: Path) -> Path:
     return folder
 
 
-def test_given_poses_with_tracks_and_a_centre_that_nobody_looked_for_are_refined(tmp_path):
+def test_given_poses_with_tracks_and_principal_points_at_the_centre_are_refined(tmp_path):
     plan = plan_of(posed(tmp_path, tracks=20, size=(128, 96)))
     assert skipped(plan) == ["decode", "features", "matches", "sfm", "undistort"]
-    assert "middle" in plan.stages["refine"].reason
+    assert "not calibrated" in plan.stages["refine"].reason
 
 
 @pytest.mark.parametrize(
     "change, options, why",
     [
         ({"tracks": 20}, {"poses": "keep"}, "poses: keep"),
-        ({"tracks": 20}, {"sfm": {"refine_principal_point": "no"}}, "held"),
+        ({"tracks": 20}, {"sfm": {"refine_principal_point": "no"}}, "fixed"),
         ({"tracks": 19}, {}, "19 tracked points"),
         ({"tracks": 0}, {}, "no tracks"),
-        ({"tracks": 20, "count": 4}, {}, "no camera of 5"),
+        ({"tracks": 20, "count": 4}, {}, "no camera with 5"),
     ],
 )
 def test_given_poses_that_gain_nothing_are_not_refined(tmp_path, change, options, why):
@@ -126,8 +127,8 @@ def test_given_poses_that_gain_nothing_are_not_refined(tmp_path, change, options
 
 
 def test_a_calibrated_lens_is_refined_on_demand_alone(tmp_path):
-    scene = moved_centre(posed(tmp_path, tracks=20))
-    assert "no camera of 5" in plan_of(scene).stages["refine"].reason
+    scene = with_principal_point_off_centre(posed(tmp_path, tracks=20))
+    assert "no camera with 5" in plan_of(scene).stages["refine"].reason
     assert plan_of(scene, sfm={"refine_principal_point": "yes"}).runs("refine")
 
 
@@ -163,7 +164,7 @@ def test_undistort_follows_the_camera_model_of_sfm(tmp_path, model, runs):
     assert plan.runs("undistort") == runs and "cameras" in plan.stages["undistort"].reason
 
 
-def test_nothing_that_can_be_settled_stays_auto(tmp_path):
+def test_options_are_settled(tmp_path):
     photos(tmp_path / "images", 3)
     config = plan_of(tmp_path).config
     assert config.inspect.image_folder == "images"
@@ -219,7 +220,7 @@ def nerfstudio(folder: Path) -> None:
 )
 @pytest.mark.parametrize("poses", ["auto", "ignore"])
 def test_a_settled_config_finds_the_same_scene(tmp_path, layout, poses):
-    """Stages look at the folder with the settled config and must see what the plan saw."""
+    """Stages scan the folder with the settled config and must find what the plan found."""
     layout(tmp_path)
     first = look(tmp_path, poses=poses)
     settled = make_plan(first, Config(poses=poses)).config
@@ -228,7 +229,7 @@ def test_a_settled_config_finds_the_same_scene(tmp_path, layout, poses):
     assert make_plan(again, settled).config == settled
 
 
-def test_what_the_user_sets_stays(tmp_path):
+def test_configured_options_do_not_change(tmp_path):
     chosen = {
         "matches": {"pairs": "sequential"},
         "sfm": {"mapper": "global", "camera_model": "OPENCV", "share_cameras": "single"},
@@ -248,7 +249,7 @@ def test_what_the_user_sets_stays(tmp_path):
         (41, {}, "retrieval", "incremental"),
         (151, {}, "retrieval", "incremental"),
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0)}, "spatial", "incremental"),
-        # GPS noise around one place sorts nothing.
+        # Positions within the error of GPS.
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-6 * i, 0.0)}, "retrieval", "incremental"),
         (90, {"gps": lambda i: (50.0, 8.0 + 1e-4 * i, 0.0) if i % 2 else None}, "retrieval", None),
     ],
@@ -280,7 +281,7 @@ def test_cameras(tmp_path, group, share, model):
     assert (sfm.share_cameras, sfm.camera_model) == (share, model)
 
 
-def test_decisions_say_the_resolution_and_the_split(tmp_path):
+def test_decisions_contain_the_resolution_and_the_split(tmp_path):
     photos(tmp_path / "images", 2, (72, 128))
     plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"test_every": 5})
     assert plan.facts["view_size"] == [54, 96]
@@ -309,8 +310,8 @@ def test_description_names_every_stage_once(tmp_path):
         assert line.split()[1] == ("run" if stage.run else "skip") and stage.reason in line
 
 
-def test_the_snakefile_can_afford_it():
-    """Planning imports nothing heavy: it happens at every start, before any job."""
+def test_planning_imports_nothing_heavy():
+    """The Snakefile makes the plan at every start, before any job."""
     program = (
         "import sys, pipeline.plan.plan, pipeline.plan.given_poses, pipeline.scene.views;"
         "print([m for m in ('torch', 'cv2', 'scipy', 'skimage', 'pycolmap', 'rawpy', 'tifffile')"
@@ -323,20 +324,20 @@ def test_the_snakefile_can_afford_it():
 @pytest.mark.parametrize(
     "count, options, budget",
     [
-        (2000, {}, 20_000),  # tiny views: the least
+        (2000, {}, 20_000),  # the minimum
         (2000, {"pixels_per_gaussian": 0.1}, 48_000),
         (100, {"pixels_per_gaussian": 0.1}, 20_000),  # few photographs
         (100, {"pixels_per_gaussian": 0.1, "max_gaussians": 500}, 500),
     ],
 )
-def test_the_budget_of_gaussians_follows_the_pixels(tmp_path, count, options, budget):
+def test_the_number_of_gaussians_follows_the_pixels(tmp_path, count, options, budget):
     size = {"width": lambda i: 80, "height": lambda i: 60}
     config = Config.model_validate({"train": {"density": options}})
     plan = make_plan(many(tmp_path, count, **size), config)
     assert plan.config.train.density.max_gaussians == budget
     assert plan.config.init.max_points == budget // 2
     assert any(f"at most {budget} Gaussians" in text for text in plan.stages["train"].decisions)
-    # What was settled settles to the same.
+    # Settling is idempotent.
     again = make_plan(many(tmp_path, count, **size), plan.config)
     assert again.config == plan.config
 
@@ -350,7 +351,7 @@ def test_the_published_strategy_is_limited_by_its_maximum_alone(tmp_path):
 @pytest.mark.parametrize(
     "count, wanted, weight", [(30, "auto", 0.03), (31, "auto", 0.0), (31, 0.5, 0.5), (9, 0.0, 0.0)]
 )
-def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
+def test_few_photographs_get_a_loss_on_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
     config = Config.model_validate({"train": {"depth_loss_weight": wanted}})
     plan = make_plan(many(tmp_path, count), config)
     assert plan.config.train.depth_loss_weight == weight
@@ -359,7 +360,7 @@ def test_few_photographs_are_held_to_the_depths_of_sparse_points(tmp_path, count
     )
 
 
-def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
+def test_depth_maps_are_used_with_any_number_of_photographs(tmp_path):
     some = many(
         tmp_path,
         50,
@@ -371,25 +372,25 @@ def test_depth_maps_are_used_however_many_photographs_there_are(tmp_path):
     assert any("30 depth maps" in text for text in plan.stages["train"].decisions)
 
 
-def test_a_run_of_minutes_gets_no_more_gaussians_than_it_can_train(tmp_path):
+def test_a_time_budget_limits_the_number_of_gaussians(tmp_path):
     scan = many(tmp_path, 2000, width=lambda i: 80, height=lambda i: 60)
     train = {"budget_minutes": 0.5, "density": {"pixels_per_gaussian": 0.1}}
     plan = make_plan(scan, Config.model_validate({"train": train}))
     assert plan.config.train.density.max_gaussians == 25_000
-    text = "at most 25000 Gaussians: 50000 for each of 0.5 minutes"
+    text = "at most 25000 Gaussians: 50000 per minute of 0.5 minutes"
     assert text in plan.stages["train"].decisions
 
 
 @pytest.mark.parametrize(
     "minutes, budget", [(None, 200_000), (4, 200_000), (15, 750_000), (30, 800_000)]
 )
-def test_a_run_of_many_minutes_gets_two_gaussians_for_each_pixel(tmp_path, minutes, budget):
+def test_a_large_time_budget_gets_two_gaussians_per_pixel(tmp_path, minutes, budget):
     scan = many(tmp_path, 100, width=lambda i: 800, height=lambda i: 500)
     plan = make_plan(scan, Config.model_validate({"train": {"budget_minutes": minutes}}))
     assert plan.config.train.density.max_gaussians == budget
 
 
-def test_training_says_what_memory_it_takes(tmp_path):
+def test_the_plan_estimates_the_memory_of_training(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
     config = Config.model_validate({"train": {"density": density}})
@@ -398,8 +399,8 @@ def test_training_says_what_memory_it_takes(tmp_path):
     assert "about 3.2 GB of memory" in plan.stages["train"].decisions
 
 
-def test_memory_that_is_given_limits_gaussians_and_sends_pictures_to_disk(tmp_path):
-    """200 views of 300 MB in all and at most 1 000 000 Gaussians of 2500 MB."""
+def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gaussians(tmp_path):
+    """200 views need 300 MB in total, 1 000 000 Gaussians 2500 MB."""
     size = {"width": lambda i: 800, "height": lambda i: 500}
     scan = many(tmp_path, 200, **size)
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
@@ -410,12 +411,12 @@ def test_memory_that_is_given_limits_gaussians_and_sends_pictures_to_disk(tmp_pa
 
     roomy, tight, small = planned(3200), planned(3199), planned(1400)
     assert "about 3.2 GB of memory" in roomy.stages["train"].decisions
-    from_disk = "3.2 GB of memory, as configured: pictures are read from disk"
+    from_disk = "3.2 GB of memory, as configured: photographs are read from disk"
     assert from_disk in tight.stages["train"].decisions
     assert tight.config.train.density.max_gaussians == 1_000_000
     assert small.config.train.density.max_gaussians == 400_000
-    held = "at most 400000 Gaussians: what 1400 MB of memory hold"
-    assert held in small.stages["train"].decisions
+    limited = "at most 400000 Gaussians: as many as fit into 1400 MB of memory"
+    assert limited in small.stages["train"].decisions
     assert [plan.facts["training_memory_mb"] for plan in (roomy, tight, small)] == [
         3200,
         3199,

@@ -1,11 +1,11 @@
-"""Real photographs: what the scan says of them, against what is known of the sets."""
+"""Scans and plans of real data sets, compared with known facts about them."""
 
 import numpy as np
 import pytest
 
 from pipeline.config.schema import Config
-from pipeline.plan.given_poses import load_given
 from pipeline.plan.scan import Scan, scan
+from tests.plan.test_scan import given_model
 from tests.plans import make_plan
 from tests.tools import need_data
 
@@ -49,17 +49,17 @@ def test_exif_of_a_phone():
     assert {p.orientation for p in seen.photos} != {1}
 
 
-def test_bonsai_poses_explain_its_points():
+def test_bonsai_points_have_small_reprojection_errors():
     seen = look("mip360_bonsai")
-    model = load_given(seen).model
+    model = given_model(seen).model
     assert len(model.images) == 292 and len(model.points) == 91_625
     assert float(np.mean(model.points.error)) < 1.0
 
 
 def test_lego_cameras_look_at_the_model():
-    model = load_given(look("nerf_lego")).model
+    model = given_model(look("nerf_lego")).model
     for image in model.images.values():
-        # All stand on a sphere around the origin and look at it.
+        # All cameras are on a sphere around the origin and look at it.
         ahead = image.rotation[2]
         towards = -image.centre / np.linalg.norm(image.centre)
         assert ahead @ towards > 0.99

@@ -1,4 +1,4 @@
-"""Scanning a scene folder: each layout users bring, EXIF facts, fingerprints, messages."""
+"""Scanning a scene folder: supported layouts, EXIF data, fingerprints, errors."""
 
 import dataclasses
 import json
@@ -13,10 +13,10 @@ from PIL import Image
 from pipeline.config.schema import Config
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
-from pipeline.plan.given_poses import load_given
+from pipeline.plan.given_poses import GivenModel, load_given
 from pipeline.plan.scan import Scan, scan
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from tests.io.test_llff import llff_row
 from tests.io.test_transforms import frame, write
 from tests.pictures import photos, picture
@@ -30,6 +30,17 @@ def config(**sections) -> Config:
     return Config.model_validate(sections)
 
 
+def given_model(result: Scan) -> GivenModel:
+    assert result.poses is not None
+    return load_given(
+        result.folder / result.poses.path,
+        result.poses.kind,
+        result.photos,
+        listed=result.listed,
+        base_folder=result.base_folder,
+    )
+
+
 def names(result: Scan) -> list[str]:
     return [photo.name for photo in result.photos]
 
@@ -37,12 +48,12 @@ def names(result: Scan) -> list[str]:
 def write_sparse(
     folder: Path, photo_names: list[str], size: tuple[int, int], model: str = "PINHOLE"
 ) -> None:
-    """A COLMAP model with one point, seen in the middle of each photograph."""
+    """A COLMAP model with one point, observed at the centre of each photograph."""
     count = len(photo_names)
     params = {"PINHOLE": [50.0, 50, size[0] / 2, size[1] / 2]}
     params["SIMPLE_RADIAL"] = [50.0, size[0] / 2, size[1] / 2, 0.1]
     images = {
-        i + 1: Posed(name, 1, np.eye(3), np.array([0.0, 0, i]))
+        i + 1: PosedImage(name, 1, np.eye(3), np.array([0.0, 0, i]))
         for i, name in enumerate(photo_names)
     }
     points = Points(
@@ -80,7 +91,7 @@ def test_plain_folder_of_photographs(tmp_path):
     assert "2 of 3 photographs have no mask" in result.warnings
 
 
-def test_plain_folder_says_what_it_does_not_use(tmp_path):
+def test_unused_subfolders_are_a_warning(tmp_path):
     photos(tmp_path, 2)
     photos(tmp_path / "thumbs", 1)
     (warning,) = look(tmp_path).warnings
@@ -94,7 +105,7 @@ def test_photographs_in_subfolders(tmp_path):
     assert names(look(tmp_path)) == ["left/p00.jpg", "right/p00.jpg"]
 
 
-def test_one_folder_of_another_name_counts_as_images(tmp_path):
+def test_a_single_subfolder_with_another_name_is_used(tmp_path):
     photos(tmp_path / "input", 2)
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
     result = look(tmp_path)
@@ -112,7 +123,7 @@ def test_smaller_copies_match_the_model_by_stem(tmp_path, long_side, chosen):
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
     result = look(tmp_path, config(views={"max_long_side_px": long_side}))
     assert result.image_folder == chosen
-    model = load_given(result).model
+    model = given_model(result).model
     size = (result.photos[0].width, result.photos[0].height)
     assert sorted(model.by_name()) == names(result)
     (camera,) = model.cameras.values()
@@ -125,7 +136,7 @@ def test_smaller_copies_match_the_model_by_stem(tmp_path, long_side, chosen):
     ("scene", "chosen"),
     [("garden", "images_4"), ("mip360_bonsai", "images_2"), ("360_v2-room", "images_2")],
 )
-def test_scenes_of_mip_nerf_360_get_the_size_that_papers_use(tmp_path, scene, chosen):
+def test_scenes_of_mip_nerf_360_have_the_size_that_papers_use(tmp_path, scene, chosen):
     folder = tmp_path / scene
     for n in (1, 2, 4, 8):
         name = "images" if n == 1 else f"images_{n}"
@@ -137,7 +148,7 @@ def test_scenes_of_mip_nerf_360_get_the_size_that_papers_use(tmp_path, scene, ch
     assert look(folder, config(views={"max_long_side_px": 64})).image_folder == "images"
 
 
-def test_without_poses_features_get_the_resolution_they_ask_for(tmp_path):
+def test_without_poses_images_are_large_enough_for_features(tmp_path):
     photos(tmp_path / "images", 2, (64, 48))
     photos(tmp_path / "images_2", 2, (32, 24))
     small = {"max_long_side_px": 32}
@@ -145,7 +156,7 @@ def test_without_poses_features_get_the_resolution_they_ask_for(tmp_path):
     assert look(tmp_path, config(views=small, features=small)).image_folder == "images_2"
 
 
-def test_smaller_copies_that_would_lose_masks_or_photographs_are_not_taken(tmp_path):
+def test_smaller_copies_without_all_masks_and_photographs_are_not_used(tmp_path):
     small = config(views={"max_long_side_px": 32}, features={"max_long_side_px": 32})
     photos(tmp_path / "images", 3, (64, 48))
     photos(tmp_path / "images_2", 2, (32, 24))
@@ -158,12 +169,12 @@ def test_smaller_copies_that_would_lose_masks_or_photographs_are_not_taken(tmp_p
     assert (result.image_folder, result.num_masks) == ("images_2", 3)
 
 
-def test_only_a_smaller_copy_is_there(tmp_path):
+def test_only_a_smaller_copy_exists(tmp_path):
     photos(tmp_path / "images_4", 2, (16, 12))
     write_sparse(tmp_path / "sparse", ["p00.JPG", "p01.JPG"], (64, 48))
     result = look(tmp_path)
     assert (result.image_folder, result.poses.path) == ("images_4", "sparse")
-    assert next(iter(load_given(result).model.cameras.values())).width == 16
+    assert next(iter(given_model(result).model.cameras.values())).width == 16
 
 
 def test_configured_folder(tmp_path):
@@ -189,16 +200,16 @@ def test_given_colmap_model_and_truth(tmp_path):
     assert result.truth == tmp_path / "sparse_gt"
     assert any("gone.jpg" in line for line in result.warnings)
     assert any("p02.jpg" in line and "no given pose" in line for line in result.warnings)
-    model = load_given(result).model
+    model = given_model(result).model
     assert sorted(model.by_name()) == listed[:2]
     assert model.points.track_length.tolist() == [2]
     assert look(tmp_path, config(poses="ignore")).poses is None
 
 
 @pytest.mark.parametrize(("away", "moved"), [(0.0, False), (50.0, False), (1e5, True), (1e9, True)])
-def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
-    """float32 has 24 bits: at 1e5 of a scene's sizes from the origin they tell no pixel from the
-    next. What the cameras see stays the same, and the way back is told."""
+def test_poses_far_from_the_origin_are_translated(tmp_path, away, moved):
+    """At 1e5 times a scene's size from the origin, float32 cannot resolve a pixel. Projections do
+    not change, and the translation is recorded."""
     files = photos(tmp_path / "images", 4)
     folder = tmp_path / "sparse" / "0"
     write_sparse(folder, [path.name for path in files], (64, 48))
@@ -209,8 +220,8 @@ def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
     }
     points = dataclasses.replace(near.points, xyz=near.points.xyz + shift)
     write_model(folder, Reconstruction(near.cameras, images, points))
-    given = load_given(look(tmp_path))
-    assert bool(given.origin.any()) == moved == (given.sidecar() is not None)
+    given = given_model(look(tmp_path))
+    assert bool(given.origin.any()) == moved == (given.georeference() is not None)
     for i, image in given.model.images.items():
         local = image.rotation @ given.model.points.xyz[0] + image.translation
         np.testing.assert_allclose(local, near.images[i].translation, atol=1e-15 * away + 1e-12)
@@ -219,11 +230,11 @@ def test_poses_far_from_their_origin_come_near_it(tmp_path, away, moved):
         assert (given.origin == np.round(given.origin)).all()
         back = given.model.points.xyz[0] + given.origin
         np.testing.assert_allclose(back, shift, rtol=1e-12)
-        assert given.sidecar()["origin"] == dict(zip("xyz", given.origin, strict=True))
+        assert given.georeference()["origin"] == dict(zip("xyz", given.origin, strict=True))
 
 
 @pytest.mark.parametrize(("focal", "ok"), [(1.0, False), (2.0, True), (6e4, True), (1e9, False)])
-def test_a_focal_length_that_no_lens_has_is_told(tmp_path, focal, ok):
+def test_an_impossible_focal_length_is_a_user_error(tmp_path, focal, ok):
     files = photos(tmp_path / "images", 2)
     folder = tmp_path / "sparse" / "0"
     write_sparse(folder, [path.name for path in files], (64, 48))
@@ -231,10 +242,10 @@ def test_a_focal_length_that_no_lens_has_is_told(tmp_path, focal, ok):
     camera = dataclasses.replace(model.cameras[1], params=np.array([focal, focal, 32, 24]))
     write_model(folder, dataclasses.replace(model, cameras={1: camera}))
     if ok:
-        assert load_given(look(tmp_path)).model.cameras[1].pinhole[0] == focal
+        assert given_model(look(tmp_path)).model.cameras[1].pinhole[0] == focal
     else:
         with pytest.raises(UserError, match="focal length of"):
-            load_given(look(tmp_path))
+            given_model(look(tmp_path))
 
 
 def test_truth_is_never_an_input(tmp_path):
@@ -255,9 +266,9 @@ def test_nerf_synthetic(tmp_path):
         write(tmp_path, {"camera_angle_x": 0.7, "frames": frames}, f"transforms_{split}.json")
     result = look(tmp_path)
     expected = ["test/r_0.png", "test/r_1.png", "train/r_0.png", "train/r_1.png"]
-    assert names(result) == expected == sorted(load_given(result).model.by_name())
+    assert names(result) == expected == sorted(given_model(result).model.by_name())
     assert (result.num_alpha, result.poses.kind, result.poses.pinhole) == (4, "transforms", True)
-    assert any("2 of 6 cameras have no photograph" in line for line in result.warnings)
+    assert any("2 of 6 poses have no photograph" in line for line in result.warnings)
     assert names(look(tmp_path, config(poses="ignore"))) == expected
 
 
@@ -269,7 +280,7 @@ def test_nerfstudio_with_masks(tmp_path):
     result = look(tmp_path)
     assert (result.image_folder, names(result)) == ("images", ["p00.jpg", "p01.jpg"])
     assert (result.num_masks, result.poses.models) == (2, ("OPENCV",))
-    (camera,) = load_given(result).model.cameras.values()
+    (camera,) = given_model(result).model.cameras.values()
     assert (camera.width, camera.pinhole[0]) == (64, 25)
 
 
@@ -282,21 +293,21 @@ def test_transforms_with_absolute_paths_and_photographs_elsewhere(tmp_path):
     frames = [frame(path=path) for path in inside + outside]
     write(folder, {"fl_x": 50, "frames": frames})
     result = look(folder)
-    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(load_given(result).model.by_name())
-    assert any("2 of 4 cameras have no photograph" in line for line in result.warnings)
+    assert names(result) == ["p00.jpg", "p01.jpg"] == sorted(given_model(result).model.by_name())
+    assert any("2 of 4 poses have no photograph" in line for line in result.warnings)
 
 
-def test_llff_goes_by_order_even_past_a_broken_photograph(tmp_path):
+def test_llff_order_includes_unreadable_photographs(tmp_path):
     photos(tmp_path / "images", 3)
     (tmp_path / "images" / "p01.jpg").write_text("not a picture")
     rows = [llff_row(np.eye(3), np.array([i, 0.0, 0]), 48, 64, 50.0) for i in range(3)]
     np.save(tmp_path / "poses_bounds.npy", rows)
     result = look(tmp_path)
     assert result.poses.kind == "llff"
-    centres = {name: image.centre[0] for name, image in load_given(result).model.by_name().items()}
+    centres = {name: image.centre[0] for name, image in given_model(result).model.by_name().items()}
     assert centres == {"p00.jpg": 0, "p02.jpg": 2}
     picture(tmp_path / "images" / "p03.jpg")
-    with pytest.raises(UserError, match="3 poses, but images/ holds 4"):
+    with pytest.raises(UserError, match="3 poses and 4 photographs in images/"):
         look(tmp_path)
 
 
@@ -333,7 +344,7 @@ def test_exif_facts(tmp_path):
     a, b = look(tmp_path).photos
     assert (a.width, a.height, a.orientation) == (64, 48, 6)
     assert a.camera_group == "NIKON D60 | 18-55mm | 29 mm | 64x48"
-    # 43 mm of a 43.27 mm diagonal; the picture's diagonal is 80 pixels.
+    # The diagonals are 43.27 mm and 80 pixels.
     assert a.focal_px == pytest.approx(43 / 43.27 * 80)
     assert a.gps == pytest.approx((-10.51, -20.0, -12.5))
     assert a.taken == "2011-05-02T17:24:09"
@@ -346,8 +357,8 @@ def test_exif_facts(tmp_path):
     )
 
 
-def test_an_alpha_channel_that_hides_nothing_is_none(tmp_path):
-    """Else the scene would be trained and measured over other backgrounds than its copy in RGB."""
+def test_an_opaque_alpha_channel_is_ignored(tmp_path):
+    """The scene must be trained over the same background as its copy in RGB."""
     (tmp_path / "images").mkdir()
     for i, (mode, least) in enumerate((("RGBA", 255), ("RGBA", 254), ("LA", 255), ("LA", 0))):
         image = Image.new(mode, (64, 48), "gray")
@@ -361,24 +372,24 @@ def test_an_alpha_channel_that_hides_nothing_is_none(tmp_path):
 @pytest.mark.parametrize(
     "exif, focal",
     [
-        # 64 pixels kept of 6400 on a sensor of 20 pixels a mm... resized a hundredfold.
+        # 6400 pixels at 20 pixels per mm, resized to 64.
         ({0x920A: 50.0, 0xA20E: 200.0, 0xA210: 4, 0xA002: 6400, 0xA003: 4800}, 100.0),
         ({0x920A: 50.0, 0xA20E: 508.0, 0xA210: 2, 0xA002: 640, 0xA003: 480}, 100.0),
         ({0x920A: 50.0, 0xA20E: 9999.0, 0xA002: 64, 0xA003: 48}, None),
         ({0x920A: 50.0}, None),
         ({0xA405: 0, 0x920A: 0.0}, None),
         ({0xA405: 2000}, None),
-        # Cropped to another shape since: the 35 mm equivalent is of the whole picture.
+        # Cropped: the 35 mm equivalent refers to the whole image.
         ({0xA405: 43, 0xA002: 6400, 0xA003: 3600}, None),
     ],
 )
-def test_focal_lengths_and_their_sanity(tmp_path, exif, focal):
+def test_focal_lengths_and_their_checks(tmp_path, exif, focal):
     photos(tmp_path, 2, exif=exif)
     found = look(tmp_path).photos[0].focal_px
     assert found == (pytest.approx(focal) if focal else None)
 
 
-def test_damaged_exif_is_no_reason_to_lose_the_photograph(tmp_path):
+def test_photographs_with_damaged_exif_are_used(tmp_path):
     photos(tmp_path, 2, exif={0xA405: 43})
     file = tmp_path / "p00.jpg"
     data = bytearray(file.read_bytes())
@@ -423,7 +434,7 @@ def test_order(tmp_path):
 
 
 def write_dng(path: Path, width: int = 64, height: int = 48) -> None:
-    """A Bayer DNG; the pattern's size, its colours, black and white level, matrix, focal."""
+    """A Bayer DNG with make, model, focal length, colour matrix, black and white level."""
     import tifffile
 
     rng = np.random.default_rng(list(path.name.encode()))
@@ -445,7 +456,7 @@ def write_dng(path: Path, width: int = 64, height: int = 48) -> None:
     tifffile.imwrite(path, pixels, photometric="CFA", extratags=extra, metadata=None)
 
 
-def test_raw_and_its_jpeg_twin(tmp_path):
+def test_of_raw_and_jpeg_pairs_one_is_used(tmp_path):
     for name in ("a.dng", "b.DNG"):
         write_dng(tmp_path / "images" / name)
     picture(tmp_path / "images" / "a.JPG")
@@ -456,10 +467,10 @@ def test_raw_and_its_jpeg_twin(tmp_path):
     assert photo.camera_group == "Maker Model 1 | ? | 35 mm | 64x48"
     assert "a.JPG" in result.warnings[0]
     write_sparse(tmp_path / "sparse" / "0", ["a.JPG"], (64, 48))
-    assert names(look(tmp_path)) == ["a.JPG", "b.DNG"]  # The poses are the picture's.
+    assert names(look(tmp_path)) == ["a.JPG", "b.DNG"]  # The poses name the JPEG.
 
 
-def test_unreadable_raw_leaves_its_twin(tmp_path):
+def test_the_jpeg_of_an_unreadable_raw_file_is_used(tmp_path):
     photos(tmp_path, 2)
     (tmp_path / "p00.cr2").write_bytes(b"II*\0 nothing")
     result = look(tmp_path)
@@ -480,7 +491,7 @@ def scene(tmp_path) -> Path:
     return folder
 
 
-def test_fingerprint_knows_neither_times_nor_places(scene, tmp_path, monkeypatch):
+def test_fingerprint_is_independent_of_times_and_location(scene, tmp_path, monkeypatch):
     before = look(scene).fingerprint
     for path in scene.rglob("*"):
         os.utime(path, (1, 1))
@@ -493,7 +504,7 @@ def test_fingerprint_knows_neither_times_nor_places(scene, tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("file", ["images/p01.jpg", "masks/p01.jpg", "sparse/0/images.bin"])
-def test_fingerprint_sees_one_changed_byte(scene, file, tmp_path):
+def test_fingerprint_changes_with_one_byte(scene, file, tmp_path):
     cache = tmp_path / "cache.json"
     before = look(scene, cache=cache).fingerprint
     time = (scene / file).stat().st_mtime_ns
@@ -505,7 +516,7 @@ def test_fingerprint_sees_one_changed_byte(scene, file, tmp_path):
     assert look(scene, cache=cache).fingerprint != before
 
 
-def test_fingerprint_sees_names(scene):
+def test_fingerprint_changes_with_names(scene):
     before = look(scene).fingerprint
     (scene / "masks" / "p02.jpg").unlink()
     without = look(scene).fingerprint
@@ -513,7 +524,7 @@ def test_fingerprint_sees_names(scene):
     assert len({before, without, look(scene).fingerprint}) == 3
 
 
-def test_cache_changes_nothing_and_may_fail(scene, tmp_path):
+def test_scans_are_equal_with_a_missing_or_damaged_cache(scene, tmp_path):
     cache = tmp_path / "cache.json"
     plain = look(scene)
     assert look(scene, cache=cache) == plain == look(scene, cache=cache)
@@ -525,16 +536,18 @@ def test_cache_changes_nothing_and_may_fail(scene, tmp_path):
     assert look(scene, cache=tmp_path / "file" / "cache.json") == plain
 
 
-def test_cached_looks_open_no_photograph(scene, tmp_path, monkeypatch):
+def test_cached_scans_open_no_photograph(scene, tmp_path, monkeypatch):
     look(scene, cache=tmp_path / "cache.json")
-    monkeypatch.setattr("pipeline.plan.scan.read_facts", lambda path: pytest.fail(f"{path}"))
+    for module in ("scan", "photo_folder"):
+        name = f"pipeline.plan.{module}.read_facts"
+        monkeypatch.setattr(name, lambda path: pytest.fail(f"{path}"))
     look(scene, cache=tmp_path / "cache.json")
 
 
 # --- bad input ----------------------------------------------------------------------------
 
 
-def test_missing_scene_lists_those_that_are_there(tmp_path):
+def test_the_error_for_a_missing_scene_lists_the_scenes(tmp_path):
     photos(tmp_path / "house", 1)
     with pytest.raises(UserError, match="no such scene") as error:
         look(tmp_path / "hose")
@@ -555,7 +568,7 @@ def test_empty_folder_and_too_few(tmp_path):
     assert len(look(tmp_path, config(inspect={"min_images": 1})).photos) == 1
 
 
-def test_no_picture_inside(tmp_path):
+def test_unreadable_files_are_warnings(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "images" / "text.jpg").write_text("not a picture")
     (tmp_path / "images" / "empty.png").write_bytes(b"")
@@ -577,15 +590,15 @@ def test_mask_of_another_size(tmp_path):
 def test_poses_of_other_photographs(tmp_path):
     photos(tmp_path / "images", 2)
     write_sparse(tmp_path / "sparse" / "0", ["x.jpg", "y.jpg"], (64, 48))
-    with pytest.raises(UserError, match="none of its 2 cameras has a photograph"):
+    with pytest.raises(UserError, match="none of its 2 images is a photograph"):
         look(tmp_path)
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg"], (48, 64))
     with pytest.raises(UserError, match="64x48, its given camera 48x64"):
-        load_given(look(tmp_path))
+        given_model(look(tmp_path))
 
 
-def test_turned_photographs_do_not_fit_their_cameras(tmp_path):
-    """Poses made from pictures turned by EXIF are not those of the stored pixel grid."""
+def test_poses_of_rotated_photographs_are_a_user_error(tmp_path):
+    """Poses must refer to the stored pixels, not to images rotated by EXIF orientation."""
     photos(tmp_path / "a" / "images", 2)
     frames = [frame(path=f"images/p0{i}.jpg") for i in range(2)]
     write(tmp_path / "a", {"fl_x": 50, "w": 48, "h": 64, "frames": frames})
@@ -594,10 +607,10 @@ def test_turned_photographs_do_not_fit_their_cameras(tmp_path):
     np.save(tmp_path / "b" / "poses_bounds.npy", rows)
     for name in "ab":
         with pytest.raises(UserError, match="64x48, its given camera 48x64"):
-            load_given(look(tmp_path / name))
+            given_model(look(tmp_path / name))
 
 
-def test_malformed_poses_stop_unless_ignored(tmp_path):
+def test_malformed_poses_are_a_user_error_unless_ignored(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "transforms.json").write_text("{")
     with pytest.raises(UserError, match="line 1"):
@@ -611,7 +624,7 @@ def test_malformed_poses_stop_unless_ignored(tmp_path):
         look(tmp_path)
 
 
-def test_half_a_model_is_named(tmp_path):
+def test_an_incomplete_model_is_a_warning(tmp_path):
     photos(tmp_path / "images", 2)
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg"], (64, 48))
     (tmp_path / "sparse" / "0" / "images.bin").unlink()
@@ -620,7 +633,7 @@ def test_half_a_model_is_named(tmp_path):
     assert any("images" in line and "sparse/0" in line for line in result.warnings)
 
 
-def test_links_in_a_circle_end(tmp_path):
+def test_circular_symbolic_links_are_followed_once(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "images" / "again").symlink_to(tmp_path / "images")
     assert names(look(tmp_path)) == ["p00.jpg", "p01.jpg"]

@@ -1,4 +1,4 @@
-"""Views: sizes, scaled intrinsics, the split and the scene's extent."""
+"""Views: sizes, scaled intrinsics, test views, the scene's extent and up direction."""
 
 import numpy as np
 import pytest
@@ -7,7 +7,7 @@ from pipeline.config.schema import Split, Views
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.up_direction import up_direction
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import load_views, scene_extent, view_size
 
 
@@ -21,7 +21,7 @@ def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruc
         for n in names
     ]
     images = {
-        i + 1: Posed(n, 1, np.eye(3), np.array([-float(i), 0, 0])) for i, n in enumerate(names)
+        i + 1: PosedImage(n, 1, np.eye(3), np.array([-float(i), 0, 0])) for i, n in enumerate(names)
     }
     return Manifest(scene="s", photos=tuple(photos)), Reconstruction({1: camera}, images)
 
@@ -41,9 +41,9 @@ def test_intrinsics_scale_by_the_exact_ratio_of_each_side():
     np.testing.assert_allclose((view.fx, view.fy, view.cx, view.cy), expected)
 
 
-def test_every_eighth_of_the_posed_photographs_by_name_is_held_out():
+def test_every_eighth_photograph_with_a_pose_is_a_test_view():
     manifest, model = make(20)
-    del model.images[1]  # p00 has no pose: p01 is the first of the split.
+    del model.images[1]  # Without p00's pose, p01 is the first test view.
     views = load_views(manifest, model, Views(), Split())
     assert [view.name for view in views if view.is_test] == ["p01.jpg", "p09.jpg", "p17.jpg"]
     assert not any(
@@ -57,7 +57,7 @@ def test_masks_can_be_ignored():
     assert load_views(manifest, model, Views(masks="ignore"), Split())[0].mask is None
 
 
-def test_distorting_cameras_are_refused():
+def test_cameras_with_lens_distortion_are_an_error():
     manifest, model = make(1, Camera("SIMPLE_RADIAL", 301, 200, np.array([250.0, 150, 100, 0.1])))
     with pytest.raises(ValueError, match="SIMPLE_RADIAL"):
         load_views(manifest, model, Views(), Split())
@@ -66,27 +66,27 @@ def test_distorting_cameras_are_refused():
 def test_extent():
     manifest, model = make(9)
     views = load_views(manifest, model, Views(), Split(test_every=8))
-    # Training cameras stand at x = 1 ... 7: 3 from their mean.
+    # Training cameras are at x = 1 ... 7, at most 3 from their mean.
     assert scene_extent(views) == pytest.approx(3.3)
     assert scene_extent(views[:1]) == 1.0
 
 
-def test_rounding_is_no_extent():
-    """Cameras in one place, whose poses say so to the last bit but one."""
+def test_extent_of_cameras_in_one_place_is_one():
+    """The camera centres differ by rounding errors only."""
     manifest, model = make(9)
     rng = np.random.default_rng(0)
     images = {}
     for number, image in model.images.items():
         turned = np.linalg.qr(rng.normal(size=(3, 3)))[0]
         centre = np.array([0.3, -7.0, 2.0])
-        images[number] = Posed(image.name, 1, turned, -turned @ centre)
+        images[number] = PosedImage(image.name, 1, turned, -turned @ centre)
     views = load_views(manifest, Reconstruction(model.cameras, images), Views(), Split())
     assert len({tuple(view.centre) for view in views}) > 1
     assert scene_extent(views) == 1.0
 
 
-def test_up_is_what_the_cameras_agree_on():
-    """Cameras around a y-down world that look down at it: tilts cancel, up stays."""
+def test_up_of_cameras_around_a_scene():
+    """Cameras on a circle that look down at the middle of a y-down world: their tilts cancel."""
     rotations = []
     for angle in np.arange(0, 2 * np.pi, 0.5 * np.pi):
         forward = np.array([np.cos(angle), 0.6, np.sin(angle)]) / np.sqrt(1.36)
@@ -97,9 +97,9 @@ def test_up_is_what_the_cameras_agree_on():
 
 
 @pytest.mark.parametrize("orientation, quarter_turns", [(1, 0), (8, 1), (3, 2), (6, 3)])
-def test_up_knows_cameras_that_were_turned(orientation, quarter_turns):
-    """EXIF says how the picture is to be turned (anticlockwise by 90 degrees for 8) to stand: a
-    camera turned clockwise sees the world's up to its right."""
+def test_up_follows_the_exif_orientation(orientation, quarter_turns):
+    """The orientation is the rotation that makes the image upright, anticlockwise by 90 degrees
+    for 8: up is to the right in the stored image of a camera that was turned clockwise."""
     angle = quarter_turns * np.pi / 2
     c, s = np.cos(angle), np.sin(angle)
     turned = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
@@ -107,8 +107,8 @@ def test_up_knows_cameras_that_were_turned(orientation, quarter_turns):
     np.testing.assert_allclose(found, [0, -1, 0], atol=1e-9)
 
 
-def test_up_is_level_where_all_cameras_look_up():
-    """A facade from below: every camera is tilted the same way, and up is still up."""
+def test_up_of_cameras_with_the_same_tilt():
+    """A facade photographed from below: the mean of the columns alone would be tilted too."""
     rotations = []
     for angle in np.radians([-30, -10, 10, 30]):
         forward = np.array([np.sin(angle), -0.5, np.cos(angle)]) / np.sqrt(1.25)
@@ -119,8 +119,8 @@ def test_up_is_level_where_all_cameras_look_up():
     assert np.degrees(np.arccos(found @ [0, -1, 0])) < 4, found
 
 
-def test_up_is_above_cameras_that_look_down():
-    """A drone that flies to and fro: its pictures' tops point all ways along the ground."""
+def test_up_of_cameras_that_look_straight_down():
+    """A drone's nadir images in several headings: their columns lie in the ground plane."""
     down, rotations = np.array([0.0, 1.0, 0.0]), []
     for angle in np.radians([0, 0, 180, 180, 175, 5, 90]):
         right = np.array([np.cos(angle), 0.0, np.sin(angle)])
@@ -129,5 +129,5 @@ def test_up_is_above_cameras_that_look_down():
     np.testing.assert_allclose(found, [0, -1, 0], atol=0.1)
 
 
-def test_up_without_cameras_is_against_y():
+def test_up_without_cameras_is_minus_y():
     assert up_direction(np.zeros((0, 3, 3)), []).tolist() == [0, -1, 0]

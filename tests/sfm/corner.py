@@ -11,7 +11,7 @@ import numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.io.recorded import digest_of
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 WIDTH, HEIGHT, FOCAL = 400, 300, 380.0
 _TEXTURE = 512
@@ -96,7 +96,7 @@ def write_scene(
         path = folder / f"{prefix}{index:02d}.png"
         cv2.imwrite(str(path), picture(rotation, translation, seed))
         photos.append(photo(path, **facts))
-        images[index] = Posed(path.name, 1, rotation, translation)
+        images[index] = PosedImage(path.name, 1, rotation, translation)
     return photos, Reconstruction({1: camera()}, images)
 
 

@@ -18,7 +18,7 @@ from benchmarks.sfm.scenes import configurations, load_scene
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 ERROR = PoseError(0.1, 0.1, 0.02, 0.02, 0.004, 5.0, 1.0, {1.0: 0.9, 5.0: 1.0, 10.0: 1.0}, 8, 8)
 
@@ -108,7 +108,7 @@ def test_interpolated_views_lie_between_neighbouring_cameras():
     images = {}
     for i in range(6):
         rotation = rotated if i == 5 else np.eye(3)
-        images[i] = Posed(f"{i}.jpg", 1, rotation, -rotation @ np.array([float(i * i), 0, 0]))
+        images[i] = PosedImage(f"{i}.jpg", 1, rotation, -rotation @ np.array([float(i * i), 0, 0]))
     model = Reconstruction({}, images)
     found = between(model, 40)
     again = between(model, 40)

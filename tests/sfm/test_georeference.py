@@ -178,8 +178,8 @@ def test_ground_control_file(tmp_path):
         "missing.jpg",
     )
     # Whole numbers are OpenDroneMap's pixel centres.
-    assert control.points[0].seen == {"a.jpg": (101.0, 200.5), "sub/b.jpg": (300.5, 200.5)}
-    assert set(control.points[1].seen) == {"a.jpg", "sub/b.jpg"}
+    assert control.points[0].pixels == {"a.jpg": (101.0, 200.5), "sub/b.jpg": (300.5, 200.5)}
+    assert set(control.points[1].pixels) == {"a.jpg", "sub/b.jpg"}
 
 
 @pytest.mark.parametrize(

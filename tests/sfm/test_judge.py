@@ -67,14 +67,14 @@ def test_the_benchmark_aligns_a_model_by_the_majority_of_its_views():
     all of them."""
     from benchmarks.judge.truth import grade
     from pipeline.geometry.cameras import Camera
-    from pipeline.scene.reconstruction import Posed, Reconstruction
+    from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
     rng = np.random.default_rng(0)
     camera = Camera("SIMPLE_PINHOLE", 100, 100, np.array([90.0, 50, 50]))
 
     def model(poses: list[tuple[np.ndarray, np.ndarray]]) -> Reconstruction:
         images = {
-            i: Posed(f"{i}.jpg", 1, rotation, -rotation @ centre)
+            i: PosedImage(f"{i}.jpg", 1, rotation, -rotation @ centre)
             for i, (rotation, centre) in enumerate(poses, start=1)
         }
         return Reconstruction({1: camera}, images)

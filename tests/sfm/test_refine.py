@@ -13,7 +13,7 @@ from pipeline.config.schema import Sfm
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.sfm.isolate import run_isolated
 from tests.sfm import corner
 from tests.sfm.jobs import digests
@@ -38,7 +38,7 @@ def truth(off: np.ndarray, noise_px: float, points: int = POINTS) -> Reconstruct
     images = {}
     for i, (rotation, translation) in enumerate(corner.poses(COUNT), start=1):
         about_axis = roll(30 * (-1) ** i)
-        images[i] = Posed(f"{i:02d}.png", 1, about_axis @ rotation, about_axis @ translation)
+        images[i] = PosedImage(f"{i:02d}.png", 1, about_axis @ rotation, about_axis @ translation)
     xyz = rng.uniform(0, 0.8, (points, 3)) * (1, -1, -1)
     seen = []
     for image in images.values():

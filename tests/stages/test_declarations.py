@@ -1,4 +1,4 @@
-"""What stages declare: their keys, their order, and what they may read."""
+"""Declarations of stages: keys, order, and the options that they can read."""
 
 import subprocess
 import sys
@@ -14,7 +14,7 @@ from pipeline.runtime.section import read_section
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan
 
-RESULT_FREE = ("train.memory_mb",)
+NOT_IN_KEYS = ("train.memory_mb",)
 
 
 def differing(one: Plan, two: Plan) -> set[str]:
@@ -79,7 +79,7 @@ def test_an_option_reruns_exactly_the_stages_that_declare_it(path):
     assert declaring or path == "preset", f"no stage declares {path}"
 
 
-@pytest.mark.parametrize("path", RESULT_FREE)
+@pytest.mark.parametrize("path", NOT_IN_KEYS)
 def test_an_option_that_changes_no_result_is_in_no_key(path):
     assert path not in set(option_paths())
     base = Config()
@@ -98,13 +98,13 @@ def test_an_undeclared_option_cannot_be_read():
     assert read_section(Views, selected["views"]) == Views()
     with pytest.raises(KeyError):
         select(Config(), ("train.no_such_option",))
-    # The whole section reads as the schema's own.
+    # A whole section is an object of the schema.
     whole = select(Config(), ("train", "split"))
     assert read_section(Train, whole["train"]) == Train()
     assert read_section(Split, whole["split"]) == Split()
 
 
-def test_stages_follow_what_feeds_them():
+def test_stages_come_after_their_inputs():
     names = list(STAGES)
     assert names[0] == "inspect" and names[-1] == "report"
     for name, spec in STAGES.items():
@@ -113,24 +113,24 @@ def test_stages_follow_what_feeds_them():
             assert all(names.index(source) < names.index(name) for source in candidates)
 
 
-def test_seeds_share_what_draws_nothing():
+def test_runs_with_different_seeds_share_stages_that_are_not_seeded():
     seeded = {name for name, spec in STAGES.items() if spec.seeded}
     assert differing(full_plan(Config()), full_plan(Config(seed=1))) == seeded
 
 
-def test_configurations_share_what_stands_before_their_difference():
-    """The stages after it differ by what they read: train's options."""
+def test_configurations_share_the_stages_before_their_difference():
+    """The stages after it read options of train as well."""
     other = Config.model_validate({"train": {"sh_degree": 0}})
     after = {"train", "evaluate", "coverage", "export", "report"}
-    # The report does not draw, it shows the plan and what training made.
+    # The report does not read this option.
     assert differing(full_plan(Config()), full_plan(other)) == after - {"report"}
 
 
-def test_runs_share_all_but_the_page_that_names_them():
+def test_runs_with_equal_options_share_all_stages_but_the_report():
     assert differing(full_plan(Config()), full_plan(Config(), "fox@copy")) == {"report"}
 
 
-def test_the_plan_says_what_feeds_each_stage():
+def test_the_plan_lists_each_stages_inputs():
     plan = full_plan(Config())
     assert plan.stages["train"].inputs == ["init", "undistort"]
     for name, spec in STAGES.items():
@@ -138,7 +138,7 @@ def test_the_plan_says_what_feeds_each_stage():
 
 
 def test_declarations_import_nothing_heavy():
-    """The Snakefile imports them all before any job starts."""
+    """The Snakefile imports all declarations before any job starts."""
     heavy = ("torch", "cv2", "pycolmap", "scipy", "skimage", "matplotlib", "rawpy")
     code = (
         "import sys; import stages.workflow.registry; "

@@ -16,7 +16,7 @@ from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.io.colmap import write_model
 from pipeline.io.ply import write_splat_ply
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
 from pipeline.training.loop.metrics_log import NAME
@@ -33,7 +33,7 @@ def scene(tmp_path: Path) -> Path:
     poses = {}
     for index in range(4):
         pose = camera_at(index * np.pi / 2).world_to_camera
-        poses[index + 1] = Posed(f"{index}.png", 1, pose[:3, :3], pose[:3, 3])
+        poses[index + 1] = PosedImage(f"{index}.png", 1, pose[:3, :3], pose[:3, 3])
     camera = Camera("PINHOLE", WIDTH, HEIGHT, np.array([FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]))
     write_model(folder / "sfm" / "sparse" / "0", Reconstruction({1: camera}, poses))
     (folder / "plan.json").write_text("{}")

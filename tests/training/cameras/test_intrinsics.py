@@ -11,7 +11,7 @@ import torch
 
 from pipeline.geometry.cameras import Camera
 from pipeline.render.views import raster_camera
-from pipeline.scene.reconstruction import Posed, Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import View
 from pipeline.training.cameras.intrinsics import (
     IntrinsicsRefinement,
@@ -100,7 +100,7 @@ def test_a_change_of_intrinsics_is_independent_of_the_image_size(scene: TinyScen
         3: Camera("SIMPLE_PINHOLE", *size, np.array([view.fx, view.cx, view.cy])),
         7: Camera("PINHOLE", *size, np.array([view.fx, view.fy, view.cx, view.cy])),
     }
-    image = Posed("a", 7, np.eye(3), np.zeros(3))
+    image = PosedImage("a", 7, np.eye(3), np.zeros(3))
     model = with_intrinsics(Reconstruction(given, {1: image}), {7: -WRONG})
     assert model.cameras[3] is given[3] and model.images == {1: image}
     assert model.cameras[7].pinhole[0] == pytest.approx(scene.views[0].fx, rel=1e-12)

@@ -17,7 +17,7 @@ from pipeline.config.schema import Gradient, Train
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view
-from pipeline.scene.reconstruction import Points, Posed, Reconstruction
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
@@ -30,7 +30,7 @@ from tests.training.conftest import HEIGHT, WIDTH, camera_at
 def test_depths_are_known_in_the_views_that_see_a_point():
     views = [replace(camera_at(angle), name=f"{i}.png") for i, angle in enumerate((0.0, 0.4))]
     images = {
-        7 + i: Posed(v.name, 1, v.world_to_camera[:3, :3], v.world_to_camera[:3, 3])
+        7 + i: PosedImage(v.name, 1, v.world_to_camera[:3, :3], v.world_to_camera[:3, 3])
         for i, v in enumerate(views)
     }
     points = Points(

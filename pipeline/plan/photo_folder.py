@@ -1,0 +1,169 @@
+"""The choice of the folder whose photographs a scene uses."""
+
+from __future__ import annotations
+
+import posixpath
+import re
+from collections.abc import Sequence
+from pathlib import Path, PurePosixPath
+
+from pipeline.config.schema import Config
+from pipeline.io.fact_cache import FactCache
+from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
+from pipeline.io.names import NameIndex
+from pipeline.io.photofile import FileFacts, read_facts
+from pipeline.io.posefiles import GivenPoses, transforms_photos
+from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
+from pipeline.runtime.errors import UserError
+
+# Suffixes of folders with full-size photographs and with copies at 1/2, 1/4 and 1/8.
+_COPY_SUFFIXES = ("", "_2", "_4", "_8")
+
+
+def choose_photo_folder(
+    folder: Path,
+    config: Config,
+    poses: GivenPoses | None,
+    cache: FactCache,
+    warnings: list[str],
+) -> PhotoFolder:
+    """The folder of ``inspect.image_folder``; with "auto" that of the photographs that
+    transforms.json lists, else ``images`` or a smaller copy of it, else the scene folder.
+
+    Args:
+        folder: the scene folder.
+        warnings: warnings are added to this list.
+
+    Raises:
+        UserError: ``inspect.image_folder`` is not a folder inside ``folder``.
+    """
+    configured = config.inspect.image_folder
+    if configured != "auto":
+        configured = PurePosixPath(configured).as_posix()
+        inside = not configured.startswith("/") and ".." not in configured.split("/")
+        if not inside or not (folder / configured).is_dir():
+            raise UserError(
+                "expected inspect.image_folder to be a folder inside the scene folder",
+                file=folder / configured,
+                fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
+            )
+    if poses is None or poses.kind == "transforms":
+        listed = transforms_photos(folder, warnings if poses is not None else None)
+        if listed is not None and configured in ("auto", listed.path):
+            return listed
+    if configured not in ("auto", "."):
+        names = pictures_in(folder / configured, warnings)
+        base = "images" if re.fullmatch(r"images_[248]", configured) else configured
+        return PhotoFolder(configured, base, "as configured", names)
+    copies = [f"images{suffix}" for suffix in _COPY_SUFFIXES]
+    copies = [name for name in copies if (folder / name).is_dir()]
+    if configured == "auto" and copies:
+        return _choose_copy(folder, copies, config, poses, cache, warnings)
+    return _scene_folder(folder, warnings)
+
+
+def _scene_folder(folder: Path, warnings: list[str]) -> PhotoFolder:
+    """The photographs in the scene folder itself, else those in its subfolders."""
+    top = pictures_in(folder, warnings, recursive=False)
+    if top:
+        below = [name for name in relative_folders(folder) if pictures_in(folder / name, [])]
+        if below:
+            warnings.append(
+                f"{folder}: photographs in {', '.join(below)} are not used, because there are "
+                "photographs in the scene folder itself (inspect.image_folder)"
+            )
+        return PhotoFolder(".", ".", "no images/; photographs are in the scene folder", top)
+    names = pictures_in(folder, warnings)
+    parents = [posixpath.dirname(name) for name in names]
+    base = posixpath.commonpath(parents) if parents else ""
+    names = [posixpath.relpath(name, base or ".") for name in names]
+    where = f"{base}/" if base else "subfolders"
+    return PhotoFolder(base or ".", base or ".", f"no images/; photographs are in {where}", names)
+
+
+def _choose_copy(
+    folder: Path,
+    copies: Sequence[str],
+    config: Config,
+    poses: GivenPoses | None,
+    cache: FactCache,
+    warnings: list[str],
+) -> PhotoFolder:
+    """The smallest of images/ and its reduced copies that is not smaller than training and feature
+    extraction need; for scenes of Mip-NeRF 360 the copy that papers use."""
+    needed = config.views.max_long_side_px
+    if poses is None:
+        needed = max(needed, config.features.max_long_side_px)
+    found: list[tuple[int, PhotoFolder]] = []
+    for path in copies:
+        names = pictures_in(folder / path, warnings)
+        if names:
+            facts = read_all(folder, path, names[:1], cache, [])
+            longest = max((max(f.width, f.height) for f in facts.values()), default=0)
+            found.append((longest, PhotoFolder(path, "images", "", names)))
+    if not found:
+        return PhotoFolder("images", "images", "images/ holds no photograph", [])
+    longest, full = found[0]
+    usable = [entry for entry in found if _is_complete(folder, entry[1], full, poses, config)]
+    large_enough = [entry for entry in usable if entry[0] >= needed]
+    published = MIP_NERF_360.get(benchmark_scene(folder.name))
+    of_papers = [entry for entry in usable if entry[1].path == published]
+    if of_papers:
+        longest, best = of_papers[0]
+    elif large_enough:
+        longest, best = min(large_enough, key=lambda entry: entry[0])
+    else:
+        longest, best = max(usable, key=lambda entry: entry[0])
+    others = [f"{entry.path}/ ({size} px)" for size, entry in found if entry is not best]
+    reason = f"{best.path}/ ({longest} px long side)"
+    if of_papers:
+        reason += f": the copy that papers use for {benchmark_scene(folder.name)} of Mip-NeRF 360"
+    elif others:
+        rule = "the smallest of at least" if longest >= needed else "the largest; none has"
+        reason += f": {rule} {needed} px; others: {', '.join(others)}"
+    return PhotoFolder(best.path, "images", reason, best.names)
+
+
+def _is_complete(
+    folder: Path, copy: PhotoFolder, full: PhotoFolder, poses: GivenPoses | None, config: Config
+) -> bool:
+    """Whether ``copy`` has all photographs of ``full`` that are used, with masks and depth maps."""
+    if copy is full:
+        return True
+    suffix = copy.path[len("images") :]
+    for kind in ("masks", "depths"):
+        used = kind == "depths" or config.views.masks == "auto"
+        if used and (folder / kind).is_dir() and not (folder / f"{kind}{suffix}").is_dir():
+            return False
+    if poses is not None and poses.kind == "transforms":
+        return False  # Without w and h, the focal length may refer to the full size.
+    if poses is not None and poses.kind == "llff":
+        return len(copy.names) == poses.num_images
+    needed = poses.names if poses is not None else full.names
+    in_copy, in_full = NameIndex(copy.names), NameIndex(full.names)
+    return all(in_copy.find(name) for name in needed if in_full.find(name))
+
+
+def read_all(
+    folder: Path, image_folder: str, names: Sequence[str], cache: FactCache, warnings: list[str]
+) -> dict[str, FileFacts]:
+    """Name -> metadata of the photographs that can be read; the others add a warning each."""
+    facts: dict[str, FileFacts] = {}
+    for name in names:
+        path = folder / image_folder / name
+
+        def read(path: Path = path) -> dict:
+            try:
+                return read_facts(path).model_dump()
+            except UserError as error:
+                return {"unreadable": error.what}
+
+        try:
+            found = cache.get(path, "photo", read)
+        except OSError as error:
+            found = {"unreadable": f"cannot be read: {error.strerror}"}
+        if "unreadable" in found:
+            warnings.append(f"{path}: left out: {found['unreadable']}")
+        else:
+            facts[name] = FileFacts.model_validate(found)
+    return facts

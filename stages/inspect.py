@@ -46,8 +46,9 @@ def work(job: Job) -> None:
     count = len(manifest.photos)
     job.counters = {"photos": count, "left_out": len(found.listed) - count}
     if (poses := found.poses) is not None:
-        where = {"listed": found.listed, "base_folder": found.base_folder}
-        given = load_given(folder / poses.path, poses.kind, manifest.photos, **where)
+        given = load_given(
+            folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
+        )
         job.add_messages(given.write(job.out), [])
         job.counters["given_poses"] = len(given.model.images)
         job.counters["given_points"] = len(given.model.points)

@@ -40,7 +40,7 @@ def test_layout_is_that_of_antimatter15_splat(tmp_path) -> None:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (lambda data: data[:-1], "expected 32 bytes"),
+        (lambda data: data[:-1], "multiple of 32 bytes"),
         (lambda data: b"\xff" * 32 + data, "impossible"),
         (lambda data: data[:12] + np.float32(-1).tobytes() + data[16:], "impossible"),
     ],

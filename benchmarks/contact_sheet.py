@@ -61,7 +61,7 @@ def sheet(
             fix="take of these: "
             + ", ".join(f"{r['scene']}@{r['config']}" for r in rows if r["status"] == "ok"),
         )
-    tiles: list[Image.Image] = []
+    tiles: list[tuple[str, Image.Image]] = []
     for config in configs or done:
         # Folders of a batch without seeds have no seed in their name.
         named = batch.parent / done[config].name
@@ -113,7 +113,9 @@ def main() -> int:
     )
     parser.add_argument("batch", type=Path, metavar="benchmark.json")
     parser.add_argument("--scene", required=True)
-    parser.add_argument("--configs", nargs="+", default=[], help="configurations, in order (default: all)")
+    parser.add_argument(
+        "--configs", nargs="+", default=[], help="configurations, in order (default: all)"
+    )
     parser.add_argument("--view", help="name of a test view (default: the median one)")
     parser.add_argument("--photograph", action="store_true", help="put the photograph first")
     parser.add_argument("--width", type=int, default=240, help="of a render, pixels")

@@ -15,7 +15,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# Views 12 degrees apart: fewer overlap, and the held-out ones still lie between others.
+# Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
 # Small enough for a full run in well under a minute, large enough to go through densification.
 TINY = {

@@ -69,13 +69,16 @@ def scenes(records: Sequence[Record]) -> str:
 
 def headline(records: Sequence[Record]) -> str:
     """The short table of the README."""
-    rows = [["scene", "photographs", "PSNR (dB)", "SSIM", "Gaussians", "CPU minutes in all"]]
+    rows = [
+        ["scene", "photographs", "seeds", "PSNR (dB)", "SSIM", "Gaussians", "CPU minutes in all"]
+    ]
     for record in records:
         runs = record["runs"]
         rows.append(
             [
                 record["scene"],
                 str(record["photographs"]),
+                str(len(runs)),
                 _middle([run["psnr"] for run in runs], "{:.2f}"),
                 _middle([run["ssim"] for run in runs], "{:.3f}"),
                 f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",

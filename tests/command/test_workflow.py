@@ -16,7 +16,7 @@ from pipeline.command.main import main
 def started(monkeypatch: pytest.MonkeyPatch) -> list[list[str]]:
     """The commands that would have replaced the process."""
     commands: list[list[str]] = []
-    monkeypatch.setattr(workflow, "become", commands.append)
+    monkeypatch.setattr(workflow, "replace_process", commands.append)
     return commands
 
 

@@ -10,11 +10,10 @@ from PIL import Image
 
 from pipeline.config.schema import Config
 from pipeline.io import heif
-from pipeline.photos.load import load_rgba
+from pipeline.photos.load import Picture, load_rgba
 from pipeline.photos.verify import verify_photos
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
-from pipeline.sfm.sift import Picture
 from tests.tools import need_data
 
 pytestmark = pytest.mark.skipif(

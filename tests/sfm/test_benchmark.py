@@ -71,7 +71,7 @@ def test_patterns_select_configurations_that_are_possible(demo):
     # No GPS. The plan's choice under the other presets is added.
     assert not any("spatial" in name for name in names)
     assert {n for n, planned in names.items() if planned} == {
-        f"{preset}/incremental/exhaustive" for preset in ("fast", "balanced", "high")
+        f"{preset}/incremental/exhaustive" for preset in ("fast", "balanced", "high", "original")
     }
     assert {n.split("/")[1] for n in names} == {"incremental", "global"}
     fast = configurations(scene, ["fast/*/exhaustive"])

@@ -72,4 +72,4 @@ def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path
 
     (project / "report").mkdir()
     snakemake(project, TABLE, "--report", "report/all.html", config=CONFIG)
-    assert "What the scene needed" in (project / "report/all.html").read_text()
+    assert "The stages that run, with their inputs" in (project / "report/all.html").read_text()

@@ -135,7 +135,7 @@ def test_a_changed_mask_is_noticed_and_new_truth_measures_only(project):
 def test_the_commands_of_the_readme_are_commands(project):
     text = (ROOT / "README.md").read_text()
     lines = re.findall(r"^    (snakemake .*?)(?:\s+#.*)?$", text, re.M)
-    assert len(lines) >= 5
+    assert len(lines) >= 3
     (project / "mine.yaml").write_text("preset: fast\n")
     for line in lines:
         line = re.sub(r"(bicycle|garden)", "tiny", line).replace("/data/360_v2", "data")
@@ -153,7 +153,7 @@ def test_the_commands_of_the_readme_are_commands(project):
 def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
     """From the photographs on, killed in mapping, before training's first checkpoint and after
     one, and in evaluation."""
-    trainer = project / "pipeline/training/loop/trainer.py"
+    trainer = project / "pipeline/training/loop/session.py"
     text = trainer.read_text()
     often = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.2")
     assert often != text

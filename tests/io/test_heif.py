@@ -10,10 +10,11 @@ from PIL import Image
 
 from pipeline.config.schema import Config
 from pipeline.io import heif
-from pipeline.photos.load import Picture, load_rgba
+from pipeline.photos.load import load_rgba
 from pipeline.photos.verify import verify_photos
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
+from pipeline.sfm.sift import DetectionImage
 from tests.tools import need_data
 
 pytestmark = pytest.mark.skipif(
@@ -43,7 +44,7 @@ def test_heic_photographs_are_found_described_and_decoded(tmp_path: Path) -> Non
     assert verify_photos(found.manifest, threads=1)[1] == []
     rgb, alpha = load_rgba(photo.path)
     assert alpha is None and np.abs(rgb.astype(int) - written[0]).mean() < 3
-    assert np.array_equal(Picture(photo, 1000).rgb, rgb)
+    assert np.array_equal(DetectionImage(photo, 1000).rgb, rgb)
 
 
 def test_size_and_pixels_agree_for_rotated_images(tmp_path: Path) -> None:
@@ -51,7 +52,7 @@ def test_size_and_pixels_agree_for_rotated_images(tmp_path: Path) -> None:
     write(tmp_path / "b.heic", orientation=6)
     photo = scan(tmp_path, "s", Config(), cache=None).photos[0]
     assert load_rgba(photo.path)[0].shape == (photo.height, photo.width, 3)
-    assert Picture(photo, 1000).rgb.shape == (photo.height, photo.width, 3)
+    assert DetectionImage(photo, 1000).rgb.shape == (photo.height, photo.width, 3)
 
 
 def test_a_file_from_a_phone_is_read() -> None:

@@ -185,8 +185,8 @@ def test_ground_control_file(tmp_path):
 @pytest.mark.parametrize(
     ("text", "what"),
     [
-        ("", "names no projection"),
-        ("1 2 3 4 5 a.jpg\n", "names no projection"),
+        ("", "expected a projection"),
+        ("1 2 3 4 5 a.jpg\n", "expected a projection"),
         ("EPSG:32632\n1 2 3 4 a.jpg\n", "line 2 is malformed"),
         ("EPSG:32632\n1 2 nan 4 5 a.jpg\n", "line 2 is not finite"),
         ("EPSG:32632\n\n1 2 3 4 5\n", "line 3 is malformed"),

@@ -5,7 +5,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Split, Train
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 

@@ -7,15 +7,16 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.plan.values import Plan
 
 # With refined cameras, the poses of test views are fitted to their photographs before measuring.
 FIT_OPTIONS = ("train.refine_poses", "train.ssim_loss_weight")

@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Features, Init, Matches
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from stages.workflow import inputs

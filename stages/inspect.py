@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Config
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.runtime.section import read_section
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.plan.values import Plan
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:

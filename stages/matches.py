@@ -6,7 +6,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Matches, Sfm
-from pipeline.plan.stage import StagePlan, StageSpec, unless_posed
+from pipeline.plan.stage import StageSpec, unless_posed
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Split, Train
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs

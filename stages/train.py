@@ -7,15 +7,16 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.plan.values import Plan
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:

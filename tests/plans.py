@@ -2,9 +2,8 @@
 
 from pipeline.config.schema import Config
 from pipeline.plan import plan as plans
-from pipeline.plan.plan import Plan
 from pipeline.plan.scan import Scan
-from pipeline.plan.stage import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from stages.workflow.registry import STAGES
 
 

@@ -1,8 +1,11 @@
-"""Imports go one way: a room imports itself and the rooms above it in this list."""
+"""Imports go one way: a room imports itself and the rooms above it in this list, and no module
+imports itself through others."""
 
 from __future__ import annotations
 
 import ast
+import graphlib
+from collections.abc import Collection
 from pathlib import Path
 
 import pytest
@@ -49,6 +52,30 @@ def test_a_room_imports_only_rooms_above_it(room: str) -> None:
     for path in (ROOT / "pipeline").joinpath(*room.split(".")).rglob("*.py"):
         climbs = {name for name in imports(path) if room_of(name) not in allowed}
         assert not climbs, f"{path} imports {sorted(climbs)}"
+
+
+def module_of(name: str, modules: Collection[str]) -> str | None:
+    """The module that an imported name is, or is defined in."""
+    while name and name not in modules:
+        name = name.rpartition(".")[0]
+    return name or None
+
+
+def test_no_modules_import_each_other() -> None:
+    """At their top, for types only, or inside a function."""
+    files = {
+        ".".join(path.relative_to(ROOT / "pipeline").with_suffix("").parts): path
+        for path in (ROOT / "pipeline").rglob("*.py")
+    }
+    modules = {name.removesuffix(".__init__"): path for name, path in files.items()}
+    graph = {
+        module: {module_of(name, modules) for name in imports(path)} - {None, module}
+        for module, path in modules.items()
+    }
+    try:
+        graphlib.TopologicalSorter(graph).prepare()
+    except graphlib.CycleError as error:
+        pytest.fail(f"imports in a cycle: {' <- '.join(error.args[1])}")
 
 
 def test_the_library_knows_nothing_of_stages() -> None:

@@ -7,8 +7,9 @@ from importlib.metadata import version
 from typing import Any
 
 from pipeline.config.options import select
-from pipeline.plan.plan import Plan, public_plan
+from pipeline.plan.plan import public_plan
 from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import Plan
 from pipeline.runtime.record import canonical
 from pipeline.runtime.source import stage_source_hash
 

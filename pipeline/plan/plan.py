@@ -10,41 +10,16 @@ from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
-from pydantic import BaseModel, ConfigDict
-
 from pipeline.config.schema import Config
 from pipeline.plan.budget import training_memory_mb
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
-from pipeline.plan.stage import StagePlan, StageSpec
+from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
 # Limits the length of lists in the plan, which is passed on command lines.
 MAX_LISTED = 20
-
-
-class Plan(BaseModel):
-    """The plan of a scene.
-
-    Attributes:
-        scene: name of the scene or run.
-        stages: name -> plan of the stage, in the order of the DAG.
-        config: the settled options.
-        facts: facts about the scene that the plan depends on.
-        folder: the scene folder, relative to the working directory or absolute.
-    """
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    scene: str
-    stages: dict[str, StagePlan]
-    warnings: list[str]
-    config: Config
-    facts: dict[str, Any]
-    folder: str = ""
-
-    def runs(self, stage: str) -> bool:
-        return self.stages[stage].run
 
 
 def make_plan(

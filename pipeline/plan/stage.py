@@ -6,25 +6,12 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
-from pydantic import BaseModel, ConfigDict
+from pipeline.plan.values import Plan, StagePlan
 
 if TYPE_CHECKING:
-    from pipeline.plan.plan import Plan
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
     from pipeline.runtime.job import Job
-
-
-class StagePlan(BaseModel):
-    """Whether a stage runs for a scene, the reason, and decisions about its options."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    run: bool
-    reason: str
-    decisions: list[str] = []
-    inputs: list[str] = []
-    """The stages whose output it reads."""
 
 
 _POSE_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}

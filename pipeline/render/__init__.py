@@ -25,7 +25,7 @@ from pipeline.render.types import (
 )
 
 if TYPE_CHECKING:
-    from pipeline.render.backend import Backend, make_backend
+    from pipeline.render.backend import Backend
     from pipeline.render.operators import (
         adam_step,
         backward,
@@ -34,6 +34,7 @@ if TYPE_CHECKING:
         l1_ssim,
         render,
     )
+    from pipeline.render.registry import make_backend
 
 __all__ = [
     "Backend",
@@ -58,10 +59,14 @@ __all__ = [
 
 def __getattr__(name: str) -> Any:
     # Import statements, not names in strings: the keys of stages are computed from imports.
-    if name in ("Backend", "make_backend"):
-        from pipeline.render import backend
+    if name == "Backend":
+        from pipeline.render.backend import Backend
 
-        return getattr(backend, name)
+        return Backend
+    if name == "make_backend":
+        from pipeline.render.registry import make_backend
+
+        return make_backend
     if name in __all__:
         from pipeline.render import operators
 

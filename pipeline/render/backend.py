@@ -3,14 +3,13 @@
 Inputs and outputs are float32 tensors on the CPU; a backend may compute on another device and in
 another precision. Results do not depend on the number of threads.
 
-To add a backend, derive a class from ``Backend`` and add it to ``make_backend``.
+To add a backend, derive a class from ``Backend`` and add it to ``pipeline.render.registry``.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from functools import cache
 from typing import Generic, TypeVar
 
 import torch
@@ -29,8 +28,6 @@ from pipeline.render.types import (
 
 Projected = TypeVar("Projected")
 Binned = TypeVar("Binned")
-
-BACKENDS = ("cpu", "reference")
 
 
 class Backend(ABC, Generic[Projected, Binned]):
@@ -184,18 +181,3 @@ class Backend(ABC, Generic[Projected, Binned]):
         )
         checks.check_camera(camera, options.near)
         return self.blend(self.bin(self.project(parameters, camera, options)))
-
-
-@cache
-def make_backend(name: str = "cpu") -> Backend:
-    """The backend of this name, one of ``BACKENDS``."""
-    # Explicit imports: the keys of stages are computed from imports.
-    if name == "cpu":
-        from pipeline.render.cpu.backend import CpuBackend
-
-        return CpuBackend()
-    if name == "reference":
-        from pipeline.render.reference_backend import ReferenceBackend
-
-        return ReferenceBackend()
-    raise ValueError(f"no backend {name!r}; there are {', '.join(BACKENDS)}")

@@ -6,7 +6,7 @@ from typing import Any
 
 import torch
 
-from pipeline.render.backend import make_backend
+from pipeline.render.registry import make_backend
 from pipeline.render.types import RasterCamera, RasterOptions, RenderOutput
 
 _backend = make_backend()

@@ -25,6 +25,7 @@ NEUTRAL = (
     "pipeline.plan.plan",
     "pipeline.plan.settle",
     "pipeline.plan.stage",
+    "pipeline.plan.values",
 )
 
 # Modules with C++ code -> the folder of its sources.

@@ -14,9 +14,10 @@ from typing import Any, NoReturn
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, parse_run
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import Plan, describe, make_plan, public_plan, upstream
+from pipeline.plan.plan import describe, make_plan, public_plan, upstream
 from pipeline.plan.scan import scan
 from pipeline.plan.stage import StageSpec
+from pipeline.plan.values import Plan
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError

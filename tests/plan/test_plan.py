@@ -9,8 +9,9 @@ import pytest
 
 from pipeline.config.schema import Config
 from pipeline.io.colmap import read_model, write_model
-from pipeline.plan.plan import Plan, describe
+from pipeline.plan.plan import describe
 from pipeline.plan.scan import Scan, scan
+from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, Reconstruction
 from stages.workflow.registry import STAGES

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from pipeline.render import Backend, FrameAdam, RasterOptions, ShAdam, make_backend
-from pipeline.render.backend import BACKENDS
+from pipeline.render.registry import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 
 REFERENCE = make_backend("reference")

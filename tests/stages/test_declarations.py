@@ -9,7 +9,8 @@ import pytest
 from pipeline.config.options import option_paths, select
 from pipeline.config.schema import Config, Split, Train, Views
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import Plan, upstream
+from pipeline.plan.plan import upstream
+from pipeline.plan.values import Plan
 from pipeline.runtime.section import read_section
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan

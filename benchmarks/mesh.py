@@ -16,11 +16,11 @@ from tempfile import TemporaryDirectory
 from benchmarks.surface import align, measure, true_points
 from pipeline.config.schema import Split, Train, Views
 from pipeline.io.colmap import read_model
+from pipeline.io.npz import read_npz
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
-from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.mesh import build_mesh
 
@@ -43,7 +43,7 @@ def main() -> int:
         Views.model_validate(sections["views"]),
         split,
     )
-    gaussians = Gaussians.load(options.results / "train" / "gaussians.npz")
+    gaussians = read_npz(options.results / "train" / "gaussians.npz")
     raster = choose_protocol(views, split, train).options(train, options.threads)
     start, cpu = time.monotonic(), time.process_time()
     with TemporaryDirectory() as folder:

@@ -21,13 +21,13 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pipeline.io.npz import read_npz
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.metrics.image import psnr
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render.views import render_view, to_bytes
 from pipeline.reporting.space import upright_camera
 from pipeline.scene.views import View
-from pipeline.splats.gaussians import Gaussians
 
 FLAGS = [
     "--headless=new",
@@ -55,7 +55,7 @@ def main() -> int:
         print("error: no Chromium on PATH", file=sys.stderr)
         return 2
     scene = posed_scene(results, None, None)
-    gaussians = Gaussians.load(results / "train" / "gaussians.npz")
+    gaussians = read_npz(results / "train" / "gaussians.npz")
     protocol = choose_protocol(scene.views, scene.split, scene.train)
     picks = np.linspace(0, len(scene.views) - 1, CAMERAS + 2).round().astype(int)[1:-1]
     views = [scene.views[i] for i in picks]

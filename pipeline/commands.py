@@ -15,9 +15,9 @@ from PIL import Image
 from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
 from pipeline.io.splat_files import check_suffix, read_gaussians, write_gaussians
-from pipeline.metrics.evaluate import BLACK, NO_GAINS, WHITE, choose_protocol, evaluate_views
+from pipeline.metrics.evaluate import NO_GAINS, choose_protocol, evaluate_views
 from pipeline.plan.posed_scene import posed_scene
-from pipeline.render import RasterOptions
+from pipeline.render import BACKGROUNDS, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.errors import UserError
@@ -103,7 +103,7 @@ def render(
         warnings.append(f"{cameras}: lens distortion is not rendered")
     # The near plane depends on all views, so that it is independent of ``names``.
     options = RasterOptions(
-        background=WHITE if how.background == "white" else BLACK,
+        background=BACKGROUNDS[how.background or "black"],
         antialias=bool(how.antialias),
         near=near_plane(scene_extent(views)),
         threads=how.threads,

@@ -138,42 +138,43 @@ def _libraries() -> list[Finding]:
     """The native libraries. The modules that declare them do not import torch; the matcher's
     imports numpy."""
     found = []
-    for topic, make in (("rasterizer", _rasterizer), ("matcher", _matcher)):
+    for topic, declared in (("rasterizer", _rasterizer), ("matcher", _matcher)):
         try:
-            variants = targets.usable_variants((library := make()).extensions)
-            # As in NativeLibrary.build: other variants only without a compiler.
-            if native.find_compiler() is not None:
-                variants = variants[:1]
-            built = next(filter(None, map(library.find, variants)), None)
+            found += [Finding(topic, _describe(library)) for library in declared()]
         except UserError as error:
             found.append(Finding(topic, error.what, "missing", error.fix))
         except ImportError as error:
             found.append(Finding(topic, f"cannot be loaded: {error}", "missing", "make setup"))
-        else:
-            found.append(_library_finding(topic, built))
     return found
 
 
-def _library_finding(topic: str, built: native.Built | None) -> Finding:
+def _describe(library: native.NativeLibrary) -> str:
+    """How the library was built.
+
+    Raises:
+        UserError: it is not built, and there is no compiler.
+    """
+    variants = targets.usable_variants(library.extensions)
+    # As in NativeLibrary.build: other variants only without a compiler.
+    if native.find_compiler() is not None:
+        variants = variants[:1]
+    built = next(filter(None, map(library.find, variants)), None)
     if built is not None:
-        return Finding(topic, f"built for {built.target} by {built.compiler}")
-    try:
-        native.compiler()
-    except UserError as error:
-        return Finding(topic, error.what, "missing", error.fix)
-    return Finding(topic, "not built: compiled when first used, or by make setup")
+        return f"built for {built.target} by {built.compiler}"
+    native.compiler()
+    return "not built: compiled when first used, or by make setup"
 
 
-def _rasterizer() -> native.NativeLibrary:
-    from pipeline.render.cpu.build import library
+def _rasterizer() -> Sequence[native.NativeLibrary]:
+    from pipeline.render.libraries import native_libraries
 
-    return library()
+    return native_libraries()
 
 
-def _matcher() -> native.NativeLibrary:
+def _matcher() -> Sequence[native.NativeLibrary]:
     from pipeline.sfm.nearest import LIBRARY
 
-    return LIBRARY
+    return [LIBRARY]
 
 
 def _memory() -> list[Finding]:

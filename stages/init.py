@@ -34,9 +34,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.io.arrays import write_arrays
     from pipeline.io.colmap import read_model
     from pipeline.sfm.triangulation import triangulate
-    from pipeline.splats.arrays import write_arrays
     from pipeline.splats.first import first_gaussians
 
     config, experiments = job.section(Init), job.section(Experiments)

@@ -36,14 +36,14 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.io.colmap import write_model
-    from pipeline.splats.gaussians import Gaussians
+    from pipeline.io.npz import read_npz, write_npz
     from pipeline.training.scene import train_scene
 
     trained = train_scene(
         inputs.input_views(job),
         inputs.read_manifest(job, "views"),
         inputs.input_model(job),
-        Gaussians.load(job.inputs["init"] / "gaussians.npz"),
+        read_npz(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
         job.section(Experiments).train,
         seed=job.seed,
@@ -52,7 +52,7 @@ def work(job: Job) -> None:
         checkpoint_dir=job.scratch / "checkpoints",
         logs=job.logs,
     )
-    trained.result.gaussians.save(job.out / "gaussians.npz")
+    write_npz(job.out / "gaussians.npz", trained.result.gaussians)
     if trained.model is not None:
         write_model(job.out / "sparse" / "0", trained.model)
     write_json(job.out / "curve.json", trained.result.curve)

@@ -15,6 +15,7 @@ from pipeline.config.schema import Config, ExportFormat
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
+from pipeline.io.npz import write_npz
 from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
@@ -57,7 +58,7 @@ def scene(tmp_path: Path) -> Path:
         )
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
     (scene / "train").mkdir()
-    sample(50).save(scene / "train" / "gaussians.npz")
+    write_npz(scene / "train" / "gaussians.npz", sample(50))
     return scene
 
 

@@ -54,6 +54,17 @@ def test_a_room_imports_only_rooms_above_it(room: str) -> None:
         assert not climbs, f"{path} imports {sorted(climbs)}"
 
 
+def test_only_the_render_room_imports_a_backend() -> None:
+    """Others use the interface, so that a backend can be added or replaced in one place."""
+    for folder in ("pipeline", "stages"):
+        for path in (ROOT / folder).rglob("*.py"):
+            inside = path.is_relative_to(ROOT / "pipeline" / "render")
+            backends = {
+                n for n in imports(path) if n.startswith(("render.cpu", "render.reference"))
+            }
+            assert inside or not backends, f"{path} imports {sorted(backends)}"
+
+
 def module_of(name: str, modules: Collection[str]) -> str | None:
     """The module that an imported name is, or is defined in."""
     while name and name not in modules:

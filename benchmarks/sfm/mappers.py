@@ -75,6 +75,7 @@ def compare_mappers(
 
 def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
     """As in the stages undistort, init and train, on all views; always with the same seed."""
+    from pipeline.io.npz import write_npz
     from pipeline.photos.undistort import undistort
     from pipeline.scene.views import load_views, scene_extent
     from pipeline.splats.gaussians import Gaussians
@@ -105,18 +106,18 @@ def _train(manifest: Manifest, config: Config, folder: Path, threads: int) -> No
         threads=threads,
         checkpoint_dir=folder / "checkpoints",
     )
-    result.gaussians.save(folder / "gaussians.npz")
+    write_npz(folder / "gaussians.npz", result.gaussians)
 
 
 def _compare(
     folders: dict[Name, Path], config: Config, count: int, threads: int
 ) -> dict[tuple[Name, Name], Likeness]:
     """Render the same views of all models, and compare each pair."""
+    from pipeline.io.npz import read_npz
     from pipeline.metrics.image import psnr, ssim
     from pipeline.render import RasterOptions
     from pipeline.render.views import near_plane, render_view
     from pipeline.scene.views import load_views, scene_extent
-    from pipeline.splats.gaussians import Gaussians
 
     models = {name: read_model(folder / "pinhole/sparse/0") for name, folder in folders.items()}
     first = next(iter(folders))
@@ -125,7 +126,7 @@ def _compare(
     places = between(models[first], count)
     pictures = {}
     for name, folder in folders.items():
-        gaussians = Gaussians.load(folder / "gaussians.npz")
+        gaussians = read_npz(folder / "gaussians.npz")
         scale, turn, shift = _similarity(models[first], models[name])
         near = near_plane(scale * scene_extent(seen))
         options = RasterOptions(near=near, threads=threads)

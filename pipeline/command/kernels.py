@@ -10,7 +10,7 @@ import shutil
 import sys
 from pathlib import Path
 
-from pipeline.render.cpu import build
+from pipeline.render.libraries import native_libraries
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.native import build_targets
 from pipeline.sfm import nearest
@@ -20,7 +20,7 @@ def main(folder: Path) -> int:
     try:
         built = [
             item
-            for library in (build.library(), nearest.LIBRARY)
+            for library in (*native_libraries(), nearest.LIBRARY)
             for item in build_targets(library, ["all"])
         ]
     except UserError as error:

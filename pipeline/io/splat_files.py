@@ -9,6 +9,7 @@ from typing import TypeVar
 import torch
 
 from pipeline.io.gltf import read_gltf, write_gltf
+from pipeline.io.npz import read_npz, write_npz
 from pipeline.io.ply import read_splat_ply, write_splat_ply
 from pipeline.io.splat import read_splat, write_splat
 from pipeline.io.spz import read_spz, write_spz
@@ -20,14 +21,14 @@ _READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".spz": read_spz,
     ".splat": read_splat,
     ".glb": read_gltf,
-    ".npz": Gaussians.load,
+    ".npz": read_npz,
 }
 _WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
     ".ply": write_splat_ply,
     ".spz": write_spz,
     ".splat": write_splat,
     ".glb": write_gltf,
-    ".npz": lambda path, gaussians: gaussians.save(path),
+    ".npz": write_npz,
 }
 T = TypeVar("T")
 SUFFIXES = tuple(_READERS)

@@ -18,7 +18,7 @@ from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
-from pipeline.render import RasterOptions
+from pipeline.render import BACKGROUNDS, Color, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
@@ -47,8 +47,6 @@ POSES_PROTOCOL = (
 )
 Mask = NDArray[np.bool_]
 
-BLACK, WHITE = (0.0, 0.0, 0.0), (1.0, 1.0, 1.0)
-
 
 @dataclass(frozen=True)
 class Protocol:
@@ -66,7 +64,7 @@ class Protocol:
     views: list[View]
     training_views: list[View]
     every: int
-    background: tuple[float, float, float]
+    background: Color
     near: float
     extent: float
 
@@ -94,13 +92,12 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
         .round()
         .astype(int)
     )
-    white = train.background in ("white", "random")
     extent = scene_extent(list(views))
     return Protocol(
         test or list(views),
         [training[i] for i in picks] if test else [],
         split.test_every if test else 0,
-        WHITE if white else BLACK,
+        BACKGROUNDS["white" if train.background in ("white", "random") else "black"],
         near_plane(extent),
         extent,
     )

@@ -13,7 +13,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING, Any
 
 from pipeline.render.types import (
+    BACKGROUNDS,
     CameraGradients,
+    Color,
     Forward,
     FrameAdam,
     Gradients,
@@ -37,8 +39,10 @@ if TYPE_CHECKING:
     from pipeline.render.registry import make_backend
 
 __all__ = [
+    "BACKGROUNDS",
     "Backend",
     "CameraGradients",
+    "Color",
     "Forward",
     "FrameAdam",
     "Gradients",

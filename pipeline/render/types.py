@@ -11,6 +11,12 @@ if TYPE_CHECKING:
     import torch
 
 
+Color = tuple[float, float, float]
+"""RGB in [0, 1]."""
+
+BACKGROUNDS: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
+
+
 @dataclass(frozen=True)
 class RasterCamera:
     """A pinhole camera in COLMAP's convention: x right, y down, z forward.
@@ -38,7 +44,7 @@ class RasterOptions:
 
     Attributes:
         sh_degree: active spherical harmonics degree, 0 to 3; coefficients above are ignored.
-        background: RGB of the background; None for none (the same image as black).
+        background: the color behind the Gaussians; None for none (the same image as black).
         antialias: scale opacities by Mip-Splatting's compensation, so that the 0.3 px dilation
             changes a Gaussian's size but not its energy.
         near: distance of the near plane in world units: Gaussians whose mean has camera z <= near
@@ -51,7 +57,7 @@ class RasterOptions:
     """
 
     sh_degree: int = 3
-    background: tuple[float, float, float] | None = None
+    background: Color | None = None
     antialias: bool = False
     near: float = 0.01
     clamp_color_gradient: bool = False

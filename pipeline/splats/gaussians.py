@@ -1,23 +1,16 @@
-"""The parameters of a scene's Gaussians, and their checkpoint file."""
+"""The parameters of a scene's Gaussians."""
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from pathlib import Path
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.runtime.errors import UserError
-from pipeline.splats.arrays import write_arrays
 from pipeline.splats.init import InitGaussians
-
-FIX = "delete the file and run again"
 
 
 @dataclass
@@ -86,44 +79,6 @@ class Gaussians:
             self.opacity_logits,
             resize_bands(self.sh, degree),
         )
-
-    def save(self, path: Path) -> None:
-        """Write a ``.npz`` file, atomically and deterministically."""
-        write_arrays(path, self.arrays())
-
-    @staticmethod
-    def load(path: Path) -> Gaussians:
-        """Read a file that ``save`` wrote.
-
-        Raises:
-            UserError: the file is missing, damaged, or not a file of Gaussians.
-        """
-        try:
-            with np.load(path) as archive:
-                gaussians = Gaussians.from_arrays({name: archive[name] for name in archive.files})
-            n, k = gaussians.means.shape[0], (min(gaussians.sh_degree, 3) + 1) ** 2
-        except (
-            *(OSError, ValueError, KeyError, IndexError, EOFError, TypeError),
-            *(zipfile.BadZipFile, zlib.error),
-        ) as error:
-            raise UserError(
-                f"expected a file of Gaussians, could not read it: {error}", file=path, fix=FIX
-            ) from error
-        shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
-        expected = {
-            "means": (n, 3),
-            "log_scales": (n, 3),
-            "quats": (n, 4),
-            "opacity_logits": (n,),
-            "sh": (n, k, 3),
-        }
-        if shapes != expected:
-            raise UserError(
-                f"expected arrays of Gaussians of shapes {expected}, found {shapes}",
-                file=path,
-                fix=FIX,
-            )
-        return gaussians
 
 
 def concat(parts: list[Gaussians]) -> Gaussians:

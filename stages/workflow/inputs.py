@@ -68,9 +68,9 @@ def input_views(job: Job) -> list[View]:
 
 
 def trained_gaussians(job: Job) -> Gaussians:
-    from pipeline.splats.gaussians import Gaussians
+    from pipeline.io.npz import read_npz
 
-    return Gaussians.load(job.inputs["train"] / "gaussians.npz")
+    return read_npz(job.inputs["train"] / "gaussians.npz")
 
 
 def trained_views(job: Job) -> list[View]:

@@ -14,6 +14,7 @@ from pipeline.command.main import main
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.io.colmap import write_model
+from pipeline.io.npz import write_npz
 from pipeline.io.ply import write_splat_ply
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
@@ -68,7 +69,7 @@ def test_the_newest_state_is_shown(scene: Path) -> None:
     assert source.refresh()
     assert source.shown.summary == "step 20, 40 Gaussians, PSNR 25.00 dB, 50% done"
     (scene / "train").mkdir()
-    ball(50, 1).save(scene / "train" / "gaussians.npz")
+    write_npz(scene / "train" / "gaussians.npz", ball(50, 1))
     assert source.refresh()
     assert source.shown.summary == "50 Gaussians, trained"
     # Snakemake removes outputs before it recreates them: the last state is still shown.

@@ -1,4 +1,4 @@
-"""Training images: 8-bit pixels of the views at the resolution in use, and losses on alpha."""
+"""Training images: 8-bit pixels of the views at the resolution in use."""
 
 from __future__ import annotations
 
@@ -44,49 +44,6 @@ class Target:
             return self.rgb
         behind = (255 - self.alpha.to(torch.int16)).to(torch.float32)[..., None]
         return (self.rgb.to(torch.float32) + behind * torch.tensor(background)) / 255.0
-
-    def alpha_gradient(
-        self,
-        alpha: Tensor,
-        mask_loss_weight: float,
-        alpha_loss_weight: float,
-        squared_error_weight: float,
-    ) -> Tensor | None:
-        """(H, W) float32 gradient of the losses on the rendered ``alpha`` (H, W); None without any.
-
-        Args:
-            mask_loss_weight: of alpha on ignored pixels (``mask_gradient``).
-            alpha_loss_weight, squared_error_weight: of the error on other pixels
-                (``error_gradient``).
-        """
-        masked = self.mask_gradient(mask_loss_weight)
-        error = self.error_gradient(alpha, alpha_loss_weight, squared_error_weight)
-        if masked is None or error is None:
-            return error if masked is None else masked
-        return masked + error
-
-    def mask_gradient(self, weight: float) -> Tensor | None:
-        """(H, W) float32 gradient of ``weight`` times the sum of alpha over ignored pixels, divided
-        by the number of the other pixels; None without ignored pixels or weight."""
-        if self.ignored is None or not weight:
-            return None
-        counted = self.ignored.numel() - int(self.ignored.sum())
-        return self.ignored * (weight / max(1, counted))
-
-    def error_gradient(
-        self, alpha: Tensor, weight: float, squared_error_weight: float
-    ) -> Tensor | None:
-        """(H, W) float32 gradient of ``weight`` times the mean error of the rendered ``alpha``, L1
-        plus ``squared_error_weight`` times its square, over pixels that are not ignored; None for
-        an opaque view or without weight. It replaces random backgrounds, without their noise."""
-        if self.alpha is None or not weight:
-            return None
-        error = alpha - self.alpha.to(torch.float32) / 255.0
-        counted = error.numel()
-        if self.ignored is not None:
-            error = error.masked_fill(self.ignored, 0.0)
-            counted -= int(self.ignored.sum())
-        return (weight / max(1, counted)) * (error.sign() + 2 * squared_error_weight * error)
 
     def psnr(self, rendered: Tensor, image: Tensor) -> float:
         """PSNR in dB of ``rendered`` (H, W, 3) and ``over``'s image, without ignored pixels."""

@@ -9,7 +9,7 @@ from torch import Tensor
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.render import Backend, Forward, RasterCamera, RasterOptions
+from pipeline.render import BACKGROUNDS, Backend, Color, Forward, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.training.data.targets import Target, usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
@@ -17,6 +17,7 @@ from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.schedule import Schedule
 from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
+from pipeline.training.losses.alpha import alpha_gradient
 from pipeline.training.losses.depth import depth_gradients
 
 # PSNR is computed in some of the steps only: it takes a pass over the image.
@@ -24,9 +25,6 @@ PSNR_INTERVAL = 10
 # The depth loss is computed in some of the steps only, with a weight as if in all: rendering depths
 # and their gradients takes half the time of a step.
 DEPTH_INTERVAL = 4
-
-Color = tuple[float, float, float]
-BACKGROUNDS: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
 class Trainer:
@@ -114,8 +112,9 @@ class Trainer:
         self, rendered: Forward, target: Target, index: int
     ) -> tuple[Tensor | None, Tensor | None]:
         """Gradients of the losses on alpha and depth; None without these losses."""
-        d_alpha = target.alpha_gradient(
+        d_alpha = alpha_gradient(
             rendered.alpha,
+            target,
             self.config.mask_loss_weight,
             self.experiments.alpha_loss_weight,
             self.experiments.squared_error_loss_weight,

@@ -66,27 +66,6 @@ def test_a_reduced_pixel_is_the_mean_of_pixels_that_are_not_ignored(tmp_path: Pa
     counting = picture[:2, :2].reshape(4, 3)[1:]
     assert np.abs(targets.get(0, 2).rgb[0, 0].numpy() - counting.mean(0)).max() <= 0.5
     assert not targets.get(0, 1).rgb[torch.from_numpy(mask == 0)].any()
-    masked = targets.get(0, 1).mask_gradient(0.5)
-    assert masked is not None and targets.get(0, 1).mask_gradient(0.0) is None
-    np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
-
-
-def test_alpha_gradient_is_the_gradient_of_its_losses(
-    tmp_path: Path,
-) -> None:
-    rng = np.random.default_rng(0)
-    picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
-    mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
-    target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
-    alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
-    counts = torch.from_numpy(mask > 0)
-    error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
-    wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
-    (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
-    gradient = target.alpha_gradient(alpha.detach(), 0.3, 0.4, 2.5)
-    assert gradient is not None and alpha.grad is not None
-    torch.testing.assert_close(gradient, alpha.grad)
-    assert target.alpha_gradient(alpha.detach(), 0.0, 0.0, 2.5) is None
 
 
 def test_the_reduced_camera_renders_the_reduced_image(scene: TinyScene) -> None:

@@ -1,4 +1,4 @@
-"""Write Gaussians as a ``.npz`` file; without torch, which takes seconds to import."""
+"""Writing arrays as a ``.npz`` file. Importing this module does not import torch."""
 
 from __future__ import annotations
 

@@ -1,0 +1,38 @@
+"""Losses on alpha."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from pipeline.training.data.targets import Targets
+from pipeline.training.losses.alpha import alpha_gradient, mask_gradient
+from tests.training.data.test_targets import view_of
+
+
+def test_the_mask_loss_is_relative_to_the_pixels_that_are_not_ignored(tmp_path: Path) -> None:
+    mask = np.full((8, 8), 255, np.uint8)
+    mask[0, 0] = mask[6:, 4:] = 0
+    picture = np.full((8, 8, 3), 90, np.uint8)
+    target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
+    masked = mask_gradient(target, 0.5)
+    assert masked is not None and mask_gradient(target, 0.0) is None
+    np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+
+
+def test_alpha_gradient_is_the_gradient_of_its_losses(tmp_path: Path) -> None:
+    rng = np.random.default_rng(0)
+    picture = rng.integers(0, 255, (7, 9, 4), np.uint8)
+    mask = np.where(rng.random((7, 9)) < 0.2, 0, 255).astype(np.uint8)
+    target = Targets([view_of(tmp_path / "a.png", picture, mask)], threads=1).get(0, 1)
+    alpha = torch.from_numpy(rng.random((7, 9), np.float32)).requires_grad_()
+    counts = torch.from_numpy(mask > 0)
+    error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
+    wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
+    (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
+    gradient = alpha_gradient(alpha.detach(), target, 0.3, 0.4, 2.5)
+    assert gradient is not None and alpha.grad is not None
+    torch.testing.assert_close(gradient, alpha.grad)
+    assert alpha_gradient(alpha.detach(), target, 0.0, 0.0, 2.5) is None

@@ -1,4 +1,4 @@
-"""splatmake: photographs in; camera poses, a trained 3D Gaussian scene and its metrics out.
+"""The Python API: load a result, render views, measure quality.
 
 import splatmake
 
@@ -6,19 +6,37 @@ scene = splatmake.load("results/garden")
 print(scene.measure().psnr)
 """
 
-from pipeline.api import (
-    Gaussians,
-    Quality,
-    Render,
-    Scene,
-    UserError,
-    View,
-    load,
-    psnr,
-    read_gaussians,
-    ssim,
-    write_gaussians,
+from __future__ import annotations
+
+import json
+import tempfile
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from os import PathLike
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config.schema import Evaluate, Train
+from pipeline.io import splat_files
+from pipeline.io.camera_files import choose_views
+from pipeline.metrics.evaluate import (
+    NO_GAINS,
+    Protocol,
+    choose_protocol,
+    evaluate_views,
+    photo_over_background,
 )
+from pipeline.metrics.image import psnr, ssim
+from pipeline.photos.load import load_view
+from pipeline.plan.posed_scene import PosedScene, posed_scene
+from pipeline.render.views import Render, render_view
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import usable_cores
+from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
 
 __all__ = [
     "Gaussians",
@@ -33,3 +51,154 @@ __all__ = [
     "ssim",
     "write_gaussians",
 ]
+
+
+@dataclass(frozen=True)
+class Quality:
+    """Image quality of renders, as in metrics.json.
+
+    Attributes:
+        psnr: in dB.
+        lpips: None if its weights are not installed.
+        views: name -> quality of a single view; empty for a single view.
+    """
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+    views: dict[str, Quality]
+
+
+class Scene:
+    """Gaussians with views and photographs of the same scene.
+
+    Args:
+        gaussians: the model.
+        posed: the views, and the settings that the scene was trained with.
+        threads: threads for rendering; the number does not affect results.
+
+    Attributes:
+        gaussians: the model; can be replaced.
+        views: all views, sorted by name.
+    """
+
+    def __init__(self, gaussians: Gaussians, posed: PosedScene, threads: int):
+        self.gaussians = gaussians
+        self.views: list[View] = posed.views
+        self._train: Train = posed.train
+        self._protocol: Protocol = choose_protocol(posed.views, posed.split, posed.train)
+        self._gains = json.loads(posed.gains.read_text()) if posed.gains else NO_GAINS
+        self._threads = threads
+
+    @property
+    def test_views(self) -> list[View]:
+        """The test views, which are not used for training; may be empty."""
+        return [view for view in self.views if view.is_test]
+
+    def view(self, name: str) -> View:
+        """The view with this name, which may omit the suffix.
+
+        Raises:
+            UserError: there is none.
+        """
+        return choose_views(self.views, [name], Path(name))[0]
+
+    def render(self, view: View) -> Render:
+        """Render colours, opacity and depth of a view, without exposure gains.
+
+        Args:
+            view: one of ``views``, or a modified copy (``dataclasses.replace``).
+        """
+        return render_view(self.gaussians, view, self._protocol.options(self._train, self._threads))
+
+    def photograph(self, view: View) -> NDArray[np.float32]:
+        """The photograph of a view at the view's size, (H, W, 3) float32 in [0, 1].
+
+        Raises:
+            UserError: its file is missing or cannot be read.
+        """
+        pixels = load_view(view)
+        return photo_over_background(pixels, self._protocol.background).astype(
+            np.float32
+        ) / np.float32(255)
+
+    def measure(self, views: Sequence[View] = ()) -> Quality:
+        """Render views and compare them with their photographs, with the protocol of metrics.json.
+
+        Args:
+            views: those to measure; empty: the test views, or all views if there are no test views.
+
+        Raises:
+            UserError: a photograph that cannot be read, or masks that leave no pixel.
+        """
+        protocol = replace(
+            self._protocol, views=list(views) or self._protocol.views, training_views=[]
+        )
+        with tempfile.TemporaryDirectory() as renders:
+            found = evaluate_views(
+                self.gaussians,
+                protocol,
+                Evaluate(),
+                self._train,
+                Path(renders),
+                gains=self._gains,
+                threads=self._threads,
+            )
+        _warn(found["warnings"])
+        single = {
+            view["name"]: Quality(view["psnr"], view["ssim"], view["lpips"], {})
+            for view in found["per_view"]
+        }
+        return Quality(found["psnr"], found["ssim"], found["lpips"], single)
+
+
+def load(
+    folder: str | PathLike[str],
+    model: str | PathLike[str] | None = None,
+    *,
+    max_side: int | None = None,
+    threads: int | None = None,
+) -> Scene:
+    """Load a finished scene (``results/NAME``), or a scene folder with poses and a model.
+
+    Args:
+        folder: the finished scene; or photographs with poses and without lens distortion.
+        model: file of Gaussians; None: those of the finished scene.
+        max_side: longer side to which larger views are reduced, in pixels; None: as in the
+            finished scene, else full size.
+        threads: threads for rendering; None: one per core.
+
+    Raises:
+        UserError: a scene or a file that is missing or cannot be read.
+    """
+    folder = Path(folder)
+    file = folder / "train" / "gaussians.npz" if model is None else Path(model)
+    posed = posed_scene(folder, max_side, None)
+    _warn(posed.warnings)
+    return Scene(read_gaussians(file), posed, threads or usable_cores())
+
+
+def read_gaussians(file: str | PathLike[str]) -> Gaussians:
+    """Read Gaussians from a .ply, .spz, .splat, .glb or .npz file.
+
+    Raises:
+        UserError: an unknown suffix, or a file that cannot be read.
+    """
+    found: list[str] = []
+    gaussians = splat_files.read_gaussians(Path(file), found)
+    _warn(found)
+    return gaussians
+
+
+def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
+    """Write Gaussians in the format of the file's suffix.
+
+    Raises:
+        UserError: an unknown suffix, or Gaussians that the format cannot hold.
+    """
+    splat_files.write_gaussians(Path(file), gaussians)
+
+
+def _warn(messages: Sequence[str]) -> None:
+    for message in messages:
+        warnings.warn(message, stacklevel=3)

@@ -9,7 +9,7 @@ To add a backend, derive a class from ``Backend`` and add it to ``pipeline.rende
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Generic, TypeVar
 
 import torch
@@ -17,6 +17,7 @@ import torch
 from pipeline.render import checks
 from pipeline.render.checks import Parameters
 from pipeline.render.types import (
+    DenseAdam,
     Forward,
     FrameAdam,
     Gradients,
@@ -111,27 +112,12 @@ class Backend(ABC, Generic[Projected, Binned]):
 
     @abstractmethod
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        exp_avg: torch.Tensor,
-        exp_avg_sq: torch.Tensor,
-        lr: float | Sequence[float],
-        step: int,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        eps: float = 1e-15,
-        threads: int = 0,
+        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
     ) -> None:
         """One step of Adam, in place, as ``torch.optim.Adam``.
 
         Args:
-            param, grad, exp_avg, exp_avg_sq: float32, contiguous, of the same shape. If ``param``
-                is (N, 3) or (N, 4), ``exp_avg_sq`` may be (N, 1): rows then share the second moment
-                of their mean square, which makes steps equivariant under rotation.
-            lr: learning rate. Several rates are repeated over the elements, for example one for
-                each column; a shared second moment requires a single rate.
-            step: number of this step, starting at 1.
+            param, grad: float32, contiguous, of the same shape.
         """
 
     @abstractmethod

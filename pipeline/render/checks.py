@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import torch
 
-from pipeline.render.types import FrameAdam, RasterCamera, ShAdam
+from pipeline.render.types import DenseAdam, FrameAdam, RasterCamera, ShAdam
 
 MAX_IMAGE_SIDE = 1 << 16
 
@@ -117,15 +115,9 @@ def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
         raise ValueError(f"sh_adam: step {adam.step} must be at least 1 and the rates finite")
 
 
-def check_adam(
-    param: torch.Tensor,
-    grad: torch.Tensor,
-    exp_avg: torch.Tensor,
-    exp_avg_sq: torch.Tensor,
-    lr: float | Sequence[float],
-    step: int,
-) -> None:
+def check_adam(param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam) -> None:
     """Raise ValueError if the arguments of ``adam_step`` are invalid."""
+    exp_avg, exp_avg_sq, lr, step = adam.exp_avg, adam.exp_avg_sq, adam.lr, adam.step
     shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
     for tensor in (param, grad, exp_avg, exp_avg_sq):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
@@ -147,7 +139,7 @@ def check_frame_adam(
     d_quats: torch.Tensor,
     adam: FrameAdam,
 ) -> None:
-    """ValueError where ``frame_adam`` cannot be taken."""
+    """Raise ValueError if the arguments of ``frame_adam`` are invalid."""
     moments = (adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg, adam.rotation_avg_sq)
     fours = (quats, d_quats)
     for tensor in (means, log_scales, d_means, *moments, *fours):

@@ -12,14 +12,20 @@ N Gaussians, V visible ones among them, an image of H x W pixels.
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 
-from pipeline.render.types import FrameAdam, RasterCamera, RasterOptions, RenderOutput, ShAdam
+from pipeline.render.types import (
+    DenseAdam,
+    FrameAdam,
+    RasterCamera,
+    RasterOptions,
+    RenderOutput,
+    ShAdam,
+)
 
 # The same constants as in cpu/csrc/constants.h, which has their reasons.
 DILATION = 0.3
@@ -403,28 +409,18 @@ def l1_ssim(
     return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
 
 
-def adam_step(
-    param: torch.Tensor,
-    grad: torch.Tensor,
-    exp_avg: torch.Tensor,
-    exp_avg_sq: torch.Tensor,
-    lr: float | Sequence[float],
-    step: int,
-    beta1: float = 0.9,
-    beta2: float = 0.999,
-    eps: float = 1e-15,
-) -> None:
-    """Adam (Kingma & Ba 2015, algorithm 1), in place; see ``Backend.adam_step``."""
-    pattern = torch.atleast_1d(torch.tensor(lr, dtype=param.dtype))
+def adam_step(param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam) -> None:
+    """Adam (Kingma & Ba 2015, algorithm 1), in place; see ``DenseAdam``."""
+    pattern = torch.atleast_1d(torch.tensor(adam.lr, dtype=param.dtype))
     repeats = -(-param.numel() // len(pattern))
     rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
-    exp_avg.mul_(beta1).add_(grad, alpha=1 - beta1)
+    adam.exp_avg.mul_(adam.beta1).add_(grad, alpha=1 - adam.beta1)
     squares = grad.square()
-    if exp_avg_sq.shape != grad.shape:
+    if adam.exp_avg_sq.shape != grad.shape:
         squares = squares.mean(1, keepdim=True)
-    exp_avg_sq.mul_(beta2).add_(squares, alpha=1 - beta2)
-    denominator = exp_avg_sq.sqrt() / math.sqrt(1 - beta2**step) + eps
-    param.sub_(rates / (1 - beta1**step) * exp_avg / denominator)
+    adam.exp_avg_sq.mul_(adam.beta2).add_(squares, alpha=1 - adam.beta2)
+    denominator = adam.exp_avg_sq.sqrt() / math.sqrt(1 - adam.beta2**adam.step) + adam.eps
+    param.sub_(rates / (1 - adam.beta1**adam.step) * adam.exp_avg / denominator)
 
 
 def frame_adam(
@@ -460,8 +456,8 @@ def frame_adam(
     ):
         local = torch.zeros_like(exp_avg)
         local_grad = torch.einsum("nij,ni->nj", axes, grad)
-        betas = adam.beta1, adam.beta2
-        adam_step(local, local_grad, exp_avg, exp_avg_sq, rate, adam.step, *betas, adam.eps)
+        decay = adam.beta1, adam.beta2, adam.eps
+        adam_step(local, local_grad, DenseAdam(exp_avg, exp_avg_sq, rate, adam.step, *decay))
         param.add_(torch.einsum("nij,nj->ni", axes, local))
 
 
@@ -484,7 +480,7 @@ def sh_adam(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: S
     scale = math.sqrt(1 - adam.beta2**adam.step)
     p -= rates / (1 - adam.beta1**adam.step) * drift * m / (v.sqrt() / scale + adam.eps)
     m, v = m * adam.beta1**missed, v * adam.beta2**missed
-    betas = adam.beta1, adam.beta2
-    adam_step(p, grad[rows], m, v, rates.flatten().tolist(), adam.step, *betas, adam.eps)
+    decay = adam.beta1, adam.beta2, adam.eps
+    adam_step(p, grad[rows], DenseAdam(m, v, rates.flatten().tolist(), adam.step, *decay))
     sh[rows], adam.exp_avg[rows], adam.exp_avg_sq[rows] = p, m, v
     adam.last[rows] = adam.step

@@ -3,7 +3,7 @@ scenes only."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -14,6 +14,7 @@ from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.types import (
     CameraGradients,
+    DenseAdam,
     Forward,
     FrameAdam,
     Gradients,
@@ -156,21 +157,12 @@ class ReferenceBackend(Backend[Projected, Projected]):
         )
 
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        exp_avg: torch.Tensor,
-        exp_avg_sq: torch.Tensor,
-        lr: float | Sequence[float],
-        step: int,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        eps: float = 1e-15,
-        threads: int = 0,
+        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
     ) -> None:
-        checks.check_adam(param, grad, exp_avg, exp_avg_sq, lr, step)
-        with _in_double(param, exp_avg, exp_avg_sq) as (p, first, second):
-            reference.adam_step(p, grad.double(), first, second, lr, step, beta1, beta2, eps)
+        checks.check_adam(param, grad, adam)
+        with _in_double(param, adam.exp_avg, adam.exp_avg_sq) as (p, first, second):
+            precise = replace(adam, exp_avg=first, exp_avg_sq=second)
+            reference.adam_step(p, grad.double(), precise)
 
     def frame_adam(
         self,

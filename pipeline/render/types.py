@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
@@ -145,6 +145,28 @@ class Gradients:
     means2d: torch.Tensor
     means2d_abs: torch.Tensor | None
     camera: CameraGradients | None
+
+
+@dataclass(frozen=True)
+class DenseAdam:
+    """Adam over all elements of a tensor (``Backend.adam_step``).
+
+    Attributes:
+        exp_avg, exp_avg_sq: float32, of the parameter's shape, updated in place. If the parameter
+            is (N, 3) or (N, 4), ``exp_avg_sq`` may be (N, 1): rows then share the second moment of
+            their mean square, which makes steps equivariant under rotation.
+        lr: learning rate. Several rates are repeated over the elements, for example one for each
+            column; a shared second moment requires a single rate.
+        step: number of the current step, starting at 1.
+    """
+
+    exp_avg: torch.Tensor
+    exp_avg_sq: torch.Tensor
+    lr: float | Sequence[float]
+    step: int
+    beta1: float = 0.9
+    beta2: float = 0.999
+    eps: float = 1e-15
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pipeline.render import Backend, FrameAdam, RasterOptions, ShAdam, make_backend
+from pipeline.render import Backend, DenseAdam, FrameAdam, RasterOptions, ShAdam, make_backend
 from pipeline.render.registry import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 
@@ -87,7 +87,7 @@ def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> 
     for each in (backend, REFERENCE):
 
         def plain(m: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
-            each.adam_step(m, d_means, a, b, 0.01, 3)
+            each.adam_step(m, d_means, DenseAdam(a, b, 0.01, 3))
 
         def frame(m: torch.Tensor, q: torch.Tensor, *state: torch.Tensor, each=each) -> None:
             adam = FrameAdam(*state, mean_rate=0.02, rotation_rate=0.01, step=3)
@@ -118,8 +118,8 @@ def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:
     with pytest.raises(ValueError, match="d_color"):
         backend.backward(drawn, torch.zeros(3, 3, 3))
     with pytest.raises(ValueError, match="step 0"):
-        tensors = [torch.zeros(4, 3) for _ in range(4)]
-        backend.adam_step(*tensors, 0.1, 0)
+        p, grad, m, v = (torch.zeros(4, 3) for _ in range(4))
+        backend.adam_step(p, grad, DenseAdam(m, v, 0.1, 0))
     assert set(backend.facts()) == {"instruction_set", "compiler"}
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +14,7 @@ from pipeline.render.checks import Parameters
 from pipeline.render.cpu import build
 from pipeline.render.types import (
     CameraGradients,
+    DenseAdam,
     Forward,
     FrameAdam,
     Gradients,
@@ -184,23 +185,13 @@ class CpuBackend(Backend[Projected, Binned]):
         return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
 
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        exp_avg: torch.Tensor,
-        exp_avg_sq: torch.Tensor,
-        lr: float | Sequence[float],
-        step: int,
-        beta1: float = 0.9,
-        beta2: float = 0.999,
-        eps: float = 1e-15,
-        threads: int = 0,
+        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
     ) -> None:
-        checks.check_adam(param, grad, exp_avg, exp_avg_sq, lr, step)
-        rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
+        checks.check_adam(param, grad, adam)
+        rates = torch.atleast_1d(torch.tensor(adam.lr, dtype=torch.float64))
         _ops().adam_step(
-            param.detach(), grad.detach(), exp_avg, exp_avg_sq, rates, step, beta1, beta2, eps,
-            _threads(threads),
+            param.detach(), grad.detach(), adam.exp_avg, adam.exp_avg_sq, rates, adam.step,
+            adam.beta1, adam.beta2, adam.eps, _threads(threads),
         )  # fmt: skip
 
     def frame_adam(

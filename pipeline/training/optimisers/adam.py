@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from pipeline.render import Backend, FrameAdam, Gradients, ShAdam, make_backend
+from pipeline.render import Backend, DenseAdam, FrameAdam, Gradients, ShAdam, make_backend
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
@@ -85,10 +85,11 @@ class Adam:
         for name, parameter in gaussians.tensors().items():
             if name in updated:
                 continue
-            self.backend.adam_step(
-                parameter, getattr(gradients, name), self.first[name], self.second[name],
-                getattr(rates, name), step, self.beta1, BETA2, EPSILON, threads,
+            adam = DenseAdam(
+                self.first[name], self.second[name], getattr(rates, name), step, self.beta1, BETA2,
+                EPSILON,
             )  # fmt: skip
+            self.backend.adam_step(parameter, getattr(gradients, name), adam, threads)
 
     def frames(self, rates: Rates, step: int) -> FrameAdam:
         return FrameAdam(

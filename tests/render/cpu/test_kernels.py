@@ -189,7 +189,7 @@ def test_results_are_bit_identical_for_any_number_of_threads() -> None:
             assert g.means2d_abs is not None
             loss = render.l1_ssim(fwd.color, d_color.abs(), 0.2, threads=threads)
             param, m, v = scene[4].clone(), torch.zeros_like(scene[4]), torch.ones_like(scene[4])
-            render.adam_step(param, g.sh, m, v, 1e-2, 3, threads=threads)
+            render.adam_step(param, g.sh, render.DenseAdam(m, v, 1e-2, 3), threads)
             means, quats, frames = scene[0].clone(), scene[2].clone(), torch.ones(4, *g.means.shape)
             adam = render.FrameAdam(*frames, 1e-2, 1e-3, 3)
             render.frame_adam(means, quats, scene[1], g.means, g.quats, adam, threads)

@@ -11,7 +11,7 @@ import pytest
 import torch
 
 from pipeline import render
-from pipeline.render import FrameAdam, RasterCamera, RasterOptions, ShAdam, reference
+from pipeline.render import DenseAdam, FrameAdam, RasterCamera, RasterOptions, ShAdam, reference
 from tests.render.scenes import Scene, camera, random_scene, relative
 
 
@@ -102,7 +102,7 @@ def test_adam_equals_torch(shape: tuple[int, ...]) -> None:
     for step in range(1, 20):
         grad = torch.randn(shape, generator=gen) * 10.0 ** (step % 5 - 3)
         grad[..., :1] = 0
-        render.adam_step(ours, grad, m, v, 1e-2, step)
+        render.adam_step(ours, grad, DenseAdam(m, v, 1e-2, step))
         theirs.grad = grad.double()
         optimizer.step()
     assert torch.allclose(ours.double(), theirs.detach(), rtol=0, atol=2e-6)
@@ -116,12 +116,12 @@ def test_learning_rates_repeat_over_rows(rows: int, columns: int) -> None:
     expected = [ours[:, c].double().clone() for c in range(columns)]
     m, v = torch.zeros_like(ours), torch.zeros_like(ours)
     for step in (1, 2, 3):
-        render.adam_step(ours, grad, m, v, rates, step)
+        render.adam_step(ours, grad, DenseAdam(m, v, rates, step))
     for column, rate in enumerate(rates):
         m64, v64 = (torch.zeros(rows, dtype=torch.float64) for _ in range(2))
         for step in (1, 2, 3):
             g64 = grad[:, column].double()
-            reference.adam_step(expected[column], g64, m64, v64, rate, step)
+            reference.adam_step(expected[column], g64, DenseAdam(m64, v64, rate, step))
     assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
 
 
@@ -135,8 +135,8 @@ def test_adam_with_shared_second_moments_equals_the_reference(rows: int, columns
     for step in range(1, 20):
         grad = torch.randn(rows, columns, generator=gen) * 10.0 ** (step % 5 - 3)
         grad[:1] = 0
-        render.adam_step(ours, grad, m, v, 1e-2, step)
-        reference.adam_step(theirs, grad.double(), m64, v64, 1e-2, step)
+        render.adam_step(ours, grad, DenseAdam(m, v, 1e-2, step))
+        reference.adam_step(theirs, grad.double(), DenseAdam(m64, v64, 1e-2, step))
     assert torch.allclose(ours.double(), theirs, rtol=0, atol=4e-6)
     assert torch.allclose(v.double(), v64, rtol=1e-5, atol=0)
 
@@ -239,23 +239,25 @@ def test_adam_with_shared_second_moments_is_equivariant_under_rotation() -> None
     moments = [(torch.zeros(50, 3), torch.zeros(50, 1)) for _ in range(2)]
     for step in range(1, 10):
         grad = torch.randn(50, 3, generator=gen, dtype=torch.float64)
-        render.adam_step(ours, grad.float(), *moments[0], 1e-2, step)
-        render.adam_step(rotated, (grad @ rotation.T).float(), *moments[1], 1e-2, step)
+        gradients = grad, grad @ rotation.T
+        for param, gradient, state in zip((ours, rotated), gradients, moments, strict=True):
+            render.adam_step(param, gradient.float(), DenseAdam(*state, 1e-2, step))
     assert torch.allclose(rotated.double(), ours.double() @ rotation.T, rtol=0, atol=1e-5)
 
 
 def test_invalid_arguments_of_adam_are_errors() -> None:
     a = torch.zeros(4, 4)
     with pytest.raises(ValueError, match="contiguous"):
-        render.adam_step(a.T[:, :2], a, a, a, 0.1, 1)
+        render.adam_step(a.T[:, :2], a, DenseAdam(a, a, 0.1, 1))
     with pytest.raises(ValueError, match="shapes differ"):
-        render.adam_step(a, torch.zeros(4), a, a, 0.1, 1)
+        render.adam_step(a, torch.zeros(4), DenseAdam(a, a, 0.1, 1))
     with pytest.raises(ValueError, match="step"):
-        render.adam_step(a, a, a, a, 0.1, 0)
+        render.adam_step(a, a, DenseAdam(a, a, 0.1, 0))
     with pytest.raises(ValueError, match="one lr"):
-        render.adam_step(a, a, a, torch.zeros(4, 1), [0.1, 0.2], 1)
+        render.adam_step(a, a, DenseAdam(a, torch.zeros(4, 1), [0.1, 0.2], 1))
     with pytest.raises(ValueError, match="shapes differ"):
-        render.adam_step(*(torch.zeros(4, 5) for _ in range(3)), torch.zeros(4, 1), 0.1, 1)
+        b = torch.zeros(4, 5)
+        render.adam_step(b, b, DenseAdam(b, torch.zeros(4, 1), 0.1, 1))
     framed = Framed.random(4, 0)
     with pytest.raises(ValueError, match="expected"):
         framed.step(1, torch.zeros(4, 3), torch.zeros(4, 3))
@@ -326,7 +328,8 @@ def test_sh_adam_approximates_dense_adam_after_skipped_steps() -> None:
     for step in range(1, 2001):
         seen = step % 10 == 0
         grad = torch.randn(dense.shape, generator=gen, dtype=torch.float64) + 0.3
-        reference.adam_step(dense, grad if seen else torch.zeros_like(grad), m, v, 1e-3, step)
+        gradient = grad if seen else torch.zeros_like(grad)
+        reference.adam_step(dense, gradient, DenseAdam(m, v, 1e-3, step))
         if seen:
             reference.sh_adam(sparse, grad, updated, dataclasses.replace(state, step=step))
     assert (sparse - dense).norm() < 0.01 * (dense - start).norm()

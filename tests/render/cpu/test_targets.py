@@ -17,7 +17,7 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.render import RasterCamera, RasterOptions, reference
+from pipeline.render import DenseAdam, RasterCamera, RasterOptions, reference
 from pipeline.render.cpu import build
 from pipeline.runtime import processor, targets
 from tests.render.cpu.compiled import compiled
@@ -144,7 +144,8 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
     loss, _, _ = reference.l1_ssim(rendered, case.incoming[3], 0.2, None, 2.5)
     assert relative(found["loss"], torch.autograd.grad(loss, rendered)[0]) <= GRADIENT
     sh, d_sh = case.scene[4].double(), found["sh"].double()
-    reference.adam_step(sh, d_sh, torch.zeros_like(sh), torch.zeros_like(sh), 1e-2, 1)
+    adam = DenseAdam(torch.zeros_like(sh), torch.zeros_like(sh), 1e-2, 1)
+    reference.adam_step(sh, d_sh, adam)
     assert (found["moved"] - sh).abs().max() <= 2e-6
 
 

@@ -7,7 +7,7 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pipeline.render import FrameAdam, RasterOptions, backward, forward
+from pipeline.render import DenseAdam, FrameAdam, RasterOptions, backward, forward
 from pipeline.render import reference as float64
 from pipeline.render.views import raster_camera
 from pipeline.training.optimisers.adam import Adam, Rates
@@ -52,7 +52,8 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
         else:
             for name, second in shared.items():
                 rate, gradient = getattr(RATES, name), getattr(gradients, name)
-                float64.adam_step(leaves[name], gradient, first[name], second, rate, step, 0.8)
+                moments = DenseAdam(first[name], second, rate, step, 0.8)
+                float64.adam_step(leaves[name], gradient, moments)
         backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
         adam.step(gaussians, gradients, RATES, step, 1)
     leaves["sh"] = torch.cat([dc, rest], 1)

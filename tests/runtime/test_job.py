@@ -87,10 +87,10 @@ def test_damaged_outputs_are_made_again(tmp_path, damage):
     elif damage == "missing":
         (out / "result.txt").unlink()
     else:
-        (out / "stranger.txt").write_text("x")
+        (out / "added.txt").write_text("x")
     assert run_stage(request(tmp_path), write("a")) == 0
     assert (out / "result.txt").read_text() == "a"
-    assert not (out / "stranger.txt").exists()
+    assert not (out / "added.txt").exists()
 
 
 def test_a_neighbours_same_work_is_taken_over(tmp_path):

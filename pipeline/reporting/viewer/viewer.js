@@ -17,9 +17,10 @@ IN NO EVENT SHALL THE AUTHORS OR COPYRIGHT HOLDERS BE LIABLE FOR ANY CLAIM, DAMA
 LIABILITY, WHETHER IN AN ACTION OF CONTRACT, TORT OR OTHERWISE, ARISING FROM, OUT OF OR IN
 CONNECTION WITH THE SOFTWARE OR THE USE OR OTHER DEALINGS IN THE SOFTWARE.
 */
-// The trained scene of a page, turnable. The page's side of it is ../space.py; README.md says how
-// viewer.min.js is made of this file. Two frames: the world, and the page's, in which y is up and
-// the unit box around the origin holds the scene; data.frame takes the one to the other.
+// Interactive view of the trained scene. ../space.py writes the page's elements and data for it;
+// README.md describes how viewer.min.js is built from this file. There are two coordinate frames:
+// the world, and the page's frame, in which y is up and the scene is in the unit box around the
+// origin. data.frame transforms world coordinates to the page's frame.
 
 import * as THREE from "three";
 import { OrbitControls } from "three/addons/controls/OrbitControls.js";
@@ -29,8 +30,8 @@ import { LineSegmentsGeometry } from "three/addons/lines/LineSegmentsGeometry.js
 import { SparkRenderer, SplatMesh } from "@sparkjsdev/spark";
 
 const FAR = 1e4;
-const CLICK_PX = 5; // a press that moves less is a click
-const NEAR_PX = 16; // what is this near to the pointer is meant
+const CLICK_PX = 5; // a click moves the pointer by at most this
+const HOVER_PX = 16; // the pointer selects a camera within this distance
 
 const box = document.getElementById("space");
 const tools = document.getElementById("space-tools");
@@ -44,10 +45,10 @@ try {
 }
 
 function fail(error) {
-  const able = document.createElement("canvas").getContext("webgl2");
-  message.textContent = "The scene cannot be shown: " + (able
+  const supported = document.createElement("canvas").getContext("webgl2");
+  message.textContent = "The scene cannot be shown: " + (supported
     ? error.message ?? error
-    : "this browser has no WebGL2, or it is switched off.");
+    : "this browser has no WebGL2, or WebGL2 is disabled.");
 }
 
 function start(data) {
@@ -58,10 +59,12 @@ function start(data) {
   const scene = new THREE.Scene();
   const frame = new THREE.Matrix4().fromArray(data.frame);
   const near = data.near * frame.getMaxScaleOnAxis();
-  const eye = new THREE.PerspectiveCamera(50, 1, near, FAR);
-  const cameras = data.cameras.map(camera => ({ ...camera, ...placed(camera.world_to_camera) }));
+  // Shows the scene; `cameras` are those of the photographs.
+  const viewCamera = new THREE.PerspectiveCamera(50, 1, near, FAR);
+  const cameras = data.cameras.map(
+    camera => ({ ...camera, ...poseInPage(camera.world_to_camera) }));
 
-  // As the program itself renders: 3DGS's dilation, Gaussians as far as alpha 1/255, by depth.
+  // As splatmake's rasterizer: 3DGS's dilation, cutoff at alpha 1/255, sorted by depth.
   const spark = new SparkRenderer({
     renderer,
     onDirty: redraw,
@@ -84,8 +87,8 @@ function start(data) {
   const frusta = new THREE.Group();
   scene.add(spark, splats, points, frusta);
 
-  // A pose in the page's frame, as three.js has it: y up, looking along -z.
-  function placed(worldToCamera) {
+  // Pose of a COLMAP camera in the page's frame, in three.js' convention: y up, looking along -z.
+  function poseInPage(worldToCamera) {
     const pose = new THREE.Matrix4().set(...worldToCamera, 0, 0, 0, 1).invert()
       .multiply(new THREE.Matrix4().makeScale(1, -1, -1)).premultiply(frame);
     const position = new THREE.Vector3(), quaternion = new THREE.Quaternion();
@@ -99,7 +102,7 @@ function start(data) {
     geometry.setAttribute("position", new THREE.BufferAttribute(xyz, 3));
     geometry.setAttribute("color", new THREE.BufferAttribute(bytes(data.colours), 3, true));
     const material = new THREE.PointsMaterial({ size: 0.02, vertexColors: true });
-    // The colours are meant for the screen as they are.
+    // The colours are sRGB already: no conversion.
     material.onBeforeCompile = shader => {
       shader.fragmentShader = shader.fragmentShader.replace("#include <colorspace_fragment>", "");
     };
@@ -109,7 +112,7 @@ function start(data) {
     return points;
   }
 
-  // Pyramids, but for the cameras about the eye, which would stand in its view.
+  // Draw a pyramid for each camera, except cameras close to viewCamera, which would block its view.
   function drawFrusta() {
     for (const { geometry, material } of frusta.children) {
       geometry.dispose();
@@ -120,8 +123,8 @@ function start(data) {
     for (const test of [false, true]) {
       const corners = [];
       for (const camera of cameras) {
-        const about = camera.position.distanceTo(eye.position) < 8 * data.size;
-        if (about || camera.test !== test) continue;
+        const close = camera.position.distanceTo(viewCamera.position) < 8 * data.size;
+        if (close || camera.test !== test) continue;
         const { width, height, fx, fy, cx, cy, position, quaternion } = camera;
         const depth = 2 * data.size / Math.max(width / fx, height / fy);
         const [a, b, c, d] = [[0, 0], [width, 0], [width, height], [0, height]].map(([x, y]) =>
@@ -138,36 +141,35 @@ function start(data) {
     redraw();
   }
 
-  let due = false, busy = false;
+  let requested = false, busy = false;
   function redraw() {
-    if (due || busy) return;
-    due = true;
+    if (requested || busy) return;
+    requested = true;
     requestAnimationFrame(() => {
-      due = false;
-      if (!busy) renderer.render(scene, eye);
+      requested = false;
+      if (!busy) renderer.render(scene, viewCamera);
     });
   }
 
-  // What the eye spans: as much of the world as the photograph it came from, whatever the shape
-  // of the window.
+  // Half the square root of the visible area at depth 1. It does not depend on the window's shape.
   let spread = 0.5;
   function resize() {
     const { clientWidth: width, clientHeight: height } = box;
     if (busy || !width || !height) return;
     renderer.setPixelRatio(Math.min(devicePixelRatio, 2));
     renderer.setSize(width, height, false);
-    eye.aspect = width / height;
-    eye.fov = 2 * THREE.MathUtils.radToDeg(Math.atan(spread / Math.sqrt(eye.aspect)));
-    eye.updateProjectionMatrix();
+    viewCamera.aspect = width / height;
+    viewCamera.fov = 2 * THREE.MathUtils.radToDeg(Math.atan(spread / Math.sqrt(viewCamera.aspect)));
+    viewCamera.updateProjectionMatrix();
     redraw();
   }
 
-  // The eye turns about a point that it looks at and an axis that keeps the view as it is.
+  // Orbit around a point in front of viewCamera, with an up axis that does not change the view.
   let controls;
-  function turnAbout(target, up) {
+  function orbitAround(target, up) {
     controls?.dispose();
-    eye.up.copy(up);
-    controls = new OrbitControls(eye, canvas);
+    viewCamera.up.copy(up);
+    controls = new OrbitControls(viewCamera, canvas);
     controls.target.copy(target);
     controls.minDistance = 2 * near;
     controls.maxDistance = 100;
@@ -177,45 +179,45 @@ function start(data) {
     controls.addEventListener("end", drawFrusta);
   }
 
-  function lookThrough(index) {
+  function showCamera(index) {
     const { position, quaternion, width, height, fx, fy } = cameras[index];
     const axis = (x, y, z) => new THREE.Vector3(x, y, z).applyQuaternion(quaternion);
     const right = axis(1, 0, 0), forward = axis(0, 0, -1);
     const up = new THREE.Vector3(0, 1, 0).addScaledVector(right, -right.y);
     if (up.length() < 0.3 || Math.abs(up.normalize().dot(forward)) > 0.97) up.copy(axis(0, 1, 0));
-    eye.position.copy(position);
+    viewCamera.position.copy(position);
     spread = Math.sqrt(width / fx * height / fy) / 2;
     const ahead = Math.max(-position.dot(forward), 0.3);
-    turnAbout(forward.multiplyScalar(ahead).add(position), up);
+    orbitAround(forward.multiplyScalar(ahead).add(position), up);
     tools.elements.view.value = index;
     drawFrusta();
     resize();
   }
 
-  function lookFromAfar() {
+  function showOverview() {
     const mean = new THREE.Vector3(0, 0, -1e-3);
     for (const { quaternion } of cameras)
       mean.add(new THREE.Vector3(0, 0, -1).applyQuaternion(quaternion));
     const yaw = Math.atan2(mean.x, mean.z) + 0.5;
-    eye.position.set(-Math.sin(yaw), 0.5, -Math.cos(yaw)).multiplyScalar(2.6);
+    viewCamera.position.set(-Math.sin(yaw), 0.5, -Math.cos(yaw)).multiplyScalar(2.6);
     spread = 0.5;
-    turnAbout(new THREE.Vector3(), new THREE.Vector3(0, 1, 0));
+    orbitAround(new THREE.Vector3(), new THREE.Vector3(0, 1, 0));
     tools.elements.view.value = "";
     drawFrusta();
     resize();
   }
 
   function look(value) {
-    if (value === "") lookFromAfar();
-    else lookThrough(Number(value));
+    if (value === "") showOverview();
+    else showCamera(Number(value));
   }
 
   function cameraAt(event) {
-    let found = null, reach = NEAR_PX;
+    let found = null, reach = HOVER_PX;
     const bounds = canvas.getBoundingClientRect();
     const pointer = [event.clientX - bounds.left, event.clientY - bounds.top];
     if (frusta.visible) cameras.forEach(({ position }, index) => {
-      const at = position.clone().project(eye);
+      const at = position.clone().project(viewCamera);
       const x = (at.x + 1) / 2 * bounds.width, y = (1 - at.y) / 2 * bounds.height;
       const distance = Math.hypot(x - pointer[0], y - pointer[1]);
       if (Math.abs(at.z) < 1 && distance < reach) {
@@ -238,7 +240,7 @@ function start(data) {
   canvas.addEventListener("click", event => {
     if (Math.hypot(event.clientX - pressed[0], event.clientY - pressed[1]) > CLICK_PX) return;
     const found = cameraAt(event);
-    if (found) lookThrough(found.index);
+    if (found) showCamera(found.index);
   });
   // The wheel scrolls the page until the scene has been clicked.
   canvas.addEventListener("wheel", event => {
@@ -277,7 +279,7 @@ function start(data) {
   new ResizeObserver(resize).observe(box);
   matchMedia("(prefers-color-scheme: dark)").addEventListener("change", drawFrusta);
 
-  // Splats coloured and ordered for this camera.
+  // Wait until the splats are coloured and sorted for this camera.
   async function settled(camera) {
     const idle = async () => {
       while (spark.sorting || spark.sortDirty) await new Promise(done => setTimeout(done, 5));
@@ -288,19 +290,19 @@ function start(data) {
   }
 
   look(data.start === null ? "" : data.start);
-  const ready = splats.initialized.then(() => settled(eye)).then(() => {
+  const ready = splats.initialized.then(() => settled(viewCamera)).then(() => {
     message.hidden = true;
     tools.firstElementChild.disabled = false;
     redraw();
   });
 
-  // The splats alone as a camera of the world sees them, as a PNG's data URL. The camera is
-  // COLMAP's pinhole, with the names that data.cameras has.
+  // Render the splats alone; returns the data URL of a PNG. The camera is a pinhole in world
+  // coordinates with the fields of data.cameras.
   async function picture({ width, height, fx, fy, cx, cy, world_to_camera }) {
     await ready;
     const camera = new THREE.PerspectiveCamera();
     Object.assign(camera, { near, far: FAR });
-    const { position, quaternion } = placed(world_to_camera);
+    const { position, quaternion } = poseInPage(world_to_camera);
     camera.position.copy(position);
     camera.quaternion.copy(quaternion);
     camera.updateMatrixWorld();

@@ -290,8 +290,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "spz_rounding": Mutant(
         "pipeline/io/spz.py",
-        "to_bytes((log_scales + np.log(shrink) + 10) * 16),",
-        "to_bytes((log_scales + np.log(shrink) + 10) * 16 - 0.5),",
+        "to_uint8((log_scales + np.log(shrink) + 10) * 16),",
+        "to_uint8((log_scales + np.log(shrink) + 10) * 16 - 0.5),",
         "SPZ's scales cut off instead of rounded",
         ("tests/io/test_spz.py",),
     ),

@@ -23,7 +23,7 @@ from pipeline.runtime.atomic import write_bytes, write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.views import camera_views, scene_extent
-from pipeline.splats.reduce import prepare
+from pipeline.splats.reduce import reduce_gaussians
 
 
 @dataclass(frozen=True)
@@ -55,7 +55,7 @@ def convert(
     """Convert a file of Gaussians to the format of ``target``'s suffix.
 
     Args:
-        sh_degree, min_opacity, morton_order: see ``splats.reduce.prepare``.
+        sh_degree, min_opacity, morton_order: see ``splats.reduce.reduce_gaussians``.
         warnings: warnings are added to this list.
 
     Returns:
@@ -66,7 +66,7 @@ def convert(
     """
     check_suffix(target)
     found = read_gaussians(source, warnings)
-    made = prepare(found, sh_degree, min_opacity, morton_order)
+    made = reduce_gaussians(found, sh_degree, min_opacity, morton_order)
     write_gaussians(target, made)
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"

@@ -1,1 +1,1 @@
-"""Coverage of a scene by its photographs: trust, defects, and viewpoints to add."""
+"""How well the photographs cover a scene: trust, defects, and viewpoints to add."""

@@ -1,1 +1,1 @@
-"""The files that a finished scene is handed on as."""
+"""Export of a finished scene to the files of other programs."""

@@ -22,7 +22,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.reduce import prepare
+from pipeline.splats.reduce import reduce_gaussians
 
 # A warning is given if a larger share of the Gaussians cannot be represented in a format.
 TOLERATED_SHARE = 0.05
@@ -99,7 +99,7 @@ def export_scene(
     threads: int,
 ) -> ExportReport:
     """Write the configured formats and ``frame.json`` into ``out``."""
-    gaussians = prepare(
+    gaussians = reduce_gaussians(
         scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
     )
     has_points = "points" in config.formats and len(scene.model.points) > 0

@@ -32,7 +32,8 @@ class Camera:
     Attributes:
         model: a key of ``CAMERA_MODELS``.
         width, height: pixels.
-        params: float64, in the model's order; focal lengths and principal point in pixels.
+        params: (K,) float64 in the model's order; focal lengths and principal point in pixels,
+            distortion coefficients for normalised coordinates.
     """
 
     model: str

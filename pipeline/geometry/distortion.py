@@ -1,7 +1,8 @@
 """Lens distortion of COLMAP's camera models and its inverse, vectorised.
 
 Formulas: COLMAP's documentation, "Camera Models"; OpenCV's "Camera Calibration" and "Fisheye
-camera model" for FULL_OPENCV and OPENCV_FISHEYE. Normalised coordinates are (x/z, y/z).
+camera model" for FULL_OPENCV and OPENCV_FISHEYE. Normalised coordinates are (x / z, y / z) of a
+point in the camera's frame, without unit.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from pipeline.geometry.cameras import Camera
 
 Array = NDArray[np.float64]
 
-# Newton's method: at most so many steps, and the error of a solution in normalised coordinates.
+# Newton's method: the maximum number of steps, and the largest error of a solution in normalised
+# coordinates.
 MAX_ITERATIONS = 50
 MAX_ERROR = 1e-9
 

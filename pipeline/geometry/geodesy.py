@@ -42,7 +42,7 @@ def to_enu(geodetic: Array, origin: Array) -> Array:
 
     Args:
         geodetic: (..., 3) latitude and longitude in degrees, ellipsoidal height in metres.
-        origin: (3,) likewise.
+        origin: (3,) latitude, longitude and height of the local frame's origin.
 
     Returns:
         (..., 3) metres east, north and up of ``origin``.

@@ -16,7 +16,12 @@ OUTLIER_SIGMAS = 3.5
 
 @dataclass(frozen=True)
 class Similarity:
-    """``y = scale * rotation @ x + translation``; call it with (N, 3) points."""
+    """``y = scale * rotation @ x + translation``. Calling it transforms (N, 3) points.
+
+    Attributes:
+        rotation: (3, 3), proper.
+        translation: (3,) in the target's unit.
+    """
 
     scale: float
     rotation: Array
@@ -31,7 +36,7 @@ class RobustFit(NamedTuple):
 
     Attributes:
         similarity: maps source points to target points.
-        inliers: (N,) the points that it was fitted to.
+        inliers: (N,) bool, the points that it was fitted to.
         sigma: standard deviation of the weighted residuals along one axis of the ground plane,
             from their median; in the target's unit.
     """
@@ -49,8 +54,9 @@ def robust_similarity(
 
     Args:
         source, target: (N, 3) corresponding points, N >= 3.
-        weight: (3,) of the residuals along the target's axes.
-        min_sigma: lower bound of ``RobustFit.sigma``, by which outliers are recognised.
+        weight: (3,) factors of the residuals along the target's axes.
+        min_sigma: lower bound of ``RobustFit.sigma``, in the target's unit. Points with residuals
+            above ``OUTLIER_SIGMAS`` times sigma are outliers.
 
     Returns:
         None if the source points are collinear or no triple determines a similarity.

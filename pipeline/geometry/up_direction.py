@@ -17,8 +17,8 @@ def up_direction(
     """The scene's up direction as a (3,) unit vector in the world.
 
     Photographers tilt cameras but rarely roll them, so up is the direction most perpendicular to
-    the rows of all images. If the rows leave it open (all cameras have the same heading), the mean
-    direction of the images' columns decides.
+    the rows of all images. If the rows do not determine it (all cameras have the same heading), the
+    mean direction of the images' columns does.
 
     Args:
         rotations: (N, 3, 3) world to camera.
@@ -26,7 +26,8 @@ def up_direction(
             and columns of the upright image follow from the orientation.
 
     Returns:
-        -y (up for a camera at the identity) without cameras, or if their directions cancel.
+        (3,). (0, -1, 0) if there are no cameras or their directions cancel: COLMAP's y axis
+        points down.
     """
     # Direction of the upright image's top on the sensor. Source: EXIF 2.3, tag Orientation.
     top = {3: (0, 1), 4: (0, 1), 5: (-1, 0), 6: (-1, 0), 7: (1, 0), 8: (1, 0)}

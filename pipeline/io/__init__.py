@@ -1,1 +1,1 @@
-"""File formats: COLMAP, transforms.json, LLFF, EXIF, ground control, Gaussians."""
+"""File formats: COLMAP, transforms.json, LLFF, ground control points, EXIF, Gaussians."""

@@ -47,7 +47,7 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
     """The views with these names, in this order; names may omit the suffix.
 
     Args:
-        source: the file or folder that error messages name.
+        source: the file or folder of the views, for error messages.
 
     Raises:
         UserError: no view has one of the names.

@@ -11,14 +11,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
 from pipeline.io import colmap_binary, colmap_text
 from pipeline.io.colmap_records import POINT2D, REMEDY, Keypoints, PointTable, Tracks
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, Reconstruction
-
-__all__ = ["has_model", "quat_to_rotation", "read_model", "rotation_to_quat", "write_model"]
 
 
 def has_model(folder: Path) -> bool:

@@ -83,6 +83,7 @@ class _Reader:
 
 
 def read_cameras(file: Path) -> dict[int, Camera]:
+    """Camera id -> camera, from ``cameras`` of a model."""
     reader = _Reader(file)
     cameras: dict[int, Camera] = {}
     for _ in range(reader.count(48)):
@@ -99,6 +100,7 @@ def read_cameras(file: Path) -> dict[int, Camera]:
 def read_images(
     file: Path, cameras: dict[int, Camera]
 ) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
+    """Image id -> image, and image id -> (K, 2) float64 pixels of its keypoints."""
     reader = _Reader(file)
     images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
@@ -114,6 +116,7 @@ def read_images(
 
 
 def read_points(file: Path) -> PointTable:
+    """The content of ``points3D``."""
     reader = _Reader(file)
     # Records differ in length because of their tracks: find the starts, then gather all at once.
     count = reader.count(_POINT3D.itemsize)
@@ -152,6 +155,7 @@ def read_points(file: Path) -> PointTable:
 
 
 def cameras_bytes(model: Reconstruction) -> bytes:
+    """The content of ``cameras``."""
     out = [struct.pack("<Q", len(model.cameras))]
     for number, camera in sorted(model.cameras.items()):
         kind = CAMERA_MODELS[camera.model][0]
@@ -161,6 +165,7 @@ def cameras_bytes(model: Reconstruction) -> bytes:
 
 
 def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
+    """The content of ``images``."""
     out = [struct.pack("<Q", len(model.images))]
     for number, image in sorted(model.images.items()):
         pose = [*rotation_to_quat(image.rotation), *image.translation]
@@ -172,6 +177,7 @@ def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
 
 
 def points_bytes(points: Points, tracks: Tracks) -> bytes:
+    """The content of ``points3D``."""
     table = np.zeros(len(points), _POINT3D)
     table["id"] = np.arange(1, len(points) + 1)
     table["xyz"], table["rgb"] = points.xyz, points.rgb

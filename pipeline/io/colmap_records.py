@@ -1,4 +1,7 @@
-"""Records of COLMAP's model files, and checks, for the binary and the text format."""
+"""Records of COLMAP's model files and their checks, shared by the binary and the text format.
+
+Functions raise a ``UserError`` that names ``file`` for values that no model can have.
+"""
 
 from __future__ import annotations
 
@@ -16,15 +19,19 @@ from pipeline.scene.reconstruction import PosedImage
 
 REMEDY = "export the model again from COLMAP (binary or text), or set poses: ignore"
 POINT2D = np.dtype([("xy", "<f8", (2,)), ("point", "<u8")])
-"""A keypoint as in binary files."""
+"""A keypoint as in binary files: position in pixels, and id of its 3D point."""
 Keypoints = dict[int, NDArray[np.void]]
 """Image id -> keypoints (``POINT2D``), for writing."""
 
 
 @dataclass(frozen=True)
 class Tracks:
-    """Tracks, for writing: lengths (P,), and image ids and keypoint indices of all tracks
-    concatenated (M,)."""
+    """The tracks of P points, concatenated, for writing.
+
+    Attributes:
+        length: (P,) number of observations of each point.
+        image, index: (M,) image id, and index among the image's keypoints, of each observation.
+    """
 
     length: NDArray[np.int64]
     image: NDArray[np.int64]
@@ -33,8 +40,12 @@ class Tracks:
 
 @dataclass(frozen=True)
 class PointTable:
-    """points3D as stored: ids (P,), xyz (P, 3), rgb (P, 3), error (P,), track lengths (P,), and
-    image ids and keypoint indices of all tracks concatenated (M,)."""
+    """The content of ``points3D``, in the file's order.
+
+    Attributes:
+        ids: (P,). xyz: (P, 3) world. rgb: (P, 3). error: (P,) pixels.
+        length, image, index: the tracks, as in ``Tracks``.
+    """
 
     ids: NDArray[np.int64]
     xyz: NDArray[np.float64]
@@ -48,6 +59,7 @@ class PointTable:
 def make_camera(
     file: Path, number: int, name: str, width: int, height: int, p: list[float]
 ) -> Camera:
+    """The camera with id ``number``, model ``name`` and parameters ``p``, checked."""
     names = CAMERA_MODELS[name][1]
     if len(p) != len(names):
         raise UserError(
@@ -71,6 +83,7 @@ def make_camera(
 def make_image(
     file: Path, name: str, camera_id: int, quat: list[float], translation: list[float]
 ) -> PosedImage:
+    """An image with the pose ``quat`` (wxyz) and ``translation``, world to camera, checked."""
     q, t = np.array(quat, np.float64), np.array(translation, np.float64)
     norm = math.hypot(*quat)
     if not (1e-12 < norm < 1e12) or not np.isfinite(t).all():
@@ -90,6 +103,7 @@ def add_image(
     number: int,
     image: PosedImage,
 ) -> None:
+    """Add the image with id ``number`` to ``images``."""
     if image.camera_id not in cameras:
         raise UserError(
             f"image {image.name} belongs to camera {image.camera_id}, which is not in the model",
@@ -102,6 +116,7 @@ def add_image(
 
 
 def unknown_model(file: Path, number: int, found: str) -> UserError:
+    """The error of camera ``number`` with the unsupported model ``found``."""
     return UserError(
         f"camera {number}: unknown camera model {found}; expected {', '.join(CAMERA_MODELS)}",
         file=file,

@@ -68,6 +68,7 @@ def _id(text: str) -> int:
 
 
 def read_cameras(file: Path) -> dict[int, Camera]:
+    """Camera id -> camera, from ``cameras`` of a model."""
     cameras: dict[int, Camera] = {}
     for line_number, line in _lines(file):
         if not line.strip():
@@ -84,6 +85,7 @@ def read_cameras(file: Path) -> dict[int, Camera]:
 def read_images(
     file: Path, cameras: dict[int, Camera]
 ) -> tuple[dict[int, PosedImage], dict[int, NDArray[np.float64]]]:
+    """Image id -> image, and image id -> (K, 2) float64 pixels of its keypoints."""
     images: dict[int, PosedImage] = {}
     keypoints: dict[int, NDArray[np.float64]] = {}
     lines = _lines(file)
@@ -107,6 +109,7 @@ def read_images(
 
 
 def read_points(file: Path) -> PointTable:
+    """The content of ``points3D``."""
     rows: list[list] = []
     tracks: list[list[int]] = []
     types: list[Callable[[str], Any]] = [_natural, *[float] * 3, *[_natural] * 3, float]
@@ -141,6 +144,7 @@ def read_points(file: Path) -> PointTable:
 
 
 def cameras_bytes(model: Reconstruction) -> bytes:
+    """The content of ``cameras``."""
     out = ["# CAMERA_ID, MODEL, WIDTH, HEIGHT, PARAMS[]"]
     for number, camera in sorted(model.cameras.items()):
         params = " ".join(repr(float(v)) for v in camera.params)
@@ -149,6 +153,7 @@ def cameras_bytes(model: Reconstruction) -> bytes:
 
 
 def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
+    """The content of ``images``."""
     out = ["# IMAGE_ID, QW, QX, QY, QZ, TX, TY, TZ, CAMERA_ID, NAME", "# X, Y, POINT3D_ID ..."]
     for number, image in sorted(model.images.items()):
         pose = [*rotation_to_quat(image.rotation), *image.translation]
@@ -161,6 +166,7 @@ def images_bytes(model: Reconstruction, keypoints: Keypoints) -> bytes:
 
 
 def points_bytes(points: Points, tracks: Tracks) -> bytes:
+    """The content of ``points3D``."""
     out = ["# POINT3D_ID, X, Y, Z, R, G, B, ERROR, TRACK[] as (IMAGE_ID, POINT2D_IDX)"]
     elements = [f"{i} {k}" for i, k in zip(tracks.image, tracks.index, strict=True)]
     ends = np.cumsum(tracks.length).tolist()

@@ -15,7 +15,7 @@ _VERSION = 4
 
 
 class FactCache:
-    """JSON values by file and kind. A cache file that cannot be read or written is no error.
+    """JSON values by file and kind. An unreadable or unwritable cache file is ignored.
 
     Args:
         path: the JSON file; None: cache in memory only.
@@ -52,6 +52,7 @@ class FactCache:
         return value
 
     def save(self) -> None:
+        """Write the file if values were added."""
         if self._path is None or not self._changed:
             return
         try:

@@ -17,7 +17,7 @@ import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
-from pipeline.io.splat_codec import logit, read_file, sigmoid, to_bytes
+from pipeline.io.splat_codec import logit, read_file, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians, concat
@@ -54,7 +54,7 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     columns: dict[str, NDArray[Any]] = {
         "POSITION": means,
-        "COLOR_0": to_bytes(rgba * 255),
+        "COLOR_0": to_uint8(rgba * 255),
         f"{_NAME}:ROTATION": np.where(norm > 0, quats / np.maximum(norm, 1e-30), (1, 0, 0, 0))[
             :, [1, 2, 3, 0]
         ],

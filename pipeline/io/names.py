@@ -37,7 +37,7 @@ def stem_key(name: str) -> str:
 
 
 class NameIndex:
-    """Finds a photograph by its exact name, else by its name without suffix."""
+    """Finds a photograph by its exact name, else by its name without suffix (``stem_key``)."""
 
     def __init__(self, names: Iterable[str]):
         self._exact = set(names)

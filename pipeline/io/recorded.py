@@ -1,4 +1,4 @@
-"""The bytes of photographs, masks and depth maps, compared with the digests in ``images.json``."""
+"""Reading photographs, masks and depth maps whose digests are recorded in ``images.json``."""
 
 from __future__ import annotations
 
@@ -22,13 +22,12 @@ def digest_of(path: Path) -> str:
 
 
 def read_recorded(path: str | Path, digest: str | None) -> bytes:
-    """The bytes of a file.
+    """The bytes of a file, checked against its digest.
 
-    The bytes that are returned are the ones that were compared: decode them, do not read the file
-    again.
+    Decode these bytes instead of reading the file again, which may have changed since.
 
     Args:
-        digest: what ``digest_of`` gave when the file was recorded; None compares nothing.
+        digest: the recorded result of ``digest_of``; None: no check.
 
     Raises:
         ChangedFileError: the file has another digest.

@@ -11,7 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_bytes
+from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
@@ -29,9 +29,9 @@ def write_splat(path: Path, gaussians: Gaussians) -> None:
     table = np.zeros(len(gaussians), _ROW)
     table["mean"] = means
     table["scale"] = np.exp(log_scales)
-    table["rgb"] = to_bytes((0.5 + SH_C0 * sh[:, 0]) * 255)
-    table["alpha"] = to_bytes(sigmoid(logits) * 255)
-    table["quat"] = to_bytes(quats / np.maximum(norm, 1e-12) * 128 + 128)
+    table["rgb"] = to_uint8((0.5 + SH_C0 * sh[:, 0]) * 255)
+    table["alpha"] = to_uint8(sigmoid(logits) * 255)
+    table["quat"] = to_uint8(quats / np.maximum(norm, 1e-12) * 128 + 128)
     write_bytes(path, table.tobytes())
 
 

@@ -30,7 +30,7 @@ def read_file(path: Path, kind: str) -> bytes:
         ) from error
 
 
-def to_bytes(values: NDArray[Any]) -> NDArray[np.uint8]:
+def to_uint8(values: NDArray[Any]) -> NDArray[np.uint8]:
     """Round and clamp to 0..255."""
     return np.rint(values).clip(0, 255).astype(np.uint8)
 

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_bytes
+from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
@@ -27,10 +27,10 @@ _ANTIALIASED, _HAS_EXTENSIONS = 1, 2
 # Quantisation steps per unit of the DC coefficient, as in Niantic's encoder; 8 bits then cover
 # colours beyond [0, 1].
 _DC_STEPS = 0.15 * 255
-# SH coefficients above DC by degree; ours end at 3. They are written with all 8 bits, where other
-# encoders keep 5 or 4 to compress better.
+# SH coefficients above DC by degree; splatmake's end at 3. They are written with all 8
+# bits; other encoders keep 5 or 4 to compress better.
 _HIGHER = (0, 3, 8, 15, 24)
-# Positions have 24 bits, of which at most so many are fractional.
+# Positions have 24 bits; the maximum number of fractional bits.
 _MAX_FRACTION_BITS = 20
 # Gaussians farther from the origin than this many median distances are outliers: they are moved
 # nearer, so that the other positions keep their resolution.
@@ -81,11 +81,11 @@ def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
     header = _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
     sections = (
         steps.reshape(-1, 1).view(np.uint8)[:, :3],
-        to_bytes(sigmoid(logits) * 255),
-        to_bytes(sh[:, 0] * _DC_STEPS + 127.5),
-        to_bytes((log_scales + np.log(shrink) + 10) * 16),
+        to_uint8(sigmoid(logits) * 255),
+        to_uint8(sh[:, 0] * _DC_STEPS + 127.5),
+        to_uint8((log_scales + np.log(shrink) + 10) * 16),
         _pack_quats(quats),
-        to_bytes(sh[:, 1:] * 128 + 128),
+        to_uint8(sh[:, 1:] * 128 + 128),
     )
     return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
 

@@ -86,9 +86,9 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
 
     Args:
         path: a scene folder or a file.
-        sizes: photograph (relative to the folder of the json) -> width and height. Frames of
-            other photographs are omitted; suffixes may differ. The sizes are those of the
-            intrinsics if the file has no ``w`` and ``h``.
+        sizes: photograph (relative to the folder of the json) -> width and height in pixels.
+            Frames of other photographs are omitted; suffixes may differ. Intrinsics refer to
+            these sizes if the file has no ``w`` and ``h``.
 
     Returns:
         Images named by the keys of ``sizes``, cameras of the file's sizes, no points.

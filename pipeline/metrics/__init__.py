@@ -1,1 +1,1 @@
-"""Image quality, pose errors and the evaluation of views."""
+"""Image quality (PSNR, SSIM, LPIPS), pose errors, and evaluation on test views."""

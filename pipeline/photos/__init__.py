@@ -1,1 +1,1 @@
-"""Pixels: reading, RAW, undistortion, exposure."""
+"""Photographs: RAW development, reading, undistortion and exposure."""

@@ -1,1 +1,1 @@
-"""The scan of a scene folder and the plan: stages, settled options, budgets."""
+"""The scan of a scene folder, and the plan: which stages run, with which options."""

@@ -1,4 +1,4 @@
-"""Interface of the rasterizer's backends, ``cpu`` and ``reference_backend``.
+"""Interface of the rasterizer's backends (``cpu.backend``, ``reference_backend``).
 
 Inputs and outputs are float32 tensors on the CPU; a backend may compute on another device and in
 another precision. Results do not depend on the number of threads.

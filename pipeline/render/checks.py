@@ -1,4 +1,4 @@
-"""Checks of a backend's inputs: types, shapes and cameras."""
+"""Checks of a backend's inputs: types, shapes and cameras; they raise ``ValueError``."""
 
 from __future__ import annotations
 

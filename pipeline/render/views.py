@@ -32,8 +32,8 @@ class Render(NamedTuple):
 
 
 def near_plane(extent: float) -> float:
-    """Distance of the near plane for a scene of size ``extent``, in world units: Gaussians closer
-    to a camera are floaters."""
+    """Distance of the near plane in world units, for a scene with this ``scene_extent``. Gaussians
+    closer to a camera are floaters and not rendered."""
     return 0.01 * extent
 
 

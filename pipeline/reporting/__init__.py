@@ -1,1 +1,1 @@
-"""metrics.json and the pages."""
+"""metrics.json, a scene's page, the page of all scenes, and tables of batches."""

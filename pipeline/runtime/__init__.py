@@ -1,1 +1,1 @@
-"""How work is run: stages' folders and keys, progress, errors, native libraries."""
+"""Running stages: folders, keys, locks, progress, errors and native libraries."""

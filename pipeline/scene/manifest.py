@@ -26,19 +26,24 @@ class Photo(BaseModel):
     path: str
     """The file, relative to the working directory or absolute."""
     width: int
+    """Pixels."""
     height: int
+    """Pixels."""
     digest: str
-    """Hex digest of the file's bytes (``recorded.digest_of``), which every reader compares."""
+    """Hex digest of the file's bytes (``pipeline.io.recorded``), checked whenever it is read."""
     raw: bool = False
+    """Whether the file is a camera's RAW file."""
     alpha: bool = False
+    """Whether any pixel is transparent."""
     bits: int = 8
+    """Bits per channel of the file."""
     orientation: int = 1
     """EXIF orientation, 1 to 8."""
     mask: str | None = None
     """Mask file; pixels with mask value 0 are ignored."""
     mask_digest: str | None = None
     depth: str | None = None
-    """Depth map file."""
+    """Depth map file; see ``pipeline.photos.load`` for its formats."""
     depth_digest: str | None = None
     focal_px: float | None = None
     """Focal length from EXIF, in pixels at ``width`` x ``height``."""

@@ -52,7 +52,8 @@ class Points:
         xyz: (P, 3) float64, world.
         rgb: (P, 3) uint8.
         error: (P,) float64, mean reprojection error in pixels; -1 where unknown.
-        track_start: (P + 1,) int64; point p is seen in ``track_image_id[start[p]:start[p + 1]]``.
+        track_start: (P + 1,) int64; point p is observed in the images
+            ``track_image_id[track_start[p]:track_start[p + 1]]``.
         track_image_id: (M,) int64, keys into ``Reconstruction.images``.
         track_xy: (M, 2) float64 pixels of the observations, NaN where unknown.
     """
@@ -86,7 +87,12 @@ class Points:
 
 @dataclass(frozen=True)
 class Reconstruction:
-    """Cameras and images by COLMAP id, and sparse points."""
+    """A sparse model.
+
+    Attributes:
+        cameras: COLMAP's camera id -> intrinsics.
+        images: COLMAP's image id -> image.
+    """
 
     cameras: dict[int, Camera]
     images: dict[int, PosedImage]

@@ -28,7 +28,7 @@ class View:
         world_to_camera: (4, 4) float64.
         is_test: whether this is a test view, which is not trained on.
         camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
-        image_digest, mask_digest: digests of the files (``recorded.digest_of``), checked when read.
+        image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
     """
 
     name: str
@@ -75,7 +75,8 @@ def load_views(
 ) -> list[View]:
     """The photographs that have a pose, as views sorted by name.
 
-    Intrinsics are scaled by the exact ratios of the widths and of the heights.
+    Large photographs become smaller views; intrinsics are scaled by the exact ratios of widths and
+    of heights.
 
     Args:
         views: the largest side of a view, and whether masks are used.
@@ -135,7 +136,7 @@ def scene_extent(views: list[View]) -> float:
 
 
 def scene_up(views: Sequence[View], manifest: Manifest) -> NDArray[np.float64]:
-    """(3,) ``up_direction`` of the views' cameras and their photographs' EXIF orientations."""
+    """The scene's up direction as a (3,) unit vector in the world: see ``up_direction``."""
     orientation = {photo.name: photo.orientation for photo in manifest.photos}
     rotations = np.stack([view.world_to_camera[:3, :3] for view in views])
     return up_direction(rotations, [orientation[view.name] for view in views])

@@ -1,1 +1,1 @@
-"""Structure from motion: features, matching, mapping, judging, georeferencing."""
+"""Structure from motion: features, matching, mapping, verification, georeferencing."""

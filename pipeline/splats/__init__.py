@@ -1,1 +1,1 @@
-"""Gaussians as values: the first ones, their order, and fewer of them."""
+"""Gaussians: parameters, initialisation, Morton order and reduction."""

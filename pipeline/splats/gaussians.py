@@ -1,4 +1,4 @@
-"""The parameters of a scene's Gaussians."""
+"""The parameters of a scene's Gaussians, as tensors."""
 
 from __future__ import annotations
 
@@ -19,10 +19,13 @@ class Gaussians:
 
     Attributes:
         means: (N, 3) centres in world coordinates.
-        log_scales: (N, 3) natural logarithm of the standard deviations.
-        quats: (N, 4) rotations as quaternions (wxyz), not necessarily normalised.
-        opacity_logits: (N,) opacity before the sigmoid.
-        sh: (N, K, 3) spherical harmonics, K = (degree + 1)^2; coefficient 0 is the constant.
+        log_scales: (N, 3) natural logarithm of the standard deviations along the Gaussian's axes,
+            in world units.
+        quats: (N, 4) rotations from the Gaussian's axes to the world, as quaternions (wxyz), not
+            necessarily normalised.
+        opacity_logits: (N,) logits: the opacity is their sigmoid.
+        sh: (N, K, 3) spherical harmonics of R, G and B, K = (degree + 1)^2, ordered and signed as
+            in 3DGS; coefficient 0 is the constant (DC).
     """
 
     means: Tensor
@@ -68,6 +71,7 @@ class Gaussians:
         return Gaussians(*(tensor[which].contiguous() for tensor in self.tensors().values()))
 
     def clone(self) -> Gaussians:
+        """A copy of all tensors."""
         return Gaussians(*(tensor.clone() for tensor in self.tensors().values()))
 
     def with_sh_degree(self, degree: int) -> Gaussians:

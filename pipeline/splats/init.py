@@ -47,10 +47,11 @@ THINNING_SEED = 0
 
 @dataclass
 class InitGaussians:
-    """Structure of arrays, float32: see ``pipeline.splats.gaussians.Gaussians``.
+    """The arrays of ``pipeline.splats.gaussians.Gaussians``, in numpy.
 
     Attributes:
-        means, log_scales: (N, 3); quats: (N, 4) wxyz; opacity_logits: (N,); sh: (N, K, 3).
+        means, log_scales: (N, 3) float32. quats: (N, 4) float32, wxyz. opacity_logits: (N,)
+            float32. sh: (N, K, 3) float32.
         num_dropped: number of points left out because they are not finite, too near or too far.
         num_thinned: number of points left out because there are more than ``Init.max_points``.
     """

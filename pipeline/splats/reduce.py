@@ -7,7 +7,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
 
 
-def prepare(
+def reduce_gaussians(
     gaussians: Gaussians, sh_degree: int, min_opacity: float, morton_order: bool
 ) -> Gaussians:
     """Remove SH bands above ``sh_degree`` and Gaussians with an opacity below ``min_opacity``, and

@@ -1,1 +1,5 @@
-"""3D Gaussian splatting (Kerbl et al. 2023), in rooms from data to the loop."""
+"""Training of 3D Gaussians (Kerbl et al. 2023).
+
+``data``, ``losses``, ``optimisers``, ``cameras`` (refinement), ``density`` (control) and
+``checkpoints`` are the parts; ``loop`` runs the steps, and ``scene`` trains a whole scene.
+"""

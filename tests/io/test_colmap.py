@@ -12,7 +12,8 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
-from pipeline.io.colmap import quat_to_rotation, read_model, rotation_to_quat, write_model
+from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
+from pipeline.io.colmap import read_model, write_model
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 

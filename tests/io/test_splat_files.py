@@ -9,7 +9,7 @@ import torch
 from pipeline.io.splat_files import SUFFIXES, read_gaussians, write_gaussians
 from pipeline.runtime.errors import UserError
 from pipeline.splats.morton import in_morton_order
-from pipeline.splats.reduce import prepare
+from pipeline.splats.reduce import reduce_gaussians
 from tests.splats.samples import Within, sample
 
 #: The coarsest of the formats.
@@ -69,13 +69,13 @@ def test_nothing_to_render_is_an_error(tmp_path) -> None:
 
 def test_faint_gaussians_and_high_bands_are_left_out() -> None:
     gaussians = sample(100)
-    found = prepare(gaussians, 1, 0.5, False)
+    found = reduce_gaussians(gaussians, 1, 0.5, False)
     kept = gaussians.opacity_logits >= 0
     assert torch.equal(found.means, gaussians.means[kept])
     assert torch.equal(found.sh, gaussians.sh[kept][:, :4])
-    assert prepare(sample(10, 0), 3, 0, False).sh_degree == 0
+    assert reduce_gaussians(sample(10, 0), 3, 0, False).sh_degree == 0
     with pytest.raises(UserError, match="have an opacity below"):
-        prepare(gaussians, 3, 1.0, False)
+        reduce_gaussians(gaussians, 3, 1.0, False)
 
 
 def test_morton_order_is_a_permutation_with_neighbours_close_together() -> None:

@@ -1,1 +1,1 @@
-"""Terms of the loss, as gradients on the rendered images."""
+"""Loss terms besides the colour loss: gradients with respect to rendered alpha and depth."""

@@ -122,7 +122,7 @@ def undistort(
                 )
 
             def work(photo: Photo, lens: _Lens = lens) -> Photo:
-                return _write(photo, names[photo.name], lens, config, views, out)
+                return _write(photo, names[photo.name], lens, config, out)
 
             for photo, new in zip(group, pool.map(work, group), strict=True):
                 camera_of[photo.name] = number
@@ -216,7 +216,6 @@ def _write(
     name: str,
     lens: _Lens,
     config: schema.Undistort,
-    views: schema.Views,
     out: Path,
 ) -> Photo:
     """Write one photograph with its mask and depth map; returns its new entry in the manifest."""
@@ -230,7 +229,7 @@ def _write(
     else:
         _encode(path, np.dstack([_bgr(picture), alpha]))
 
-    mask = _mask(photo, lens, views)
+    mask = _mask(photo, lens)
     mask_path = out / "masks" / f"{name}.png" if mask is not None else None
     if mask is not None and mask_path is not None:
         _encode(mask_path, mask.astype(np.uint8) * 255)
@@ -285,11 +284,11 @@ def _picture(photo: Photo, lens: _Lens) -> tuple[Picture, NDArray[np.uint8] | No
     return resize_rgba(new, new_alpha, *size)
 
 
-def _mask(photo: Photo, lens: _Lens, views: schema.Views) -> NDArray[np.bool_] | None:
+def _mask(photo: Photo, lens: _Lens) -> NDArray[np.bool_] | None:
     """(H, W) mask of the undistorted image, True for valid pixels; None if all are valid."""
     size = (lens.target.width, lens.target.height)
     mask = None
-    if photo.mask is not None and views.masks == "auto":
+    if photo.mask is not None:
         full = load_mask(photo.mask, photo.mask_digest).astype(np.uint8)
         full = _nearest(full, photo.width, photo.height)
         new = lens.remap(full, cv2.INTER_NEAREST, cv2.BORDER_CONSTANT)

@@ -125,9 +125,6 @@ def test_alpha_masks_and_depth_are_undistorted(tmp_path: Path) -> None:
     assert np.mean(load_mask(new.mask) == (true_alpha > 127)) > 0.99
     true_depth = render(posed("a"), target, rays(target), OBJECTS).depth
     assert np.median(np.abs(np.load(new.depth) - true_depth)) < 0.005
-    ignored = Views(masks="ignore")
-    report = undistort(manifest, model, Undistort(), ignored, tmp_path / "out2", threads=1)
-    assert report.manifest.photos[0].mask is None
 
 
 def test_observations_are_undistorted_and_unregistered_photographs_are_left_out(

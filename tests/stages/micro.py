@@ -1,0 +1,111 @@
+"""Runs stages in this process on scenes of a few tiny photographs.
+
+Must not import torch: pycolmap's stages run in a process of their own (``pipeline.sfm.isolate``).
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import re
+import shutil
+import tempfile
+from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.schema import Config
+from pipeline.demo.write import DemoSpec, write_demo
+from pipeline.plan.keys import stage_key
+from pipeline.plan.plan import Plan, upstream
+from pipeline.plan.scan import scan
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
+from pipeline.runtime.job import Request, run_stage
+from pipeline.runtime.record import content_digest, identity, output_digests
+from stages.workflow.registry import STAGES
+from tests.plans import make_plan
+
+Options = Mapping[str, Any]
+
+SCENES = {
+    # As many photographs of this size as structure from motion needs.
+    "photos": DemoSpec(views=20, width=200, height=150, poses="colmap", masks=True),
+    "raw": DemoSpec(views=3, width=48, height=36, format="dng"),
+    "alpha": DemoSpec(views=6, width=64, height=48, format="png", alpha=True, poses="colmap"),
+}
+
+
+def write_scenes(folder: Path) -> None:
+    for name, spec in SCENES.items():
+        write_demo(folder / name, spec)
+    photos = folder / "photos"
+    shutil.copytree(photos / "images", photos / "others")
+
+
+def with_option(options: Options, path: str, value: Any) -> dict[str, Any]:
+    """``options`` with another value for the option at a dotted path."""
+    first, _, rest = path.partition(".")
+    return {**options, first: with_option(options.get(first, {}), rest, value) if rest else value}
+
+
+class Runner:
+    """Runs stages below ``folder``; one whose key and inputs have occurred before runs once."""
+
+    def __init__(self, scenes: Path, folder: Path):
+        self._scenes, self._folder = scenes, folder
+        self._done: dict[str, Path] = {}
+        self._plan = cache(self._make_plan)
+
+    def outputs(
+        self, run: str, scene: str, options: Options, stage: str, **machine: int
+    ) -> dict[str, str]:
+        """Path -> digest of all outputs of a stage; empty if the plan leaves the stage out, and an
+        error in place of the outputs if options are refused.
+
+        Args:
+            run: name of the folder of results.
+            machine: ``threads`` and ``memory_mb``.
+        """
+        try:
+            plan = self._plan(scene, json.dumps(options))
+            if not plan.runs(stage):
+                return {}
+            folder = self._run(run, plan, stage, machine)
+        except UserError as error:
+            return {"error": str(error)}
+        return {
+            name: _without_numbers(folder / name) if name.endswith(".html") else digest
+            for name, digest in output_digests(folder).items()
+        }
+
+    def _make_plan(self, scene: str, options: str) -> Plan:
+        config = Config.model_validate_json(options)
+        folder = self._scenes / scene
+        found = scan(folder, scene, config, cache=self._folder / f"{scene}.json")
+        return make_plan(found, config, str(folder))
+
+    def _run(self, run: str, plan: Plan, stage: str, machine: Mapping[str, int]) -> Path:
+        spec, out = STAGES[stage], self._folder / run / stage
+        sources = upstream(spec, plan)
+        folders = {role: self._run(run, plan, name, machine) for role, name in sources.items()}
+        key = json.loads(stage_key(spec, plan))
+        digests = {role: content_digest(folder) for role, folder in folders.items()}
+        name = identity(key | machine, digests)
+        if name not in self._done:
+            threads, memory_mb = machine.get("threads", 1), machine.get("memory_mb")
+            request = Request(stage, key, folders, out, threads, None, {}, memory_mb)
+            try:
+                code = run_stage(request, spec.work)
+            finally:
+                tempfile.tempdir = None  # was the stage's scratch folder
+            if code == EXIT_USER_ERROR:
+                raise UserError(f"{stage} ended with an error")
+            assert code == 0, f"{stage} failed for {run}"
+            self._done[name] = out
+        return self._done[name]
+
+
+def _without_numbers(page: Path) -> str:
+    """The digest of a page without its figures, some of which are times."""
+    return hashlib.sha256(re.sub(r"[\d.]+", "", page.read_text()).encode()).hexdigest()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import re
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -152,13 +153,17 @@ def test_killed_at_twenty_random_steps_and_resumed_gives_the_same_bytes(
     write_npz(tmp_path / "whole.npz", run(scene, tmp_path / "whole", config).gaussians)
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0.0)
     calls = np.random.default_rng(11).permutation(np.arange(1, 61))[:20]
-    for call in calls:
+    done = 0
+    for step in map(int, sorted(calls)):
         with monkeypatch.context() as patch:
-            interrupt_at(patch, int(call))
+            interrupt_at(patch, step - done)
             with pytest.raises(KeyboardInterrupt):
-                run(scene, tmp_path / f"{call}", config)
-        write_npz(tmp_path / "resumed.npz", run(scene, tmp_path / f"{call}", config).gaussians)
-        assert (tmp_path / "resumed.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
+                run(scene, tmp_path, config)
+        done = step - 1
+        kept = [int(re.sub(r"\D", "", file.stem)) for file in tmp_path.glob(PATTERN)]
+        assert max(kept, default=0) == done, f"killed in step {step}"
+    write_npz(tmp_path / "resumed.npz", run(scene, tmp_path, config).gaussians)
+    assert (tmp_path / "resumed.npz").read_bytes() == (tmp_path / "whole.npz").read_bytes()
 
 
 def test_the_metrics_log_has_each_step_once_after_a_kill(

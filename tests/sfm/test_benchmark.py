@@ -60,7 +60,7 @@ def test_table_and_plot_compare_with_pycolmap():
 @pytest.fixture(scope="module")
 def demo(tmp_path_factory):
     folder = tmp_path_factory.mktemp("scenes") / "demo"
-    write_demo(folder, DemoSpec(views=6, width=320, height=240))
+    write_demo(folder, DemoSpec(views=6, width=200, height=150))
     return folder
 
 

@@ -114,18 +114,6 @@ def stages(records: Sequence[Record]) -> str:
     return _markdown(rows)
 
 
-def formats(records: Sequence[Record]) -> str:
-    """What a format costs in size and quality."""
-    (record,) = records
-    rows = [["format", "bytes a Gaussian", "MB", "PSNR (dB)"]]
-    for each in record["formats"]:
-        size = each["bytes"] / record["gaussians"]
-        rows.append(
-            [each["format"], f"{size:.0f}", f"{each['bytes'] / 1e6:.1f}", f"{each['psnr']:.2f}"]
-        )
-    return _markdown(rows)
-
-
 def _memory(runs: Sequence[Record]) -> str:
     known = [run["peak_mb"] for run in runs if run["peak_mb"] is not None]
     return f"{max(known) / 1e3:.1f} GB" if known else ""
@@ -160,7 +148,6 @@ KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "headline": headline,
     "sources": sources,
     "stages": stages,
-    "formats": formats,
 }
 MARKER = re.compile(rf"<!-- ({'|'.join(KINDS)}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?")
 FIGURE = re.compile(r"<!-- figure: (\S+) (\S+) -->.*?<!-- end -->", re.DOTALL)

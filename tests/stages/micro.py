@@ -18,8 +18,9 @@ from typing import Any
 from pipeline.config.schema import Config
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import Plan, upstream
+from pipeline.plan.plan import upstream
 from pipeline.plan.scan import scan
+from pipeline.plan.values import Plan
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.record import content_digest, identity, output_digests

@@ -49,8 +49,8 @@ def install(python: Path, source: Path) -> None:
 
 def variables(environment: Path, cache: Path) -> dict[str, str]:
     """Environment variables of a user who has this environment's programs first."""
-    ours = {k: v for k, v in os.environ.items() if k not in ("PYTHONPATH", "CXX")}
-    return ours | {
+    inherited = {k: v for k, v in os.environ.items() if k != "PYTHONPATH"}
+    return inherited | {
         "PATH": os.pathsep.join([str(environment / "bin"), os.environ["PATH"]]),
         "SPLATMAKE_CACHE": str(cache),
         "NO_COLOR": "1",

@@ -61,13 +61,16 @@ demo: extension data/demo/demo.json
 	@$(BIN)/snakemake --cores $(CORES) results/demo/metrics.json --config 'train={"steps": 1500}'
 	@$(BIN)/python -m pipeline.reporting.headline results/demo/metrics.json
 
+# More than two cores' worth: tests that run Snakemake start many programs, one after the other.
+WORKERS := 3
+
 test: setup $(VENV)/dev
-	@$(BIN)/python -m pytest tests -n 2 --dist worksteal
+	@$(BIN)/python -m pytest tests -n $(WORKERS) --dist worksteal
 
 # What a C++ compiler can change; CXX chooses it.
 NATIVE_TESTS := tests/render tests/sfm/test_matching.py tests/training
 test-native: setup $(VENV)/dev
-	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n 2 --dist worksteal
+	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n $(WORKERS) --dist worksteal
 
 # Other projects' readers and decoders: without them, the tests that compare with them are skipped.
 test-packages: $(VENV)/test $(READERS)/node_modules/.package-lock.json

@@ -15,14 +15,20 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
-    """Slow tests first: pytest-xdist's two workers begin with a half each and, at the end, take
+    """Slow tests first: pytest-xdist's workers begin with an equal part each and, at the end, take
     from one another what stands last."""
-    if "PYTEST_XDIST_WORKER" not in os.environ:
-        return
-    slow = [item for item in items if item.get_closest_marker("slow")]
-    fast = [item for item in items if not item.get_closest_marker("slow")]
-    middle, half = len(slow) // 2, len(fast) // 2
-    items[:] = slow[:middle] + fast[:half] + slow[middle:] + fast[half:]
+    workers = int(os.environ.get("PYTEST_XDIST_WORKER_COUNT", "0"))
+    groups = [
+        [item for item in items if bool(item.get_closest_marker("slow")) == slow]
+        for slow in (True, False)
+    ]
+    if workers:
+        items[:] = [
+            item
+            for worker in range(workers)
+            for group in groups
+            for item in group[len(group) * worker // workers : len(group) * (worker + 1) // workers]
+        ]
 
 
 @pytest.hookimpl(wrapper=True)

@@ -51,11 +51,15 @@ def with_option(options: Options, path: str, value: Any) -> dict[str, Any]:
 
 
 class Runner:
-    """Runs stages below ``folder``; one whose key and inputs have occurred before runs once."""
+    """Runs stages below ``folder``; one whose key and inputs have occurred before runs once.
+
+    A run's stages are side by side, as the report reads them: a stage that another run has
+    finished is linked from there, as in a folder of results.
+    """
 
     def __init__(self, scenes: Path, folder: Path):
         self._scenes, self._folder = scenes, folder
-        self._done: dict[str, Path] = {}
+        self._done: set[tuple[Path, str]] = set()
         self._plan = cache(self._make_plan)
 
     def outputs(
@@ -87,13 +91,15 @@ class Runner:
         return make_plan(found, config, str(folder))
 
     def _run(self, run: str, plan: Plan, stage: str, machine: Mapping[str, int]) -> Path:
-        spec, out = STAGES[stage], self._folder / run / stage
+        # Results of another machine's run are not linked: they are in a folder of their own.
+        root = self._folder / ("other-machine" if machine else "results")
+        spec, out = STAGES[stage], root / run / stage
         sources = upstream(spec, plan)
         folders = {role: self._run(run, plan, name, machine) for role, name in sources.items()}
         key = json.loads(stage_key(spec, plan))
         digests = {role: content_digest(folder) for role, folder in folders.items()}
-        name = identity(key | machine, digests)
-        if name not in self._done:
+        done = out, identity(key | machine, digests)
+        if done not in self._done:
             threads, memory_mb = machine.get("threads", 1), machine.get("memory_mb")
             request = Request(stage, key, folders, out, threads, None, {}, memory_mb)
             try:
@@ -103,8 +109,8 @@ class Runner:
             if code == EXIT_USER_ERROR:
                 raise UserError(f"{stage} ended with an error")
             assert code == 0, f"{stage} failed for {run}"
-            self._done[name] = out
-        return self._done[name]
+            self._done.add(done)
+        return out
 
 
 def _without_numbers(page: Path) -> str:

@@ -8,6 +8,9 @@ from __future__ import annotations
 
 import os
 import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import NoReturn
@@ -35,6 +38,18 @@ def need(*programs: str) -> None:
     if lacking:
         packages = " ".join(PACKAGES.get(program, program) for program in lacking)
         pytest.skip(f"not run: {', '.join(lacking)} missing (apt-get install {packages})")
+
+
+def need_sanitizers(compiler: Sequence[str], kinds: str) -> None:
+    """Skips the test where the compiler's runtime for ``-fsanitize=kinds`` is not installed."""
+    with tempfile.TemporaryDirectory() as folder:
+        command = [*compiler, f"-fsanitize={kinds}", "-x", "c++", "-", "-o", f"{folder}/program"]
+        done = subprocess.run(command, input="int main() {}", text=True, capture_output=True)
+    if done.returncode != 0:
+        pytest.skip(
+            f"not run: {compiler[0]} cannot link -fsanitize={kinds} "
+            "(for clang++, apt-get install libclang-rt-dev)"
+        )
 
 
 def need_package(name: str, exactly: str | None = None) -> None:

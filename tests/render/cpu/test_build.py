@@ -14,7 +14,7 @@ from pipeline.render.cpu import build
 from pipeline.runtime import native, targets
 from pipeline.runtime.errors import UserError
 from tests.render.cpu.compiled import compiled
-from tests.tools import unsupported
+from tests.tools import need_sanitizers, unsupported
 
 REPOSITORY = Path(__file__).parents[3]
 CHECKS_BY_CALLS = {
@@ -115,6 +115,7 @@ def test_concurrent_builds_leave_one_complete_library(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kinds", ["address,undefined", "thread"])
 def test_sanitizers_find_nothing(tmp_path_factory: pytest.TempPathFactory, kinds: str) -> None:
     """Every kernel on 300 scenes with arbitrary values, on one to three threads."""
+    need_sanitizers(build.compiler(), kinds)
     flags = [*targets.usable()[0].flags, "-std=c++17", "-O1", "-g1", "-pthread", "-Wno-psabi"]
     flags += [f"-fsanitize={kinds}", "-fno-sanitize-recover=all"]
     if "address" in kinds:  # checks by calls: inline checks compile slowly

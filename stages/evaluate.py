@@ -65,7 +65,7 @@ def facts(plan: Plan) -> dict[str, Any]:
     from pipeline.metrics.lpips import weights_found
 
     weights = weights_found(plan.config.evaluate.lpips_net)
-    return {"lpips_weights": weights, "truth": plan.facts["truth_digest"]}
+    return {"lpips_weights": weights, "truth": plan.facts.truth_digest}
 
 
 SPEC = StageSpec(

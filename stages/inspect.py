@@ -64,8 +64,8 @@ def work(job: Job) -> None:
 def facts(plan: Plan) -> dict[str, Any]:
     return {
         "folder": plan.folder,
-        "fingerprint": plan.facts["fingerprint"],
-        "truth": plan.facts["truth_digest"],
+        "fingerprint": plan.facts.fingerprint,
+        "truth": plan.facts.truth_digest,
     }
 
 

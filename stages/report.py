@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Split, Train
+from pipeline.plan.record import PlanRecord
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.atomic import write_json
@@ -31,7 +32,8 @@ def work(job: Job) -> None:
     from pipeline.reporting.scene import SceneResults, report_data
 
     start = time.perf_counter()
-    plan, views, train = job.key["plan"], inputs.trained_views(job), job.section(Train)
+    views, train = inputs.trained_views(job), job.section(Train)
+    plan = PlanRecord.model_validate(job.key["plan"])
     evaluation = inputs.read_json(job.inputs["evaluate"] / "evaluation.json")
     results = job.inputs["inspect"].parent
     own = job.run_record(time.perf_counter() - start)

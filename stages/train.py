@@ -63,7 +63,7 @@ def work(job: Job) -> None:
 
 def memory_mb(plan: Plan) -> int:
     """The configured limit, or 1.5 times the plan's estimate."""
-    return plan.config.train.memory_mb or round(1.5 * plan.facts["training_memory_mb"])
+    return plan.config.train.memory_mb or round(1.5 * plan.facts.training_memory_mb)
 
 
 SPEC = StageSpec(

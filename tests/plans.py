@@ -1,10 +1,37 @@
 """Plans for tests: of a scan, and of a scene that needs every stage."""
 
+from collections.abc import Mapping, Sequence
+
 from pipeline.config.schema import Config
 from pipeline.plan import plan as plans
+from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
-from pipeline.plan.values import Plan, StagePlan
+from pipeline.plan.values import Plan, SceneFacts, StagePlan
 from stages.workflow.registry import STAGES
+
+FACTS = SceneFacts(
+    photographs=20,
+    raw=0,
+    alpha=0,
+    masks=0,
+    depths=0,
+    gps=0,
+    ground_control=False,
+    gps_extent_m=0.0,
+    focal_priors=20,
+    turned_by_exif=0,
+    bits=8,
+    sizes={"640x480": 20},
+    camera_groups={"640x480": 20},
+    ordered=None,
+    image_folder="images",
+    view_size=(640, 480),
+    training_memory_mb=1000,
+    given_poses=None,
+    truth=None,
+    truth_digest=None,
+    fingerprint="p",
+)
 
 
 def make_plan(scan: Scan, config: Config, folder: str = "") -> Plan:
@@ -23,7 +50,15 @@ def full_plan(config: Config, scene: str = "fox", skipped: tuple[str, ...] = ())
         )
         for name, spec in STAGES.items()
     }
-    facts = {"truth_digest": None, "fingerprint": "p", "training_memory_mb": 1000}
     return Plan(
-        scene=scene, stages=stages, warnings=[], config=config, facts=facts, folder="folder"
+        scene=scene, stages=stages, warnings=[], config=config, facts=FACTS, folder="folder"
+    )
+
+
+def record_of(
+    stages: Mapping[str, StagePlan], warnings: Sequence[str] = (), scene: str = "barn"
+) -> PlanRecord:
+    """A ``plan.json`` with these stages."""
+    return PlanRecord(
+        scene=scene, stages=dict(stages), order=list(stages), warnings=list(warnings), facts=FACTS
     )

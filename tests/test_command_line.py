@@ -20,12 +20,14 @@ from pipeline.io.ply import write_splat_ply
 from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import write_transforms
+from pipeline.plan.values import StagePlan
 from pipeline.render import RasterOptions
 from pipeline.render.views import near_plane, render_view, to_bytes
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import camera_views, scene_extent
 from pipeline.splats.gaussians import Gaussians
+from tests.plans import record_of
 from tests.splats.samples import sample
 
 SIZE = 48
@@ -135,7 +137,7 @@ def test_all_views_and_their_size_are_a_matter_of_choice(folder):
     assert len(found["per_view"]) == 3 and found["protocol"]["resolution"] == ["24x24"]
 
 
-def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
+def test_a_finished_scene_brings_its_settings(folder, monkeypatch, capsys):
     """Photographs that no stage copied are found from another working directory, too."""
     project = folder / "project"
     scene = project / "results" / "NAME"
@@ -153,8 +155,9 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
     ]
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "inspect" / "images.json")
     write_model(scene / "inspect" / "sparse" / "0", cameras())
-    plan = {"stages": {"inspect": {"run": True}, "undistort": {"run": False}}}
-    (scene / "plan.json").write_text(json.dumps(plan))
+    stages = {"inspect": True, "undistort": False}
+    plan = record_of({name: StagePlan(run=run, reason="") for name, run in stages.items()})
+    (scene / "plan.json").write_text(plan.model_dump_json())
     config = Config().model_dump(mode="json")
     config["split"]["test_every"], config["train"]["background"] = 2, "black"
     (scene / "train").mkdir()
@@ -165,6 +168,11 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch):
     found = measured(folder / "model.ply", scene)
     assert [view["name"] for view in found["per_view"]] == ["p0.png", "p2.png"]
     assert found["psnr"] == 100
+    (scene / "plan.json").write_text('{"version": 2}')
+    assert run("evaluate", folder / "model.ply", "--scene", scene) == 2
+    said = capsys.readouterr().err
+    assert f"{scene}/plan.json: cannot be read" in said and "--forcerun plan" in said
+    assert "Traceback" not in said
 
 
 def test_renders_are_named_as_the_views(folder, capsys):

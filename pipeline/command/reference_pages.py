@@ -37,6 +37,7 @@ _FILES = {
     "stage": "stage.json",
     "run": "run.json",
     "images": "images.json",
+    "plan": "plan.json",
 }
 
 

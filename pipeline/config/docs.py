@@ -31,12 +31,13 @@ PAGE, EXPERIMENTS_PAGE = (ROOT / name for name in REFERENCE)
 DEFAULTS = ROOT / "config" / "config.yaml"
 SCHEMAS = ROOT / "docs" / "schemas"
 
-# File that a stage writes -> its model. By name: no module of the library imports one above it.
+# File of the results -> its model. By name: no module of the library imports one above it.
 _RECORDS = {
     "stage.json": "pipeline.runtime.record:StageRecord",
     "run.json": "pipeline.runtime.record:RunRecord",
     "images.json": "pipeline.scene.manifest:Manifest",
     "metrics.json": "pipeline.reporting.metrics:Metrics",
+    "plan.json": "pipeline.plan.record:PlanRecord",
 }
 
 _INTRO = f"""# Configuration

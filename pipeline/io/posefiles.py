@@ -9,7 +9,7 @@ from pathlib import Path, PurePosixPath
 from typing import Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import has_model, read_model
@@ -32,32 +32,37 @@ MIN_IMAGES_PER_CAMERA = 5
 PoseKind = Literal["colmap", "transforms", "llff"]
 
 
-class GivenPoses(BaseModel):
-    """Summary of the poses in a scene folder.
-
-    Attributes:
-        path: relative to the scene folder: the model's folder, the json or npy file, or "." for
-            several transforms files.
-        names: photographs' names in the pose files; empty for LLFF, which goes by order.
-        models: camera models in use.
-        pinhole: whether no camera has lens distortion.
-        num_points: number of sparse points.
-        tracked: number of observations with known pixels in the image that has the fewest.
-        centred: whether a camera of ``MIN_IMAGES_PER_CAMERA`` or more images has its principal
-            point exactly at the image centre, as if it had not been estimated.
-    """
+class PoseSummary(BaseModel):
+    """Summary of the poses in a scene folder."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    kind: PoseKind
-    path: str
+    kind: PoseKind = Field(description="Kind of the pose files.")
+    path: str = Field(
+        description="The model's folder, the json or the npy file, relative to the scene folder; "
+        "`.` for several transforms files."
+    )
+    num_images: int = Field(description="Number of images with a pose.")
+    models: tuple[str, ...] = Field(description="Camera models in use.")
+    pinhole: bool = Field(description="Whether no camera has lens distortion.")
+    num_points: int = Field(description="Number of sparse points.")
+    tracked: int = Field(
+        description="Number of observations with known pixels in the image that has the fewest."
+    )
+    centred: bool = Field(
+        description=f"Whether a camera of {MIN_IMAGES_PER_CAMERA} or more images has its principal "
+        "point exactly at the image centre, as if it had not been estimated."
+    )
+
+
+class GivenPoses(PoseSummary):
+    """The poses in a scene folder.
+
+    Attributes:
+        names: photographs' names in the pose files; empty for LLFF, which goes by order.
+    """
+
     names: tuple[str, ...]
-    num_images: int
-    models: tuple[str, ...]
-    pinhole: bool
-    num_points: int
-    tracked: int
-    centred: bool
 
 
 def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:

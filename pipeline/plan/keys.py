@@ -7,7 +7,7 @@ from importlib.metadata import version
 from typing import Any
 
 from pipeline.config.options import select
-from pipeline.plan.plan import public_plan
+from pipeline.plan.plan import plan_record
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
 from pipeline.runtime.record import canonical
@@ -34,5 +34,5 @@ def stage_key(spec: StageSpec, plan: Plan) -> str:
         "config": select(plan.config, spec.options),
     }
     if spec.shows_plan:
-        key["plan"] = public_plan(plan)
+        key["plan"] = plan_record(plan).model_dump(mode="json")
     return canonical(key | spec.facts(plan))

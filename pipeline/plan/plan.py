@@ -8,14 +8,15 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
-from typing import Any
 
 from pipeline.config.schema import Config
+from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.budget import training_memory_mb
+from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import Plan
+from pipeline.plan.values import Plan, SceneFacts
 from pipeline.scene.views import view_size
 
 # Limits the length of lists in the plan, which is passed on command lines.
@@ -58,16 +59,20 @@ def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
     }
 
 
-def public_plan(plan: Plan) -> dict[str, Any]:
-    """The content of ``plan.json``: for every stage whether it runs, why and what it reads; facts;
-    warnings; and ``order``, the stages in the order of the DAG."""
-    shown = plan.model_dump(mode="json", exclude={"config", "folder"})
-    return shown | {"order": list(plan.stages)}
+def plan_record(plan: Plan) -> PlanRecord:
+    """The content of ``plan.json``."""
+    return PlanRecord(
+        scene=plan.scene,
+        stages=plan.stages,
+        order=list(plan.stages),
+        warnings=plan.warnings,
+        facts=plan.facts,
+    )
 
 
 def describe(plan: Plan) -> str:
     """The plan as a table for the terminal."""
-    lines = [f"{plan.scene}: {plan.facts['photographs']} photographs"]
+    lines = [f"{plan.scene}: {plan.facts.photographs} photographs"]
     for name, stage in plan.stages.items():
         lines.append(f"  {name:<10} {'run ' if stage.run else 'skip'}  {stage.reason}")
         if stage.run:
@@ -90,33 +95,31 @@ def _most_frequent(counts: Counter[str]) -> dict[str, int]:
     return dict(ordered[:MAX_LISTED]) | ({"others": rest} if rest else {})
 
 
-def _facts(scan: Scan, config: Config) -> dict[str, Any]:
+def _facts(scan: Scan, config: Config) -> SceneFacts:
     photos = scan.photos
-    width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
     sizes = Counter(f"{photo.width}x{photo.height}" for photo in photos)
     groups = Counter(photo.camera_group for photo in photos)
-    return {
-        "photographs": len(photos),
-        "raw": scan.num_raw,
-        "alpha": scan.num_alpha,
-        "masks": scan.num_masks,
-        "depths": scan.num_depths,
-        "gps": scan.num_gps,
-        "ground_control": scan.ground_control is not None,
-        "gps_extent_m": round(gps_extent_m(scan), 1),
-        "focal_priors": scan.num_focal,
-        "turned_by_exif": sum(photo.orientation != 1 for photo in photos),
-        "bits": max(photo.bits for photo in photos),
-        "sizes": _most_frequent(sizes),
-        "camera_groups": _most_frequent(groups),
-        "ordered": scan.ordered,
-        "image_folder": scan.image_folder,
-        "view_size": [width, height],
-        "training_memory_mb": training_memory_mb(scan, config),
-        "given_poses": None
-        if scan.poses is None
-        else scan.poses.model_dump(mode="json", exclude={"names"}),
-        "truth": "sparse_gt" if scan.truth is not None else None,
-        "truth_digest": scan.truth_digest,
-        "fingerprint": scan.fingerprint,
-    }
+    poses = scan.poses
+    return SceneFacts(
+        photographs=len(photos),
+        raw=scan.num_raw,
+        alpha=scan.num_alpha,
+        masks=scan.num_masks,
+        depths=scan.num_depths,
+        gps=scan.num_gps,
+        ground_control=scan.ground_control is not None,
+        gps_extent_m=round(gps_extent_m(scan), 1),
+        focal_priors=scan.num_focal,
+        turned_by_exif=sum(photo.orientation != 1 for photo in photos),
+        bits=max(photo.bits for photo in photos),
+        sizes=_most_frequent(sizes),
+        camera_groups=_most_frequent(groups),
+        ordered=scan.ordered,
+        image_folder=scan.image_folder,
+        view_size=view_size(*scan.sizes[0], config.views.max_long_side_px),
+        training_memory_mb=training_memory_mb(scan, config),
+        given_poses=poses and PoseSummary.model_validate(poses.model_dump(exclude={"names"})),
+        truth="sparse_gt" if scan.truth is not None else None,
+        truth_digest=scan.truth_digest,
+        fingerprint=scan.fingerprint,
+    )

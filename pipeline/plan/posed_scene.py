@@ -10,6 +10,8 @@ from pipeline.config.schema import Config, Split, Train, Views
 from pipeline.io.camera_files import STAGES_WITH_MODEL
 from pipeline.io.colmap import read_model
 from pipeline.plan.given_poses import load_given
+from pipeline.plan.record import NAME as PLAN
+from pipeline.plan.record import read_plan
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
@@ -50,7 +52,7 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
     Raises:
         UserError: no such scene, no poses, cameras with lens distortion.
     """
-    if (folder / "plan.json").is_file():
+    if (folder / PLAN).is_file():
         return _finished(folder, max_long_side, every)
     side = Views(max_long_side_px=max_long_side or 2**31)
     split = Split() if every is None else Split(test_every=every)
@@ -109,10 +111,10 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
 
 def _output(folder: Path, stages: tuple[str, ...], name: str) -> Path:
     """The output ``name`` of the first of ``stages`` that the scene's plan runs and that has it."""
-    planned = json.loads((folder / "plan.json").read_text())["stages"]
+    planned = read_plan(folder).stages
     for stage in stages:
         path = folder / stage / name
-        if planned.get(stage, {}).get("run") and path.exists():
+        if stage in planned and planned[stage].run and path.exists():
             return path
     raise UserError(
         f"expected a finished scene, found no {name}",

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-from typing import Any
-
-from pydantic import BaseModel, ConfigDict
+from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.config.schema import Config
+from pipeline.io.posefiles import PoseSummary
 
 
 class StagePlan(BaseModel):
@@ -14,11 +13,55 @@ class StagePlan(BaseModel):
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
-    run: bool
-    reason: str
-    decisions: list[str] = []
-    inputs: list[str] = []
-    """The stages whose output it reads."""
+    run: bool = Field(description="Whether the scene needs the stage.")
+    reason: str = Field(description="Why it runs, or why not.")
+    decisions: list[str] = Field([], description="Values of its options, with the reasons.")
+    inputs: list[str] = Field([], description="The stages whose output it reads.")
+
+
+class SceneFacts(BaseModel):
+    """The facts about a scene that its plan depends on."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    photographs: int = Field(description="Number of photographs that can be read.")
+    raw: int = Field(description="Number of RAW files among them.")
+    alpha: int = Field(description="Number of photographs with transparent pixels.")
+    masks: int = Field(description="Number of photographs with a mask.")
+    depths: int = Field(description="Number of photographs with a depth map.")
+    gps: int = Field(description="Number of photographs with a GPS position.")
+    ground_control: bool = Field(description="Whether the scene has a `gcp_list.txt`.")
+    gps_extent_m: float = Field(
+        description="Diagonal of the GPS positions' bounding box, metres; 0 without positions."
+    )
+    focal_priors: int = Field(description="Number of photographs with a focal length from EXIF.")
+    turned_by_exif: int = Field(
+        description="Number of photographs with an EXIF orientation other than 1."
+    )
+    bits: int = Field(description="Largest number of bits per channel.")
+    sizes: dict[str, int] = Field(
+        description="Size of photographs, `<width>x<height>` in pixels, to their number; the most "
+        "frequent sizes, `others` counts the rest."
+    )
+    camera_groups: dict[str, int] = Field(
+        description="Camera body, lens, focal length and size to the number of photographs; the "
+        "most frequent groups, `others` counts the rest."
+    )
+    ordered: str | None = Field(
+        description="Why the photographs are treated as a sequence; null where they are not."
+    )
+    image_folder: str = Field(description="Folder of the photographs, relative to the scene's.")
+    view_size: tuple[int, int] = Field(
+        description="Width and height of the training views of the most frequent size, pixels."
+    )
+    training_memory_mb: int = Field(description="Estimate of the memory of training, MB.")
+    given_poses: PoseSummary | None = Field(description="null where no poses are given or used.")
+    truth: str | None = Field(description="Folder of ground truth poses; null without any.")
+    truth_digest: str | None = Field(description="Digest of the ground truth poses.")
+    fingerprint: str = Field(
+        description="Digest of the names and contents of photographs, masks, depth maps, pose "
+        "files and ground control points."
+    )
 
 
 class Plan(BaseModel):
@@ -38,7 +81,7 @@ class Plan(BaseModel):
     stages: dict[str, StagePlan]
     warnings: list[str]
     config: Config
-    facts: dict[str, Any]
+    facts: SceneFacts
     folder: str = ""
 
     def runs(self, stage: str) -> bool:

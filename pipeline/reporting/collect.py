@@ -6,13 +6,14 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.record import read_stage
 
 
 def collect_metrics(
     scene: str,
-    plan: Mapping[str, Any],
+    plan: PlanRecord,
     folder: Path,
     evaluation: Mapping[str, Any],
     *,
@@ -23,7 +24,7 @@ def collect_metrics(
 
     Args:
         scene: name of the scene.
-        plan: ``plan.json``.
+        plan: of the scene.
         folder: ``results/<scene>``, which contains the folders of the stages.
         evaluation: ``evaluate/evaluation.json``.
         seed: of the run.
@@ -32,14 +33,14 @@ def collect_metrics(
     Raises:
         UserError: a stage's record is missing or damaged.
     """
-    warnings: list[str] = list(plan["warnings"])
+    warnings: list[str] = list(plan.warnings)
     counters: dict[str, dict[str, Any]] = {}
-    for name, step in plan["stages"].items():
-        if not step["run"] or name == "report":
+    for name, step in plan.stages.items():
+        if not step.run or name == "report":
             continue
         record = read_stage(folder / name)
         counters[name] = record.counters
-        warnings += [f"{name}: {text}" for text in record.warnings if text not in plan["warnings"]]
+        warnings += [f"{name}: {text}" for text in record.warnings if text not in plan.warnings]
     inspect, sfm, refined = (counters.get(name, {}) for name in ("inspect", "sfm", "refine"))
     return Metrics.model_validate(
         {
@@ -52,8 +53,8 @@ def collect_metrics(
             "sfm_verdict": sfm.get("verdict"),
             "georeference": sfm.get("georeference"),
             "stages": {
-                name: {"skipped": not step["run"], "reason": step["reason"]}
-                for name, step in plan["stages"].items()
+                name: {"skipped": not step.run, "reason": step.reason}
+                for name, step in plan.stages.items()
             },
             "versions": versions,
             "seed": seed,

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import textwrap
 from collections.abc import Mapping
-from typing import Any
 
+from pipeline.plan.record import PlanRecord
+from pipeline.plan.values import StagePlan
 from pipeline.reporting.text import escape
 
 _BOX_W, _BOX_H = 92, 34
@@ -24,25 +25,19 @@ _STYLE = (
 )
 
 
-def plan_svg(plan: Mapping[str, Any]) -> str:
+def plan_svg(plan: PlanRecord) -> str:
     """The plan as an ``<svg>`` element, for a page or as a separate file.
-
-    Args:
-        plan: the content of ``plan.json``: ``stages`` maps a name to ``run``, ``reason``,
-            ``decisions`` and ``inputs`` (the stages whose output it reads).
 
     Returns:
         Running stages from left to right, with arrows from their inputs (without those implied by
         a longer path); below them, dashed, the skipped stages with the reason. The tooltip of
         each box has its reason and decisions.
     """
-    stages: dict[str, Mapping[str, Any]] = {
-        name: plan["stages"][name] for name in plan.get("order", plan["stages"])
-    }
+    stages = {name: plan.stages[name] for name in plan.order}
     edges = _edges(stages)
     places, columns, lanes = _places(stages, edges)
     skip_y = _MARGIN + lanes * (_BOX_H + _GAP_Y)
-    skipped = any(not stage["run"] for stage in stages.values())
+    skipped = any(not stage.run for stage in stages.values())
     height = skip_y - _GAP_Y + _MARGIN
     if skipped:
         height = skip_y + _BOX_H + _REASON_LINES * _LINE_H + _MARGIN
@@ -50,22 +45,22 @@ def plan_svg(plan: Mapping[str, Any]) -> str:
     corner = {
         name: (
             _MARGIN + column * (_BOX_W + _GAP_X),
-            _MARGIN + lane * (_BOX_H + _GAP_Y) if stages[name]["run"] else skip_y,
+            _MARGIN + lane * (_BOX_H + _GAP_Y) if stages[name].run else skip_y,
         )
         for name, (column, lane) in places.items()
     }
     parts = [_arrow(corner[source], corner[target]) for source, target in edges]
     parts += [_box(name, stage, *corner[name]) for name, stage in stages.items()]
-    label = escape(f"plan of {plan.get('scene', 'the scene')}")
+    label = escape(f"plan of {plan.scene}")
     return (
         f'<svg class="plan" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
         f'role="img" aria-label="{label}"><style>{_STYLE}</style>{"".join(parts)}</svg>'
     )
 
 
-def _edges(stages: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
+def _edges(stages: Mapping[str, StagePlan]) -> list[tuple[str, str]]:
     """Edges from inputs to stages, without those implied by a longer path."""
-    inputs = {name: list(stage.get("inputs") or []) for name, stage in stages.items()}
+    inputs = {name: stage.inputs for name, stage in stages.items()}
 
     def reaches(target: str) -> set[str]:
         found: set[str] = set()
@@ -87,7 +82,7 @@ def _edges(stages: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str]]:
 
 
 def _places(
-    stages: Mapping[str, Mapping[str, Any]], edges: list[tuple[str, str]]
+    stages: Mapping[str, StagePlan], edges: list[tuple[str, str]]
 ) -> tuple[dict[str, tuple[int, int]], int, int]:
     """Column and lane of each stage, and the numbers of columns and lanes. A running stage that
     does not depend on the one before it is placed below that, in the same column."""
@@ -96,22 +91,22 @@ def _places(
     in_column: set[str] = set()
     for name, stage in stages.items():
         depends = any(target == name and source in in_column for source, target in edges)
-        if stage["run"] and in_column and not depends and any(t == name for _, t in edges):
+        if stage.run and in_column and not depends and any(t == name for _, t in edges):
             lane += 1
         else:
             column, lane, in_column = column + 1, 0, set()
-        if stage["run"]:
+        if stage.run:
             in_column.add(name)
         lanes = max(lanes, lane + 1)
         places[name] = (column, lane)
     return places, column + 1, lanes
 
 
-def _box(name: str, stage: Mapping[str, Any], x: float, y: float) -> str:
-    tip = "\n".join([stage["reason"], *stage.get("decisions", [])])
-    why = "" if stage["run"] else _reason(stage["reason"], x + _BOX_W / 2, y + _BOX_H + _LINE_H)
+def _box(name: str, stage: StagePlan, x: float, y: float) -> str:
+    tip = "\n".join([stage.reason, *stage.decisions])
+    why = "" if stage.run else _reason(stage.reason, x + _BOX_W / 2, y + _BOX_H + _LINE_H)
     return (
-        f'<g class="{"run" if stage["run"] else "skipped"}"><title>{escape(name)}: {escape(tip)}'
+        f'<g class="{"run" if stage.run else "skipped"}"><title>{escape(name)}: {escape(tip)}'
         f'</title><rect x="{x}" y="{y}" width="{_BOX_W}" height="{_BOX_H}" rx="8"/>'
         f'<text class="name" x="{x + _BOX_W / 2}" y="{y + _BOX_H / 2 + 4.5}">{escape(name)}</text>'
         f"{why}</g>"

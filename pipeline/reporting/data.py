@@ -9,6 +9,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.plan.record import PlanRecord
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
@@ -80,7 +81,7 @@ class ReportData:
     Attributes:
         scene: its name.
         metrics: the content of ``metrics.json``.
-        plan: the content of ``plan.json``; ``stages`` maps a name to ``run`` and ``reason``.
+        plan: of the scene, or None.
         decisions: stage -> its decisions, as recorded in ``stage.json``.
         curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, if
             known, ``seconds`` since the start of training; a missing or null value is a gap.
@@ -94,7 +95,7 @@ class ReportData:
 
     scene: str
     metrics: Mapping[str, Any]
-    plan: Mapping[str, Any] = field(default_factory=dict)
+    plan: PlanRecord | None = None
     decisions: Mapping[str, Sequence[str]] = field(default_factory=dict)
     curve: Sequence[Mapping[str, float | None]] = ()
     comparisons: Sequence[Comparison] = ()

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.plan.record import PlanRecord
 from pipeline.reporting.batch import (
     Result,
     Spread,
@@ -88,14 +89,14 @@ class Batch:
         results: one per run, ordered by scene; at least one.
         renders: run's name -> render of a test view.
         photos: scene -> the photograph of that view.
-        plans: scene -> ``plan.json`` of its first run.
+        plans: scene -> plan of its first run.
         stages: names in the order of the DAG.
     """
 
     results: Sequence[Result]
     renders: Mapping[str, Thumbnail] = field(default_factory=dict)
     photos: Mapping[str, Thumbnail] = field(default_factory=dict)
-    plans: Mapping[str, Mapping[str, Any]] = field(default_factory=dict)
+    plans: Mapping[str, PlanRecord] = field(default_factory=dict)
     stages: Sequence[str] = ()
 
 

@@ -147,7 +147,7 @@ def _cards(data: ReportData) -> str:
 
 
 def _warnings(data: ReportData) -> str:
-    both = [*(data.metrics.get("warnings") or []), *(data.plan.get("warnings") or [])]
+    both = [*(data.metrics.get("warnings") or []), *(data.plan.warnings if data.plan else [])]
     texts = list(dict.fromkeys(str(text) for text in both))
     if not texts:
         return '<div class="calm">No warnings</div>'
@@ -277,7 +277,7 @@ def _how(data: ReportData) -> str:
         f"<h3>Versions</h3>"
         f"{definitions({**(m.get('versions') or {}), 'seed': m.get('seed')})}</div></div>"
         + _raw("metrics.json", m)
-        + _raw("plan.json", data.plan)
+        + (_raw("plan.json", data.plan.model_dump(mode="json")) if data.plan else "")
     )
 
 

@@ -13,6 +13,7 @@ from PIL import Image
 
 from pipeline.metrics.evaluate import Protocol, photo_over_background
 from pipeline.photos.load import load_view
+from pipeline.plan.record import PlanRecord
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
 from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.manifest import Manifest
@@ -27,7 +28,6 @@ class SceneResults:
 
     Attributes:
         metrics: the content of ``metrics.json`` with the times of the stages.
-        plan: the content of ``plan.json``.
         folders: role -> the stage's folder: inspect, train, evaluate and coverage.
         manifest: photographs of the views.
         model: cameras (refined, if training refines them) and sparse points.
@@ -36,7 +36,7 @@ class SceneResults:
 
     scene: str
     metrics: Mapping[str, Any]
-    plan: Mapping[str, Any]
+    plan: PlanRecord
     folders: Mapping[str, Path]
     manifest: Manifest
     model: Reconstruction
@@ -120,13 +120,13 @@ def _curve(train: Path) -> list[dict[str, Any]]:
     return [r | {"seconds": s} for r, s in zip(records, seconds, strict=True)]
 
 
-def _decisions(plan: Mapping[str, Any], results: Path) -> dict[str, list[str]]:
+def _decisions(plan: PlanRecord, results: Path) -> dict[str, list[str]]:
     """The decisions of each stage that ran: those of the plan, then those of the stage."""
     return {
-        name: step["decisions"]
+        name: step.decisions
         + (list(read_stage(results / name).decisions) if name != "report" else [])
-        for name, step in plan["stages"].items()
-        if step["run"]
+        for name, step in plan.stages.items()
+        if step.run
     }
 
 

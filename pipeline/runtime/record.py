@@ -150,27 +150,34 @@ def read_run(folder: Path) -> RunRecord:
     return read_record(folder / RUN, RunRecord)
 
 
-def read_record(path: Path, model: type[M]) -> M:
-    """A JSON file in a stage's folder, as ``model``.
+def read_record(path: Path, model: type[M], fix: str | None = None) -> M:
+    """A JSON file that a stage wrote, as ``model``.
+
+    Args:
+        fix: what to do about a damaged file; None: rerun the stage whose folder it is in.
 
     Raises:
         UserError: it is missing, truncated, or not valid for ``model``.
     """
+    fix = fix or rerun(path.parent)
     try:
         return model.model_validate_json(path.read_bytes())
     except FileNotFoundError:
-        raise UserError(
-            "this stage's output is missing", file=path, fix=rerun(path.parent)
-        ) from None
+        raise UserError("this stage's output is missing", file=path, fix=fix) from None
     except ValidationError as error:
-        first = error.errors()[0]
-        where = ".".join(map(str, first["loc"]))
-        found = f"{where}: {first['msg']}" if where else first["msg"]
-        raise UserError(
-            f"cannot be read: it is damaged or from another version of the program ({found})",
-            file=path,
-            fix=rerun(path.parent),
-        ) from None
+        raise unreadable(path, error, fix) from None
+
+
+def unreadable(path: Path, error: ValidationError, fix: str) -> UserError:
+    """The error for a record that does not fit its model."""
+    first = error.errors()[0]
+    where = ".".join(map(str, first["loc"]))
+    found = f"{where}: {first['msg']}" if where else first["msg"]
+    return UserError(
+        f"cannot be read: it is damaged or from another version of the program ({found})",
+        file=path,
+        fix=fix,
+    )
 
 
 def content_digest(folder: Path) -> str:

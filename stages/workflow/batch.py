@@ -12,6 +12,7 @@ from PIL import Image
 from pipeline.config.runs import Run
 from pipeline.metrics.evaluate import photo_over_background
 from pipeline.photos.load import ViewPixels, load_rgba, resize_rgba
+from pipeline.plan.record import PlanRecord, read_plan
 from pipeline.reporting.batch import MACHINE, Result, as_csv, as_json
 from pipeline.reporting.data import ranked
 from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
@@ -59,15 +60,15 @@ def batch_of(found: list[Result], results: Path) -> Batch:
     """The page's content. All images of a scene show the same view: the first run's median."""
     renders: dict[str, Thumbnail] = {}
     photos: dict[str, Thumbnail] = {}
-    plans: dict[str, dict[str, Any]] = {}
+    plans: dict[str, PlanRecord] = {}
     views: dict[str, str] = {}
     for result in (r for r in found if r.ok):
         scene, folder = result.run.scene, results / result.run.name
         per_view = result.metrics["per_view"]
-        plan = plans.setdefault(scene, read_json(folder / "plan.json"))
+        plan = plans.setdefault(scene, read_plan(folder))
         name = views.setdefault(scene, ranked(per_view, 1)[0][1]["name"])
         measured = next((v for v in per_view if v["name"] == name), per_view[0])
-        source = next(s for s in ("undistort", "decode", "inspect") if plan["stages"][s]["run"])
+        source = next(s for s in ("undistort", "decode", "inspect") if plan.stages[s].run)
         manifest = Manifest.read(folder / source / "images.json")
         photo = next(p for p in manifest.photos if p.name == measured["name"])
         with Image.open(folder / "evaluate" / "renders" / measured["render"]) as opened:
@@ -82,10 +83,6 @@ def batch_of(found: list[Result], results: Path) -> Batch:
                 photo_over_background(pixels, background), photo.orientation, name
             )
     return Batch(found, renders, photos, plans, list(STAGES))
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text())
 
 
 if __name__ == "__main__":

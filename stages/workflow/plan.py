@@ -4,9 +4,9 @@ Outputs: ``results/<scene>/plan.json`` and a picture of it, ``plan.svg``.
 """
 
 import argparse
-import json
 from pathlib import Path
 
+from pipeline.plan.record import PlanRecord
 from pipeline.reporting.dag import plan_svg
 from pipeline.runtime.atomic import write_json, write_text
 
@@ -16,6 +16,6 @@ if __name__ == "__main__":
     parser.add_argument("--picture", type=Path, required=True)
     parser.add_argument("--plan", required=True, help="the plan as JSON")
     args = parser.parse_args()
-    plan = json.loads(args.plan)
-    write_json(args.out, plan)
+    plan = PlanRecord.model_validate_json(args.plan)
+    write_json(args.out, plan.model_dump(mode="json"))
     write_text(args.picture, plan_svg(plan))

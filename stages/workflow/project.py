@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, parse_run
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import describe, make_plan, public_plan, upstream
+from pipeline.plan.plan import describe, make_plan, plan_record, upstream
 from pipeline.plan.scan import scan
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
@@ -120,7 +120,7 @@ class SnakemakeProject:
 
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
-        return canonical(public_plan(self._plan(wildcards.scene)))
+        return canonical(plan_record(self._plan(wildcards.scene)).model_dump(mode="json"))
 
     def _inputs(self, spec: StageSpec, name: str) -> dict[str, Path]:
         sources = upstream(spec, self._plan(name))

@@ -285,7 +285,7 @@ def test_cameras(tmp_path, group, share, model):
 def test_decisions_contain_the_resolution_and_the_split(tmp_path):
     photos(tmp_path / "images", 2, (72, 128))
     plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"test_every": 5})
-    assert plan.facts["view_size"] == [54, 96]
+    assert plan.facts.view_size == (54, 96)
     assert any("54x96" in line and "0.75" in line for line in plan.stages["train"].decisions)
     assert "one view in 5" in plan.stages["evaluate"].reason
     assert "no test views" in plan_of(tmp_path, split={"test_every": 0}).stages["evaluate"].reason
@@ -296,7 +296,7 @@ def test_facts_and_warnings_go_with_the_plan(tmp_path):
     (tmp_path / "images" / "x.jpg").write_text("no picture")
     write_sparse(tmp_path / "sparse_gt", [path.name for path in files], (64, 48))
     plan = plan_of(tmp_path)
-    assert plan.facts["photographs"] == 2 and plan.facts["truth"] == "sparse_gt"
+    assert plan.facts.photographs == 2 and plan.facts.truth == "sparse_gt"
     assert any("x.jpg" in line for line in plan.warnings)
     assert any("sparse_gt" in line for line in plan.stages["evaluate"].decisions)
     assert Plan.model_validate_json(plan.model_dump_json()) == plan
@@ -396,7 +396,7 @@ def test_the_plan_estimates_the_memory_of_training(tmp_path):
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
     config = Config.model_validate({"train": {"density": density}})
     plan = make_plan(many(tmp_path, 200, **size), config)
-    assert plan.facts["training_memory_mb"] == 400 + 300 + 2500
+    assert plan.facts.training_memory_mb == 400 + 300 + 2500
     assert "about 3.2 GB of memory" in plan.stages["train"].decisions
 
 
@@ -418,7 +418,7 @@ def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gauss
     assert small.config.train.density.max_gaussians == 400_000
     limited = "at most 400000 Gaussians: as many as fit into 1400 MB of memory"
     assert limited in small.stages["train"].decisions
-    assert [plan.facts["training_memory_mb"] for plan in (roomy, tight, small)] == [
+    assert [plan.facts.training_memory_mb for plan in (roomy, tight, small)] == [
         3200,
         3199,
         1400,

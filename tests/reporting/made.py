@@ -7,9 +7,11 @@ import dataclasses
 import numpy as np
 import torch
 
+from pipeline.plan.values import StagePlan
 from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from tests.plans import record_of
 
 
 def ring(count: int = 5, *, width: int = 200, height: int = 150) -> list[View]:
@@ -146,7 +148,7 @@ def report(**changes) -> ReportData:
     data = ReportData(
         scene="barn",
         metrics=metrics(),
-        plan={"stages": {"decode": {"run": False, "reason": "no RAW"}}, "warnings": ["it is dark"]},
+        plan=record_of({"decode": StagePlan(run=False, reason="no RAW")}, ["it is dark"]),
         decisions={"sfm": ["incremental mapper: 49 images"], "train": []},
         curve=[
             {"step": 100, "loss": 0.2345, "psnr": 17.89, "num_gaussians": 5001, "seconds": 3.0},

@@ -3,7 +3,8 @@
 import xml.etree.ElementTree as ET
 
 from pipeline.config.schema import Config
-from pipeline.plan.plan import public_plan
+from pipeline.plan.plan import plan_record
+from pipeline.plan.record import PlanRecord
 from pipeline.reporting.dag import plan_svg
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan
@@ -11,11 +12,11 @@ from tests.plans import full_plan
 SVG = "{http://www.w3.org/2000/svg}"
 
 
-def plan(*skipped: str) -> dict:
-    return public_plan(full_plan(Config(), skipped=skipped))
+def plan(*skipped: str) -> PlanRecord:
+    return plan_record(full_plan(Config(), skipped=skipped))
 
 
-def drawn(found: dict) -> tuple[dict[str, tuple[float, float]], ET.Element]:
+def drawn(found: PlanRecord) -> tuple[dict[str, tuple[float, float]], ET.Element]:
     """Corner of each box by stage."""
     root = ET.fromstring(plan_svg(found))
     boxes = {}
@@ -56,5 +57,5 @@ def test_arrows_are_the_inputs_without_implied_ones():
 
 def test_a_plan_read_from_its_file_gives_the_same_diagram():
     found = plan("decode")
-    alphabetical = found | {"stages": dict(sorted(found["stages"].items()))}
+    alphabetical = found.model_copy(update={"stages": dict(sorted(found.stages.items()))})
     assert plan_svg(alphabetical) == plan_svg(found)

@@ -4,12 +4,14 @@ import json
 
 import pytest
 
+from pipeline.plan.values import StagePlan
 from pipeline.reporting.collect import collect_metrics
 from pipeline.reporting.headline import headline, main
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs, with_times
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import RunRecord, StageRecord
+from tests.plans import record_of
 
 COUNTERS = {
     "inspect": {"photos": 7, "left_out": 1},
@@ -17,11 +19,11 @@ COUNTERS = {
     "train": {"num_gaussians": 1000},
     "report": {},
 }
-PLAN = {
-    "warnings": ["it is dark"],
-    "stages": {name: {"run": True, "reason": "needed"} for name in COUNTERS}
-    | {"decode": {"run": False, "reason": "no RAW files"}},
-}
+PLAN = record_of(
+    {name: StagePlan(run=True, reason="needed") for name in COUNTERS}
+    | {"decode": StagePlan(run=False, reason="no RAW files")},
+    ["it is dark"],
+)
 EVALUATION = {
     "psnr": 27.5,
     "ssim": 0.9,

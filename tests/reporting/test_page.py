@@ -9,8 +9,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.plan.values import StagePlan
 from pipeline.reporting.data import Coverage, ReportData
 from pipeline.reporting.page import report_html, write_report
+from tests.plans import record_of
 from tests.reporting.made import coverage, metrics, report, ring, trained
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
@@ -75,7 +77,7 @@ def test_metrics_and_plan_are_embedded_verbatim() -> None:
     data = report()
     page = Page(report_html(data))
     found = [json.loads(t) for t in page.text if t.startswith("{\n")]
-    assert found == [data.metrics, data.plan]
+    assert found == [data.metrics, data.plan and data.plan.model_dump(mode="json")]
 
 
 def test_no_network_requests() -> None:
@@ -118,7 +120,7 @@ def test_no_string_of_the_user_becomes_markup() -> None:
     data = report(
         scene=NASTY,
         metrics=nasty,
-        plan={"warnings": [NASTY], NASTY: NASTY},
+        plan=record_of({NASTY: StagePlan(run=True, reason=NASTY)}, [NASTY]),
         decisions={NASTY: [NASTY]},
         trained=trained(views=[dataclasses.replace(v, name=NASTY) for v in ring()]),
         coverage=nasty_coverage(),
@@ -146,7 +148,7 @@ def nothing_held_out() -> Coverage:
         {"comparisons": ()},
         {"curve": ()},
         {"curve": [{"step": 1, "loss": None, "psnr": float("nan"), "num_gaussians": 5}]},
-        {"decisions": {}, "plan": {}},
+        {"decisions": {}, "plan": None},
         {"points_xyz": np.zeros((0, 3)), "points_rgb": np.zeros((0, 3), np.uint8)},
         {"trained": None},
         {"coverage": None},

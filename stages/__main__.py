@@ -37,7 +37,8 @@ def main() -> int:
         publish=_pairs(args.publish),
         memory_mb=args.memory_mb,
     )
-    return run_stage(request, importlib.import_module(f"stages.{args.stage}").SPEC.work)
+    spec = importlib.import_module(f"stages.{args.stage}").SPEC
+    return run_stage(request, spec.work, spec.counters)
 
 
 def _pairs(items: list[str]) -> dict[str, Path]:

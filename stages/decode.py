@@ -9,6 +9,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Decode
+from pipeline.photos.counters import DecodeCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -40,19 +41,18 @@ def work(job: Job) -> None:
 
     manifest = inputs.read_manifest(job, "photos")
     report = develop(manifest, job.section(Decode), job.out, threads=job.threads)
-    for text in report.warnings:
-        job.warn(text)
     if (job.inputs["photos"] / "sparse" / "0").is_dir():
         given = renamed(inputs.input_model(job, "photos"), report.manifest)
         write_model(job.out / "sparse" / "0", given)
     inputs.copy_georeference(job, "photos")
-    job.counters = {"developed": len(report.manifest.photos)}
+    job.record(DecodeCounters(developed=len(report.manifest.photos)), [], report.warnings)
 
 
 SPEC = StageSpec(
     name="decode",
     work=work,
     decide=decide,
+    counters=DecodeCounters,
     inputs={"photos": ("inspect",)},
     options=("decode",),
     packages=("rawpy",),

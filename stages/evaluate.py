@@ -7,8 +7,9 @@ from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.metrics.counters import EvaluateCounters
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
@@ -16,7 +17,6 @@ from stages.workflow import inputs
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
-    from pipeline.plan.values import Plan
 
 # With refined cameras, the poses of test views are fitted to their photographs before measuring.
 FIT_OPTIONS = ("train.refine_poses", "train.ssim_loss_weight")
@@ -49,13 +49,12 @@ def work(job: Job) -> None:
     )
     job.add_messages([], evaluation.pop("warnings"))
     evaluation["pose_error"] = None
-    truth = job.inputs["inspect"] / "truth"
-    if truth.is_dir():
+    if (truth := job.inputs["inspect"] / "truth").is_dir():
         refined = train.refine_poses
         model = inputs.trained_model(job) if refined else inputs.input_model(job, "poses")
         evaluation["pose_error"] = asdict(pose_error(model, read_model(truth)))
     write_json(job.out / "evaluation.json", evaluation)
-    job.counters = {name: evaluation[name] for name in ("psnr", "ssim", "lpips")}
+    job.counters = EvaluateCounters(**{n: evaluation[n] for n in EvaluateCounters.model_fields})
     job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
     if not protocol.every:
         job.warn("there are no test views: quality was measured on training views")
@@ -72,6 +71,7 @@ SPEC = StageSpec(
     name="evaluate",
     work=work,
     decide=decide,
+    counters=EvaluateCounters,
     inputs={**inputs.TRAINED, "inspect": ("inspect",)},
     options=("evaluate", "views", "split", *inputs.DRAWING_OPTIONS, *FIT_OPTIONS),
     packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),

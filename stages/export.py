@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Export, Split, Train, Views
+from pipeline.export.counters import ExportCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -56,13 +57,14 @@ def work(job: Job) -> None:
         split,
         threads=job.threads,
     )
-    job.record(report)
+    job.record(report.counters, report.decisions, report.warnings)
 
 
 SPEC = StageSpec(
     name="export",
     work=work,
     decide=decide,
+    counters=ExportCounters,
     inputs=inputs.TRAINED,
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),

@@ -8,6 +8,7 @@ from pipeline.config.schema import Features
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
+from pipeline.sfm.counters import FeaturesCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -34,15 +35,16 @@ def work(job: Job) -> None:
         cache=job.shared_cache,
         threads=job.threads,
     )
-    job.record(report)
+    job.record(report.counters, report.decisions, report.warnings)
     # Not a counter: it depends on earlier runs.
-    job.timings["num_cached"] = job.counters.pop("num_cached")
+    job.timings["num_cached"] = report.num_cached
 
 
 SPEC = StageSpec(
     name="features",
     work=work,
     decide=decide,
+    counters=FeaturesCounters,
     inputs={"photos": inputs.PHOTOS},
     options=("features",),
     packages=("opencv-contrib-python-headless", "pycolmap"),

@@ -8,8 +8,8 @@ from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Features, Init, Matches
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
-from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
+from pipeline.splats.counters import InitCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -40,13 +40,9 @@ def work(job: Job) -> None:
     from pipeline.splats.first import first_gaussians
 
     config, experiments = job.section(Init), job.section(Experiments)
-    training = [view for view in inputs.input_views(job) if not view.is_test]
-    if not training:
-        raise UserError(
-            "expected training views, found no photograph with a pose",
-            fix="check the photographs' names in the pose file, or set poses: ignore",
-        )
+    training = inputs.training_views(job)
     points = inputs.input_model(job).points
+    extra = {}
     if config.method != "random" and len(points) == 0:
         job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
@@ -62,17 +58,17 @@ def work(job: Job) -> None:
         )
         job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
-        job.counters["triangulated_points"] = len(points)
+        extra = {"triangulated_points": len(points)}
     first = first_gaussians(points, training, config, experiments.init, job.seed)
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
-    job.add_messages(first.decisions, first.warnings)
-    job.counters |= first.counters
+    job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
 
 
 SPEC = StageSpec(
     name="init",
     work=work,
     decide=decide,
+    counters=InitCounters,
     inputs={"views": inputs.VIEWS, "model": inputs.MODEL},
     options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),

@@ -11,8 +11,9 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Config
+from pipeline.photos.counters import InspectCounters
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.runtime.section import read_section
@@ -20,7 +21,6 @@ from pipeline.runtime.section import read_section
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
-    from pipeline.plan.values import Plan
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -44,15 +44,15 @@ def work(job: Job) -> None:
     )
     job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
-    count = len(manifest.photos)
-    job.counters = {"photos": count, "left_out": len(found.listed) - count}
+    count, given_counts = len(manifest.photos), {}
     if (poses := found.poses) is not None:
         given = load_given(
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
         job.add_messages(given.write(job.out), [])
-        job.counters["given_poses"] = len(given.model.images)
-        job.counters["given_points"] = len(given.model.points)
+        images, points = given.model.images, given.model.points
+        given_counts = {"given_poses": len(images), "given_points": len(points)}
+    job.counters = InspectCounters(photos=count, left_out=len(found.listed) - count, **given_counts)
     if found.ground_control is not None and found.poses is None:
         # A malformed file is reported before the hours of later stages.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])
@@ -73,6 +73,7 @@ SPEC = StageSpec(
     name="inspect",
     work=work,
     decide=decide,
+    counters=InspectCounters,
     options=("poses", "inspect", "views.masks"),
     facts=facts,
 )

@@ -9,6 +9,7 @@ from pipeline.config.schema import Matches, Sfm
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
+from pipeline.sfm.counters import MatchesCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -34,15 +35,16 @@ def work(job: Job) -> None:
         seed=job.seed,
         experiments=job.section(Experiments).matches,
     )
-    job.record(report)
+    job.record(report.counters, report.decisions, report.warnings)
     # Not a counter: it depends on earlier runs.
-    job.timings["num_cached"] = job.counters.pop("num_cached")
+    job.timings["num_cached"] = report.num_cached
 
 
 SPEC = StageSpec(
     name="matches",
     work=work,
     decide=decide,
+    counters=MatchesCounters,
     inputs={"photos": inputs.PHOTOS, "features": ("features",)},
     options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
     packages=("pycolmap",),

@@ -10,6 +10,7 @@ from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
+from pipeline.sfm.counters import RefineCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -53,9 +54,8 @@ def work(job: Job) -> None:
     from pipeline.sfm.known_poses import refine_known_poses
 
     given = job.inputs["model"]
-    job.record(
-        refine_known_poses(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0")
-    )
+    report = refine_known_poses(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0")
+    job.record(report.counters, report.decisions)
     inputs.copy_georeference(job, "model")
 
 
@@ -63,6 +63,7 @@ SPEC = StageSpec(
     name="refine",
     work=work,
     decide=decide,
+    counters=RefineCounters,
     inputs={"model": inputs.GIVEN},
     options=("sfm.refine_radial", "sfm.refine_principal_point"),
     packages=("pycolmap", "numpy", "scipy"),

@@ -9,6 +9,7 @@ from pipeline.config.schema import Config, Sfm
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
+from pipeline.sfm.counters import SfmCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
@@ -49,13 +50,14 @@ def work(job: Job) -> None:
         seed=job.seed,
         ground_control=control if control.is_file() else None,
     )
-    job.record(report)
+    job.record(report.counters, report.decisions, report.warnings)
 
 
 SPEC = StageSpec(
     name="sfm",
     work=work,
     decide=decide,
+    counters=SfmCounters,
     inputs={"photos": inputs.PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
     options=("sfm",),
     packages=("pycolmap", "numpy", "scipy"),

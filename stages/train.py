@@ -8,15 +8,15 @@ from typing import TYPE_CHECKING
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import StagePlan
+from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
+from pipeline.training.loop.counters import TrainCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
-    from pipeline.plan.values import Plan
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
@@ -57,8 +57,8 @@ def work(job: Job) -> None:
         write_model(job.out / "sparse" / "0", trained.model)
     write_json(job.out / "curve.json", trained.result.curve)
     write_json(job.out / "exposure.json", trained.gains)
-    job.add_messages(trained.decisions, trained.warnings)
-    job.counters, job.timings = trained.counters, trained.timings
+    job.record(trained.counters, trained.decisions, trained.warnings)
+    job.timings = trained.timings
 
 
 def memory_mb(plan: Plan) -> int:
@@ -70,6 +70,7 @@ SPEC = StageSpec(
     name="train",
     work=work,
     decide=decide,
+    counters=TrainCounters,
     inputs={"views": inputs.VIEWS, "model": inputs.MODEL, "init": ("init",)},
     options=("train", "views", "split", "experiments.train"),
     packages=("torch", "numpy", "opencv-contrib-python-headless"),

@@ -8,6 +8,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Undistort, Views
+from pipeline.photos.counters import UndistortCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -41,15 +42,14 @@ def work(job: Job) -> None:
         job.out,
         threads=job.threads,
     )
-    for text in report.warnings:
-        job.warn(text)
-    job.counters = {"undistorted": len(report.manifest.photos)}
+    job.record(UndistortCounters(undistorted=len(report.manifest.photos)), [], report.warnings)
 
 
 SPEC = StageSpec(
     name="undistort",
     work=work,
     decide=decide,
+    counters=UndistortCounters,
     inputs={"photos": inputs.PHOTOS, "model": inputs.POSES},
     options=("undistort", "views.max_long_side_px"),
     packages=("opencv-contrib-python-headless",),

@@ -12,6 +12,7 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Config, ExportFormat
+from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
@@ -94,7 +95,7 @@ def test_every_format_the_schema_offers_is_written(scene):
         scene, formats=list(WRITERS), sh_degree=1, min_opacity=0.3, morton_order=False
     )
     kept = sample(50).select(sample(50).opacity_logits.sigmoid() >= 0.3)
-    assert job.counters == {"exported_gaussians": len(kept)}
+    assert job.counters == ExportCounters(exported_gaussians=len(kept))
     for suffix, degree in ((".ply", 1), (".spz", 1), (".glb", 1), (".splat", 0)):
         found = read_gaussians(out / f"point_cloud{suffix}", [])
         assert len(found) == len(kept) and found.sh_degree == degree

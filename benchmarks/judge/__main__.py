@@ -92,8 +92,7 @@ def _model(best: Attempt, folder: Path) -> Any:
 def _row(
     name: str, seed: int, truth: Truth | None, best: Attempt, total: int, tried: int, cpu: float
 ) -> Row:
-    evidence = asdict(best.evidence) if best.evidence else {}
-    evidence.pop("focal_prior_px", None)
+    evidence = best.evidence.model_dump() if best.evidence else {}
     return Row(
         name,
         seed,

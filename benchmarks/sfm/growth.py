@@ -124,8 +124,9 @@ def mapping(folder: Path, count: int, mapper: str) -> None:
     report = reconstruct(
         manifest, folder / "database.db", config, folder / mapper, threads=1, seed=0
     )
-    if report.verdict != "good":  # the other mapper has run as well
-        raise UserError(f"{mapper} mapping of {count} photographs is {report.verdict}")
+    verdict = report.counters.verdict
+    if verdict != "good":  # the other mapper has run as well
+        raise UserError(f"{mapper} mapping of {count} photographs is {verdict}")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:

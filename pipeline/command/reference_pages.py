@@ -35,6 +35,7 @@ null is marked by `?`.
 _FILES = {
     "metrics": "metrics.json",
     "stage": "stage.json",
+    "counters": "Counters",
     "run": "run.json",
     "images": "images.json",
     "plan": "plan.json",

@@ -15,7 +15,7 @@ from types import NoneType, UnionType
 from typing import Annotated, Any, Literal, Union, get_args, get_origin
 
 import yaml
-from pydantic import BaseModel
+from pydantic import BaseModel, Field, create_model
 from pydantic.fields import FieldInfo
 
 from pipeline.config.experiments import Experiments
@@ -31,7 +31,8 @@ PAGE, EXPERIMENTS_PAGE = (ROOT / name for name in REFERENCE)
 DEFAULTS = ROOT / "config" / "config.yaml"
 SCHEMAS = ROOT / "docs" / "schemas"
 
-# File of the results -> its model. By name: no module of the library imports one above it.
+# File of the results -> its model. These and the declarations of the stages are imported by name:
+# no module of the library imports one above it.
 _RECORDS = {
     "stage.json": "pipeline.runtime.record:StageRecord",
     "run.json": "pipeline.runtime.record:RunRecord",
@@ -222,15 +223,30 @@ def _words(kind: Any, metadata: Sequence[Any] = ()) -> str:
 
 
 def json_schemas() -> dict[Path, str]:
-    """The JSON schemas (draft 2020-12) of the files that stages write, by path."""
+    """The JSON schemas (draft 2020-12) of the files of the results, by path."""
     found = {}
-    for name, model in _RECORDS.items():
-        module, _, attribute = model.partition(":")
-        schema = getattr(import_module(module), attribute).model_json_schema(mode="serialization")
-        schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
-        path = SCHEMAS / name.replace(".json", ".schema.json")
-        found[path] = json.dumps(schema, indent=2) + "\n"
-    return found
+    for name, place in _RECORDS.items():
+        module, _, attribute = place.partition(":")
+        model = getattr(import_module(module), attribute)
+        found[SCHEMAS / name.replace(".json", ".schema.json")] = _schema(model)
+    return found | {SCHEMAS / "counters.schema.json": _schema(_counters())}
+
+
+def _schema(model: type[BaseModel]) -> str:
+    schema = model.model_json_schema(mode="serialization")
+    schema["$schema"] = "https://json-schema.org/draft/2020-12/schema"
+    return json.dumps(schema, indent=2) + "\n"
+
+
+def _counters() -> type[BaseModel]:
+    """A model with the counters of each stage as a field."""
+    stages = import_module("stages.workflow.registry").STAGES
+    # The default: a scene has the counters of the stages that ran.
+    fields: dict[str, Any] = {
+        name: (spec.counters, Field(default_factory=spec.counters)) for name, spec in stages.items()
+    }
+    about = "The `counters` in `stage.json`, by stage."
+    return create_model("Counters", __doc__=about, **fields)
 
 
 def main() -> int:

@@ -9,6 +9,7 @@ from typing import Any
 
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
+from pipeline.export.counters import ExportCounters
 from pipeline.io.colmap import write_model
 from pipeline.io.frame_json import describe_frame
 from pipeline.io.gltf import write_gltf
@@ -57,7 +58,7 @@ class ExportScene:
 class ExportReport:
     """What was exported, and messages to the user."""
 
-    exported_gaussians: int
+    counters: ExportCounters
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
@@ -109,7 +110,9 @@ def export_scene(
         file, write = WRITERS[name]
         write(out / file, files)
         written.append(file)
-    report = ExportReport(len(gaussians), warnings=_warnings(files, config))
+    report = ExportReport(
+        ExportCounters(exported_gaussians=len(gaussians)), warnings=_warnings(files, config)
+    )
     _write_frame(out, files, written, train, split)
     if not set(config.formats) <= WRITERS.keys():
         _write_rendered_formats(out, scene, config, train, split, threads, report)

@@ -23,7 +23,7 @@ class PlanRecord(BaseModel):
     stages: dict[str, StagePlan] = Field(description="Stage to its plan.")
     order: list[str] = Field(description="The stages in the order of the DAG.")
     warnings: list[str] = Field(description="What the user should know before the stages run.")
-    facts: SceneFacts
+    facts: SceneFacts = Field(description="The facts about the scene that the plan depends on.")
 
     @model_validator(mode="after")
     def _order_has_every_stage(self) -> Self:

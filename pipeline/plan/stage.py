@@ -7,6 +7,7 @@ from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
 
 from pipeline.plan.values import Plan, StagePlan
+from pipeline.runtime.counters import NoCounters, StageCounters
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -42,6 +43,7 @@ class StageSpec:
             because the Snakefile imports every declaration.
         decide: whether a scene needs the stage, and why. Pure.
         inputs: role -> the stages that can provide this input; the first that the plan runs does.
+        counters: model of the counters that ``work`` records.
         options: dotted paths of the options or sections that the stage reads; others cannot be
             read (see ``pipeline.config.options``).
         packages: packages whose version affects the result.
@@ -58,6 +60,7 @@ class StageSpec:
     work: Callable[[Job], None]
     decide: Callable[[Scan, Settled], StagePlan]
     inputs: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
+    counters: type[StageCounters] = NoCounters
     options: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
     seeded: bool = False

@@ -20,7 +20,7 @@ class StagePlan(BaseModel):
 
 
 class SceneFacts(BaseModel):
-    """The facts about a scene that its plan depends on."""
+    """Counts and properties of a scene's files."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 

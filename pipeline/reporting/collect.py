@@ -6,9 +6,13 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.photos.counters import InspectCounters
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import Metrics
+from pipeline.runtime.counters import read_counters
 from pipeline.runtime.record import read_stage
+from pipeline.sfm.counters import RefineCounters, SfmCounters
+from pipeline.training.loop.counters import TrainCounters
 
 
 def collect_metrics(
@@ -31,27 +35,27 @@ def collect_metrics(
         versions: of the packages that affect results.
 
     Raises:
-        UserError: a stage's record is missing or damaged.
+        UserError: a stage's record is missing or damaged, or its counters are.
     """
-    warnings: list[str] = list(plan.warnings)
-    counters: dict[str, dict[str, Any]] = {}
-    for name, step in plan.stages.items():
-        if not step.run or name == "report":
-            continue
-        record = read_stage(folder / name)
-        counters[name] = record.counters
-        warnings += [f"{name}: {text}" for text in record.warnings if text not in plan.warnings]
-    inspect, sfm, refined = (counters.get(name, {}) for name in ("inspect", "sfm", "refine"))
+    ran = [name for name, step in plan.stages.items() if step.run and name != "report"]
+    warnings = list(plan.warnings)
+    for name in ran:
+        found = read_stage(folder / name).warnings
+        warnings += [f"{name}: {text}" for text in found if text not in plan.warnings]
+    inspect = read_counters(folder / "inspect", InspectCounters)
+    sfm = read_counters(folder / "sfm", SfmCounters) if "sfm" in ran else None
+    refined = read_counters(folder / "refine", RefineCounters) if "refine" in ran else None
+    error_px = refined.error_px if refined else None
     return Metrics.model_validate(
         {
             "scene": scene,
             **{name: evaluation[name] for name in Metrics.model_fields if name in evaluation},
-            "num_gaussians": counters["train"]["num_gaussians"],
-            "registered_images": sfm.get("registered", inspect.get("given_poses")),
-            "total_images": inspect["photos"] + inspect["left_out"],
-            "reprojection_error_px": sfm.get("mean_reprojection_error_px", refined.get("error_px")),
-            "sfm_verdict": sfm.get("verdict"),
-            "georeference": sfm.get("georeference"),
+            "num_gaussians": read_counters(folder / "train", TrainCounters).num_gaussians,
+            "registered_images": sfm.registered if sfm else inspect.given_poses,
+            "total_images": inspect.photos + inspect.left_out,
+            "reprojection_error_px": sfm.mean_reprojection_error_px if sfm else error_px,
+            "sfm_verdict": sfm.verdict if sfm else None,
+            "georeference": sfm.georeference if sfm else None,
             "stages": {
                 name: {"skipped": not step.run, "reason": step.reason}
                 for name, step in plan.stages.items()

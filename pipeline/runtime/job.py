@@ -13,7 +13,6 @@ files of its inputs are compared with their records.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import sqlite3
@@ -22,14 +21,15 @@ import tempfile
 import time
 import traceback
 from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
+from pipeline.runtime.counters import NoCounters, StageCounters
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.facts import run_record
 from pipeline.runtime.lock import locked, logging_to
@@ -40,7 +40,6 @@ from pipeline.runtime.record import (
     STAGE,
     RunRecord,
     StageRecord,
-    canonical,
     check_outputs,
     content_digest,
     identity,
@@ -66,7 +65,8 @@ class Job:
             of the key.
         threads: number of native threads; does not affect results.
         memory_mb: memory limit, or None; does not affect results.
-        counters, decisions, warnings: written to ``stage.json``.
+        counters, decisions, warnings: written to ``stage.json``; counters are of the model that
+            the stage declares.
         timings: written to ``run.json``.
         logs: folder for logs, which are not part of the result.
     """
@@ -81,7 +81,7 @@ class Job:
     threads: int
     memory_mb: int | None
     logs: Path
-    counters: dict[str, Any] = field(default_factory=dict)
+    counters: StageCounters = field(default_factory=NoCounters)
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     timings: dict[str, Any] = field(default_factory=dict)
@@ -95,12 +95,12 @@ class Job:
         """The config section of type ``model``, with the options that the stage declares."""
         return read_section(model, self.key["config"][model.__name__.lower()])
 
-    def record(self, report: Any) -> None:
-        """Record a report (a dataclass): ``decisions`` and ``warnings`` are messages, other fields
-        become counters."""
-        counters = asdict(report)
-        self.add_messages(counters.pop("decisions", []), counters.pop("warnings", []))
-        self.counters |= counters
+    def record(
+        self, counters: StageCounters, decisions: Sequence[str] = (), warnings: Sequence[str] = ()
+    ) -> None:
+        """Record the counters; print and record decisions and warnings."""
+        self.counters = counters
+        self.add_messages(decisions, warnings)
 
     def run_record(self, wall: float) -> RunRecord:
         """The record of the run after ``wall`` seconds."""
@@ -139,8 +139,15 @@ class Request:
     memory_mb: int | None = None
 
 
-def run_stage(request: Request, work: Callable[[Job], None]) -> int:
+def run_stage(
+    request: Request,
+    work: Callable[[Job], None],
+    counters: type[StageCounters] = NoCounters,
+) -> int:
     """Run ``work`` as a stage and return the exit code.
+
+    Args:
+        counters: model of the counters that ``work`` must record.
 
     0: finished, or up to date. 2: a ``UserError``, with its message. 1: another exception, which is
     a bug of the program, with a traceback.
@@ -148,7 +155,7 @@ def run_stage(request: Request, work: Callable[[Job], None]) -> int:
     with logging_to(request.log, request.out.parent.name):
         try:
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
-            return _run_locked(request, work)
+            return _run_locked(request, work, counters)
         except UserError as error:
             _say_error(request, error)
             return EXIT_USER_ERROR
@@ -176,14 +183,16 @@ def _say_error(request: Request, error: UserError) -> None:
     print(f"error in {request.stage} of {scene}: {error}", file=sys.stderr, flush=True)
 
 
-def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
+def _run_locked(
+    request: Request, work: Callable[[Job], None], counters: type[StageCounters]
+) -> int:
     scene_folder = request.out.parent
     scratch_root = scene_folder / ".scratch"
     scratch_root.mkdir(parents=True, exist_ok=True)
     with locked(scratch_root / f"{request.stage}.lock", request.stage, request.out):
         digests = {role: content_digest(folder) for role, folder in request.inputs.items()}
         _recover(request.out)
-        if _is_done(request, digests):
+        if _is_done(request, digests, counters):
             write_bytes(request.out / STAGE, (request.out / HIDDEN_STAGE).read_bytes())
             _publish(request)
             print(f"{request.stage}: up to date, nothing to do", file=sys.stderr)
@@ -194,7 +203,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
         if out.exists():
             shutil.rmtree(out)
         out.mkdir(parents=True)
-        if _reuse_other_run(request, digests, out):
+        if _reuse_other_run(request, digests, counters, out):
             shutil.rmtree(stage_scratch, ignore_errors=True)
             return 0
         check_outputs(request.inputs.values(), request.threads)
@@ -218,6 +227,7 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
         start = time.perf_counter()
         try:
             work(job)
+            _check_counters(job, counters)
         except BaseException:
             shutil.rmtree(out, ignore_errors=True)
             raise
@@ -230,22 +240,35 @@ def _run_locked(request: Request, work: Callable[[Job], None]) -> int:
     return 0
 
 
-def _is_done(request: Request, inputs: dict[str, str]) -> bool:
-    record = _finished(request.out)
+def _check_counters(job: Job, model: type[StageCounters]) -> None:
+    """Raises: TypeError: the stage recorded no counters, or other ones than it declares."""
+    if type(job.counters) is not model:
+        found = type(job.counters).__name__
+        raise TypeError(f"stage {job.stage} declares {model.__name__}, and recorded {found}")
+    # A copy with changed fields is not validated when it is made.
+    model.model_validate(job.counters.recorded())
+
+
+def _is_done(request: Request, inputs: dict[str, str], counters: type[StageCounters]) -> bool:
+    record = _finished(request.out, counters)
     if record is None or record.identity != identity(request.key, inputs):
         return False
     return output_digests(request.out, request.threads) == record.outputs
 
 
-def _finished(folder: Path) -> StageRecord | None:
+def _finished(folder: Path, counters: type[StageCounters]) -> StageRecord | None:
     """The hidden record of a finished stage; None if it is missing or damaged."""
     try:
-        return read_record(folder / HIDDEN_STAGE, StageRecord)
-    except (UserError, OSError):
+        record = read_record(folder / HIDDEN_STAGE, StageRecord)
+        counters.model_validate(record.counters)
+    except (UserError, OSError, ValidationError):
         return None
+    return record
 
 
-def _reuse_other_run(request: Request, inputs: dict[str, str], out: Path) -> bool:
+def _reuse_other_run(
+    request: Request, inputs: dict[str, str], counters: type[StageCounters], out: Path
+) -> bool:
     """Link the results of another run with the same key and inputs, if there is one.
 
     Files are hard links if the file system supports them. This is safe, because stages replace
@@ -254,7 +277,7 @@ def _reuse_other_run(request: Request, inputs: dict[str, str], out: Path) -> boo
     required = identity(request.key, inputs)
     for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/{HIDDEN_STAGE}")):
         source = hidden.parent
-        record = _finished(source)
+        record = _finished(source, counters)
         if source == request.out or record is None or record.identity != required:
             continue
         try:
@@ -300,7 +323,7 @@ def _write_records(job: Job, inputs: dict[str, str], wall: float) -> None:
         key=job.key,
         inputs=inputs,
         outputs=output_digests(job.out, job.threads),
-        counters=json.loads(canonical(job.counters)),  # tuples become lists
+        counters=job.counters.recorded(),
         decisions=tuple(job.decisions),
         warnings=tuple(job.warnings),
     )

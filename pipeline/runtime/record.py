@@ -44,7 +44,10 @@ class StageRecord(BaseModel):
     outputs: dict[str, str] = Field(
         description="Path of a file, relative to the stage's folder, to the SHA-256 of its bytes."
     )
-    counters: dict[str, Any] = Field(description="Counts and measures of the result.")
+    counters: dict[str, Any] = Field(
+        description="Counts and measures of the result; `counters.schema.json` has those of each "
+        "stage."
+    )
     decisions: tuple[str, ...] = Field(description="What the stage decided and why.")
     warnings: tuple[str, ...] = Field(description="What the user should know.")
 
@@ -168,10 +171,16 @@ def read_record(path: Path, model: type[M], fix: str | None = None) -> M:
         raise unreadable(path, error, fix) from None
 
 
-def unreadable(path: Path, error: ValidationError, fix: str) -> UserError:
-    """The error for a record that does not fit its model."""
+def unreadable(
+    path: Path, error: ValidationError, fix: str, inside: tuple[str, ...] = ()
+) -> UserError:
+    """The error for a record that does not fit its model.
+
+    Args:
+        inside: the field of the record that was validated; empty: all of it.
+    """
     first = error.errors()[0]
-    where = ".".join(map(str, first["loc"]))
+    where = ".".join(map(str, (*inside, *first["loc"])))
     found = f"{where}: {first['msg']}" if where else first["msg"]
     return UserError(
         f"cannot be read: it is damaged or from another version of the program ({found})",

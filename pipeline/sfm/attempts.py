@@ -15,10 +15,11 @@ from pathlib import Path
 
 import pycolmap
 
+from pipeline.sfm.counters import AttemptRecord, Mapper
 from pipeline.sfm.database import DEFAULT_FOCAL_FACTOR, share_cameras_by_size
 from pipeline.sfm.evidence import collect_evidence
-from pipeline.sfm.judge import Evidence, Grade, Verdict, judge
-from pipeline.sfm.mappers import Mapper, run_mapper
+from pipeline.sfm.judge import Evidence, Verdict, judge
+from pipeline.sfm.mappers import run_mapper
 
 # Initial focal lengths over the longer side that are tried: wide, normal and long lens.
 SWEPT_FOCALS = (0.55, DEFAULT_FOCAL_FACTOR, 2.5)
@@ -27,25 +28,6 @@ SAME_FOCAL_RATIO = 1.4
 FISHEYE_FOCAL = 0.4
 # A lens with a focal length over the longer side below this may be a fisheye.
 FISHEYE_BELOW = 0.6
-
-
-@dataclass(frozen=True)
-class AttemptRecord:
-    """One mapping attempt, as recorded in ``stage.json``.
-
-    Attributes:
-        change: difference from the first attempt in words, "" for the first.
-        registered: number of registered photographs in the largest model, 0 without a model.
-        verdict, reasons: see ``judge.Verdict``.
-        taken: whether the stage uses the model of this attempt.
-    """
-
-    mapper: Mapper
-    change: str
-    registered: int
-    verdict: Grade
-    reasons: list[str]
-    taken: bool
 
 
 @dataclass(frozen=True)
@@ -67,12 +49,12 @@ class Attempt:
 
     def record(self, taken: bool) -> AttemptRecord:
         return AttemptRecord(
-            self.mapper,
-            self.change,
-            int(self.models[0].num_reg_images()) if self.models else 0,
-            self.verdict.grade,
-            self.verdict.reasons,
-            taken,
+            mapper=self.mapper,
+            change=self.change,
+            registered=int(self.models[0].num_reg_images()) if self.models else 0,
+            verdict=self.verdict.grade,
+            reasons=self.verdict.reasons,
+            taken=taken,
         )
 
 

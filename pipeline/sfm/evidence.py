@@ -40,11 +40,8 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
     behind, observations, angles = _geometry(model)
     camera_of = {i: model.image(i).camera_id for i in registered}
     used = set(camera_of.values())
-    priors = {}
+    priors = focal_priors(database)
     with pycolmap.Database.open(database) as opened:
-        for camera in opened.read_all_cameras():
-            if camera.has_prior_focal_length and camera.camera_id in used:
-                priors[camera.camera_id] = float(camera.mean_focal_length())
         verified = _verified_pairs(opened)
         pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(registered)}
         explained = _explained_matches(model, opened, pairs)
@@ -52,7 +49,11 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         consistency = measure_consistency(model, opened, pairs)
     focal = {i: float(model.camera(i).mean_focal_length()) for i in used}
     side = {i: max(model.camera(i).width, model.camera(i).height) for i in used}
-    off = {i: max(focal[i] / prior, prior / max(focal[i], 1e-9)) for i, prior in priors.items()}
+    off = {
+        i: max(focal[i] / prior, prior / max(focal[i], 1e-9))
+        for i, prior in priors.items()
+        if i in used
+    }
     offs = [off[camera_id] for camera_id in camera_of.values() if camera_id in off]
     focal_off = float(np.median(offs)) if offs else None
     return Evidence(
@@ -73,8 +74,17 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         focal_off=focal_off,
         focal_certainty=None if _agrees_with_exif(focal_off) else _focal_certainty(model),
         focal_relative=float(np.median([focal[c] / side[c] for c in camera_of.values()])),
-        focal_prior_px=priors,
     )
+
+
+def focal_priors(database: Path) -> dict[int, float]:
+    """Camera id -> focal length from EXIF in pixels, for the cameras that have one."""
+    with pycolmap.Database.open(database) as opened:
+        return {
+            camera.camera_id: float(camera.mean_focal_length())
+            for camera in opened.read_all_cameras()
+            if camera.has_prior_focal_length
+        }
 
 
 def _geometry(model: pycolmap.Reconstruction) -> tuple[float, int, NDArray[np.float64]]:

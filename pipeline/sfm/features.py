@@ -15,6 +15,7 @@ import numpy as np
 from pipeline.config import schema
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.sfm.counters import FeaturesCounters
 from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
@@ -30,12 +31,11 @@ class FeatureReport:
     """Result of the features stage.
 
     Attributes:
-        counts: photograph name -> number of keypoints.
         num_cached: number of photographs whose keypoints were found in the cache.
         decisions, warnings: sentences for the log.
     """
 
-    counts: dict[str, int]
+    counters: FeaturesCounters
     num_cached: int
     decisions: list[str]
     warnings: list[str]
@@ -82,7 +82,7 @@ def extract_features(
     num_cached = len(manifest.photos) - len(absent)
     median = int(np.median(list(counts.values()))) if counts else 0
     return FeatureReport(
-        counts=counts,
+        counters=FeaturesCounters(counts=counts),
         num_cached=num_cached,
         decisions=[
             f"SIFT by {config.backend}: a median of {median} keypoints in each of "

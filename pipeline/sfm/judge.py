@@ -12,6 +12,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from pydantic import BaseModel, ConfigDict, Field
+
 Grade = Literal["good", "weak", "failed"]
 
 # Thresholds (failed, weak), chosen on the corpus of ``python -m benchmarks.judge``: each lies
@@ -55,47 +57,56 @@ _REPEATED = (
 )
 
 
-@dataclass(frozen=True)
-class Evidence:
-    """Statistics of a model from which ``judge`` derives its verdict.
+class Evidence(BaseModel):
+    """Statistics of a model from which ``judge`` derives its verdict."""
 
-    Attributes:
-        registered, total: numbers of registered images and of all images.
-        reachable: number of images in the largest connected component of the view graph.
-        points, observations_per_image, mean_track_length, reprojection_px: of the model, as COLMAP
-            reports them.
-        explained_matches: share of the verified matches between registered images whose two
-            keypoints are observations of the same 3D point.
-        agreeing_matches, agreeing_pairs, missing_covisibility: see ``consistency.Consistency``.
-        behind_camera: share of observations whose point is behind the camera.
-        parallax: residual of the matches under pure rotation, as a share of the longer side.
-        median_angle_deg: median over the points of the triangulation angle.
-        focal_off: median over the images with an EXIF prior of max(f / prior, prior / f); None
-            without any prior. Images cropped after capture have wrong priors.
-        focal_certainty: smallest relative increase of the bundle adjustment cost for a focal length
-            that is off by 20%; None (not computed) if the focal length agrees with EXIF.
-        focal_relative: median over the images of the focal length over the longer side.
-        focal_prior_px: camera id -> EXIF prior, pixels.
-    """
+    model_config = ConfigDict(extra="forbid", frozen=True)
 
-    registered: int
-    total: int
-    reachable: int
-    points: int
-    observations_per_image: float
-    mean_track_length: float
-    reprojection_px: float
-    explained_matches: float
-    agreeing_matches: float
-    agreeing_pairs: float
-    missing_covisibility: float
-    behind_camera: float
-    parallax: float
-    median_angle_deg: float
-    focal_off: float | None
-    focal_certainty: float | None
-    focal_relative: float
-    focal_prior_px: dict[int, float]
+    registered: int = Field(description="Number of registered images.")
+    total: int = Field(description="Number of all images.")
+    reachable: int = Field(
+        description="Number of images in the largest connected component of the view graph."
+    )
+    points: int = Field(description="Number of points.")
+    observations_per_image: float = Field(description="Mean number of observations per image.")
+    mean_track_length: float = Field(description="Mean number of observations per point.")
+    reprojection_px: float = Field(description="Mean reprojection error, pixels.")
+    explained_matches: float = Field(
+        description="Share of the verified matches between registered images whose two keypoints "
+        "are observations of the same point."
+    )
+    agreeing_matches: float = Field(
+        description="Share of the verified matches between registered images that satisfy the "
+        "epipolar constraint of the model's relative pose and triangulate in front of both cameras."
+    )
+    agreeing_pairs: float = Field(
+        description="Share of the strong pairs of which at least half of the matches agree."
+    )
+    missing_covisibility: float = Field(
+        description="Share of neighbouring images that should observe many common points and "
+        "observe few."
+    )
+    behind_camera: float = Field(
+        description="Share of the observations whose point is behind the camera."
+    )
+    parallax: float = Field(
+        description="Residual of the matches under pure rotation, as a share of the longer side."
+    )
+    median_angle_deg: float = Field(
+        description="Median over the points of the triangulation angle, degrees."
+    )
+    focal_off: float | None = Field(
+        description="Median over the images with an EXIF focal length of the factor by which it "
+        "differs from the model's, at least 1; null without EXIF focal lengths. Images cropped "
+        "after capture have wrong ones."
+    )
+    focal_certainty: float | None = Field(
+        description="Smallest relative increase of the bundle adjustment cost for a focal length "
+        "that is off by 20 %; null (not computed) if the focal length agrees with EXIF."
+    )
+    focal_relative: float = Field(
+        description="Median over the images of the focal length over the longer side."
+    )
 
 
 @dataclass(frozen=True)

@@ -21,6 +21,7 @@ from pipeline.config import schema
 from pipeline.geometry.similarity import robust_similarity
 from pipeline.io.posefiles import pose_files
 from pipeline.sfm.alignment import transform_model
+from pipeline.sfm.counters import RefineCounters
 from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap
 from pipeline.sfm.refine import Refined, adjust_points, bundle_adjust, refine
@@ -43,18 +44,9 @@ Tracks = list[tuple[int, list[int]]]
 
 @dataclass(frozen=True)
 class KnownPosesReport:
-    """Result of ``refine_known_poses``.
+    """Result of ``refine_known_poses``. ``decisions`` are sentences for the log."""
 
-    Attributes:
-        freed: whether camera parameters were freed and the model adjusted; otherwise the output is
-            a copy of the input.
-        error_before_px, error_px: mean reprojection errors of the input and the output.
-        decisions: sentences for the log.
-    """
-
-    freed: bool
-    error_before_px: float
-    error_px: float
+    counters: RefineCounters
     decisions: list[str]
 
 
@@ -83,7 +75,8 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
         for file in pose_files(sparse):
             shutil.copy(file, out)
         unchanged = [*refined.decisions, "known poses are unchanged"]
-        return KnownPosesReport(False, before, before, unchanged)
+        counters = RefineCounters(freed=False, error_before_px=before, error_px=before)
+        return KnownPosesReport(counters, unchanged)
     _copy_parameters(model, adjusted)
     adjust_points(model, loss_px=LOSS_PX, done=adjusted.point3D_ids())
     _align(model, anchors, original)
@@ -93,7 +86,8 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
         f"known poses, points and cameras adjusted to their tracks: mean reprojection error "
         f"{before:.3f} px before, {after:.3f} px after"
     )
-    return KnownPosesReport(True, before, after, [*refined.decisions, decision])
+    counters = RefineCounters(freed=True, error_before_px=before, error_px=after)
+    return KnownPosesReport(counters, [*refined.decisions, decision])
 
 
 def _adjust_more_tracks(

@@ -5,13 +5,11 @@ from __future__ import annotations
 import shutil
 import tempfile
 from pathlib import Path
-from typing import Literal
 
 import pycolmap
 
 from pipeline.runtime.progress import Progress
-
-Mapper = Literal["incremental", "global"]
+from pipeline.sfm.counters import Mapper
 
 # Smallest number of registered images of a model (2 for a scene of two photographs).
 MIN_MODEL_SIZE = 3

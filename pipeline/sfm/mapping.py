@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pycolmap
@@ -19,10 +19,10 @@ from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
-from pipeline.sfm.attempts import Attempt, AttemptRecord, map_until_good
-from pipeline.sfm.evidence import collect_evidence
+from pipeline.sfm.attempts import Attempt, map_until_good
+from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
+from pipeline.sfm.evidence import collect_evidence, focal_priors
 from pipeline.sfm.georeference import summary
-from pipeline.sfm.judge import Evidence
 from pipeline.sfm.matching import list_names
 from pipeline.sfm.models import Colors, color_points, write_model
 from pipeline.sfm.quiet import quiet_colmap
@@ -32,50 +32,10 @@ KNOWN_POSES_HINT = "or give known poses (sparse/0, transforms.json)"
 
 
 @dataclass(frozen=True)
-class CameraSummary:
-    """One camera of the model: size, parameters (pixels, COLMAP's order), number of registered
-    images and EXIF focal length."""
-
-    camera_id: int
-    model: str
-    width: int
-    height: int
-    params: list[float]
-    num_images: int
-    focal_prior_px: float | None
-
-
-@dataclass(frozen=True)
 class SfmReport:
-    """Result of the sfm stage.
+    """Result of the sfm stage. ``decisions`` and ``warnings`` are sentences for the log."""
 
-    Attributes:
-        mapper: the mapper that produced the model.
-        registered, total: numbers of registered photographs and of all photographs.
-        not_registered: names of the photographs without a pose.
-        mean_reprojection_error_px, num_points, mean_track_length: of the model.
-        other_models: numbers of images of the smaller models, written to ``other_models``.
-        cameras: the model's cameras.
-        verdict: "good" or "weak" (a failed reconstruction raises).
-        evidence: statistics behind the verdict (see ``judge.Evidence``).
-        attempts: the mapping attempts, in order (see ``attempts``).
-        georeference: method, origin and residuals (see ``georeference.WorldFrame``).
-        decisions, warnings: sentences for the log.
-    """
-
-    mapper: str
-    registered: int
-    total: int
-    not_registered: list[str]
-    mean_reprojection_error_px: float
-    num_points: int
-    mean_track_length: float
-    other_models: list[int]
-    cameras: list[CameraSummary]
-    verdict: str
-    evidence: dict[str, float | int | None]
-    attempts: list[AttemptRecord]
-    georeference: dict[str, Any]
+    counters: SfmCounters
     decisions: list[str]
     warnings: list[str]
 
@@ -137,6 +97,7 @@ def reconstruct(
             evidence = collect_evidence(model, attempt.database, total)
         else:
             decisions.append("cameras not refined further: the model is weak and would overfit")
+        cameras = _camera_summaries(model, focal_priors(attempt.database))
     frame = align_model(model, manifest, config.georeference, ground_control)
     decisions += frame.decisions
     warnings += frame.warnings
@@ -167,7 +128,7 @@ def reconstruct(
             f"the reconstruction is weak: {'; '.join(attempt.verdict.reasons)} (to improve it: "
             f"{'; '.join(attempt.verdict.remedies)})"
         )
-    return SfmReport(
+    counters = SfmCounters(
         mapper=attempt.mapper,
         registered=len(registered),
         total=total,
@@ -176,18 +137,17 @@ def reconstruct(
         num_points=int(model.num_points3D()),
         mean_track_length=float(model.compute_mean_track_length()),
         other_models=[int(other.num_reg_images()) for other in others],
-        cameras=_camera_summaries(model, evidence),
+        cameras=cameras,
         verdict=attempt.verdict.grade,
-        evidence={k: v for k, v in asdict(evidence).items() if k != "focal_prior_px"},
+        evidence=evidence,
         attempts=attempts,
         georeference={
             "method": frame.method,
             "origin": frame.origin,
             "residuals_m": summary(frame.residuals),
         },
-        decisions=decisions,
-        warnings=warnings,
     )
+    return SfmReport(counters, decisions, warnings)
 
 
 def _describe(record: AttemptRecord, total: int) -> str:
@@ -236,7 +196,10 @@ def _read_colors(path: Path) -> Colors | None:
         return {int(key): data[key] for key in data.files}
 
 
-def _camera_summaries(model: pycolmap.Reconstruction, evidence: Evidence) -> list[CameraSummary]:
+def _camera_summaries(
+    model: pycolmap.Reconstruction, priors: Mapping[int, float]
+) -> list[CameraSummary]:
+    """The cameras of registered images; ``priors``: camera id -> focal length from EXIF, pixels."""
     count: dict[int, int] = {}
     for image_id in model.reg_image_ids():
         camera_id = model.image(image_id).camera_id
@@ -249,7 +212,7 @@ def _camera_summaries(model: pycolmap.Reconstruction, evidence: Evidence) -> lis
             height=camera.height,
             params=[float(value) for value in camera.params],
             num_images=count[camera_id],
-            focal_prior_px=evidence.focal_prior_px.get(camera_id),
+            focal_prior_px=priors.get(camera_id),
         )
         for camera_id, camera in sorted(model.cameras.items())
         if camera_id in count

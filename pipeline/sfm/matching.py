@@ -19,6 +19,7 @@ from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm import pairs as choose
+from pipeline.sfm.counters import MatchesCounters
 from pipeline.sfm.database import (
     MatchingSettings,
     build_database,
@@ -36,21 +37,11 @@ class MatchReport:
     """Result of the matches stage.
 
     Attributes:
-        num_pairs, num_verified: numbers of matched pairs and of pairs with a two-view geometry.
-        median_inliers: median number of inliers of the verified pairs.
-        components: sizes of the connected components of the view graph, largest first.
-        isolated: names of the photographs outside the largest component.
-        num_cameras: number of cameras.
         num_cached: number of pairs found in the cache.
         decisions, warnings: sentences for the log.
     """
 
-    num_pairs: int
-    num_verified: int
-    median_inliers: int
-    components: list[int]
-    isolated: list[str]
-    num_cameras: int
+    counters: MatchesCounters
     num_cached: int
     decisions: list[str]
     warnings: list[str]
@@ -114,13 +105,16 @@ def match_features(
         )
     priors = sum(camera.has_prior_focal_length for camera in cameras)
     median = int(np.median(list(verified.values())))
-    return MatchReport(
+    counters = MatchesCounters(
         num_pairs=len(pairs),
         num_verified=len(verified),
         median_inliers=median,
         components=components,
         isolated=isolated,
         num_cameras=len(cameras),
+    )
+    return MatchReport(
+        counters=counters,
         num_cached=num_cached,
         decisions=[
             decision,

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import numpy as np
 
@@ -12,6 +11,7 @@ from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
+from pipeline.splats.counters import InitCounters
 from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
 
 # With fewer sparse points than this, Gaussians are initialised at random.
@@ -23,7 +23,7 @@ class FirstGaussians:
     """Initial Gaussians, with the counters, decisions and warnings of the init stage."""
 
     gaussians: InitGaussians
-    counters: dict[str, Any]
+    counters: InitCounters
     decisions: list[str]
     warnings: list[str] = field(default_factory=list)
 
@@ -52,10 +52,10 @@ def first_gaussians(
         centres = np.array([view.centre for view in training])
         first = gaussians_from_points(points, centres, config, 0, experiments)
     source = "random positions" if method == "random" else "points"
-    counters = {
-        "num_gaussians": len(first),
-        "points": len(points),
-        "dropped": first.num_dropped,
-        "thinned": first.num_thinned,
-    }
+    counters = InitCounters(
+        num_gaussians=len(first),
+        points=len(points),
+        dropped=first.num_dropped,
+        thinned=first.num_thinned,
+    )
     return FirstGaussians(first, counters, [f"{len(first)} Gaussians from {source}"], warnings)

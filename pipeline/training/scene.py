@@ -25,6 +25,7 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
 from pipeline.training.density.floaters import empty_depths
 from pipeline.training.loop import metrics_log
+from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
 
@@ -56,7 +57,7 @@ class TrainedScene:
     gains: dict[str, list[float]]
     decisions: list[str]
     warnings: list[str]
-    counters: dict[str, Any]
+    counters: TrainCounters
     timings: dict[str, Any]
 
 
@@ -117,12 +118,13 @@ def train_scene(
     if result.poses is not None:
         refined = with_poses(refined, with_common_motion(views, result.poses))
         notes.decisions.append(describe_poses(views, result.poses))
-    notes.counters |= {
-        "num_gaussians": len(result.gaussians),
-        "steps": result.steps,
-        "known_depths": sum(map(len, inputs.depths or ())),
+    counters = TrainCounters(
+        num_gaussians=len(result.gaussians),
+        steps=result.steps,
+        known_depths=sum(map(len, inputs.depths or ())),
+        **notes.counters,
         **result.counters,
-    }
+    )
     timings = {
         "ms_per_step": round(1e3 * result.seconds / result.steps, 3),
         "curve_seconds": result.curve_seconds,
@@ -134,7 +136,7 @@ def train_scene(
         gains=gains,
         decisions=notes.decisions,
         warnings=notes.warnings,
-        counters=notes.counters,
+        counters=counters,
         timings=timings,
     )
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 from pipeline.config.schema import Split, Views
 from pipeline.io.colmap import has_model, read_model
 from pipeline.plan.given_poses import GEOREFERENCE
+from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
@@ -65,6 +66,21 @@ def trained_model(job: Job) -> Reconstruction:
 def input_views(job: Job) -> list[View]:
     """All views, with the cameras before training."""
     return _views(job, input_model(job))
+
+
+def training_views(job: Job) -> list[View]:
+    """The views that are not test views, with the cameras before training.
+
+    Raises:
+        UserError: there are none.
+    """
+    found = [view for view in input_views(job) if not view.is_test]
+    if not found:
+        raise UserError(
+            "expected training views, found no photograph with a pose",
+            fix="check the photographs' names in the pose file, or set poses: ignore",
+        )
+    return found
 
 
 def trained_gaussians(job: Job) -> Gaussians:

@@ -21,6 +21,9 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+from pipeline.runtime.counters import read_counters
+from pipeline.splats.counters import InitCounters
+from pipeline.training.loop.counters import TrainCounters
 from tests.e2e.harness import TINY, TINY_DEMO, copy_project, make_scene, snakemake
 
 FILE = Path(__file__).with_name("expected.json")
@@ -49,22 +52,22 @@ def observe(project: Path, scene: str) -> dict[str, Any]:
     """What one finished run gave, by the names of ``MEASURED`` and ``EXACT``."""
     folder = project / "results" / scene
     found = json.loads((folder / "metrics.json").read_text())
-    train = json.loads((folder / "train" / "stage.json").read_text())["counters"]
-    start = json.loads((folder / "init" / "stage.json").read_text())["counters"]
+    train = read_counters(folder / "train", TrainCounters)
+    start = read_counters(folder / "init", InitCounters)
     return {
         "stages": sorted(name for name, s in found["stages"].items() if not s["skipped"]),
         "registered_images": found["registered_images"],
         "total_images": found["total_images"],
         "held_out_views": found["protocol"]["num_views"],
-        "steps": train["steps"],
+        "steps": train.steps,
         "psnr_db": found["psnr"],
         "train_psnr_db": found["train_psnr"],
         "ssim": found["ssim"],
         "gaussians": found["num_gaussians"],
-        "cloned": train["changes"]["cloned"],
-        "split": train["changes"]["split"],
-        "pruned": train["changes"]["pruned"],
-        "sparse_points": start["points"],
+        "cloned": train.changes.cloned,
+        "split": train.changes.split,
+        "pruned": train.changes.pruned,
+        "sparse_points": start.points,
         "reprojection_error_px": found["reprojection_error_px"],
         "rotation_error_deg": found["pose_error"]["rotation_median_deg"],
         "centre_error_share": found["pose_error"]["centre_relative_median"],

@@ -11,7 +11,11 @@ import subprocess
 import pytest
 from PIL import Image
 
+from pipeline.plan.record import read_plan
 from pipeline.reporting.metrics import Metrics
+from pipeline.runtime.counters import read_counters
+from pipeline.runtime.errors import UserError
+from stages.workflow.registry import STAGES
 from tests.documented import commands
 from tests.e2e.harness import (
     TINY,
@@ -61,6 +65,22 @@ def test_photographs_become_a_scene(finished):
     logs = [p.read_bytes() for p in (folder / "logs").glob("*.log")]
     assert logs
     assert not any(b"\r" in log for log in logs)
+
+
+def test_counters_and_plan_fit_their_models(finished, tmp_path):
+    folder = finished / "results/tiny"
+    plan = read_plan(folder)
+    ran = [name for name in plan.order if plan.stages[name].run]
+    assert list(STAGES) == plan.order and "train" in ran
+    for name in ran:
+        record = json.loads((folder / name / "stage.json").read_text())
+        model = STAGES[name].counters
+        assert read_counters(folder / name, model).recorded() == record["counters"]
+        record["counters"]["unknown"] = 1
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "stage.json").write_text(json.dumps(record))
+        with pytest.raises(UserError, match=f"{name}/stage.json: cannot be read.*\n.*{name}$"):
+            read_counters(tmp_path / name, model)
 
 
 def test_a_second_run_does_nothing_and_a_dry_run_shows_the_plan(project):

@@ -30,7 +30,7 @@ def test_a_plan_comes_back_from_its_file(tmp_path):
     [
         ("", "Invalid JSON"),
         (json.dumps(WHOLE)[:-40], "Invalid JSON"),
-        ("[]", "valid dictionary"),
+        ("[]", "should be an object"),
         ('{"fox": 1}', "scene: Field required"),
         (json.dumps(WHOLE | {"version": 2}), "version: Input should be 1"),
         (json.dumps(WHOLE | {"facts": {}}), "facts.photographs: Field required"),

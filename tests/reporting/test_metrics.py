@@ -1,23 +1,28 @@
 """metrics.json: gathered from records, the same on any machine; times come from run.json."""
 
 import json
+from collections.abc import Mapping
+from pathlib import Path
 
 import pytest
 
+from pipeline.plan.record import PlanRecord
 from pipeline.plan.values import StagePlan
 from pipeline.reporting.collect import collect_metrics
 from pipeline.reporting.headline import headline, main
 from pipeline.reporting.metrics import Metrics, read_metrics, read_runs, with_times
 from pipeline.runtime.atomic import write_json
+from pipeline.runtime.counters import NoCounters, StageCounters
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import RunRecord, StageRecord
+from tests.counters import INSPECT, REFINE, SFM, TRAIN
 from tests.plans import record_of
 
-COUNTERS = {
-    "inspect": {"photos": 7, "left_out": 1},
-    "sfm": {"registered": 6, "mean_reprojection_error_px": 0.5, "verdict": "good"},
-    "train": {"num_gaussians": 1000},
-    "report": {},
+COUNTERS: dict[str, StageCounters] = {
+    "inspect": INSPECT,
+    "sfm": SFM,
+    "train": TRAIN,
+    "report": NoCounters(),
 }
 PLAN = record_of(
     {name: StagePlan(run=True, reason="needed") for name in COUNTERS}
@@ -58,23 +63,31 @@ def run(wall: float, **more) -> RunRecord:
 def folder(tmp_path):
     """A finished scene's records."""
     scene = tmp_path / "barn"
-    for name, counters in COUNTERS.items():
+    write_records(scene, COUNTERS)
+    found = collect(scene, PLAN)
+    write_json(scene / "report" / "metrics.json", found.model_dump(mode="json"))
+    return scene
+
+
+def collect(scene: Path, plan: PlanRecord) -> Metrics:
+    return collect_metrics("barn", plan, scene, EVALUATION, seed=3, versions={"torch": "2"})
+
+
+def write_records(scene: Path, counters_of: Mapping[str, StageCounters]) -> None:
+    for name, counters in counters_of.items():
         record = StageRecord(
             stage=name,
             scene="barn",
             key={},
             inputs={},
             outputs={},
-            counters=counters,
+            counters=counters.recorded(),
             decisions=(),
             warnings=("it is dark", f"{name} is unsure") if name == "sfm" else (),
         )
         write_json(scene / name / "stage.json", record.model_dump(mode="json"))
         more = {"earlier_s": 2.0} if name == "train" else {}
         write_json(scene / name / "run.json", run(3.0, **more).model_dump(mode="json"))
-    found = collect_metrics("barn", PLAN, scene, EVALUATION, seed=3, versions={"torch": "2"})
-    write_json(scene / "report" / "metrics.json", found.model_dump(mode="json"))
-    return scene
 
 
 def test_metrics_come_from_the_records_and_hold_no_times(folder):
@@ -85,6 +98,26 @@ def test_metrics_come_from_the_records_and_hold_no_times(folder):
     assert found.stages["decode"].skipped and not found.stages["train"].skipped
     assert "_s" not in "".join(found.stages["train"].model_dump())
     assert json.loads((folder / "report" / "metrics.json").read_text())["schema_version"] == 1
+
+
+def test_given_poses_count_as_registered_and_have_the_error_of_their_adjustment(tmp_path):
+    given = INSPECT.model_copy(update={"given_poses": 5, "given_points": 0})
+    write_records(tmp_path, {"inspect": given, "refine": REFINE, "train": TRAIN})
+    ran = {name: StagePlan(run=True, reason="") for name in ("inspect", "refine", "train")}
+    found = collect(tmp_path, record_of(ran))
+    assert (found.registered_images, found.reprojection_error_px) == (5, REFINE.error_px)
+    assert found.sfm_verdict is None and found.georeference is None
+    (tmp_path / "refine" / "stage.json").unlink()
+    del ran["refine"]
+    assert collect(tmp_path, record_of(ran)).reprojection_error_px is None
+
+
+@pytest.mark.parametrize("name", ["inspect", "sfm", "train"])
+def test_damaged_counters_are_one_clear_error(folder, name):
+    file = folder / name / "stage.json"
+    file.write_text(json.dumps(json.loads(file.read_text()) | {"counters": {"frames": 3}}))
+    with pytest.raises(UserError, match=rf"{name}/stage.json: cannot be read.*\n.*forcerun {name}"):
+        collect(folder, PLAN)
 
 
 def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):

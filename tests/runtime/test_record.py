@@ -10,6 +10,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.io.recorded import digest_of, read_recorded
+from pipeline.runtime.counters import NoCounters, StageCounters, read_counters
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job, Request, run_stage
 from pipeline.runtime.record import (
@@ -33,6 +34,11 @@ def _temporary_files_stay_where_they_were(monkeypatch):
     monkeypatch.setattr(tempfile, "tempdir", None)
 
 
+class Shape(StageCounters):
+    shape: tuple[int, float]
+    colours: int | None = None
+
+
 @pytest.fixture
 def first(tmp_path):
     """A request whose stage has run, with two files."""
@@ -42,9 +48,9 @@ def first(tmp_path):
         (job.out / "sparse").mkdir()
         (job.out / "sparse" / "images.bin").write_bytes(b"cameras")
         (job.out / "points.bin").write_bytes(b"points")
-        job.counters["shape"] = (3, 0.1)
+        job.counters = Shape(shape=(3, 0.1))
 
-    assert run_stage(asked, work) == 0
+    assert run_stage(asked, work, Shape) == 0
     return asked
 
 
@@ -83,9 +89,9 @@ def test_a_changed_input_is_an_error_and_the_command_in_it_repairs_it(
         (job.out / "sparse").mkdir()
         (job.out / "sparse" / "images.bin").write_bytes(b"cameras")
         (job.out / "points.bin").write_bytes(b"points")
-        job.counters["shape"] = (3, 0.1)
+        job.counters = Shape(shape=(3, 0.1))
 
-    assert run_stage(first, again) == 0
+    assert run_stage(first, again, Shape) == 0
     assert output_digests(first.out) == before
     assert run_stage(second, lambda job: None) == 0
 
@@ -128,8 +134,48 @@ def test_a_damaged_record_of_an_input_ends_the_stage_with_a_message(first, secon
     assert "stage.json: cannot be read" in message and "Traceback" not in message
     # --forcerun: the work is there, and its hidden record puts the declared one back.
     (first.out / "stage.json").unlink()
-    assert run_stage(first, never) == 0
+    assert run_stage(first, never, Shape) == 0
     assert (first.out / "stage.json").read_text() == whole
+
+
+def test_counters_come_back_from_the_record(first):
+    assert read_counters(first.out, Shape) == Shape(shape=(3, 0.1))
+    recorded = json.loads((first.out / "stage.json").read_text())["counters"]
+    assert recorded == {"shape": [3, 0.1]}, "a field that is not set is not recorded"
+    assert Shape(shape=(3, 0.1), colours=None).recorded() == recorded | {"colours": None}
+
+
+@pytest.mark.parametrize(
+    ("counters", "said"),
+    [
+        ({}, "counters.shape: Field required"),
+        ({"shape": [3]}, "counters.shape.1: Field required"),
+        ({"shape": [3, "many"]}, "counters.shape.1: Input should be a valid number"),
+        ({"shape": [3, 0.1], "size": 4}, "counters.size: Extra inputs"),
+        ([], "counters: Input should be an object"),
+    ],
+)
+def test_counters_that_do_not_fit_are_one_clear_error(first, counters, said):
+    record = json.loads((first.out / "stage.json").read_text()) | {"counters": counters}
+    (first.out / "stage.json").write_text(json.dumps(record))
+    with pytest.raises(UserError) as caught:
+        read_counters(first.out, Shape)
+    message = str(caught.value)
+    assert "first/stage.json: cannot be read" in message and said in message
+    assert "--forcerun first" in message
+
+
+@pytest.mark.parametrize("counters", [NoCounters(), Shape.model_construct(shape="square")])
+def test_a_stage_that_records_other_counters_than_it_declares_fails(first, counters, capfd):
+    """A fault of the program: with a traceback, and without an output."""
+    before = (first.out / "stage.json").read_text()
+
+    def work(job: Job) -> None:
+        job.counters = counters
+
+    assert run_stage(replace(first, key=KEY | {"seed": 1}), work, Shape) == 1
+    assert "Shape" in capfd.readouterr().err
+    assert (first.out / "stage.json").read_text() == before
 
 
 def test_another_stages_record_is_refused(first):
@@ -140,14 +186,16 @@ def test_another_stages_record_is_refused(first):
 
 
 def test_a_damaged_hidden_record_has_the_work_done_again(first):
-    for content in ("", "[]", "{}", '{"key": 3}'):
+    whole = (first.out / ".stage.json").read_text()
+    for content in ("", "[]", "{}", '{"key": 3}', whole.replace('"shape"', '"form"')):
         (first.out / ".stage.json").write_text(content)
         worked = []
 
         def work(job: Job, worked: list = worked) -> None:
             worked.append(job.stage)
+            job.counters = Shape(shape=(3, 0.1))
 
-        assert run_stage(first, work) == 0
+        assert run_stage(first, work, Shape) == 0
         assert worked == ["first"]
 
 

@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import hashlib
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +17,12 @@ def digests(folder: Path) -> dict[str, str]:
         str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
         for path in files
     }
+
+
+def flat(report: Any) -> dict[str, Any]:
+    """A stage's report, its counters as in ``stage.json``."""
+    values = vars(report).copy()
+    return values.pop("counters").recorded() | values
 
 
 def match(
@@ -42,7 +47,7 @@ def match(
         threads=threads,
         seed=0,
     )
-    return asdict(report)
+    return flat(report)
 
 
 def reconstruct(
@@ -50,7 +55,7 @@ def reconstruct(
 ) -> dict[str, Any]:
     from pipeline.sfm import mapping
 
-    return asdict(mapping.reconstruct(manifest, database, config, out, threads=threads, seed=0))
+    return flat(mapping.reconstruct(manifest, database, config, out, threads=threads, seed=0))
 
 
 def match_and_reconstruct(

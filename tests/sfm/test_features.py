@@ -47,7 +47,7 @@ def test_the_strongest_keypoints_are_selected_and_sorted_by_scale(tmp_path, pixe
     photo = saved(tmp_path, "a.png", pixels)
     found, report = extract(tmp_path, [photo])
     keypoints = found["a.png"]
-    assert len(keypoints) == report.counts["a.png"] == CONFIG.max_features
+    assert len(keypoints) == report.counters.counts["a.png"] == CONFIG.max_features
     assert (np.diff(keypoints.scale) <= 0).all()
     assert keypoints.descriptors.shape == (500, 128)
     norms = np.linalg.norm(keypoints.descriptors.astype(float), axis=1)

@@ -15,8 +15,9 @@ from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.isolate import run_isolated
-from pipeline.sfm.judge import Evidence, judge
+from pipeline.sfm.judge import judge
 from pipeline.sfm.triangulation import triangulate
+from tests.counters import GOOD
 from tests.sfm import corner, jobs
 
 FEATURES = schema.Features(max_features=1500)
@@ -260,28 +261,6 @@ def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
     assert error.rotation_median_deg < 0.5
 
 
-GOOD = Evidence(
-    registered=20,
-    total=20,
-    reachable=20,
-    points=4000,
-    observations_per_image=800,
-    mean_track_length=4.0,
-    reprojection_px=0.5,
-    explained_matches=0.9,
-    agreeing_matches=0.99,
-    agreeing_pairs=1.0,
-    missing_covisibility=0.02,
-    behind_camera=0.0,
-    parallax=0.05,
-    median_angle_deg=12.0,
-    focal_off=1.05,
-    focal_certainty=0.8,
-    focal_relative=0.9,
-    focal_prior_px={},
-)
-
-
 @pytest.mark.parametrize(
     ("change", "grade", "reason"),
     [
@@ -309,7 +288,7 @@ GOOD = Evidence(
     ],
 )
 def test_verdicts_follow_from_the_evidence(change, grade, reason):
-    verdict = judge(replace(GOOD, **change), min_registered_share=0.5)
+    verdict = judge(GOOD.model_copy(update=change), min_registered_share=0.5)
     assert verdict.grade == grade
     assert reason is None or reason in "; ".join(verdict.reasons)
 
@@ -319,13 +298,13 @@ def test_no_model_is_a_failure():
 
 
 def test_a_verdict_has_remedies_and_whether_another_attempt_may_help():
-    rotating = judge(replace(GOOD, parallax=0.001), 0.5)
+    rotating = judge(GOOD.model_copy(update={"parallax": 0.001}), 0.5)
     assert "move sideways" in rotating.remedies[0] and not rotating.worth_retrying
-    repeated = judge(replace(GOOD, agreeing_pairs=0.5), 0.5)
+    repeated = judge(GOOD.model_copy(update={"agreeing_pairs": 0.5}), 0.5)
     assert "look alike" in repeated.remedies[0] and repeated.worth_retrying
     # The largest connected component is registered: no mapper can add the other images.
-    complete = judge(replace(GOOD, registered=12, reachable=12), 0.5)
+    complete = judge(GOOD.model_copy(update={"registered": 12, "reachable": 12}), 0.5)
     assert complete.grade == "weak" and not complete.worth_retrying
-    assert judge(replace(GOOD, registered=12), 0.5).worth_retrying
-    both = judge(replace(GOOD, registered=12, parallax=0.003), 0.5)
+    assert judge(GOOD.model_copy(update={"registered": 12}), 0.5).worth_retrying
+    both = judge(GOOD.model_copy(update={"registered": 12, "parallax": 0.003}), 0.5)
     assert both.grade == "weak" and not both.worth_retrying

@@ -102,7 +102,8 @@ def _adjust_fixed(sparse: Path, out: Path) -> None:
 def test_an_offset_principal_point_and_the_poses_are_recovered(biased, tmp_path):
     true = truth(OFF, 0.0)
     report, model = refined(biased, tmp_path)
-    assert report.freed and report.error_px < report.error_before_px
+    found = report.counters
+    assert found.freed and found.error_px < found.error_before_px
     np.testing.assert_allclose(model.cameras[1].pinhole[2:], true.cameras[1].pinhole[2:], atol=0.7)
     before, now = pose_error(biased, true), pose_error(model, true)
     assert now.rotation_median_deg < 0.2 * before.rotation_median_deg
@@ -121,7 +122,7 @@ def test_the_refined_model_stays_in_the_input_frame(biased, tmp_path):
         points=replace(biased.points, xyz=40 * biased.points.xyz + [300, 0, 50]),
     )
     report, model = refined(far, tmp_path)
-    assert report.freed
+    assert report.counters.freed
     assert len(model.points) == POINTS
     moved = np.linalg.norm(model.points.xyz - far.points.xyz, axis=1)
     assert np.median(moved) < 0.1  # of 32
@@ -130,7 +131,7 @@ def test_the_refined_model_stays_in_the_input_frame(biased, tmp_path):
 @pytest.mark.parametrize("noise_px, why", [(0.3, "fixed"), (0.0, "exactly")])
 def test_a_model_without_gain_is_copied(tmp_path, noise_px, why):
     report, _ = refined(truth(np.zeros(2), noise_px), tmp_path)
-    assert not report.freed and why in " ".join(report.decisions)
+    assert not report.counters.freed and why in " ".join(report.decisions)
     assert digests(tmp_path / "out") == digests(tmp_path / "given")
 
 
@@ -138,10 +139,10 @@ def test_points_outside_the_longest_tracks_are_adjusted_too(biased, tmp_path):
     """With a smaller limit of tracks per image, the other points follow the adjusted cameras."""
     report, all_of_them = refined(biased, tmp_path)
     few = run_isolated(_refine_with_limit, 150, tmp_path / "given", tmp_path / "few")
-    assert report.freed and few.freed
+    assert report.counters.freed and few.counters.freed
     model = read_model(tmp_path / "few")
     assert len(model.points) == POINTS
-    assert few.error_px == pytest.approx(report.error_px, rel=0.02)
+    assert few.counters.error_px == pytest.approx(report.counters.error_px, rel=0.02)
     apart = np.linalg.norm(model.points.xyz - all_of_them.points.xyz, axis=1)
     assert np.median(apart) < 0.005
 
@@ -155,7 +156,7 @@ def _refine_with_limit(tracks: int, sparse: Path, out: Path) -> Any:
 
 def test_the_result_is_deterministic(biased, tmp_path):
     for name in "ab":
-        assert refined(biased, tmp_path / name)[0].freed
+        assert refined(biased, tmp_path / name)[0].counters.freed
     assert digests(tmp_path / "a") == digests(tmp_path / "b")
 
 

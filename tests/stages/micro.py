@@ -103,7 +103,7 @@ class Runner:
             threads, memory_mb = machine.get("threads", 1), machine.get("memory_mb")
             request = Request(stage, key, folders, out, threads, None, {}, memory_mb)
             try:
-                code = run_stage(request, spec.work)
+                code = run_stage(request, spec.work, spec.counters)
             finally:
                 tempfile.tempdir = None  # was the stage's scratch folder
             if code == EXIT_USER_ERROR:

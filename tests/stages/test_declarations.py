@@ -10,6 +10,7 @@ from pipeline.config.options import option_paths, select
 from pipeline.config.schema import Config, Split, Train, Views
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import upstream
+from pipeline.plan.record import PlanRecord
 from pipeline.plan.values import Plan
 from pipeline.runtime.section import read_section
 from stages.workflow.registry import STAGES
@@ -147,3 +148,10 @@ def test_declarations_import_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+@pytest.mark.parametrize("model", [spec.counters for spec in STAGES.values()] + [PlanRecord])
+def test_every_field_of_counters_and_plan_has_a_description(model):
+    for part in (schema := model.model_json_schema(), *schema.get("$defs", {}).values()):
+        for name, field in part.get("properties", {}).items():
+            assert field.get("description", "").endswith("."), f"{part['title']}.{name}"

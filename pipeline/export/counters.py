@@ -1,0 +1,15 @@
+"""Counters of the export stage."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pipeline.runtime.counters import StageCounters
+
+
+class ExportCounters(StageCounters):
+    """Counters of the export stage."""
+
+    exported_gaussians: int = Field(
+        ge=0, description="Number of Gaussians in each exported file, after `export.min_opacity`."
+    )

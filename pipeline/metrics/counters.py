@@ -1,0 +1,17 @@
+"""Counters of the evaluate stage."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pipeline.runtime.counters import StageCounters
+
+
+class EvaluateCounters(StageCounters):
+    """Counters of the evaluate stage: means over the measured views."""
+
+    psnr: float = Field(description="Mean PSNR, dB.")
+    ssim: float = Field(description="Mean SSIM; 1 for equal images.")
+    lpips: float | None = Field(
+        description="Mean LPIPS; 0 for equal images, null where it was not measured."
+    )

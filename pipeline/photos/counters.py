@@ -1,0 +1,39 @@
+"""Counters of the stages that check, develop and undistort photographs."""
+
+from __future__ import annotations
+
+from pydantic import Field
+
+from pipeline.runtime.counters import StageCounters
+
+
+class InspectCounters(StageCounters):
+    """Counters of the inspect stage."""
+
+    photos: int = Field(ge=0, description="Number of photographs that are used.")
+    left_out: int = Field(
+        ge=0,
+        description="Number of photographs that are left out: files that cannot be read, and one "
+        "of each pair of a RAW file and another file.",
+    )
+    given_poses: int | None = Field(
+        None, ge=0, description="Number of given poses that are used; absent without given poses."
+    )
+    given_points: int | None = Field(
+        None, ge=0, description="Number of given sparse points; absent without given poses."
+    )
+
+
+class DecodeCounters(StageCounters):
+    """Counters of the decode stage."""
+
+    developed: int = Field(
+        ge=0,
+        description="Number of photographs after development, with those that are not RAW files.",
+    )
+
+
+class UndistortCounters(StageCounters):
+    """Counters of the undistort stage."""
+
+    undistorted: int = Field(ge=0, description="Number of undistorted photographs.")

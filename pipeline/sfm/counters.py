@@ -1,0 +1,106 @@
+"""Counters of the stages of structure from motion."""
+
+from __future__ import annotations
+
+from typing import Any, Literal
+
+from pydantic import BaseModel, Field
+
+from pipeline.runtime.counters import StageCounters
+from pipeline.sfm.judge import Evidence, Grade
+
+Mapper = Literal["incremental", "global"]
+
+
+class FeaturesCounters(StageCounters):
+    """Counters of the features stage."""
+
+    counts: dict[str, int] = Field(description="Photograph's name to its number of keypoints.")
+
+
+class MatchesCounters(StageCounters):
+    """Counters of the matches stage."""
+
+    num_pairs: int = Field(ge=0, description="Number of matched pairs of photographs.")
+    num_verified: int = Field(ge=0, description="Number of pairs with a two-view geometry.")
+    median_inliers: int = Field(ge=0, description="Median number of inliers of the verified pairs.")
+    components: list[int] = Field(
+        description="Number of photographs in each connected component of the view graph, largest "
+        "first."
+    )
+    isolated: list[str] = Field(
+        description="Names of the photographs outside the largest component."
+    )
+    num_cameras: int = Field(ge=1, description="Number of cameras.")
+
+
+class CameraSummary(BaseModel):
+    """One camera of the model."""
+
+    model_config = StageCounters.model_config
+
+    camera_id: int = Field(description="The camera's id in the model.")
+    model: str = Field(description="COLMAP's camera model.")
+    width: int = Field(description="Width of its images, pixels.")
+    height: int = Field(description="Height of its images, pixels.")
+    params: list[float] = Field(
+        description="Parameters in COLMAP's order; focal lengths and principal point in pixels."
+    )
+    num_images: int = Field(description="Number of registered images.")
+    focal_prior_px: float | None = Field(
+        description="Focal length from EXIF, pixels; null where it is unknown."
+    )
+
+
+class AttemptRecord(BaseModel):
+    """One mapping attempt."""
+
+    model_config = StageCounters.model_config
+
+    mapper: Mapper = Field(description="The mapper.")
+    change: str = Field(
+        description="Difference from the first attempt in words; empty for the first."
+    )
+    registered: int = Field(
+        ge=0,
+        description="Number of photographs in the largest model; 0 without a model.",
+    )
+    verdict: Grade = Field(description="Quality of the largest model.")
+    reasons: list[str] = Field(description="The defects found; empty for a good model.")
+    taken: bool = Field(description="Whether the stage uses the model of this attempt.")
+
+
+class SfmCounters(StageCounters):
+    """Counters of the sfm stage."""
+
+    mapper: Mapper = Field(description="The mapper that produced the model.")
+    registered: int = Field(ge=0, description="Number of registered photographs.")
+    total: int = Field(ge=0, description="Number of all photographs.")
+    not_registered: list[str] = Field(description="Names of the photographs without a pose.")
+    mean_reprojection_error_px: float = Field(description="Mean reprojection error, pixels.")
+    num_points: int = Field(ge=0, description="Number of sparse points.")
+    mean_track_length: float = Field(description="Mean number of observations per point.")
+    other_models: list[int] = Field(
+        description="Number of images in each of the smaller models, which `other_models` has."
+    )
+    cameras: list[CameraSummary] = Field(description="The model's cameras.")
+    verdict: Grade = Field(description="Quality of the model; a failed one ends the stage.")
+    evidence: Evidence = Field(description="The statistics behind the verdict.")
+    attempts: list[AttemptRecord] = Field(description="The mapping attempts, in order.")
+    georeference: dict[str, Any] = Field(
+        description="Method, origin and residuals (metres) of the world's frame; "
+        "`georeference.json` has all of it."
+    )
+
+
+class RefineCounters(StageCounters):
+    """Counters of the refine stage."""
+
+    freed: bool = Field(
+        description="Whether camera parameters were freed and the model was adjusted; otherwise "
+        "the output is a copy of the given model."
+    )
+    error_before_px: float = Field(
+        description="Mean reprojection error of the given model, pixels."
+    )
+    error_px: float = Field(description="Mean reprojection error of the output, pixels.")

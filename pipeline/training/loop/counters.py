@@ -1,0 +1,61 @@
+"""Counters of the train stage."""
+
+from __future__ import annotations
+
+from pydantic import BaseModel, Field
+
+from pipeline.runtime.counters import StageCounters
+
+
+class ChangeCounters(BaseModel):
+    """Numbers of Gaussians that density control changed."""
+
+    model_config = StageCounters.model_config
+
+    cloned: int = Field(ge=0, description="Number of Gaussians that were cloned.")
+    split: int = Field(ge=0, description="Number of Gaussians that were split.")
+    relocated: int = Field(
+        ge=0, description="Number of useless Gaussians that were moved onto others."
+    )
+    pruned: int = Field(ge=0, description="Number of Gaussians that were removed.")
+
+
+class TrainCounters(StageCounters):
+    """Counters of the train stage."""
+
+    num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
+    steps: int = Field(ge=0, description="Number of optimiser steps.")
+    known_depths: int = Field(
+        ge=0,
+        description="Number of pixels with a known depth, over all training views; 0 without a "
+        "loss on depths.",
+    )
+    depth_maps: int | None = Field(
+        None,
+        ge=0,
+        description="Number of depth maps that are used; absent without a loss on depths.",
+    )
+    exposure_spread_stops: float | None = Field(
+        None,
+        description="Standard deviation of the photographs' exposures, stops; absent unless "
+        "`train.exposure` is `auto`, and for photographs with alpha.",
+    )
+    changes: ChangeCounters = Field(
+        description="Changes of the set of Gaussians by density control, totals of the run."
+    )
+    opacity_resets: int = Field(ge=0, description="Number of opacity resets.")
+    max_gaussians: int = Field(ge=0, description="Largest number of Gaussians during the run.")
+    num_dropped: int = Field(
+        ge=0,
+        description="Number of Gaussians that the rasterizer left out for numerical reasons, "
+        "summed over the steps.",
+    )
+    blind_steps: int = Field(ge=0, description="Number of steps whose view saw no Gaussian.")
+    unseen: int = Field(
+        ge=0,
+        description="Number of Gaussians removed at the end because no training view saw them.",
+    )
+    floaters: int = Field(
+        ge=0,
+        description="Number of Gaussians removed because they were close to a single camera.",
+    )

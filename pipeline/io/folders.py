@@ -33,12 +33,20 @@ class PhotoFolder:
     masks: dict[str, str] = field(default_factory=dict)
 
 
-def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) -> list[str]:
-    """Names of the files with a photograph's suffix, relative to ``folder``, sorted.
+def pictures_in(
+    scene: Path, path: str, warnings: list[str], *, recursive: bool = True
+) -> list[str]:
+    """Names of the files with a photograph's suffix, relative to ``path``, sorted.
 
     Hidden files and folders, and subfolders of masks, depth maps and models, are ignored. Images
     in formats that cannot be read add one warning.
+
+    Args:
+        scene: the scene folder.
+        path: a folder, relative to ``scene``.
+        warnings: warnings are added to this list; they name files relative to ``scene``.
     """
+    folder = scene / path
     names: list[str] = []
     unread: list[str] = []
     seen: set[str] = set()
@@ -56,17 +64,18 @@ def pictures_in(folder: Path, warnings: list[str], *, recursive: bool = True) ->
         for name in files:
             if not _is_utf8(name):
                 shown = os.fsencode(name).decode(errors="replace")
-                warnings.append(f"{where}: {shown} is not used: its name is not UTF-8; rename it")
+                file = (Path(where).relative_to(scene) / shown).as_posix()
+                warnings.append(f"{file} is not used: its name is not UTF-8; rename it")
                 continue
             suffix = suffix_of(name)
             if name[0] != "." and suffix in PHOTO_SUFFIXES:
                 names.append((prefix / name).as_posix())
             elif suffix in UNREAD_SUFFIXES:
-                unread.append((prefix / name).as_posix())
+                unread.append((Path(where).relative_to(scene) / name).as_posix())
     if unread:
         kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
         warnings.append(
-            f"{folder}: {len(unread)} {kinds} images are not used (first: {min(unread)}): "
+            f"{len(unread)} {kinds} images are not used (first: {min(unread)}): "
             "convert them to JPEG or PNG with their EXIF data (HEIC can be read if pillow-heif is "
             "installed)"
         )

@@ -86,8 +86,7 @@ def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
 def incomplete_models(folder: Path) -> list[str]:
     """A warning for each COLMAP folder that has cameras or images but not both."""
     return [
-        f"{folder / path}: not used: expected a COLMAP model with cameras and images, found only "
-        "one of them"
+        f"{path}: not used: expected a COLMAP model with cameras and images, found only one of them"
         for path in _COLMAP_FOLDERS
         if not has_model(folder / path)
         and any((folder / path / f"{stem}.{end}").is_file() for stem, end in _MODEL_FILES)

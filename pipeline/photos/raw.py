@@ -180,4 +180,4 @@ def _bytes_of(photo: Photo) -> io.BytesIO:
 def _left_out(photo: Photo, error: Exception) -> str:
     reason = error.args[0] if error.args else error
     text = reason.decode(errors="replace") if isinstance(reason, bytes) else str(reason)
-    return f"{photo.path}: RAW file left out, it cannot be read ({text})"
+    return f"{photo.name}: RAW file left out, it cannot be read ({text})"

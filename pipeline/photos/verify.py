@@ -42,7 +42,7 @@ def verify_photos(
         photo for photo, fault in zip(manifest.photos, faults, strict=True) if fault is None
     )
     warnings = [
-        f"{photo.path}: left out: {fault}"
+        f"{photo.name}: left out: {fault}"
         for photo, fault in zip(manifest.photos, faults, strict=True)
         if fault is not None
     ]

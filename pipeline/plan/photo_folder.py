@@ -52,7 +52,7 @@ def choose_photo_folder(
         if listed is not None and configured in ("auto", listed.path):
             return listed
     if configured not in ("auto", "."):
-        names = pictures_in(folder / configured, warnings)
+        names = pictures_in(folder, configured, warnings)
         base = "images" if re.fullmatch(r"images_[248]", configured) else configured
         return PhotoFolder(configured, base, "as configured", names)
     copies = [f"images{suffix}" for suffix in _COPY_SUFFIXES]
@@ -64,16 +64,16 @@ def choose_photo_folder(
 
 def _scene_folder(folder: Path, warnings: list[str]) -> PhotoFolder:
     """The photographs in the scene folder itself, else those in its subfolders."""
-    top = pictures_in(folder, warnings, recursive=False)
+    top = pictures_in(folder, ".", warnings, recursive=False)
     if top:
-        below = [name for name in relative_folders(folder) if pictures_in(folder / name, [])]
+        below = [name for name in relative_folders(folder) if pictures_in(folder, name, [])]
         if below:
             warnings.append(
-                f"{folder}: photographs in {', '.join(below)} are not used, because there are "
-                "photographs in the scene folder itself (inspect.image_folder)"
+                f"photographs in {', '.join(below)} are not used, because there are photographs in "
+                "the scene folder itself (inspect.image_folder)"
             )
         return PhotoFolder(".", ".", "no images/; photographs are in the scene folder", top)
-    names = pictures_in(folder, warnings)
+    names = pictures_in(folder, ".", warnings)
     parents = [posixpath.dirname(name) for name in names]
     base = posixpath.commonpath(parents) if parents else ""
     names = [posixpath.relpath(name, base or ".") for name in names]
@@ -96,7 +96,7 @@ def _choose_copy(
         needed = max(needed, config.features.max_long_side_px)
     found: list[tuple[int, PhotoFolder]] = []
     for path in copies:
-        names = pictures_in(folder / path, warnings)
+        names = pictures_in(folder, path, warnings)
         if names:
             facts = read_all(folder, path, names[:1], cache, [])
             longest = max((max(f.width, f.height) for f in facts.values()), default=0)
@@ -163,7 +163,7 @@ def read_all(
         except OSError as error:
             found = {"unreadable": f"cannot be read: {error.strerror}"}
         if "unreadable" in found:
-            warnings.append(f"{path}: left out: {found['unreadable']}")
+            warnings.append(f"{name}: left out: {found['unreadable']}")
         else:
             facts[name] = FileFacts.model_validate(found)
     return facts

@@ -261,8 +261,8 @@ def _check_pose_names(
         )
     if missing:
         warnings.append(
-            f"{folder / poses.path}: {len(missing)} of {len(poses.names)} poses have no "
-            f"photograph and are left out (first: {missing[0]})"
+            f"{len(missing)} of {len(poses.names)} poses have no photograph and are left out "
+            f"(first: {missing[0]})"
         )
     without = sorted({prefix + name for name in names} - {match for match in matched if match})
     if without:

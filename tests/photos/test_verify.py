@@ -38,6 +38,7 @@ def test_damaged_photographs_are_left_out_with_a_warning(manifest, threads):
     assert len(warnings) == len(broken & scanned)
     for name in broken:
         assert sum(name in line for line in checked.warnings) == 1, name
+    assert all(line.split(": left out: ")[0] in broken for line in checked.warnings), "by name"
 
 
 def test_too_few_photographs_is_an_error_that_names_the_damaged_ones(manifest):

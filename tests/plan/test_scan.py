@@ -23,7 +23,9 @@ from tests.pictures import photos, picture
 
 
 def look(folder: Path, config: Config | None = None, cache: Path | None = None) -> Scan:
-    return scan(folder, folder.name, config or Config(), cache=cache)
+    found = scan(folder, folder.name, config or Config(), cache=cache)
+    assert str(folder) not in "".join(found.warnings), "a warning holds a path of this machine"
+    return found
 
 
 def config(**sections) -> Config:
@@ -578,6 +580,17 @@ def test_unreadable_files_are_warnings(tmp_path):
     assert names(result) == ["p00.jpg", "p01.jpg"]
     for name in ("text.jpg", "empty.png", "gone.jpg", "phone.HEIC"):
         assert sum(name in line for line in result.warnings) == 1, name
+    assert any(line.startswith("text.jpg: left out: ") for line in result.warnings)
+
+
+def test_files_that_are_no_photographs_by_name_are_named_from_the_scene_folder(tmp_path):
+    photos(tmp_path / "images", 2)
+    (tmp_path / "images" / "b").mkdir()
+    (tmp_path / "images" / "b" / "big.jxl").write_bytes(b"")
+    Path(os.fsdecode(os.fsencode(tmp_path / "images" / "b") + b"/\xff.jpg")).write_bytes(b"")
+    not_utf8, unread = look(tmp_path).warnings
+    assert not_utf8.startswith("images/b/\ufffd.jpg is not used: its name is not UTF-8")
+    assert unread.startswith("1 JXL images are not used (first: images/b/big.jxl)")
 
 
 def test_mask_of_another_size(tmp_path):

@@ -128,9 +128,12 @@ def test_one_bad_photograph_is_left_out_with_a_warning(project, photographs):
     images[3].write_bytes(data[: len(data) // 2])
     (photographs / "images" / "notes.jpg").write_text("not a picture")
     scene = photographs.name
-    few = TINY | {"train": TINY["train"] | {"steps": 40}}
+    few = TINY | {"train": TINY["train"] | {"steps": 40}, "data_root": str(project / "data")}
     snakemake(project, f"results/{scene}/metrics.json", config=few)
     found = json.loads((project / f"results/{scene}/metrics.json").read_text())
+    assert str(project) not in json.dumps(found), "metrics.json holds a path of this machine"
+    inspected = json.loads((project / f"results/{scene}/inspect/stage.json").read_text())
+    assert str(project) not in "".join(inspected["warnings"])
     warned = "\n".join(found["warnings"])
     assert images[3].name in warned
     assert "notes.jpg" in warned

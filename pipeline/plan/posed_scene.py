@@ -50,7 +50,8 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             else the default.
 
     Raises:
-        UserError: no such scene, no poses, cameras with lens distortion.
+        UserError: no such scene, damaged records of a finished one, no poses, cameras with lens
+            distortion.
     """
     if (folder / PLAN).is_file():
         return _finished(folder, max_long_side, every)
@@ -111,10 +112,10 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
 
 def _output(folder: Path, stages: tuple[str, ...], name: str) -> Path:
     """The output ``name`` of the first of ``stages`` that the scene's plan runs and that has it."""
-    planned = read_plan(folder).stages
+    plan = read_plan(folder)
     for stage in stages:
         path = folder / stage / name
-        if stage in planned and planned[stage].run and path.exists():
+        if plan.runs(stage) and path.exists():
             return path
     raise UserError(
         f"expected a finished scene, found no {name}",

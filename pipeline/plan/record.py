@@ -25,6 +25,9 @@ class PlanRecord(BaseModel):
     warnings: list[str] = Field(description="What the user should know before the stages run.")
     facts: SceneFacts = Field(description="The facts about the scene that the plan depends on.")
 
+    def runs(self, stage: str) -> bool:
+        return stage in self.stages and self.stages[stage].run
+
     @model_validator(mode="after")
     def _order_has_every_stage(self) -> Self:
         if sorted(self.order) != sorted(self.stages):

@@ -63,6 +63,8 @@ class TrainedScene:
 
 @dataclass
 class _Notes:
+    """Messages, and the counters that only some options have."""
+
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
     counters: dict[str, Any] = field(default_factory=dict)

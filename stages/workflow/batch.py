@@ -68,7 +68,7 @@ def batch_of(found: list[Result], results: Path) -> Batch:
         plan = plans.setdefault(scene, read_plan(folder))
         name = views.setdefault(scene, ranked(per_view, 1)[0][1]["name"])
         measured = next((v for v in per_view if v["name"] == name), per_view[0])
-        source = next(s for s in ("undistort", "decode", "inspect") if plan.stages[s].run)
+        source = next((s for s in ("undistort", "decode") if plan.runs(s)), "inspect")
         manifest = Manifest.read(folder / source / "images.json")
         photo = next(p for p in manifest.photos if p.name == measured["name"])
         with Image.open(folder / "evaluate" / "renders" / measured["render"]) as opened:

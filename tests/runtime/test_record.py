@@ -165,7 +165,7 @@ def test_counters_that_do_not_fit_are_one_clear_error(first, counters, said):
     assert "--forcerun first" in message
 
 
-@pytest.mark.parametrize("counters", [NoCounters(), Shape.model_construct(shape="square")])
+@pytest.mark.parametrize("counters", [NoCounters(), Shape.model_construct()])
 def test_a_stage_that_records_other_counters_than_it_declares_fails(first, counters, capfd):
     """A fault of the program: with a traceback, and without an output."""
     before = (first.out / "stage.json").read_text()

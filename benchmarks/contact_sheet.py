@@ -19,6 +19,7 @@ from PIL import Image, ImageDraw, ImageFont
 
 from pipeline.config.runs import Run
 from pipeline.reporting.data import ranked
+from pipeline.reporting.metrics import read_metrics
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 GAP, LABEL = 6, 20  # pixels
@@ -66,15 +67,15 @@ def sheet(
         # Folders of a batch without seeds have no seed in their name.
         named = batch.parent / done[config].name
         folder = named if named.is_dir() else batch.parent / Run(scene, config, None).name
-        per_view = json.loads((folder / "metrics.json").read_text())["per_view"]
-        view = view or ranked(per_view, 1)[0][1]["name"]
-        found = next((v for v in per_view if v["name"] == view), None)
+        per_view = read_metrics(folder).per_view
+        view = view or ranked(per_view, 1)[0][1].name
+        found = next((v for v in per_view if v.name == view), None)
         if found is None:
-            names = ", ".join(v["name"] for v in per_view)
+            names = ", ".join(v.name for v in per_view)
             raise UserError(f"no test view {view}", file=folder, fix=f"choose one of: {names}")
-        picture = _scaled(folder / "evaluate" / "renders" / found["render"], width)
+        picture = _scaled(folder / "evaluate" / "renders" / found.render, width)
         if photograph and not tiles:
-            original = folder / "undistort" / "images" / found["name"]
+            original = folder / "undistort" / "images" / found.name
             if not original.is_file():
                 raise UserError(
                     "the scene was not undistorted: no photograph at the renders' grid",
@@ -82,7 +83,7 @@ def sheet(
                     fix="leave out --photograph",
                 )
             tiles.append(("photograph", _scaled(original, width)))
-        tiles.append((f"{config}  {found['psnr']:.1f} dB", picture))
+        tiles.append((f"{config}  {found.psnr:.1f} dB", picture))
     return _laid_out(tiles, min(columns, len(tiles)))
 
 

@@ -344,6 +344,20 @@ MUTANTS: dict[str, Mutant] = {
         "a camera that only turned is believed",
         ("tests/sfm/test_judge.py",),
     ),
+    "gains_of_other_views": Mutant(
+        "pipeline/scene/exposure.py",
+        "sorted(names - gains.root.keys()) if gains else []",
+        "list[str]()",
+        "exposure gains of another scene are used",
+        ("tests/scene/test_exposure.py",),
+    ),
+    "file_without_version": Mutant(
+        "pipeline/runtime/json_file.py",
+        "sorted(cls.model_fields.keys() - content.model_fields_set)",
+        "list[str]()",
+        "a file of an older version is read as of this one",
+        ("tests/runtime/test_json_file.py",),
+    ),
 }
 
 

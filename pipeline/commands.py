@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import io
-import json
 import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -15,11 +14,12 @@ from PIL import Image
 from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
 from pipeline.io.splat_files import check_suffix, read_gaussians, write_gaussians
-from pipeline.metrics.evaluate import NO_GAINS, choose_protocol, evaluate_views
+from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+from pipeline.metrics.evaluation import Evaluation
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render import BACKGROUNDS, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
-from pipeline.runtime.atomic import write_bytes, write_json
+from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.views import camera_views, scene_extent
@@ -131,7 +131,7 @@ def _png(folder: Path, name: str, taken: set[Path]) -> Path:
 
 def evaluate(
     model: Path, scene: Path, out: Path | None, every: int | None, how: Rendering
-) -> dict[str, Any]:
+) -> Evaluation:
     """Compare renders of a file of Gaussians, from any program, with a scene's photographs.
 
     Args:
@@ -140,7 +140,7 @@ def evaluate(
         how: settings for rendering.
 
     Returns:
-        The result of ``evaluate_views``, with warnings of all steps.
+        The result of ``evaluate_views``, with the warnings of all steps.
 
     Raises:
         UserError: a file or a scene that cannot be read.
@@ -155,7 +155,6 @@ def evaluate(
         changed["antialias"] = how.antialias
     train = posed.train.model_copy(update=changed)
     protocol = choose_protocol(posed.views, posed.split, train)
-    gains = json.loads(posed.gains.read_text()) if posed.gains else NO_GAINS
     with tempfile.TemporaryDirectory() as scratch:
         found = evaluate_views(
             gaussians,
@@ -163,11 +162,10 @@ def evaluate(
             Evaluate(),
             train,
             Path(scratch) if out is None else out / "renders",
-            gains=gains,
+            gains=posed.gains,
             threads=how.threads,
         )
-    found["warnings"] = [*warnings, *posed.warnings, *found["warnings"]]
-    found["model"] = {"num_gaussians": len(gaussians), "sh_degree": gaussians.sh_degree}
+    found = found.model_copy(update={"warnings": (*warnings, *posed.warnings, *found.warnings)})
     if out is not None:
-        write_json(out / "evaluation.json", found)
+        found.write(out)
     return found

@@ -8,7 +8,6 @@ print(scene.measure().psnr)
 
 from __future__ import annotations
 
-import json
 import tempfile
 import warnings
 from collections.abc import Sequence
@@ -23,7 +22,6 @@ from pipeline.config.schema import Evaluate, Train
 from pipeline.io import splat_files
 from pipeline.io.camera_files import choose_views
 from pipeline.metrics.evaluate import (
-    NO_GAINS,
     Protocol,
     choose_protocol,
     evaluate_views,
@@ -87,7 +85,7 @@ class Scene:
         self.views: list[View] = posed.views
         self._train: Train = posed.train
         self._protocol: Protocol = choose_protocol(posed.views, posed.split, posed.train)
-        self._gains = json.loads(posed.gains.read_text()) if posed.gains else NO_GAINS
+        self._gains = posed.gains
         self._threads = threads
 
     @property
@@ -144,12 +142,11 @@ class Scene:
                 gains=self._gains,
                 threads=self._threads,
             )
-        _warn(found["warnings"])
+        _warn(found.warnings)
         single = {
-            view["name"]: Quality(view["psnr"], view["ssim"], view["lpips"], {})
-            for view in found["per_view"]
+            view.name: Quality(view.psnr, view.ssim, view.lpips, {}) for view in found.per_view
         }
-        return Quality(found["psnr"], found["ssim"], found["lpips"], single)
+        return Quality(found.psnr, found.ssim, found.lpips, single)
 
 
 def load(
@@ -169,11 +166,18 @@ def load(
         threads: threads for rendering; None: one per core.
 
     Raises:
-        UserError: a scene or a file that is missing or cannot be read.
+        UserError: a scene or a file that is missing, unfinished or cannot be read.
     """
     folder = Path(folder)
-    file = folder / "train" / "gaussians.npz" if model is None else Path(model)
     posed = posed_scene(folder, max_side, None)
+    file = folder / "train" / "gaussians.npz" if model is None else Path(model)
+    if model is None and not file.is_file():
+        raise UserError(
+            "expected a finished scene (results/NAME), found no train/gaussians.npz",
+            file=folder,
+            fix="give the file of Gaussians as model, or train the scene: "
+            f"snakemake --cores all {folder}/metrics.json",
+        )
     _warn(posed.warnings)
     return Scene(read_gaussians(file), posed, threads or usable_cores())
 

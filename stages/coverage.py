@@ -22,6 +22,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.coverage.measure import measure_coverage, world_frame
     from pipeline.metrics.evaluate import choose_protocol
+    from pipeline.metrics.evaluation import Evaluation
 
     views, train = inputs.trained_views(job), job.section(Train)
     measure_coverage(
@@ -30,7 +31,7 @@ def work(job: Job) -> None:
         views,
         choose_protocol(views, job.section(Split), train),
         train,
-        inputs.read_json(job.inputs["evaluate"] / "evaluation.json"),
+        Evaluation.read_for(job.inputs["evaluate"], [view.name for view in views]),
         job.inputs["evaluate"] / "renders",
         world_frame(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
         threads=job.threads,

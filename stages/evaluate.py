@@ -3,14 +3,12 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict
 from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.metrics.counters import EvaluateCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -35,27 +33,28 @@ def work(job: Job) -> None:
     from pipeline.io.colmap import read_model
     from pipeline.metrics.evaluate import choose_protocol, evaluate_views
     from pipeline.metrics.pose import pose_error
+    from pipeline.scene.exposure import ExposureGains
 
-    train = job.section(Train)
-    protocol = choose_protocol(inputs.trained_views(job), job.section(Split), train)
+    train, views = job.section(Train), inputs.trained_views(job)
+    protocol = choose_protocol(views, job.section(Split), train)
     evaluation = evaluate_views(
         inputs.trained_gaussians(job),
         protocol,
         job.section(Evaluate),
         train,
         job.out / "renders",
-        gains=inputs.read_json(job.inputs["train"] / "exposure.json"),
+        gains=ExposureGains.read_for(job.inputs["train"], [view.name for view in views]),
         threads=job.threads,
     )
-    job.add_messages([], evaluation.pop("warnings"))
-    evaluation["pose_error"] = None
+    job.add_messages([], evaluation.warnings)
     if (truth := job.inputs["inspect"] / "truth").is_dir():
         refined = train.refine_poses
         model = inputs.trained_model(job) if refined else inputs.input_model(job, "poses")
-        evaluation["pose_error"] = asdict(pose_error(model, read_model(truth)))
-    write_json(job.out / "evaluation.json", evaluation)
-    job.counters = EvaluateCounters(**{n: evaluation[n] for n in EvaluateCounters.model_fields})
-    job.decide(f"PSNR {evaluation['psnr']:.2f} dB, SSIM {evaluation['ssim']:.4f}")
+        error = pose_error(model, read_model(truth))
+        evaluation = evaluation.model_copy(update={"pose_error": error})
+    evaluation.write(job.out)
+    job.counters = EvaluateCounters.model_validate(evaluation, from_attributes=True)
+    job.decide(f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}")
     if not protocol.every:
         job.warn("there are no test views: quality was measured on training views")
 

@@ -10,7 +10,6 @@ from pipeline.config.schema import Split, Train
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -25,22 +24,23 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.metrics.evaluate import choose_protocol
+    from pipeline.metrics.evaluation import Evaluation
     from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.headline import headline
-    from pipeline.reporting.metrics import NAME, read_runs, with_times
+    from pipeline.reporting.metrics import read_runs, with_times
     from pipeline.reporting.page import write_report
     from pipeline.reporting.scene import SceneResults, report_data
 
     start = time.perf_counter()
     views, train = inputs.trained_views(job), job.section(Train)
     plan = PlanRecord.model_validate(job.key["plan"])
-    evaluation = inputs.read_json(job.inputs["evaluate"] / "evaluation.json")
+    evaluation = Evaluation.read_for(job.inputs["evaluate"], [view.name for view in views])
     results = job.inputs["inspect"].parent
     own = job.run_record(time.perf_counter() - start)
     metrics = collect_metrics(
         job.scene, plan, results, evaluation, seed=job.seed, versions=own.versions
     )
-    write_json(job.out / NAME, metrics.model_dump(mode="json"))
+    metrics.write(job.out)
     runs = read_runs(metrics, results, without=job.stage) | {job.stage: own}
     scene = SceneResults(
         scene=job.scene,

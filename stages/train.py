@@ -9,7 +9,6 @@ from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.job import Job
 from pipeline.training.loop.counters import TrainCounters
 from stages.workflow import inputs
@@ -55,8 +54,8 @@ def work(job: Job) -> None:
     write_npz(job.out / "gaussians.npz", trained.result.gaussians)
     if trained.model is not None:
         write_model(job.out / "sparse" / "0", trained.model)
-    write_json(job.out / "curve.json", trained.result.curve)
-    write_json(job.out / "exposure.json", trained.gains)
+    trained.result.curve.write(job.out)
+    trained.gains.write(job.out)
     job.record(trained.counters, trained.decisions, trained.warnings)
     job.timings = trained.timings
 

@@ -1,6 +1,7 @@
 """Counters of stages, for tests."""
 
 from pipeline.photos.counters import InspectCounters
+from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, RefineCounters, SfmCounters
 from pipeline.sfm.judge import Evidence
 from pipeline.training.loop.counters import ChangeCounters, TrainCounters
@@ -52,7 +53,7 @@ SFM = SfmCounters(
             mapper="incremental", change="", registered=6, verdict="good", reasons=[], taken=True
         )
     ],
-    georeference={"method": "level", "origin": None, "residuals_m": None},
+    georeference=GeoreferenceSummary(method="level", origin=None, residuals_m=None),
 )
 REFINE = RefineCounters(freed=True, error_before_px=0.75, error_px=0.25)
 TRAIN = TrainCounters(

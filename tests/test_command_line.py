@@ -23,6 +23,9 @@ from pipeline.io.transforms import write_transforms
 from pipeline.plan.values import StagePlan
 from pipeline.render import RasterOptions
 from pipeline.render.views import near_plane, render_view, to_bytes
+from pipeline.runtime.atomic import write_json
+from pipeline.runtime.record import StageRecord
+from pipeline.scene.exposure import NO_GAINS
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import camera_views, scene_extent
@@ -162,7 +165,20 @@ def test_a_finished_scene_brings_its_settings(folder, monkeypatch, capsys):
     config["split"]["test_every"], config["train"]["background"] = 2, "black"
     (scene / "train").mkdir()
     key = {"config": {name: config[name] for name in ("views", "split", "train")}}
-    (scene / "train" / "stage.json").write_text(json.dumps({"key": key}))
+    write_json(
+        scene / "train" / "stage.json",
+        StageRecord(
+            stage="train",
+            scene="NAME",
+            key=key,
+            inputs={},
+            outputs={},
+            counters={},
+            decisions=(),
+            warnings=(),
+        ).model_dump(mode="json"),
+    )
+    NO_GAINS.write(scene / "train")
     (folder / "elsewhere").mkdir()
     monkeypatch.chdir(folder / "elsewhere")
     found = measured(folder / "model.ply", scene)

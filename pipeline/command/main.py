@@ -6,7 +6,7 @@ from __future__ import annotations
 import argparse
 import json
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
 from typing import Any
@@ -104,19 +104,19 @@ def _evaluate(
     from pipeline.commands import Rendering, evaluate
 
     found = evaluate(**options, how=Rendering(background, antialias, max_side, threads))
-    width = max(len(view["name"]) for view in found["per_view"])
-    protocol = found["protocol"]
-    lpips = "" if found["lpips"] is None else f", LPIPS {found['lpips']:.4f}"
-    means = f"PSNR {found['psnr']:.2f} dB, SSIM {found['ssim']:.4f}{lpips}"
+    width = max(len(view.name) for view in found.per_view)
+    protocol = found.protocol
+    lpips = "" if found.lpips is None else f", LPIPS {found.lpips:.4f}"
+    means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}{lpips}"
     lines = [
         *(
-            f"{view['name']:<{width}}  {view['psnr']:6.2f} dB  SSIM {view['ssim']:.4f}"
-            for view in found["per_view"]
+            f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}"
+            for view in found.per_view
         ),
-        f"{means}, {protocol['num_views']} views",
-        f"({protocol['split']}; {', '.join(protocol['resolution'])} pixels)",
+        f"{means}, {protocol.num_views} views",
+        f"({protocol.split}; {', '.join(protocol.resolution)} pixels)",
     ]
-    _print(lines, found["warnings"])
+    _print(lines, found.warnings)
 
 
 def _view(model: Path, cameras: Path | None, **options: Any) -> None:
@@ -141,7 +141,7 @@ def _doctor(json_wanted: bool, results: Path) -> int:
     return 0 if doctor.is_ready(found) else EXIT_USER_ERROR
 
 
-def _print(lines: list[str], warnings: list[str]) -> None:
+def _print(lines: Sequence[str], warnings: Sequence[str]) -> None:
     for text in warnings:
         print(f"warning: {text}", file=sys.stderr)
     for line in lines:

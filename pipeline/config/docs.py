@@ -39,6 +39,11 @@ _RECORDS = {
     "images.json": "pipeline.scene.manifest:Manifest",
     "metrics.json": "pipeline.reporting.metrics:Metrics",
     "plan.json": "pipeline.plan.record:PlanRecord",
+    "evaluation.json": "pipeline.metrics.evaluation:Evaluation",
+    "coverage.json": "pipeline.coverage.record:CoverageRecord",
+    "georeference.json": "pipeline.scene.georeference:Georeference",
+    "frame.json": "pipeline.io.frame_json:Frame",
+    "path.json": "pipeline.surface.path:PathFile",
 }
 
 _INTRO = f"""# Configuration

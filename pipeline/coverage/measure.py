@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,14 +24,27 @@ from pipeline.coverage.probe_views import (
     backproject,
     render_probes,
 )
+from pipeline.coverage.record import (
+    CoverageRecord,
+    ErrorByTrust,
+    ErrorClass,
+    FloaterCoverage,
+    ProposedViewpoint,
+    SeenBy,
+    SurfaceCoverage,
+    Surroundings,
+    ViewCoverage,
+)
 from pipeline.coverage.summary import describe
 from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
 from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
 from pipeline.metrics.evaluate import Protocol, photo_over_background
+from pipeline.metrics.evaluation import Evaluation
 from pipeline.photos.load import load_view, resize_area
 from pipeline.render.views import Render, render_view, to_bytes
-from pipeline.runtime.atomic import write_bytes, write_json
+from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.progress import track
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
@@ -71,7 +84,14 @@ class MeasuredView:
     trust: Floats
     squared_error: Floats
     measured: Bools
-    record: dict[str, Any]
+    record: ViewCoverage
+
+
+class Images(NamedTuple):
+    """Files of a render and of its trust map, relative to the stage's folder."""
+
+    render: str
+    trust_map: str
 
 
 @dataclass(frozen=True)
@@ -88,12 +108,12 @@ class WorldFrame:
 
 
 def world_frame(
-    views: Sequence[View], manifest: Manifest, georeference: Mapping[str, Any] | None
+    views: Sequence[View], manifest: Manifest, georeference: Georeference | None
 ) -> WorldFrame:
-    """The world frame: ``up`` from the orientation of the photographs, ``unit`` from the content of
-    ``georeference.json``."""
-    unit = str((georeference or {}).get("unit", ""))
-    return WorldFrame(scene_up(views, manifest), "m" if unit.startswith("metres") else None)
+    """The world frame: ``up`` from the orientation of the photographs, ``unit`` from the
+    georeference, None for untranslated given poses."""
+    is_metric = georeference is not None and georeference.is_metric
+    return WorldFrame(scene_up(views, manifest), "m" if is_metric else None)
 
 
 def measure_coverage(
@@ -102,11 +122,11 @@ def measure_coverage(
     views: Sequence[View],
     protocol: Protocol,
     train: Train,
-    evaluation: Mapping[str, Any],
+    evaluation: Evaluation,
     renders: Path,
     world: WorldFrame,
     threads: int,
-) -> dict[str, Any]:
+) -> CoverageRecord:
     """Write ``coverage.json`` and ``coverage/*.png`` into the folder ``out``.
 
     Args:
@@ -118,7 +138,6 @@ def measure_coverage(
     Returns:
         The content of ``coverage.json``.
     """
-
     options = protocol.options(train, threads=1)
 
     def render(view: View) -> Render:
@@ -128,13 +147,15 @@ def measure_coverage(
     rendered = render_probes(training, render, threads)
     probes = list(track(rendered, "rendering training views", len(training), unit="views"))
     depths = np.concatenate([probe.depth[~probe.empty] for probe in probes])
-    result: dict[str, Any] = {
-        "photographs": sum(not view.is_test for view in views),
-        "looked_at": len(probes),
-        "trust": FORMULA,
-    }
+    record = CoverageRecord(
+        num_training_views=sum(not view.is_test for view in views),
+        num_rendered_views=len(probes),
+        trust_definition=FORMULA,
+    )
     if not len(depths):
-        return _written(out, result | {"reason": "the scene shows no surface"})
+        record = record.model_copy(update={"reason": "the scene shows no surface"})
+        record.write(out)
+        return record
     background_depth = float(np.percentile(depths, 95))
     surface, nearest = _surface(_evenly(probes, MAX_SAMPLED), probes, background_depth)
     tested = _measure_test_views(
@@ -145,35 +166,39 @@ def measure_coverage(
     cameras = [*training, *(_named(views, item.probe.view.name) for item in tested)]
     best = propose_viewpoints(cameras, all_probes, render, world.up, background_depth, threads)
     floaters = near_floaters(gaussians, probes, all_probes[len(probes) :], nearest)
-    result |= {
-        "surface": surface,
-        "views": [item.record for item in tested],
-        "error": _error_by_trust(tested),
-        "floaters": {
-            "gaussians": floaters.count,
-            "within": floaters.within,
-            "cameras": floaters.cameras,
-        },
-        "surroundings": {
-            "viewpoints": len(best.candidates),
-            "trust": best.trust_before,
-            "trust_with_proposals": best.trust_after,
-        },
-        "viewpoints": _proposals(best, all_probes, world),
+    shown = sorted(
+        (item for item in tested if item.record.mean_trust is not None),
+        key=lambda item: item.record.mean_trust or 0.0,
+    )[:SHOWN]
+    images = {
+        item.record.name: _write_images(out, f"view_{i + 1}", item.probe, item.trust)
+        for i, item in enumerate(shown)
     }
-    shown = [item for item in tested if item.record["trust"] is not None]
-    shown = sorted(shown, key=lambda item: item.record["trust"])[:SHOWN]
-    for i, item in enumerate(shown):
-        item.record.update(_write_images(out, f"view_{i + 1}", item.probe, item.trust))
-    proposed = [proposal.probe for proposal in best.proposals]
-    for i, (trust, _) in enumerate(trust_maps(proposed, all_probes, background_depth, threads)):
-        result["viewpoints"][i] |= _write_images(out, f"next_{i + 1}", proposed[i], trust)
-    return _written(out, result)
+    record = record.model_copy(
+        update={
+            "surface": surface,
+            "views": tuple(_with_images(item.record, images) for item in tested),
+            "error": _error_by_trust(tested),
+            "floaters": FloaterCoverage(
+                num_gaussians=floaters.count,
+                search_distance=floaters.within,
+                by_camera=floaters.cameras,
+            ),
+            "surroundings": Surroundings(
+                num_viewpoints=len(best.candidates),
+                mean_trust=best.trust_before,
+                mean_trust_with_proposals=best.trust_after,
+            ),
+            "viewpoints": _proposals(out, best, all_probes, world, background_depth, threads),
+        }
+    )
+    record.write(out)
+    return record
 
 
-def _written(out: Path, result: dict[str, Any]) -> dict[str, Any]:
-    write_json(out / "coverage.json", result)
-    return result
+def _with_images(record: ViewCoverage, images: Mapping[str, Images]) -> ViewCoverage:
+    found = images.get(record.name)
+    return record if found is None else record.model_copy(update=found._asdict())
 
 
 def _evenly(items: Sequence[T], count: int) -> list[T]:
@@ -187,10 +212,10 @@ def _named(views: Sequence[View], name: str) -> View:
 
 def _surface(
     sampled: Sequence[ProbeView], probes: Sequence[ProbeView], background_depth: float
-) -> tuple[dict[str, Any], float]:
+) -> tuple[SurfaceCoverage | None, float]:
     """Statistics of how the training views ``probes`` observe the surface that ``sampled`` show,
-    and the distance of the nearest surface (2nd percentile) that at least 3 of them see; 0 if there
-    is none."""
+    None if none of them sees it, and the distance of the nearest surface (2nd percentile) that at
+    least 3 of them see; 0 if there is none."""
     counts, parallax, depth = [], [], []
     for probe in track(sampled, "counting observations", len(sampled), unit="views"):
         points = backproject(probe, background_depth, 4)
@@ -201,22 +226,20 @@ def _surface(
         depth.append(probe.focal / points.resolution[on_surface])
     count, angle, z = (np.concatenate(values) for values in (counts, parallax, depth))
     if not len(count):
-        return {}, 0.0
+        return None, 0.0
     certain = z[count > 2]
-    seen_by = {
-        "1": _share(count == 1),
-        "2": _share(count == 2),
-        "3 or more": _share(count > 2),
-    }
-    return {
-        "seen_by": seen_by,
-        "median_photographs": float(np.median(count)),
-        "median_parallax_deg": _rounded(np.median(angle)),
-    }, float(np.percentile(certain, 2)) if len(certain) else 0.0
+    seen_by = SeenBy(
+        one=_share(count == 1), two=_share(count == 2), three_or_more=_share(count > 2)
+    )
+    return SurfaceCoverage(
+        seen_by=seen_by,
+        median_photographs=float(np.median(count)),
+        median_parallax_deg=_rounded(np.median(angle)),
+    ), float(np.percentile(certain, 2)) if len(certain) else 0.0
 
 
 def _measure_test_views(
-    evaluation: Mapping[str, Any],
+    evaluation: Evaluation,
     renders: Path,
     protocol: Protocol,
     probes: Sequence[ProbeView],
@@ -226,9 +249,8 @@ def _measure_test_views(
     threads: int,
 ) -> list[MeasuredView]:
     by_name = {view.name: view for view in protocol.views if view.is_test}
-    items = [item for item in evaluation["per_view"] if item["name"] in by_name]
-    items = _evenly(items, MAX_TEST_VIEWS)
-    views = [by_name[item["name"]] for item in items]
+    items = _evenly([item for item in evaluation.per_view if item.name in by_name], MAX_TEST_VIEWS)
+    views = [by_name[item.name] for item in items]
     test_probes = list(render_probes(views, render, threads))
     maps = trust_maps(test_probes, probes, background_depth, threads)
     maps = track(maps, "mapping trust", len(items), unit="views")
@@ -236,28 +258,28 @@ def _measure_test_views(
     for item, view, probe, (trust, observed) in zip(items, views, test_probes, maps, strict=True):
         pixels = load_view(view)
         photo = photo_over_background(pixels, protocol.background)
-        with Image.open(renders / item["render"]) as image:
+        with Image.open(renders / item.render) as image:
             error = ((np.asarray(image) / 255.0 - photo / 255.0) ** 2).mean(axis=2)
         height, width = probe.depth.shape
         opaque, measured = None, probe.valid
         if pixels.alpha is not None:
             opaque = resize_area(pixels.alpha, width, height) > 127
             measured = measured & (opaque | ~probe.empty)
-        record = {
-            "name": view.name,
-            "psnr": item["psnr"],
-            "trust": _rounded(trust[measured].mean()) if measured.any() else None,
-            "little_trust": _share(trust[measured] < LOW_TRUST),
-            "holes": _share(holes(probe, observed, opaque)[measured]),
-            "floating": _share(floating(probe, observed, nearest)[measured]),
-            "median_photographs": float(np.median(observed.count)),
-        }
+        record = ViewCoverage(
+            name=view.name,
+            psnr=item.psnr,
+            mean_trust=_rounded(trust[measured].mean()) if measured.any() else None,
+            low_trust_share=_share(trust[measured] < LOW_TRUST),
+            hole_share=_share(holes(probe, observed, opaque)[measured]),
+            floater_share=_share(floating(probe, observed, nearest)[measured]),
+            median_photographs=float(np.median(observed.count)),
+        )
         small = resize_area(error.astype(np.float32), width, height)
         result.append(MeasuredView(probe, trust, small, measured, record))
     return result
 
 
-def _error_by_trust(tested: Sequence[MeasuredView]) -> dict[str, Any]:
+def _error_by_trust(tested: Sequence[MeasuredView]) -> ErrorByTrust:
     """How the error of test views depends on trust: Spearman's rank correlation over blocks, and
     the RMS error in classes of trust."""
     from scipy.stats import spearmanr
@@ -268,20 +290,20 @@ def _error_by_trust(tested: Sequence[MeasuredView]) -> dict[str, Any]:
     )
     classes = np.digitize(trust, CLASSES[1:-1])
     undefined = len(trust) < MIN_BLOCKS or np.ptp(trust) == 0 or np.ptp(error) == 0
-    return {
-        "squares": len(trust),
-        "square_px": BLOCK,
-        "rank_correlation": None if undefined else _rounded(spearmanr(trust, error).statistic),
-        "by_trust": [
-            {
-                "trust": [low, high],
-                "share": _share(classes == i),
-                "rmse": _rounded(np.sqrt(error[classes == i].mean()), 4),
-            }
+    return ErrorByTrust(
+        num_blocks=len(trust),
+        block_px=BLOCK,
+        rank_correlation=None if undefined else _rounded(spearmanr(trust, error).statistic),
+        by_trust=tuple(
+            ErrorClass(
+                trust_range=(low, high),
+                share=_share(classes == i),
+                rmse=_rounded(np.sqrt(error[classes == i].mean()), 4),
+            )
             for i, (low, high) in enumerate(pairwise(CLASSES))
             if (classes == i).any()
-        ],
-    }
+        ),
+    )
 
 
 def _blocks(item: MeasuredView) -> tuple[NDArray[Any], NDArray[Any]]:
@@ -301,27 +323,41 @@ def _blocks(item: MeasuredView) -> tuple[NDArray[Any], NDArray[Any]]:
 
 
 def _proposals(
-    best: NextBestViews, probes: Sequence[ProbeView], world: WorldFrame
-) -> list[dict[str, Any]]:
+    out: Path,
+    best: NextBestViews,
+    probes: Sequence[ProbeView],
+    world: WorldFrame,
+    background_depth: float,
+    threads: int,
+) -> tuple[ProposedViewpoint, ...]:
+    """The proposals, with their images written."""
     missing = max(1 - best.trust_before, 1e-9)
-    return [
-        {
-            "where": describe(proposal.viewpoint, probes, world.up, world.unit),
-            "position": _rounded(proposal.viewpoint.view.centre, 6),
-            "direction": _rounded(proposal.viewpoint.view.world_to_camera[2, :3], 6),
-            "look_at": _rounded(proposal.viewpoint.subject, 6),
-            "world_to_camera": _rounded(proposal.viewpoint.view.world_to_camera, 9),
-            "unknown_percent": _rounded(100 * proposal.unknown, 1),
-            "gain_percent": _rounded(100 * proposal.gain / missing, 1),
-        }
-        for proposal in best.proposals
-    ]
+    shown = [proposal.probe for proposal in best.proposals]
+    maps = trust_maps(shown, probes, background_depth, threads)
+    found = []
+    for i, (proposal, (trust, _)) in enumerate(zip(best.proposals, maps, strict=True)):
+        view = proposal.viewpoint.view
+        images = _write_images(out, f"next_{i + 1}", proposal.probe, trust)
+        found.append(
+            ProposedViewpoint(
+                description=describe(proposal.viewpoint, probes, world.up, world.unit),
+                position=_rounded(view.centre, 6),
+                direction=_rounded(view.world_to_camera[2, :3], 6),
+                look_at=_rounded(proposal.viewpoint.subject, 6),
+                world_to_camera=_rounded(view.world_to_camera, 9),
+                unknown_percent=_rounded(100 * proposal.unknown, 1),
+                gain_percent=_rounded(100 * proposal.gain / missing, 1),
+                render=images.render,
+                trust_map=images.trust_map,
+            )
+        )
+    return tuple(found)
 
 
-def _write_images(out: Path, name: str, probe: ProbeView, trust: Floats) -> dict[str, str]:
-    """Write the render and the trust map (grey, white is 1) of a probe view; their paths."""
-    files = {"render": f"coverage/{name}_render.png", "trust_map": f"coverage/{name}_trust.png"}
-    for file, values in zip(files.values(), (probe.rgb, trust), strict=True):
+def _write_images(out: Path, name: str, probe: ProbeView, trust: Floats) -> Images:
+    """Write the render and the trust map (grey, white is 1) of a probe view."""
+    files = Images(f"coverage/{name}_render.png", f"coverage/{name}_trust.png")
+    for file, values in zip(files, (probe.rgb, trust), strict=True):
         buffer = io.BytesIO()
         Image.fromarray(to_bytes(values)).save(buffer, "PNG")
         write_bytes(out / file, buffer.getvalue())

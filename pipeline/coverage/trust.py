@@ -42,7 +42,7 @@ PRIOR_SIGMA_PX = 50.0
 HALF_TRUST_ERROR_SQUARED = 2.0
 #: 1 - cos b at which support is 1/2; b is 30 degrees.
 HALF_SUPPORT_TURN = 0.134
-#: Pixels below this are counted as ``little_trust``.
+#: Pixels below this are counted as ``low_trust_share``.
 LOW_TRUST = 0.5
 
 

@@ -5,20 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
 from pipeline.export.counters import ExportCounters
 from pipeline.io.colmap import write_model
-from pipeline.io.frame_json import describe_frame
+from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.splat import write_splat
 from pipeline.io.spz import count_out_of_range, write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.evaluate import choose_protocol
-from pipeline.runtime.atomic import write_json
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, scene_up
@@ -41,7 +40,7 @@ class ExportScene:
         manifest: the photographs of the views.
         views: all views, at the size of the photographs.
         training_size_views: the same views at the size used in training.
-        georeference: content of ``georeference.json``; None without one.
+        georeference: frame of the poses; None for untranslated given poses.
         folder: final folder of the exported files.
     """
 
@@ -50,7 +49,7 @@ class ExportScene:
     manifest: Manifest
     views: list[View]
     training_size_views: list[View]
-    georeference: dict[str, Any] | None
+    georeference: Georeference | None
     folder: Path
 
 
@@ -142,14 +141,11 @@ def _warnings(files: _Files, config: Export) -> list[str]:
 def _write_frame(out: Path, files: _Files, written: list[str], train: Train, split: Split) -> None:
     scene = files.scene
     protocol = choose_protocol(scene.views, split, train)
-    render = {
-        "background": list(protocol.background),
-        "near": protocol.near,
-        "antialias": files.antialias,
-    }
+    render = RenderSettings(
+        background=protocol.background, near=protocol.near, antialias=files.antialias
+    )
     up = scene_up(scene.views, scene.manifest)
-    frame = describe_frame(files.gaussians, scene.views, up, render, written, scene.georeference)
-    write_json(out / "frame.json", frame)
+    describe_frame(files.gaussians, scene.views, up, render, written, scene.georeference).write(out)
 
 
 def _write_rendered_formats(

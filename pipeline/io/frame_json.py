@@ -3,12 +3,15 @@ file formats do not store."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from pipeline.runtime.json_file import JsonFile, JsonObject, Vector3
+from pipeline.scene.georeference import GIVEN_UNIT, METHODS, Georeference, Method, Origin
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 
@@ -16,48 +19,99 @@ AXES = (
     "right-handed, COLMAP's convention: in a camera at the identity, x is right, y is down and z "
     "is forward"
 )
-UNIT = "that of the given camera poses"
 OTHER_AXES = {
     "point_cloud.glb": "rotated by 180 degrees about z (x and y negated), because glTF is y up",
     "transforms.json": "the same world; camera axes are OpenGL's (x right, y up, z backward)",
 }
 
 
+class RenderSettings(JsonObject):
+    """The settings that the Gaussians must be rendered with."""
+
+    background: Vector3 = Field(description="RGB in 0..1.")
+    near: float = Field(gt=0, description="Near plane, world units.")
+    antialias: bool = Field(description="Mip-Splatting's opacity compensation.")
+
+
+class FrameCameras(JsonObject):
+    """The cameras of all views."""
+
+    count: int = Field(ge=1, description="Number of cameras.")
+    centre: Vector3 = Field(description="Mean of the camera centres, world.")
+    extent: float = Field(description="Radius of the scene, world units.")
+
+
+class FrameGaussians(JsonObject):
+    """The exported Gaussians."""
+
+    count: int = Field(ge=0, description="Number of Gaussians.")
+    sh_degree: int = Field(ge=0, le=3, description="Degree of the spherical harmonics.")
+
+
+class FrameGeoreference(JsonObject):
+    """Source and origin of the world frame, as in `georeference.json`."""
+
+    method: Method = Field(description=METHODS)
+    origin: Origin | None = Field(
+        description="Where the frame's origin is; null for a level frame."
+    )
+    projection: str | None = Field(
+        description="First line of `gcp_list.txt`; null without ground control points."
+    )
+
+
+class Frame(JsonFile, JsonObject):
+    """The frame of the exported files."""
+
+    file_name: ClassVar[str] = "frame.json"
+
+    schema_version: Literal[1] = Field(1, description="Version of this file's format.")
+    axes: str = Field(description="Of the world.")
+    axes_of: dict[str, str] = Field(description="File to its axes, if they differ from `axes`.")
+    up: Vector3 = Field(description="Unit vector, world.")
+    unit: str = Field(description="Unit of length.")
+    georeference: FrameGeoreference | None = Field(description="null for untranslated given poses.")
+    cameras: FrameCameras = Field(description="The cameras of all views.")
+    gaussians: FrameGaussians = Field(description="The exported Gaussians.")
+    colour: str = Field(description="Colour space of the Gaussians.")
+    render: RenderSettings = Field(description="How to render the Gaussians.")
+
+
 def describe_frame(
     gaussians: Gaussians,
     views: Sequence[View],
     up: NDArray[np.float64],
-    render: dict[str, Any],
+    render: RenderSettings,
     files: Sequence[str],
-    georeference: Mapping[str, Any] | None = None,
-) -> dict[str, Any]:
+    georeference: Georeference | None = None,
+) -> Frame:
     """The content of ``frame.json``.
 
     Args:
         views: all views of the scene.
         up: (3,) up direction in the world.
-        render: the settings that the Gaussians must be rendered with: background (RGB in
-            [0, 1]), near plane (world units), antialias.
         files: names of the exported files.
-        georeference: the content of ``georeference.json``, None if there is none.
+        georeference: None for untranslated given poses.
     """
-    world = georeference or {}
     centres = np.stack([view.centre for view in views])
-    return {
-        "axes": f"{AXES}; {world['axes']}" if world else AXES,
-        "axes_of": {name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
-        "up": np.round(up, 6).tolist(),
-        "unit": world.get("unit", UNIT),
-        "georeference": {k: world[k] for k in ("method", "origin", "projection") if k in world},
-        "cameras": {
-            "count": len(views),
-            "centre": [_rounded(value) for value in centres.mean(0)],
-            "extent": _rounded(scene_extent(list(views))),
-        },
-        "gaussians": {"count": len(gaussians), "sh_degree": gaussians.sh_degree},
-        "colour": "sRGB: 0.5 + spherical harmonics, blended without conversion to linear",
-        "render": render,
-    }
+    x, y, z = (_rounded(value) for value in centres.mean(0))
+    world = georeference
+    return Frame(
+        axes=f"{AXES}; {world.axes}" if world else AXES,
+        axes_of={name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
+        up=np.round(up, 6).tolist(),
+        unit=world.unit if world else GIVEN_UNIT,
+        georeference=world
+        and FrameGeoreference(
+            method=world.method, origin=world.origin, projection=world.projection
+        ),
+        cameras=FrameCameras(
+            count=len(views), centre=(x, y, z), extent=_rounded(scene_extent(list(views)))
+        ),
+        gaussians=FrameGaussians(count=len(gaussians), sh_degree=gaussians.sh_degree),
+        colour="sRGB: 0.5 + spherical harmonics, blended without conversion to linear",
+        render=render,
+    )
 
 
 def _rounded(value: float) -> float:

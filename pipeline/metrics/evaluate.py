@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 from collections import deque
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.metrics.evaluation import (
+    EvaluatedModel,
+    Evaluation,
+    ProtocolDescription,
+    ViewMetrics,
+)
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
 from pipeline.photos.load import ViewPixels, load_view
@@ -22,6 +26,7 @@ from pipeline.render import BACKGROUNDS, Color, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View, scene_extent
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.fit_pose import fit_pose
@@ -37,7 +42,6 @@ LARGE_GAP, LOW_PSNR = 6.0, 25.0
 #: zlib level of the renders: higher levels are much slower and save little.
 PNG_LEVEL = 1
 
-NO_GAINS: Mapping[str, Sequence[float]] = MappingProxyType({})
 EXPOSURE_PROTOCOL = (
     "renders multiplied by each photograph's gains (one per channel), which are measured at the "
     "sparse points, in test photographs as well; psnr_without_gains is without this"
@@ -110,21 +114,18 @@ def evaluate_views(
     train: Train,
     out: Path,
     *,
-    gains: Mapping[str, Sequence[float]] = NO_GAINS,
+    gains: ExposureGains = NO_GAINS,
     threads: int,
-) -> dict[str, Any]:
+) -> Evaluation:
     """Render each view, write it as 8-bit PNG, and compare that image with the photograph.
 
     Args:
-        gains: factor of each channel from the scene's typical exposure to the view's, by name of
-            the view; empty if exposure is not modelled.
+        gains: of all views of the protocol, by which renders are multiplied; empty if exposure is
+            not modelled.
         out: folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:
-        ``psnr`` (dB), ``ssim`` and ``lpips`` (means over the views; lpips is None, with
-        ``lpips_reason``, if its weights are missing), ``train_psnr`` (mean over a sample of the
-        training views, None without test views), ``psnr_without_gains`` (None without gains),
-        ``per_view``, ``warnings`` and ``protocol``.
+        The measures and their protocol, without ``pose_error``.
 
     Raises:
         UserError: the masks hide all views.
@@ -134,7 +135,7 @@ def evaluate_views(
     if lpips is not None and smallest < MIN_SIDE:
         lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
-    per_view: list[dict[str, Any]] = []
+    per_view: list[ViewMetrics] = []
     progress = Progress("evaluating", len(protocol.views) + len(protocol.training_views), "views")
     warnings: list[str] = []
     unadjusted: list[float] = []
@@ -144,36 +145,38 @@ def evaluate_views(
         pixels = load_view(view)
         photo = photo_over_background(pixels, protocol.background)
         if train.refine_poses and view.is_test:
-            gain, weight = gains.get(view.name), train.ssim_loss_weight
+            gain, weight = gains.of(view.name), train.ssim_loss_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
             )
         return render_rgb(gaussians, view, options), photo, pixels.mask
 
     def with_exposure(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
-        return to_bytes(rgb * np.array(gains[view.name], np.float32) if gains else rgb)
+        gain = gains.of(view.name)
+        return to_bytes(rgb if gain is None else rgb * np.array(gain, np.float32))
 
     def measure(
         index: int, rgb: NDArray[np.float32], photo: NDArray[np.uint8], mask: Mask | None
-    ) -> tuple[dict[str, Any], float | None]:
+    ) -> tuple[ViewMetrics, float | None]:
         view = protocol.views[index]
         image = with_exposure(rgb, view)
         name = f"{index:04d}.png"
         Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
         a, b = image / 255.0, photo / 255.0
-        record = {"name": view.name, "psnr": psnr(a, b, mask), "ssim": ssim(a, b, mask)}
-        record |= {"lpips": None, "render": name}
+        record = ViewMetrics(
+            name=view.name, psnr=psnr(a, b, mask), ssim=ssim(a, b, mask), lpips=None, render=name
+        )
         return record, psnr(to_bytes(rgb) / 255.0, b, mask) if gains else None
 
-    def collect(future: Future[tuple[dict[str, Any], float | None]]) -> None:
+    def collect(future: Future[tuple[ViewMetrics, float | None]]) -> None:
         record, psnr_without_gains = future.result()
         per_view.append(record)
         if psnr_without_gains is not None:
             unadjusted.append(psnr_without_gains)
-        progress.advance(note=f"PSNR {record['psnr']:.2f} dB")
+        progress.advance(note=f"PSNR {record.psnr:.2f} dB")
 
     # Views are measured while the next ones are rendered. The queue is short: it holds the images.
-    pending: deque[Future[tuple[dict[str, Any], float | None]]] = deque()
+    pending: deque[Future[tuple[ViewMetrics, float | None]]] = deque()
     distances: list[float] = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for index, view in enumerate(protocol.views):
@@ -189,8 +192,11 @@ def evaluate_views(
                 collect(pending.popleft())
         while pending:
             collect(pending.popleft())
-    for record, distance in zip(per_view, distances, strict=lpips is not None):
-        record["lpips"] = distance
+    if lpips is not None:
+        per_view = [
+            record.model_copy(update={"lpips": distance})
+            for record, distance in zip(per_view, distances, strict=True)
+        ]
     training: list[float] = []
     for view in protocol.training_views:
         rgb, photo, mask = render_and_load(view)
@@ -199,23 +205,34 @@ def evaluate_views(
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
-    mean_psnr = float(np.mean([v["psnr"] for v in per_view]))
+    mean_psnr = float(np.mean([v.psnr for v in per_view]))
     train_psnr = float(np.mean(training)) if training else None
     if train_psnr is not None:
         warnings += diagnose(mean_psnr, train_psnr)
-    return {
-        "psnr": mean_psnr,
-        "train_psnr": train_psnr,
-        "psnr_without_gains": float(np.mean(unadjusted)) if gains else None,
-        "ssim": float(np.mean([v["ssim"] for v in per_view])),
-        "lpips": None if lpips is None else float(np.mean([v["lpips"] for v in per_view])),
-        "lpips_reason": reason,
-        "per_view": per_view,
-        "warnings": warnings,
-        "protocol": _describe(protocol, config, len(per_view), reason if lpips is None else None)
-        | {"exposure": EXPOSURE_PROTOCOL if gains else None}
-        | {"poses": POSES_PROTOCOL if train.refine_poses else None},
-    }
+    return Evaluation(
+        psnr=mean_psnr,
+        train_psnr=train_psnr,
+        psnr_without_gains=float(np.mean(unadjusted)) if gains else None,
+        ssim=float(np.mean([v.ssim for v in per_view])),
+        lpips=float(np.mean(distances)) if lpips is not None else None,
+        lpips_reason=reason,
+        per_view=tuple(per_view),
+        protocol=ProtocolDescription(
+            resolution=_sizes(protocol.views),
+            split=_describe_split(protocol),
+            poses_and_points="from all photographs, test views included (as usual in the field)",
+            num_views=len(per_view),
+            psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
+            ssim=SSIM_VARIANT,
+            lpips=LPIPS_VARIANTS[config.lpips_net] if lpips is not None else reason,
+            masks="masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
+            background=protocol.background,
+            exposure=EXPOSURE_PROTOCOL if gains else None,
+            poses=POSES_PROTOCOL if train.refine_poses else None,
+        ),
+        model=EvaluatedModel(num_gaussians=len(gaussians), sh_degree=gaussians.sh_degree),
+        warnings=tuple(warnings),
+    )
 
 
 def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
@@ -248,22 +265,12 @@ def photo_over_background(
     return to_bytes(pixels.rgb / 255.0 * alpha + np.array(background) * (1 - alpha))
 
 
-def _describe(
-    protocol: Protocol, config: Evaluate, num_views: int, no_lpips: str | None
-) -> dict[str, Any]:
-    sizes = sorted({(view.width, view.height) for view in protocol.views})
-    return {
-        "resolution": [f"{w}x{h}" for w, h in sizes],
-        "split": (
-            f"test views: one view in {protocol.every}, sorted by name, from the first"
-            if protocol.every
-            else "no test views: measured on the TRAINING views"
-        ),
-        "poses_and_points": "from all photographs, test views included (as usual in the field)",
-        "num_views": num_views,
-        "psnr": "mean over the views of PSNR in dB, 8-bit renders, peak 1",
-        "ssim": SSIM_VARIANT,
-        "lpips": no_lpips or LPIPS_VARIANTS[config.lpips_net],
-        "masks": "masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
-        "background": list(protocol.background),
-    }
+def _sizes(views: Sequence[View]) -> tuple[str, ...]:
+    sizes = sorted({(view.width, view.height) for view in views})
+    return tuple(f"{w}x{h}" for w, h in sizes)
+
+
+def _describe_split(protocol: Protocol) -> str:
+    if not protocol.every:
+        return "no test views: measured on the TRAINING views"
+    return f"test views: one view in {protocol.every}, sorted by name, from the first"

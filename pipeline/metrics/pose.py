@@ -2,13 +2,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
 from pipeline.geometry.similarity import umeyama
 from pipeline.io.names import NameIndex
+from pipeline.runtime.json_file import JsonObject
 from pipeline.scene.reconstruction import Reconstruction
 
 Array = NDArray[np.float64]
@@ -16,33 +16,29 @@ Array = NDArray[np.float64]
 AUC_DEGREES = (1.0, 5.0, 10.0)
 
 
-@dataclass(frozen=True)
-class PoseError:
+class PoseError(JsonObject):
     """Pose errors after aligning the estimated centres to the true ones by a similarity.
 
-    Attributes:
-        rotation_median_deg, rotation_mean_deg: over the common images, degrees; None if there
-            is none.
-        centre_median, centre_mean: distances of the centres in units of the truth; None for
-            fewer than three common images (two centres align exactly).
-        centre_relative_median: ``centre_median`` over ``radius``.
-        radius: root mean square distance of the true common centres from their mean.
-        scale: length of one unit of the estimate in units of the truth.
-        auc: threshold in degrees -> area under the recall curve of the relative pose errors of all
-            pairs of true images, up to the threshold, in [0, 1]; None for fewer than two images.
-        num_common, num_truth: number of images in both, and in the truth.
+    Rotations are null without a common image, centres for fewer than three common images (two
+    centres align exactly).
     """
 
-    rotation_median_deg: float | None
-    rotation_mean_deg: float | None
-    centre_median: float | None
-    centre_mean: float | None
-    centre_relative_median: float | None
-    radius: float | None
-    scale: float | None
-    auc: dict[float, float] | None
-    num_common: int
-    num_truth: int
+    rotation_median_deg: float | None = Field(description="Over the common images, degrees.")
+    rotation_mean_deg: float | None = Field(description="Over the common images, degrees.")
+    centre_median: float | None = Field(description="Distance of the centres, in the truth's unit.")
+    centre_mean: float | None = Field(description="In the truth's unit.")
+    centre_relative_median: float | None = Field(description="`centre_median` over `radius`.")
+    radius: float | None = Field(
+        description="Root mean square distance of the true common centres from their mean."
+    )
+    scale: float | None = Field(description="Truth units in one unit of the estimate.")
+    auc: dict[float, float] | None = Field(
+        description="Threshold in degrees to the area, in 0..1, under the recall curve of the "
+        "relative pose errors of all pairs of true images, up to the threshold; null for fewer "
+        "than two images."
+    )
+    num_common: int = Field(description="Number of images in the estimate and the truth.")
+    num_truth: int = Field(description="Number of images in the truth.")
 
 
 def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
@@ -63,7 +59,18 @@ def pose_error(estimated: Reconstruction, truth: Reconstruction) -> PoseError:
     common = [name for name in names if name in found]
     auc = _relative_pose_auc(found, true, names)
     if not common:
-        return PoseError(None, None, None, None, None, None, None, auc, 0, len(names))
+        return PoseError(
+            rotation_median_deg=None,
+            rotation_mean_deg=None,
+            centre_median=None,
+            centre_mean=None,
+            centre_relative_median=None,
+            radius=None,
+            scale=None,
+            auc=auc,
+            num_common=0,
+            num_truth=len(names),
+        )
 
     r_found = np.stack([found[n].rotation for n in common])
     r_true = np.stack([true[n].rotation for n in common])

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,13 +15,11 @@ from pipeline.io.llff import read_poses_bounds
 from pipeline.io.names import NameIndex
 from pipeline.io.posefiles import PoseKind
 from pipeline.io.transforms import read_transforms
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import GIVEN_UNIT, CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
-# Output of stages with poses: how their frame differs from the given one.
-GEOREFERENCE = "georeference.json"
 # Relative difference of the aspect ratios of a photograph and its camera; rounding in reduced
 # copies causes less.
 _ASPECT_TOLERANCE = 0.02
@@ -46,19 +43,23 @@ class GivenModel:
     model: Reconstruction
     origin: NDArray[np.float64]
 
-    def georeference(self) -> dict[str, Any] | None:
+    def georeference(self) -> Georeference | None:
         """The content of ``georeference.json``; None if the world was not translated."""
         if not self.origin.any():
             return None
-        return {
-            "method": "given",
-            "axes": "those of the given poses",
-            "origin": dict(zip("xyz", self.origin.tolist(), strict=True)),
-            "projection": None,
-            "scale": 1.0,
-            "rotation": np.eye(3).tolist(),
-            "translation": (-self.origin).tolist(),
-        }
+        x, y, z = self.origin.tolist()
+        return Georeference(
+            method="given",
+            axes="those of the given poses",
+            unit=GIVEN_UNIT,
+            origin=CartesianOrigin(x=x, y=y, z=z),
+            projection=None,
+            scale=1.0,
+            rotation=np.eye(3).tolist(),
+            translation=(-self.origin).tolist(),
+            residuals_m=None,
+            residuals=(),
+        )
 
     def write(self, folder: Path) -> list[str]:
         """Write ``sparse/0`` and, if the world was translated, ``georeference.json`` into
@@ -68,10 +69,10 @@ class GivenModel:
             Messages about the translation.
         """
         write_model(folder / "sparse" / "0", self.model)
-        content = self.georeference()
-        if content is None:
+        georeference = self.georeference()
+        if georeference is None:
             return []
-        write_json(folder / GEOREFERENCE, content)
+        georeference.write(folder)
         origin = ", ".join(f"{value:.9g}" for value in self.origin)
         return [
             "the given poses are too far from their origin for float32: the scene is translated, "

@@ -2,24 +2,30 @@
 
 from __future__ import annotations
 
-import json
+import shlex
 from dataclasses import dataclass, replace
 from pathlib import Path
+
+from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.config.schema import Config, Split, Train, Views
 from pipeline.io.camera_files import STAGES_WITH_MODEL
 from pipeline.io.colmap import read_model
 from pipeline.plan.given_poses import load_given
-from pipeline.plan.record import NAME as PLAN
 from pipeline.plan.record import read_plan
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.json_file import first_error, mismatch
+from pipeline.runtime.record import STAGE, read_stage
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
 # Stages with photographs, in the order of preference.
 _STAGES_WITH_PHOTOS = ("undistort", "decode", "inspect")
+# A folder with one of these has results, finished or not.
+_RESULTS = ("plan.json", ".scratch")
 
 
 @dataclass(frozen=True)
@@ -27,15 +33,25 @@ class PosedScene:
     """Views with their photographs, and the settings for rendering them.
 
     Attributes:
-        gains: file of the photographs' exposure gains (``exposure.json``), or None.
+        gains: exposure gains of all views; empty if exposure is not modelled.
         warnings: of the scan.
     """
 
     views: list[View]
     split: Split
     train: Train
-    gains: Path | None
+    gains: ExposureGains
     warnings: tuple[str, ...]
+
+
+class _Settings(BaseModel):
+    """The sections of a training's options that apply to its evaluation."""
+
+    model_config = ConfigDict(frozen=True)
+
+    views: Views
+    split: Split
+    train: Train
 
 
 def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
@@ -50,10 +66,10 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             else the default.
 
     Raises:
-        UserError: no such scene, damaged records of a finished one, no poses, cameras with lens
-            distortion.
+        UserError: no such scene, an unfinished one, damaged records of a finished one, no poses,
+            cameras with lens distortion.
     """
-    if (folder / PLAN).is_file():
+    if any((folder / name).exists() for name in _RESULTS):
         return _finished(folder, max_long_side, every)
     side = Views(max_long_side_px=max_long_side or 2**31)
     split = Split() if every is None else Split(test_every=every)
@@ -75,22 +91,20 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
     train = Train(background="white" if found.num_alpha else "black")
-    return PosedScene(views, split, train, None, found.warnings)
+    return PosedScene(views, split, train, NO_GAINS, found.warnings)
 
 
 def _finished(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
-    record = folder / "train" / "stage.json"
+    trained = folder / "train"
+    for missing in ("plan.json", f"train/{STAGE}"):
+        if not (folder / missing).is_file():
+            raise _unfinished(folder, missing)
     try:
-        sections = json.loads(record.read_text())["key"]["config"]
-        views = Views.model_validate(sections["views"])
-        split = Split.model_validate(sections["split"])
-        train = Train.model_validate(sections["train"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
-        raise UserError(
-            f"expected a finished scene, could not read its settings: {error}",
-            file=record,
-            fix=f"run snakemake {folder}/metrics.json with this version of the program",
-        ) from None
+        settings = _Settings.model_validate(read_stage(trained).key.get("config"))
+    except ValidationError as error:
+        what = "expected the settings of a training by this version of the program"
+        raise mismatch(trained / STAGE, f"{what} ({first_error(error)})") from None
+    views, split = settings.views, settings.split
     if max_long_side is not None:
         views = views.model_copy(update={"max_long_side_px": max_long_side})
     if every is not None:
@@ -106,8 +120,17 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
         )
         for view in load_views(Manifest.read(photos), model, views, split)
     ]
-    gains = folder / "train" / "exposure.json"
-    return PosedScene(found, split, train, gains if gains.is_file() else None, ())
+    gains = ExposureGains.read_for(trained, [view.name for view in found])
+    return PosedScene(found, split, settings.train, gains, ())
+
+
+def _unfinished(folder: Path, missing: str) -> UserError:
+    target = shlex.quote(str(folder / "metrics.json"))
+    return UserError(
+        f"expected a finished scene, found no {missing}: its run has not finished",
+        file=folder,
+        fix=f"finish it: snakemake --cores all {target}, with the options of that run",
+    )
 
 
 def _output(folder: Path, stages: tuple[str, ...], name: str) -> Path:
@@ -117,11 +140,7 @@ def _output(folder: Path, stages: tuple[str, ...], name: str) -> Path:
         path = folder / stage / name
         if plan.runs(stage) and path.exists():
             return path
-    raise UserError(
-        f"expected a finished scene, found no {name}",
-        file=folder,
-        fix=f"run snakemake {folder}/metrics.json",
-    )
+    raise _unfinished(folder, " or ".join(f"{stage}/{name}" for stage in stages))
 
 
 def _resolved(root: Path, file: str) -> str:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
 
+from pipeline.metrics.evaluation import Evaluation, SceneQuality
 from pipeline.photos.counters import InspectCounters
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import Metrics
@@ -19,7 +18,7 @@ def collect_metrics(
     scene: str,
     plan: PlanRecord,
     folder: Path,
-    evaluation: Mapping[str, Any],
+    evaluation: Evaluation,
     *,
     seed: int,
     versions: dict[str, str],
@@ -30,7 +29,7 @@ def collect_metrics(
         scene: name of the scene.
         plan: of the scene.
         folder: ``results/<scene>``, which contains the folders of the stages.
-        evaluation: ``evaluate/evaluation.json``.
+        evaluation: of the evaluate stage.
         seed: of the run.
         versions: of the packages that affect results.
 
@@ -49,7 +48,7 @@ def collect_metrics(
     return Metrics.model_validate(
         {
             "scene": scene,
-            **{name: evaluation[name] for name in Metrics.model_fields if name in evaluation},
+            **{name: getattr(evaluation, name) for name in SceneQuality.model_fields},
             "num_gaussians": read_counters(folder / "train", TrainCounters).num_gaussians,
             "registered_images": sfm.registered if sfm else inspect.given_poses,
             "total_images": inspect.photos + inspect.left_out,

@@ -4,14 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.coverage.record import CoverageRecord
+from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.curve import CurveRecord
+
+Rank = Literal["worst", "low", "median", "high", "best"]
 
 
 @dataclass(frozen=True)
@@ -27,7 +32,7 @@ class Comparison:
         orientation: EXIF orientation, 1 to 8; rotates the images for display only.
     """
 
-    label: Literal["worst", "low", "median", "high", "best"]
+    label: Rank
     name: str
     photograph: NDArray[np.uint8]
     render: NDArray[np.uint8]
@@ -57,17 +62,24 @@ class TrainedScene:
 
 
 @dataclass(frozen=True)
-class Coverage:
+class CoverageSection:
     """Coverage of the scene by its photographs.
 
     Attributes:
-        record: the content of ``coverage.json``.
+        record: the measures.
         pictures: images by the names in ``record``: (H, W, 3) renders and (H, W) trust maps,
             uint8.
     """
 
-    record: Mapping[str, Any]
+    record: CoverageRecord
     pictures: Mapping[str, NDArray[np.uint8]]
+
+
+class TrainingRecord(NamedTuple):
+    """A record of the training curve, and the seconds of training at its end."""
+
+    values: CurveRecord
+    seconds: float
 
 
 def _empty(*shape: int) -> NDArray[np.float64]:
@@ -83,8 +95,7 @@ class ReportData:
         metrics: the content of ``metrics.json``.
         plan: of the scene, or None.
         decisions: stage -> its decisions, as recorded in ``stage.json``.
-        curve: records of training: ``step``, ``loss``, ``psnr``, ``num_gaussians`` and, if
-            known, ``seconds`` since the start of training; a missing or null value is a gap.
+        curve: the training curve.
         comparisons: views to show, worst first.
         trained: the Gaussians and their views.
         coverage: None without a record.
@@ -97,29 +108,27 @@ class ReportData:
     metrics: Mapping[str, Any]
     plan: PlanRecord | None = None
     decisions: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    curve: Sequence[Mapping[str, float | None]] = ()
+    curve: Sequence[TrainingRecord] = ()
     comparisons: Sequence[Comparison] = ()
     trained: TrainedScene | None = None
-    coverage: Coverage | None = None
+    coverage: CoverageSection | None = None
     points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
     points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
     reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))
     track_lengths: NDArray[Any] = field(default_factory=lambda: _empty(0))
 
 
-def ranked(
-    per_view: Sequence[Mapping[str, Any]], count: int
-) -> list[tuple[Literal["worst", "low", "median", "high", "best"], Mapping[str, Any]]]:
+def ranked(per_view: Sequence[ViewMetrics], count: int) -> list[tuple[Rank, ViewMetrics]]:
     """``count`` views from the worst PSNR to the best, evenly spaced by rank, each with its label;
     fewer if there are fewer views."""
-    ordered = sorted(per_view, key=lambda view: (view["psnr"], view["name"]))
+    ordered = sorted(per_view, key=lambda view: (view.psnr, view.name))
     count = min(count, len(ordered))
     if count == 1:
         return [("median", ordered[len(ordered) // 2])]
-    chosen: list[tuple[Literal["worst", "low", "median", "high", "best"], Mapping[str, Any]]] = []
+    chosen: list[tuple[Rank, ViewMetrics]] = []
     for i in range(count):
         share = i / (count - 1)
-        label: Literal["worst", "low", "median", "high", "best"] = (
+        label: Rank = (
             "worst"
             if i == 0
             else "best"

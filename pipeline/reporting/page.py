@@ -7,7 +7,7 @@ same data gives the same bytes.
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -203,36 +203,23 @@ def _pictures(views: Iterable[Comparison]) -> str:
 
 
 def _curves(data: ReportData) -> str:
-    kinds: list[tuple[str, str, Callable[[float], str], bool]] = [
-        ("loss", "Loss", lambda v: f"{v:.4g}", True),
-        ("psnr", "PSNR on training views, dB", lambda v: f"{v:.2f} dB", False),
-        ("num_gaussians", "Gaussians", lambda v: f"{v:,.0f}", False),
+    if not data.curve:
+        return _nothing("No curve was recorded.")
+    values = [record.values for record in data.curve]
+    kinds: list[tuple[list[float], str, Callable[[float], str], bool]] = [
+        ([v.loss for v in values], "Loss", lambda y: f"{y:.4g}", True),
+        ([v.psnr for v in values], "PSNR on training views, dB", lambda y: f"{y:.2f} dB", False),
+        ([v.num_gaussians for v in values], "Gaussians", lambda y: f"{y:,.0f}", False),
     ]
 
-    def charts(x_key: str, x_title: str) -> str:
-        parts = []
-        for key, title, label, log in kinds:
-            pairs = [(r.get(x_key), r.get(key)) for r in data.curve]
-            spots = [
-                (float(x), float(y))
-                for x, y in pairs
-                if x is not None and y is not None and np.isfinite(x) and np.isfinite(y)
-            ]
-            if spots:
-                xs, ys = zip(*spots, strict=True)
-                timed = x_key == "seconds"
-                parts.append(
-                    line_chart(
-                        xs, ys, title=title, x_title=x_title, y_label=label, timed=timed, log=log
-                    )
-                )
-        return "".join(parts)
+    def charts(xs: Sequence[float], x_title: str, timed: bool) -> str:
+        return "".join(
+            line_chart(xs, ys, title=title, x_title=x_title, y_label=label, timed=timed, log=log)
+            for ys, title, label, log in kinds
+        )
 
-    by_step, by_time = charts("step", "step"), charts("seconds", "time")
-    if not by_step:
-        return _nothing("No curve was recorded.")
-    if not by_time:
-        return f'<div class="charts">{by_step}</div>'
+    by_step = charts([v.step for v in values], "step", timed=False)
+    by_time = charts([record.seconds for record in data.curve], "time", timed=True)
     return (
         f'<div class="bar-top">{_choice("training", "timed", "By step", "By time")}</div>'
         f'<div class="charts by-step">{by_step}</div><div class="charts by-time">{by_time}</div>'

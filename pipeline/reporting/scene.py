@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,15 +10,26 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
 from pipeline.metrics.evaluate import Protocol, photo_over_background
+from pipeline.metrics.evaluation import Evaluation
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
-from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene, ranked
+from pipeline.reporting.data import (
+    Comparison,
+    CoverageSection,
+    ReportData,
+    TrainedScene,
+    TrainingRecord,
+    ranked,
+)
+from pipeline.runtime.json_file import mismatch
 from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.curve import TrainingCurve
 
 
 @dataclass(frozen=True)
@@ -46,12 +56,15 @@ class SceneResults:
     antialias: bool
 
 
-def report_data(results: SceneResults, evaluation: Mapping[str, Any], shown: int) -> ReportData:
+def report_data(results: SceneResults, evaluation: Evaluation, shown: int) -> ReportData:
     """The content of the page.
 
     Args:
-        evaluation: the content of ``evaluation.json``.
+        evaluation: of views of the scene.
         shown: number of views shown with their photographs.
+
+    Raises:
+        UserError: an output of a stage is missing, damaged, or does not match the others.
     """
     points = results.model.points
     return ReportData(
@@ -77,17 +90,15 @@ def report_data(results: SceneResults, evaluation: Mapping[str, Any], shown: int
     )
 
 
-def _comparisons(
-    results: SceneResults, evaluation: Mapping[str, Any], shown: int
-) -> list[Comparison]:
+def _comparisons(results: SceneResults, evaluation: Evaluation, shown: int) -> list[Comparison]:
     """The views to show, worst to best, each beside its photograph."""
     photos = {photo.name: photo for photo in results.manifest.photos}
     by_name = {view.name: view for view in results.views}
     comparisons = []
-    for label, measured in ranked(evaluation["per_view"], shown):
-        view = by_name[measured["name"]]
+    for label, measured in ranked(evaluation.per_view, shown):
+        view = by_name[measured.name]
         pixels = load_view(view)
-        with Image.open(results.folders["evaluate"] / "renders" / measured["render"]) as render:
+        with Image.open(results.folders["evaluate"] / "renders" / measured.render) as render:
             comparisons.append(
                 Comparison(
                     label=label,
@@ -95,29 +106,36 @@ def _comparisons(
                     photograph=photo_over_background(pixels, results.protocol.background),
                     render=np.asarray(render),
                     mask=pixels.mask,
-                    psnr=measured["psnr"],
-                    ssim=measured["ssim"],
+                    psnr=measured.psnr,
+                    ssim=measured.ssim,
                     orientation=photos[view.name].orientation,
                 )
             )
     return comparisons
 
 
-def _coverage(folder: Path) -> Coverage:
-    record = read_json(folder / "coverage.json")
+def _coverage(folder: Path) -> CoverageSection:
+    record = CoverageRecord.read(folder)
     pictures = {}
-    for shown in (*record.get("views", ()), *record.get("viewpoints", ())):
-        for name in (shown[key] for key in ("render", "trust_map") if key in shown):
+    shown: list[ViewCoverage | ProposedViewpoint] = [*record.views, *record.viewpoints]
+    for entry in shown:
+        for name in filter(None, (entry.render, entry.trust_map)):
             with Image.open(folder / name) as picture:
                 pictures[name] = np.asarray(picture)
-    return Coverage(record, pictures)
+    return CoverageSection(record, pictures)
 
 
-def _curve(train: Path) -> list[dict[str, Any]]:
+def _curve(folder: Path) -> list[TrainingRecord]:
     """The training curve with the times of the run that recorded it."""
-    seconds = read_run(train).curve_seconds or []
-    records = read_json(train / "curve.json")
-    return [r | {"seconds": s} for r, s in zip(records, seconds, strict=True)]
+    seconds = read_run(folder).curve_seconds or []
+    curve = TrainingCurve.read(folder).root
+    if len(seconds) != len(curve):
+        raise mismatch(
+            folder / TrainingCurve.file_name,
+            f"expected a record for each of the {len(seconds)} times in run.json, found "
+            f"{len(curve)} records",
+        )
+    return [TrainingRecord(*pair) for pair in zip(curve, seconds, strict=True)]
 
 
 def _decisions(plan: PlanRecord, results: Path) -> dict[str, list[str]]:
@@ -128,7 +146,3 @@ def _decisions(plan: PlanRecord, results: Path) -> dict[str, list[str]]:
         for name, step in plan.stages.items()
         if step.run
     }
-
-
-def read_json(path: Path) -> Any:
-    return json.loads(path.read_text())

@@ -17,6 +17,10 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TextIO, TypeVar
 
+from pydantic import Field
+
+from pipeline.runtime.json_file import JsonObject
+
 T = TypeVar("T")
 
 # Intervals between lines of a log (an hour's log has less than 1000 lines), updates of the JSON
@@ -26,6 +30,19 @@ FILE_SECONDS = 1.0
 LIVE_SECONDS = 0.5
 # The rate is averaged over this time, because training slows down as the number of Gaussians grows.
 RATE_SECONDS = 20.0
+
+
+class ProgressState(JsonObject):
+    """The content of the JSON file."""
+
+    label: str = Field(description="What is being done.")
+    done: int = Field(ge=0, description="Finished units.")
+    total: int = Field(ge=0, description="Units in all.")
+    unit: str = Field(description="Name of the units.")
+    rate: float = Field(description="Units per second, averaged over the last seconds.")
+    seconds_left: float = Field(description="Estimated.")
+    note: str = Field(description="State of the work, a few words; may be empty.")
+
 
 _ERASE = "\r\x1b[K"
 
@@ -173,19 +190,19 @@ class Progress:
 
     def _write(self, note: str) -> None:
         assert _file is not None
-        state = {
-            "label": self.label,
-            "done": self.done,
-            "total": self.total,
-            "unit": self.unit,
-            "rate": self.rate(),
-            "seconds_left": self.seconds_left(),
-            "note": note,
-        }
+        state = ProgressState(
+            label=self.label,
+            done=self.done,
+            total=self.total,
+            unit=self.unit,
+            rate=self.rate(),
+            seconds_left=self.seconds_left(),
+            note=note,
+        )
         # Progress is optional: a full disk or another run's file is no error.
         temporary = _file.with_suffix(f".{os.getpid()}.tmp")
         with contextlib.suppress(OSError):
-            temporary.write_text(json.dumps(state))
+            temporary.write_text(json.dumps(state.model_dump(mode="json")))
             os.replace(temporary, _file)
 
 

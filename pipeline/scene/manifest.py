@@ -19,7 +19,7 @@ class Photo(BaseModel):
     displays photographs.
     """
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     name: str
     """Relative to the image folder, "/" between folders; unique."""
@@ -42,9 +42,11 @@ class Photo(BaseModel):
     mask: str | None = None
     """Mask file; pixels with mask value 0 are ignored."""
     mask_digest: str | None = None
+    """As ``digest``, of the mask."""
     depth: str | None = None
     """Depth map file; see ``pipeline.photos.load`` for its formats."""
     depth_digest: str | None = None
+    """As ``digest``, of the depth map."""
     focal_px: float | None = None
     """Focal length from EXIF, in pixels at ``width`` x ``height``."""
     camera_group: str = ""
@@ -64,11 +66,14 @@ class Photo(BaseModel):
 class Manifest(BaseModel):
     """A scene's photographs, sorted by name."""
 
-    model_config = ConfigDict(extra="forbid", frozen=True)
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
     scene: str
+    """The run's name: a scene, alone or with configuration and seed."""
     photos: tuple[Photo, ...]
+    """The photographs that are used."""
     warnings: tuple[str, ...] = ()
+    """What the user should know."""
 
     def write(self, path: Path) -> None:
         """Write ``path``. Paths of files below its folder become relative to it ("./..."), so that

@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
-from typing import Any, Literal
+from typing import Literal
 
 from pydantic import BaseModel, Field
 
 from pipeline.runtime.counters import StageCounters
+from pipeline.scene.georeference import GeoreferenceSummary
 from pipeline.sfm.judge import Evidence, Grade
 
 Mapper = Literal["incremental", "global"]
@@ -87,7 +88,7 @@ class SfmCounters(StageCounters):
     verdict: Grade = Field(description="Quality of the model; a failed one ends the stage.")
     evidence: Evidence = Field(description="The statistics behind the verdict.")
     attempts: list[AttemptRecord] = Field(description="The mapping attempts, in order.")
-    georeference: dict[str, Any] = Field(
+    georeference: GeoreferenceSummary = Field(
         description="Method, origin and residuals (metres) of the world's frame; "
         "`georeference.json` has all of it."
     )

@@ -8,9 +8,9 @@ a line leave the roll about the line undetermined; it is taken from the up direc
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,6 +23,14 @@ from pipeline.geometry.similarity import (
     robust_similarity,
 )
 from pipeline.io.gcp import GroundControl
+from pipeline.scene.georeference import (
+    CartesianOrigin,
+    GeographicOrigin,
+    Georeference,
+    Origin,
+    Residual,
+    ResidualSummary,
+)
 
 Array = NDArray[np.float64]
 Method = Literal["gcp", "gps", "level"]
@@ -58,55 +66,55 @@ class WorldFrame:
     Attributes:
         method: source of the frame.
         similarity: from the mapper's world to this frame.
-        origin: coordinates of the frame's origin: latitude, longitude, altitude (GPS, or geographic
-            GCPs), or x, y, z in ``projection``; None for "level".
+        origin: of the frame: geographic (GPS, or geographic GCPs), or in ``projection``; None for
+            "level".
         projection: the GCP file's, None otherwise.
-        residuals: for each photograph (GPS) or point (GCP): name, horizontal and vertical residual
-            in metres, and whether it was used (an inlier).
+        residuals: of each photograph (GPS) or point (GCP).
         decisions, warnings: sentences for the log.
     """
 
     method: Method
     similarity: Similarity
-    origin: dict[str, float] | None = None
+    origin: Origin | None = None
     projection: str | None = None
-    residuals: list[dict[str, Any]] = field(default_factory=list)
+    residuals: tuple[Residual, ...] = ()
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
 
-    def sidecar(self) -> dict[str, Any]:
+    def georeference(self) -> Georeference:
         """The content of ``georeference.json``."""
         located = self.method != "level"
-        return {
-            "method": self.method,
-            "axes": "x east, y north, z up" if located else "y down; x and z level",
-            "unit": "metres"
+        return Georeference(
+            method=self.method,
+            axes="x east, y north, z up" if located else "y down; x and z level",
+            unit="metres"
             if located
             else f"{LEVEL_SHARE:.0%} of the cameras lie within {LEVEL_RADIUS:g} of their mean",
-            "origin": self.origin,
-            "projection": self.projection,
-            "scale": self.similarity.scale,
-            "rotation": self.similarity.rotation.tolist(),
-            "translation": self.similarity.translation.tolist(),
-            "residuals_m": summary(self.residuals),
-            "residuals": self.residuals,
-        }
+            origin=self.origin,
+            projection=self.projection,
+            scale=self.similarity.scale,
+            rotation=self.similarity.rotation.tolist(),
+            translation=self.similarity.translation.tolist(),
+            residuals_m=summary(self.residuals),
+            residuals=self.residuals,
+        )
 
 
-def summary(residuals: list[dict[str, Any]]) -> dict[str, float | int] | None:
+def summary(residuals: Sequence[Residual]) -> ResidualSummary | None:
     """Median and maximum of the used residuals, metres; None without any."""
-    used = [r for r in residuals if r["used"]]
+    used = [r for r in residuals if r.used]
     if not used:
         return None
-    horizontal, vertical = (np.array([r[k] for r in used]) for k in ("horizontal_m", "vertical_m"))
-    return {
-        "used": len(used),
-        "left_out": len(residuals) - len(used),
-        "horizontal_median": float(np.median(horizontal)),
-        "horizontal_max": float(horizontal.max()),
-        "vertical_median": float(np.median(np.abs(vertical))),
-        "vertical_max": float(np.abs(vertical).max()),
-    }
+    horizontal = np.array([r.horizontal_m for r in used])
+    vertical = np.abs([r.vertical_m for r in used])
+    return ResidualSummary(
+        used=len(used),
+        left_out=len(residuals) - len(used),
+        horizontal_median=float(np.median(horizontal)),
+        horizontal_max=float(horizontal.max()),
+        vertical_median=float(np.median(vertical)),
+        vertical_max=float(vertical.max()),
+    )
 
 
 def level(cameras: Cameras) -> WorldFrame:
@@ -166,18 +174,17 @@ def from_gps(
     records = _residual_records([cameras.names[i] for i in known], residual, used)
     totals = summary(records)
     assert totals is not None
-    if totals["left_out"]:
-        warnings.append(f"{totals['left_out']} GPS positions are outliers and are left out")
+    if totals.left_out:
+        warnings.append(f"{totals.left_out} GPS positions are outliers and are left out")
     return WorldFrame(
         "gps",
         similarity,
-        origin=dict(zip(("latitude", "longitude", "altitude"), origin.tolist(), strict=True)),
+        origin=_geographic(origin),
         residuals=records,
         decisions=[
-            f"georeferenced by {totals['used']} GPS positions: metres east, north and up of "
+            f"georeferenced by {totals.used} GPS positions: metres east, north and up of "
             f"{origin[0]:.6f}, {origin[1]:.6f}; median residual "
-            f"{totals['horizontal_median']:.2f} m horizontal, {totals['vertical_median']:.2f} m "
-            "vertical"
+            f"{totals.horizontal_median:.2f} m horizontal, {totals.vertical_median:.2f} m vertical"
         ],
         warnings=warnings,
     )
@@ -203,12 +210,13 @@ def from_gcp(
     if control.geographic:
         origin = np.median(places, axis=0)[[1, 0, 2]]
         target = to_enu(places[:, [1, 0, 2]], origin)
-        names = ("latitude", "longitude", "altitude")
+        named: Origin = _geographic(origin)
     else:
         # Whole metres: adding the origin to coordinates is exact.
         origin = np.round(places.mean(0))
         target = places - origin
-        names = ("x", "y", "z")
+        x, y, z = origin.tolist()
+        named = CartesianOrigin(x=x, y=y, z=z)
     source = np.array([at for _, at in placed])
     fitted = robust_similarity(source, target, np.ones(3), GCP_FLOOR_M)
     spread = np.linalg.svd(_centred(target), compute_uv=False)
@@ -220,8 +228,8 @@ def from_gcp(
     totals = summary(records)
     assert totals is not None
     warnings = []
-    if totals["left_out"]:
-        outliers = [record["name"] for record in records if not record["used"]]
+    if totals.left_out:
+        outliers = [record.name for record in records if not record.used]
         warnings.append(
             f"ground control points that are outliers are left out: {', '.join(outliers[:5])}"
         )
@@ -233,30 +241,35 @@ def from_gcp(
     return WorldFrame(
         "gcp",
         similarity,
-        origin=dict(zip(names, origin.tolist(), strict=True)),
+        origin=named,
         projection=control.projection,
         residuals=records,
         decisions=[
-            f"georeferenced by {totals['used']} ground control points ({control.projection}): "
-            f"median residual {totals['horizontal_median']:.3f} m horizontal, "
-            f"{totals['vertical_median']:.3f} m vertical"
+            f"georeferenced by {totals.used} ground control points ({control.projection}): "
+            f"median residual {totals.horizontal_median:.3f} m horizontal, "
+            f"{totals.vertical_median:.3f} m vertical"
         ],
         warnings=warnings,
     )
 
 
+def _geographic(origin: Array) -> GeographicOrigin:
+    latitude, longitude, altitude = origin.tolist()
+    return GeographicOrigin(latitude=latitude, longitude=longitude, altitude=altitude)
+
+
 def _residual_records(
     names: list[str], residual: Array, used: NDArray[np.bool_]
-) -> list[dict[str, Any]]:
-    return [
-        {
-            "name": name,
-            "horizontal_m": round(float(np.hypot(r[0], r[1])), 4),
-            "vertical_m": round(float(r[2]), 4),
-            "used": bool(inlier),
-        }
+) -> tuple[Residual, ...]:
+    return tuple(
+        Residual(
+            name=name,
+            horizontal_m=round(float(np.hypot(r[0], r[1])), 4),
+            vertical_m=round(float(r[2]), 4),
+            used=bool(inlier),
+        )
         for name, r, inlier in zip(names, residual, used, strict=True)
-    ]
+    )
 
 
 def _tilt(target: Array, used: NDArray[np.bool_], sigma: float) -> float:

@@ -15,14 +15,12 @@ import numpy as np
 import pycolmap
 
 from pipeline.config import schema
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
-from pipeline.sfm.georeference import summary
 from pipeline.sfm.matching import list_names
 from pipeline.sfm.models import Colors, color_points, write_model
 from pipeline.sfm.quiet import quiet_colmap
@@ -109,7 +107,8 @@ def reconstruct(
         if colors is not None:
             color_points(written, colors)
         write_model(written, model_folder)
-    write_json(out / "georeference.json", frame.sidecar())
+    georeference = frame.georeference()
+    georeference.write(out)
 
     registered = {model.image(i).name for i in model.reg_image_ids()}
     missing = [photo.name for photo in manifest.photos if photo.name not in registered]
@@ -141,11 +140,7 @@ def reconstruct(
         verdict=attempt.verdict.grade,
         evidence=evidence,
         attempts=attempts,
-        georeference={
-            "method": frame.method,
-            "origin": frame.origin,
-            "residuals_m": summary(frame.residuals),
-        },
+        georeference=georeference.summary(),
     )
     return SfmReport(counters, decisions, warnings)
 

@@ -18,14 +18,13 @@ from pipeline.sfm.keypoints import keypoint_file
 
 
 @dataclass(frozen=True)
-class TriangulationReport:
-    """Result of ``triangulate``.
+class TriangulatedPoints:
+    """Measures of the triangulated points.
 
     Attributes:
         num_points, mean_reprojection_error_px, mean_track_length: of the points; 0 without any.
         num_pairs, num_verified: numbers of matched and of verified pairs.
         num_images: number of photographs with a pose.
-        decisions, warnings: sentences for the log.
     """
 
     num_points: int
@@ -34,6 +33,12 @@ class TriangulationReport:
     num_pairs: int
     num_verified: int
     num_images: int
+
+
+@dataclass(frozen=True)
+class TriangulationReport(TriangulatedPoints):
+    """Result of ``triangulate``. ``decisions`` and ``warnings`` are sentences for the log."""
+
     decisions: list[str]
     warnings: list[str]
 
@@ -71,14 +76,14 @@ def triangulate(
         found = Path(folder) / "features"
         cache = cache or Path(folder) / "cache"
         feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
-        facts: dict[str, Any] = run_isolated(
+        points = run_isolated(
             _triangulate, manifest, sparse, out, found, matches, experiments.max_ratio, seed
         )
     return TriangulationReport(
-        **facts,
+        **vars(points),
         decisions=[
-            f"{facts['num_points']} points triangulated from {facts['num_verified']} verified of "
-            f"{facts['num_pairs']} pairs of neighbouring cameras"
+            f"{points.num_points} points triangulated from {points.num_verified} verified of "
+            f"{points.num_pairs} pairs of neighbouring cameras"
         ],
         warnings=feature_warnings,
     )
@@ -100,7 +105,7 @@ def _triangulate(
     config: schema.Matches,
     max_ratio: float,
     seed: int,
-) -> dict[str, Any]:
+) -> TriangulatedPoints:
     import pycolmap
 
     from pipeline.sfm.database import MatchingSettings, build_database, verified_inliers
@@ -152,16 +157,16 @@ def _triangulate(
     color_points(points, read_colors({i: keypoint_file(features, names[i]) for i in ids}))
     num_points = int(points.num_points3D())
     write_model(points, out / "sparse" / "0")
-    return {
-        "num_points": num_points,
-        "mean_reprojection_error_px": (
+    return TriangulatedPoints(
+        num_points=num_points,
+        mean_reprojection_error_px=(
             float(points.compute_mean_reprojection_error()) if num_points else 0.0
         ),
-        "mean_track_length": float(points.compute_mean_track_length()) if num_points else 0.0,
-        "num_pairs": len(pairs),
-        "num_verified": len(verified),
-        "num_images": len(ids),
-    }
+        mean_track_length=float(points.compute_mean_track_length()) if num_points else 0.0,
+        num_pairs=len(pairs),
+        num_verified=len(verified),
+        num_images=len(ids),
+    )
 
 
 def _rescaled_to(photo: Photo, camera: Any) -> Any:

@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -66,7 +65,7 @@ def write_rendered(
                 _write_mesh(out, DepthMaps(renders), up, mesh_voxel, options.threads, messages)
     if "video" in formats:
         path = camera_path(views, _typical_depth(gaussians, views, options), up)
-        write_json(out / "path.json", describe_path(path))
+        describe_path(path).write(out)
         frames = [
             to_bytes(render_rgb(gaussians, view, options))
             for view in track(path, "rendering the video", len(path), unit="frames")

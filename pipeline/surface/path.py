@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import Field
 
+from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix4
 from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
@@ -24,6 +26,25 @@ _CLOSED_GAP = 120.0
 _SWING_SHARE = 0.8
 #: ...and over at least this many degrees.
 _MIN_SWING = 6.0
+
+
+class PathFile(JsonFile, JsonObject):
+    """The camera path of the video: one pinhole camera, a pose for each frame."""
+
+    file_name: ClassVar[str] = "path.json"
+
+    schema_version: Literal[1] = Field(1, description="Version of this file's format.")
+    convention: str = Field(description="Of the poses; sentences for people.")
+    fps: int = Field(gt=0, description="Frames per second.")
+    width: int = Field(gt=0, description="Of a frame, pixels.")
+    height: int = Field(gt=0, description="Of a frame, pixels.")
+    fx: float = Field(description="Focal length along x, pixels.")
+    fy: float = Field(description="Focal length along y, pixels.")
+    cx: float = Field(description="Principal point, pixels.")
+    cy: float = Field(description="Principal point, pixels.")
+    world_to_camera: tuple[Matrix4, ...] = Field(
+        description="4 x 4 by rows, of each frame; unit and frame of the scene."
+    )
 
 
 def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
@@ -55,21 +76,21 @@ def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
     ]
 
 
-def describe_path(path: Sequence[View]) -> dict[str, Any]:
-    """The path as ``path.json``: one pinhole camera, a pose for each frame."""
+def describe_path(path: Sequence[View]) -> PathFile:
+    """The content of ``path.json``."""
     first = path[0]
-    return {
-        "convention": "world to camera, 4x4 by rows; x right, y down, z forward; pixel centres at "
+    return PathFile(
+        convention="world to camera, 4x4 by rows; x right, y down, z forward; pixel centres at "
         "half integers; unit and frame of sparse/0",
-        "fps": FPS,
-        "width": first.width,
-        "height": first.height,
-        "fx": first.fx,
-        "fy": first.fy,
-        "cx": first.cx,
-        "cy": first.cy,
-        "world_to_camera": [view.world_to_camera.tolist() for view in path],
-    }
+        fps=FPS,
+        width=first.width,
+        height=first.height,
+        fx=first.fx,
+        fy=first.fy,
+        cx=first.cx,
+        cy=first.cy,
+        world_to_camera=tuple(view.world_to_camera.tolist() for view in path),
+    )
 
 
 def _focus(centres: Array, forward: Array, depth: float) -> Array:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -14,6 +13,7 @@ import numpy as np
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
 from pipeline.scene.views import View, scene_extent
@@ -47,14 +47,14 @@ class TrainedScene:
 
     Attributes:
         model: the reconstruction with refined cameras, None where none was refined.
-        gains: each view's exposure gains by name; empty where photographs are exposed alike.
+        gains: of all views; empty if the photographs are exposed alike.
         decisions, warnings, counters: recorded in ``stage.json``.
         timings: recorded in ``run.json``.
     """
 
     result: TrainResult
     model: Reconstruction | None
-    gains: dict[str, list[float]]
+    gains: ExposureGains
     decisions: list[str]
     warnings: list[str]
     counters: TrainCounters
@@ -96,7 +96,7 @@ def train_scene(
     """
     notes = _Notes()
     has_alpha = any(photo.alpha for photo in manifest.photos)
-    gains = {} if has_alpha else _choose_gains(views, model, config, notes)
+    gains = NO_GAINS if has_alpha else _choose_gains(views, model, config, notes)
     inputs = _inputs(views, manifest, model, initial, gains, config, notes)
     start = time.perf_counter()
     result = train(
@@ -148,7 +148,7 @@ def _inputs(
     manifest: Manifest,
     model: Reconstruction,
     initial: Gaussians,
-    gains: Mapping[str, list[float]],
+    gains: ExposureGains,
     config: Train,
     notes: _Notes,
 ) -> Inputs:
@@ -160,7 +160,7 @@ def _inputs(
         initial=initial,
         extent=extent,
         scale=scene_scale(extent, points),
-        gains=np.array([gains[view.name] for view in training]) if gains else None,
+        gains=np.array([gains.of(view.name) for view in training]) if gains else None,
         depths=(
             _known_depths(training, manifest, points, notes) if config.depth_loss_weight else None
         ),
@@ -188,21 +188,22 @@ def _known_depths(
 
 def _choose_gains(
     views: list[View], model: Reconstruction, config: Train, notes: _Notes
-) -> dict[str, list[float]]:
-    """Each view's gains by name; empty where the photographs are exposed alike."""
+) -> ExposureGains:
+    """The gains of all views; empty if the photographs are exposed alike."""
     if config.exposure == "off":
-        return {}
+        return NO_GAINS
     if config.exposure == "auto":
         spread = measure_exposures(sample_views(views), model).spread
         notes.counters["exposure_spread_stops"] = round(spread, 4)
         if spread < EXPOSURES_DIFFER:
-            return {}
+            return NO_GAINS
     found = measure_exposures(views, model)
     notes.decisions.append(
         f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
         f"measured in {found.measured} of {len(views)} photographs"
     )
-    return {v.name: gain.tolist() for v, gain in zip(views, found.gains, strict=True)}
+    names = [view.name for view in views]
+    return ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
 
 
 def _describe(result: TrainResult, num_views: int, config: Train, notes: _Notes) -> None:

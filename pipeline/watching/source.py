@@ -94,7 +94,6 @@ class Source:
     def _summary(self, step: int, count: int) -> str:
         text = f"step {step}, {count} Gaussians"
         lines = read_metrics_log(self.path / "logs" / NAME)
-        if lines and lines[-1]["psnr"] is not None:
-            last = lines[-1]
-            text += f", PSNR {last['psnr']:.2f} dB, {last['share']:.0%} done"
+        if lines and lines[-1].psnr is not None:
+            text += f", PSNR {lines[-1].psnr:.2f} dB, {lines[-1].share:.0%} done"
         return text

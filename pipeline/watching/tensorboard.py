@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.runtime.errors import UserError
-from pipeline.training.loop.metrics_log import NAME, read_metrics_log
+from pipeline.training.loop.metrics_log import NAME, MetricsRecord, read_metrics_log
 
 SCALARS = {
     "loss": "train/loss",
@@ -71,11 +71,11 @@ def write_events(folders: Sequence[Path], out: Path, follow: bool) -> list[str]:
     return [*lines, f"view them with: tensorboard --logdir {out}"]
 
 
-def _write(writer: Any, record: dict[str, float | None]) -> None:
-    for key, tag in SCALARS.items():
-        value = record.get(key)
+def _write(writer: Any, line: MetricsRecord) -> None:
+    for name, tag in SCALARS.items():
+        value = getattr(line, name)
         if value is not None:
-            writer.add_scalar(tag, value, int(record["step"] or 0), record["time"])
+            writer.add_scalar(tag, value, line.step, line.time)
 
 
 def _journals(folder: Path) -> list[Path]:

@@ -64,24 +64,22 @@ def batch_of(found: list[Result], results: Path) -> Batch:
     views: dict[str, str] = {}
     for result in (r for r in found if r.ok):
         scene, folder = result.run.scene, results / result.run.name
-        per_view = result.metrics["per_view"]
+        metrics = read_metrics(folder)
         plan = plans.setdefault(scene, read_plan(folder))
-        name = views.setdefault(scene, ranked(per_view, 1)[0][1]["name"])
-        measured = next((v for v in per_view if v["name"] == name), per_view[0])
+        name = views.setdefault(scene, ranked(metrics.per_view, 1)[0][1].name)
+        measured = next((v for v in metrics.per_view if v.name == name), metrics.per_view[0])
         source = next((s for s in ("undistort", "decode") if plan.runs(s)), "inspect")
         manifest = Manifest.read(folder / source / "images.json")
-        photo = next(p for p in manifest.photos if p.name == measured["name"])
-        with Image.open(folder / "evaluate" / "renders" / measured["render"]) as opened:
+        photo = next(p for p in manifest.photos if p.name == measured.name)
+        with Image.open(folder / "evaluate" / "renders" / measured.render) as opened:
             render = np.asarray(opened.convert("RGB"))
         renders[result.run.name] = thumbnail(render, photo.orientation, name)
         if scene not in photos:
             height, width = render.shape[:2]
             rgb, alpha = load_rgba(photo.path, photo.digest)
             pixels = ViewPixels(*resize_rgba(rgb, alpha, width, height), None)
-            background = tuple(result.metrics["protocol"]["background"])
-            photos[scene] = thumbnail(
-                photo_over_background(pixels, background), photo.orientation, name
-            )
+            photograph = photo_over_background(pixels, metrics.protocol.background)
+            photos[scene] = thumbnail(photograph, photo.orientation, name)
     return Batch(found, renders, photos, plans, list(STAGES))
 
 

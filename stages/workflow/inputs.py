@@ -2,16 +2,14 @@
 
 from __future__ import annotations
 
-import json
 import shutil
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Split, Views
 from pipeline.io.colmap import has_model, read_model
-from pipeline.plan.given_poses import GEOREFERENCE
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
@@ -40,20 +38,17 @@ def input_model(job: Job, role: str = "model") -> Reconstruction:
     return read_model(job.inputs[role] / "sparse" / "0")
 
 
-def georeference(job: Job) -> dict[str, Any] | None:
-    """The frame of the poses (``georeference.json``), None if their stage has none."""
-    file = job.inputs["poses"] / GEOREFERENCE
-    return read_json(file) if file.is_file() else None
+def georeference(job: Job) -> Georeference | None:
+    """The frame of the poses, None if their stage has none."""
+    folder = job.inputs["poses"]
+    return Georeference.read(folder) if (folder / Georeference.file_name).is_file() else None
 
 
 def copy_georeference(job: Job, role: str) -> None:
     """Copy the frame of the poses from the input of this role, if it has one."""
-    if (job.inputs[role] / GEOREFERENCE).is_file():
-        shutil.copy(job.inputs[role] / GEOREFERENCE, job.out)
-
-
-def read_json(file: Path) -> Any:
-    return json.loads(file.read_text())
+    file = job.inputs[role] / Georeference.file_name
+    if file.is_file():
+        shutil.copy(file, job.out)
 
 
 def trained_model(job: Job) -> Reconstruction:

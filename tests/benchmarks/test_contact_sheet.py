@@ -10,7 +10,10 @@ import pytest
 from PIL import Image
 
 from benchmarks.contact_sheet import GAP, LABEL, sheet
+from pipeline.metrics.evaluation import SceneQuality, ViewMetrics
+from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.errors import UserError
+from tests.reporting.made import evaluation
 
 
 def batch(folder: Path) -> Path:
@@ -25,8 +28,25 @@ def batch(folder: Path) -> Path:
         for k in range(3):
             shade = (100 * i, 80 * k, 255)
             Image.new("RGB", (40, 30), shade).save(renders / f"{k}.png")
-            views.append({"name": f"view_{k}.png", "render": f"{k}.png", "psnr": 20.0 + k})
-        (renders.parents[1] / "metrics.json").write_text(json.dumps({"per_view": views}))
+            view = ViewMetrics(
+                name=f"view_{k}.png", psnr=20.0 + k, ssim=0.9, lpips=None, render=f"{k}.png"
+            )
+            views.append(view)
+        metrics = Metrics(
+            **{name: getattr(evaluation(*views), name) for name in SceneQuality.model_fields},
+            scene="room",
+            seed=0,
+            num_gaussians=1000,
+            registered_images=3,
+            total_images=3,
+            reprojection_error_px=None,
+            sfm_verdict=None,
+            georeference=None,
+            stages={},
+            versions={},
+            warnings=[],
+        )
+        metrics.write(renders.parents[1] / "report")
     path = folder / "benchmark.json"
     path.write_text(json.dumps({"runs": rows}))
     return path

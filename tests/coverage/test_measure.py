@@ -1,6 +1,5 @@
 """``coverage.json``: complete, same at any number of threads, and low trust means high error."""
 
-import json
 from dataclasses import replace
 from pathlib import Path
 
@@ -11,6 +10,7 @@ from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.coverage.measure import WorldFrame, measure_coverage
+from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
@@ -19,7 +19,7 @@ from tests.coverage.scenes import UP, camera, renderer, wall
 TRAIN = Train(background="black", exposure="off", sh_degree=0)
 
 
-def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> dict:
+def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> CoverageRecord:
     """Coverage of a wall photographed on its left side, with a test view of the right side, whose
     colours are wrong."""
     truth = wall()
@@ -38,7 +38,7 @@ def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> 
     evaluation = evaluate_views(
         scene, protocol, Evaluate(lpips_net="none"), TRAIN, folder / "renders", threads=threads
     )
-    measure_coverage(
+    found = measure_coverage(
         folder,
         scene,
         views,
@@ -49,7 +49,8 @@ def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> 
         WorldFrame(UP, None),
         threads=threads,
     )
-    return json.loads((folder / "coverage.json").read_text())
+    assert CoverageRecord.read(folder) == found
+    return found
 
 
 @pytest.fixture(autouse=True)
@@ -59,21 +60,21 @@ def fixed_seed() -> None:
 
 def test_low_trust_means_high_error_and_all_named_images_exist(tmp_path) -> None:
     found = measured(tmp_path / "a")
-    (view,) = found["views"]
-    assert view["name"] == "right.png" and 0.1 < view["little_trust"] < 0.95
-    low, high = found["error"]["by_trust"][0], found["error"]["by_trust"][-1]
-    assert low["rmse"] > 2 * high["rmse"]
-    assert found["surface"]["seen_by"]["3 or more"] > 0.3
-    assert 1 <= len(found["viewpoints"]) <= 5
+    (view,) = found.views
+    assert view.name == "right.png" and 0.1 < view.low_trust_share < 0.95
+    assert found.error is not None and found.surface is not None
+    assert found.error.by_trust[0].rmse > 2 * found.error.by_trust[-1].rmse
+    assert found.surface.seen_by.three_or_more > 0.3
+    assert 1 <= len(found.viewpoints) <= 5
     # The best viewpoint is at the right end of the cameras.
-    assert found["viewpoints"][0]["position"][0] > 0.5
-    for entry in (view, *found["viewpoints"]):
-        for name in (entry["render"], entry["trust_map"]):
+    assert found.viewpoints[0].position[0] > 0.5
+    for entry in (view, *found.viewpoints):
+        for name in (entry.render, entry.trust_map):
             with Image.open(tmp_path / "a" / name) as picture:
                 assert picture.size == (60, 60)
-    pose = np.array(found["viewpoints"][0]["world_to_camera"])
+    pose = np.array(found.viewpoints[0].world_to_camera)
     place = -pose[:3, :3].T @ pose[:3, 3]
-    assert place == pytest.approx(found["viewpoints"][0]["position"], abs=1e-5)
+    assert place == pytest.approx(found.viewpoints[0].position, abs=1e-5)
 
 
 def test_output_is_independent_of_threads(tmp_path) -> None:
@@ -89,6 +90,6 @@ def test_output_is_independent_of_threads(tmp_path) -> None:
 
 def test_without_test_views_no_error_is_reported(tmp_path) -> None:
     found = measured(tmp_path / "a", with_test_view=False)
-    assert found["views"] == [] and found["error"]["rank_correlation"] is None
-    assert found["error"]["by_trust"] == []
-    assert found["viewpoints"]
+    assert found.views == () and found.error is not None
+    assert found.error.rank_correlation is None and found.error.by_trust == ()
+    assert found.viewpoints

@@ -11,10 +11,16 @@ import subprocess
 import pytest
 from PIL import Image
 
+from pipeline.coverage.record import CoverageRecord
+from pipeline.io.frame_json import Frame
+from pipeline.metrics.evaluation import Evaluation
 from pipeline.plan.record import read_plan
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.errors import UserError
+from pipeline.scene.exposure import ExposureGains
+from pipeline.scene.georeference import Georeference
+from pipeline.training.loop.curve import TrainingCurve
 from stages.workflow.registry import STAGES
 from tests.documented import commands
 from tests.e2e.harness import (
@@ -81,6 +87,23 @@ def test_counters_and_plan_fit_their_models(finished, tmp_path):
         (tmp_path / name / "stage.json").write_text(json.dumps(record))
         with pytest.raises(UserError, match=f"{name}/stage.json: cannot be read.*\n.*{name}$"):
             read_counters(tmp_path / name, model)
+
+
+# Files that others read with their own models, or that have another program's format.
+RECORDS = {"stage.json", ".stage.json", "run.json", "images.json"}
+MODELS = (Metrics, Evaluation, CoverageRecord, Georeference, Frame, TrainingCurve, ExposureGains)
+
+
+def test_every_json_file_of_a_stage_is_what_its_model_writes(finished, tmp_path):
+    models = {model.file_name: model for model in MODELS}
+    found = set()
+    for file in (finished / "results/tiny").glob("*/*.json"):
+        if file.parent.name == "logs" or file.name in RECORDS | {"transforms.json"}:
+            continue
+        found.add(file.name)
+        models[file.name].read(file.parent).write(tmp_path)
+        assert (tmp_path / file.name).read_bytes() == file.read_bytes(), file
+    assert found == models.keys()
 
 
 def test_a_second_run_does_nothing_and_a_dry_run_shows_the_plan(project):

@@ -16,6 +16,7 @@ from pipeline.metrics.evaluate import (
 )
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
+from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
@@ -70,9 +71,9 @@ def test_only_test_views_are_measured(tmp_path):
     junk = np.full_like(black(), 255)
     views = [view(tmp_path, "a", black()), view(tmp_path, "b", junk, is_test=False, x=1.0)]
     found = measure(views, tmp_path / "out")
-    assert [v["name"] for v in found["per_view"]] == ["a"]
-    assert found["psnr"] == 100
-    assert "test views: one view in 8" in found["protocol"]["split"]
+    assert [v.name for v in found.per_view] == ["a"]
+    assert found.psnr == 100
+    assert "test views: one view in 8" in found.protocol.split
 
 
 def test_a_sample_of_training_views_is_measured_as_well(tmp_path):
@@ -83,8 +84,8 @@ def test_a_sample_of_training_views_is_measured_as_well(tmp_path):
     assert len(protocol.training_views) == NUM_TRAINING_VIEWS
     assert {"b0", "b19"} <= {v.name for v in protocol.training_views}
     found = measure(views, tmp_path / "out")
-    assert found["train_psnr"] == 0
-    assert any("training photographs badly (0.0 dB)" in text for text in found["warnings"])
+    assert found.train_psnr == 0
+    assert any("training photographs badly (0.0 dB)" in text for text in found.warnings)
 
 
 @pytest.mark.parametrize(
@@ -106,34 +107,34 @@ def test_gains_multiply_the_renders(tmp_path):
         Evaluate(),
         config,
         tmp_path / "out",
-        gains={"a": [100 / 255] * 3, "b": [50 / 255] * 3},
+        gains=ExposureGains({"a": (100 / 255,) * 3, "b": (50 / 255,) * 3}),
         threads=1,
     )
-    assert found["psnr"] == 100
-    assert found["psnr_without_gains"] < 5
-    assert "gains" in found["protocol"]["exposure"]
+    assert found.psnr == 100
+    assert found.psnr_without_gains < 5
+    assert "gains" in found.protocol.exposure
 
 
 def test_the_protocol_reports_a_missing_test_split(tmp_path):
     found = measure([view(tmp_path, "a", black(), is_test=False)], tmp_path / "out")
-    assert "TRAINING" in found["protocol"]["split"]
+    assert "TRAINING" in found.protocol.split
 
 
 def test_masked_pixels_are_excluded(tmp_path):
     picture, mask = black(), np.ones((SIZE, SIZE), bool)
     picture[:, :10], mask[:, :10] = 255, False
     found = measure([view(tmp_path, "a", picture, mask)], tmp_path / "out")
-    assert found["psnr"] == 100
-    assert found["ssim"] == pytest.approx(1)
+    assert found.psnr == 100
+    assert found.ssim == pytest.approx(1)
     # The same picture without its mask is far off.
-    assert measure([view(tmp_path, "b", picture)], tmp_path / "out")["psnr"] < 10
+    assert measure([view(tmp_path, "b", picture)], tmp_path / "out").psnr < 10
 
 
 def test_a_view_without_unmasked_pixels_is_skipped_with_a_warning(tmp_path):
     hidden = view(tmp_path, "a", black(), np.zeros((SIZE, SIZE), bool))
     found = measure([hidden, view(tmp_path, "b", black(), x=1.0)], tmp_path / "out")
-    assert found["protocol"]["num_views"] == 1
-    assert "a: its mask" in found["warnings"][0]
+    assert found.protocol.num_views == 1
+    assert "a: its mask" in found.warnings[0]
     with pytest.raises(UserError, match="masks"):
         measure([hidden], tmp_path / "out")
 
@@ -144,7 +145,7 @@ def test_background_is_that_of_training_and_white_for_random(tmp_path, trained, 
     protocol = choose_protocol(views, Split(), Train(background=trained))
     assert protocol.background == (expected,) * 3
     picture = measure(views, tmp_path / "out", background=trained)
-    assert (picture["psnr"] > 50) == (expected == 0)
+    assert (picture.psnr > 50) == (expected == 0)
 
 
 def test_transparent_photographs_are_composited_over_the_background():

@@ -232,7 +232,7 @@ def test_poses_far_from_the_origin_are_translated(tmp_path, away, moved):
         assert (given.origin == np.round(given.origin)).all()
         back = given.model.points.xyz[0] + given.origin
         np.testing.assert_allclose(back, shift, rtol=1e-12)
-        assert given.georeference()["origin"] == dict(zip("xyz", given.origin, strict=True))
+        assert [*given.georeference().origin.model_dump().values()] == given.origin.tolist()
 
 
 @pytest.mark.parametrize(("focal", "ok"), [(1.0, False), (2.0, True), (6e4, True), (1e9, False)])

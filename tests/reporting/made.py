@@ -7,10 +7,34 @@ import dataclasses
 import numpy as np
 import torch
 
+from pipeline.coverage.record import (
+    CoverageRecord,
+    ErrorByTrust,
+    ErrorClass,
+    FloaterCoverage,
+    ProposedViewpoint,
+    SeenBy,
+    SurfaceCoverage,
+    Surroundings,
+    ViewCoverage,
+)
+from pipeline.metrics.evaluation import (
+    EvaluatedModel,
+    Evaluation,
+    ProtocolDescription,
+    ViewMetrics,
+)
 from pipeline.plan.values import StagePlan
-from pipeline.reporting.data import Comparison, Coverage, ReportData, TrainedScene
+from pipeline.reporting.data import (
+    Comparison,
+    CoverageSection,
+    ReportData,
+    TrainedScene,
+    TrainingRecord,
+)
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.curve import CurveRecord
 from tests.plans import record_of
 
 
@@ -53,57 +77,87 @@ def trained(**changes) -> TrainedScene:
     return dataclasses.replace(scene, **changes)
 
 
-def coverage() -> Coverage:
+def coverage() -> CoverageSection:
     rng = np.random.default_rng(1)
     names = [f"coverage/{name}_{kind}.png" for name in ("view_1", "next_1") for kind in "rt"]
     pictures = {
         name: rng.integers(0, 256, (9, 12, 3) if name.endswith("r.png") else (9, 12), np.uint8)
         for name in names
     }
-    record = {
-        "photographs": 4,
-        "looked_at": 4,
-        "surface": {
-            "seen_by": {"1": 0.0123, "2": 0.0456, "3 or more": 0.9421},
-            "median_photographs": 5.0,
-            "median_parallax_deg": 41.3,
-        },
-        "views": [
-            {
-                "name": "0.jpg",
-                "psnr": 18.765,
-                "trust": 0.4321,
-                "little_trust": 0.6,
-                "holes": 0.0321,
-                "floating": 0.0077,
-                "median_photographs": 3.0,
-                "render": names[0],
-                "trust_map": names[1],
-            }
-        ],
-        "error": {
-            "squares": 1234,
-            "square_px": 8,
-            "rank_correlation": -0.567,
-            "by_trust": [{"trust": [0.0, 0.25], "share": 0.111, "rmse": 0.2222}],
-        },
-        "floaters": {"gaussians": 13, "within": 0.5, "cameras": {"3.jpg": 13}},
-        "surroundings": {"viewpoints": 40, "trust": 0.5, "trust_with_proposals": 0.7},
-        "viewpoints": [
-            {
-                "where": "between 1.jpg and 2.jpg, 0.4 m higher",
-                "position": [1.0, 2.0, 0.5],
-                "direction": [0.0, -1.0, 0.0],
-                "look_at": [0.0, 0.0, 0.0],
-                "world_to_camera": np.eye(4).tolist(),
-                "unknown_percent": 63.4,
-                "gain_percent": 17.2,
-                "render": names[2],
-                "trust_map": names[3],
-            }
-        ],
-    }
-    return Coverage(record, pictures)
+    record = CoverageRecord(
+        num_training_views=4,
+        num_rendered_views=4,
+        trust_definition="precision times support",
+        surface=SurfaceCoverage(
+            seen_by=SeenBy(one=0.0123, two=0.0456, three_or_more=0.9421),
+            median_photographs=5.0,
+            median_parallax_deg=41.3,
+        ),
+        views=(
+            ViewCoverage(
+                name="0.jpg",
+                psnr=18.765,
+                mean_trust=0.4321,
+                low_trust_share=0.6,
+                hole_share=0.0321,
+                floater_share=0.0077,
+                median_photographs=3.0,
+                render=names[0],
+                trust_map=names[1],
+            ),
+        ),
+        error=ErrorByTrust(
+            num_blocks=1234,
+            block_px=8,
+            rank_correlation=-0.567,
+            by_trust=(ErrorClass(trust_range=(0.0, 0.25), share=0.111, rmse=0.2222),),
+        ),
+        floaters=FloaterCoverage(num_gaussians=13, search_distance=0.5, by_camera={"3.jpg": 13}),
+        surroundings=Surroundings(num_viewpoints=40, mean_trust=0.5, mean_trust_with_proposals=0.7),
+        viewpoints=(
+            ProposedViewpoint(
+                description="between 1.jpg and 2.jpg, 0.4 m higher",
+                position=(1.0, 2.0, 0.5),
+                direction=(0.0, -1.0, 0.0),
+                look_at=(0.0, 0.0, 0.0),
+                world_to_camera=np.eye(4).tolist(),
+                unknown_percent=63.4,
+                gain_percent=17.2,
+                render=names[2],
+                trust_map=names[3],
+            ),
+        ),
+    )
+    return CoverageSection(record, pictures)
+
+
+def evaluation(*views: ViewMetrics) -> Evaluation:
+    """With the measures of these views; of one, without arguments."""
+    one = ViewMetrics(name="a.jpg", psnr=27.5, ssim=0.9, lpips=None, render="0.png")
+    return Evaluation(
+        psnr=27.5,
+        ssim=0.9,
+        lpips=None,
+        lpips_reason="switched off",
+        train_psnr=30.0,
+        psnr_without_gains=None,
+        per_view=views or (one,),
+        protocol=ProtocolDescription(
+            resolution=("80x60",),
+            split="every 8th",
+            poses_and_points="all",
+            num_views=1,
+            psnr="mean",
+            ssim="mean",
+            lpips="switched off",
+            masks=None,
+            background=(0.0, 0.0, 0.0),
+            exposure=None,
+            poses=None,
+        ),
+        model=EvaluatedModel(num_gaussians=1000, sh_degree=3),
+        warnings=("there are few photographs",),
+    )
 
 
 def metrics() -> dict:
@@ -151,8 +205,8 @@ def report(**changes) -> ReportData:
         plan=record_of({"decode": StagePlan(run=False, reason="no RAW")}, ["it is dark"]),
         decisions={"sfm": ["incremental mapper: 49 images"], "train": []},
         curve=[
-            {"step": 100, "loss": 0.2345, "psnr": 17.89, "num_gaussians": 5001, "seconds": 3.0},
-            {"step": 200, "loss": 0.1234, "psnr": 23.45, "num_gaussians": 7003, "seconds": 7.0},
+            TrainingRecord(CurveRecord(step=100, loss=0.2345, psnr=17.89, num_gaussians=5001), 3.0),
+            TrainingRecord(CurveRecord(step=200, loss=0.1234, psnr=23.45, num_gaussians=7003), 7.0),
         ],
         comparisons=[
             Comparison("worst", "a.jpg", photograph, render, mask, 21.987, 0.7123, 6),

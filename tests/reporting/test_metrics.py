@@ -17,6 +17,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import RunRecord, StageRecord
 from tests.counters import INSPECT, REFINE, SFM, TRAIN
 from tests.plans import record_of
+from tests.reporting.made import evaluation
 
 COUNTERS: dict[str, StageCounters] = {
     "inspect": INSPECT,
@@ -29,29 +30,6 @@ PLAN = record_of(
     | {"decode": StagePlan(run=False, reason="no RAW files")},
     ["it is dark"],
 )
-EVALUATION = {
-    "psnr": 27.5,
-    "ssim": 0.9,
-    "lpips": None,
-    "lpips_reason": "switched off",
-    "train_psnr": 30.0,
-    "psnr_without_gains": None,
-    "per_view": [{"name": "a.jpg", "psnr": 27.5, "ssim": 0.9, "lpips": None, "render": "0.png"}],
-    "protocol": {
-        "resolution": ["80x60"],
-        "split": "every 8th",
-        "poses_and_points": "all",
-        "num_views": 1,
-        "psnr": "mean",
-        "ssim": "mean",
-        "lpips": "switched off",
-        "masks": None,
-        "background": [0.0, 0.0, 0.0],
-        "exposure": None,
-        "poses": None,
-    },
-    "pose_error": None,
-}
 
 
 def run(wall: float, **more) -> RunRecord:
@@ -65,12 +43,12 @@ def folder(tmp_path):
     scene = tmp_path / "barn"
     write_records(scene, COUNTERS)
     found = collect(scene, PLAN)
-    write_json(scene / "report" / "metrics.json", found.model_dump(mode="json"))
+    found.write(scene / "report")
     return scene
 
 
 def collect(scene: Path, plan: PlanRecord) -> Metrics:
-    return collect_metrics("barn", plan, scene, EVALUATION, seed=3, versions={"torch": "2"})
+    return collect_metrics("barn", plan, scene, evaluation(), seed=3, versions={"torch": "2"})
 
 
 def write_records(scene: Path, counters_of: Mapping[str, StageCounters]) -> None:
@@ -137,7 +115,7 @@ def test_the_headline_has_quality_size_poses_and_time(folder, capsys):
 @pytest.mark.parametrize("name", ["report/metrics.json", "sfm/run.json"])
 def test_a_damaged_file_is_one_clear_error(folder, name, capsys):
     (folder / name).write_text('{"psnr": ')
-    with pytest.raises(UserError, match=f"{name}: cannot be read"):
+    with pytest.raises(UserError, match=f"{name}: .*damaged"):
         read_runs(read_metrics(folder), folder)
     assert main([str(folder)]) == 2
     assert "--forcerun" in capsys.readouterr().err

@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.coverage.record import CoverageRecord, ErrorByTrust
 from pipeline.plan.values import StagePlan
-from pipeline.reporting.data import Coverage, ReportData
+from pipeline.reporting.data import CoverageSection, ReportData
 from pipeline.reporting.page import report_html, write_report
 from tests.plans import record_of
 from tests.reporting.made import coverage, metrics, report, ring, trained
@@ -94,12 +95,16 @@ def test_no_network_requests() -> None:
     assert policies[0].startswith("default-src 'none'")
 
 
-def nasty_coverage():
+def nasty_coverage() -> CoverageSection:
     made = coverage()
-    for entry in (*made.record["views"], *made.record["viewpoints"]):
-        entry["name"] = entry["where"] = NASTY
-    made.record["floaters"]["cameras"] = {NASTY: 1}
-    return made
+    record = made.record
+    assert record.floaters is not None
+    changes = {
+        "views": [view.model_copy(update={"name": NASTY}) for view in record.views],
+        "viewpoints": [v.model_copy(update={"description": NASTY}) for v in record.viewpoints],
+        "floaters": record.floaters.model_copy(update={"by_camera": {NASTY: 1}}),
+    }
+    return dataclasses.replace(made, record=record.model_copy(update=changes))
 
 
 def test_viewpoints_are_on_the_map_of_cameras() -> None:
@@ -136,10 +141,18 @@ def test_no_string_of_the_user_becomes_markup() -> None:
     assert drawn["cameras"][0]["name"] == NASTY
 
 
-def nothing_held_out() -> Coverage:
-    made = coverage()
-    error = {"squares": 0, "square_px": 8, "rank_correlation": None, "by_trust": []}
-    return Coverage(made.record | {"views": [], "viewpoints": [], "error": error}, {})
+def no_test_views() -> CoverageSection:
+    error = ErrorByTrust(num_blocks=0, block_px=8, rank_correlation=None, by_trust=())
+    changes = {"views": (), "viewpoints": (), "error": error}
+    return CoverageSection(coverage().record.model_copy(update=changes), {})
+
+
+NO_SURFACE = CoverageRecord(
+    num_training_views=3,
+    num_rendered_views=3,
+    trust_definition="precision times support",
+    reason="the scene shows no surface",
+)
 
 
 @pytest.mark.parametrize(
@@ -147,13 +160,12 @@ def nothing_held_out() -> Coverage:
     [
         {"comparisons": ()},
         {"curve": ()},
-        {"curve": [{"step": 1, "loss": None, "psnr": float("nan"), "num_gaussians": 5}]},
         {"decisions": {}, "plan": None},
         {"points_xyz": np.zeros((0, 3)), "points_rgb": np.zeros((0, 3), np.uint8)},
         {"trained": None},
         {"coverage": None},
-        {"coverage": Coverage({"reason": "the scene shows no surface"}, {})},
-        {"coverage": nothing_held_out()},
+        {"coverage": CoverageSection(NO_SURFACE, {})},
+        {"coverage": no_test_views()},
         {"trained": trained(views=[])},
         {"reprojection_errors": np.full(7, -1.0), "track_lengths": np.zeros(0)},
         {"points_xyz": np.full((300, 3), np.nan)},

@@ -11,6 +11,7 @@ from pipeline.geometry.geodesy import to_ecef, to_enu
 from pipeline.geometry.similarity import Similarity
 from pipeline.io.gcp import GroundControl, read_ground_control
 from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Georeference
 from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
 
 ORIGIN = np.array([47.37, 8.54, 410.0])
@@ -78,7 +79,7 @@ def test_exact_gps_gives_the_exact_frame(seed):
     found = frame.similarity(cameras.centres)
     # The origin of the frame is the median position.
     np.testing.assert_allclose(found - found.mean(0), enu - enu.mean(0), atol=0.02)
-    assert {"latitude", "longitude", "altitude"} == set(frame.origin or {})
+    assert isinstance(frame.origin, GeographicOrigin)
 
 
 def test_gps_with_noisy_altitudes_and_outliers():
@@ -93,7 +94,7 @@ def test_gps_with_noisy_altitudes_and_outliers():
     assert frame.similarity.scale == pytest.approx(back.scale, rel=0.05)
     turn = frame.similarity.rotation @ back.rotation.T
     assert np.degrees(np.arccos((np.trace(turn) - 1) / 2)) < 8
-    left_out = {row["name"] for row in frame.residuals if not row["used"]}
+    left_out = {row.name for row in frame.residuals if not row.used}
     assert left_out >= {f"{i}.jpg" for i in range(0, 60, 5)}
     assert any("outliers" in text for text in frame.warnings)
 
@@ -139,7 +140,7 @@ def test_positions_on_both_sides_of_the_date_line():
     assert np.ptp(lonlat[:, 1]) > 300
     given_ = {n: tuple(p) for n, p in zip(cameras.names, lonlat.tolist(), strict=True)}
     frame = from_gps(cameras, given_)
-    assert isinstance(frame, WorldFrame) and max(r["horizontal_m"] for r in frame.residuals) < 0.1
+    assert isinstance(frame, WorldFrame) and max(r.horizontal_m for r in frame.residuals) < 0.1
 
 
 def test_the_level_frame_has_unit_scale():
@@ -223,12 +224,16 @@ def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
 
     frame = from_gcp(control, triangulate)
     assert isinstance(frame, WorldFrame) and frame.projection == "EPSG:32632"
-    origin = np.array([frame.origin[k] for k in "xyz"])
+    assert isinstance(frame.origin, CartesianOrigin)
+    origin = np.array([frame.origin.x, frame.origin.y, frame.origin.z])
     moved = frame.similarity(ours)
     assert np.abs(moved).max() < 100
     np.testing.assert_allclose(moved + origin, places, atol=0.03)
-    assert [row["name"] for row in frame.residuals if not row["used"]] == ["p4"]
-    assert frame.sidecar()["residuals_m"]["left_out"] == 1
+    assert [row.name for row in frame.residuals if not row.used] == ["p4"]
+    frame.georeference().write(tmp_path)
+    found = Georeference.read(tmp_path)
+    assert found == frame.georeference() and found.is_metric
+    assert found.residuals_m is not None and found.residuals_m.left_out == 1
 
 
 def test_ground_control_on_a_line_or_unobserved_is_rejected(tmp_path):

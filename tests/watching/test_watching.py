@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import os
 import urllib.request
 from pathlib import Path
@@ -20,7 +19,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
-from pipeline.training.loop.metrics_log import NAME
+from pipeline.training.loop.metrics_log import NAME, MetricsRecord
 from pipeline.watching.server import Page, ViewerFrame, picture_size
 from pipeline.watching.source import Source
 from tests.tools import need_package
@@ -51,10 +50,23 @@ def add_checkpoint(scene: Path, step: int, count: int, time: int) -> None:
 def add_journal(scene: Path, steps: int) -> None:
     (scene / "logs").mkdir(exist_ok=True)
     lines = [
-        {"time": 1e9 + step, "step": step, "share": step / 10, "loss": 1 / step, "psnr": 20 + step}
+        MetricsRecord(
+            time=1e9 + step,
+            step=step,
+            share=step / 10,
+            seconds=step,
+            seconds_left=10 - step,
+            loss=1 / step,
+            psnr=20 + step,
+            num_gaussians=100,
+            sh_degree=0,
+            resolution=0.5,
+            memory_mb=300.0,
+        )
         for step in range(1, steps + 1)
     ]
-    (scene / "logs" / NAME).write_text("".join(json.dumps(line) + "\n" for line in lines))
+    text = "".join(line.model_dump_json() + "\n" for line in lines)
+    (scene / "logs" / NAME).write_text(text + '{"time": 1')
 
 
 def test_the_newest_state_is_shown(scene: Path) -> None:

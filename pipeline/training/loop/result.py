@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.curve import TrainingCurve
 from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import TrainState
 
@@ -19,8 +20,7 @@ class TrainResult:
 
     Attributes:
         gaussians: with SH of the configured degree.
-        curve: {step, loss, psnr, num_gaussians} about every hundredth of the run: means since the
-            record before, over training views at the resolution in use. Deterministic.
+        curve: deterministic.
         curve_seconds: training time of each record; differs between runs.
         counters: totals of the run (``state.Counters``).
         near: near plane of the training, world units; renders need the same.
@@ -34,7 +34,7 @@ class TrainResult:
     """
 
     gaussians: Gaussians
-    curve: list[dict[str, float]]
+    curve: TrainingCurve
     curve_seconds: list[float]
     counters: dict[str, Any]
     near: float
@@ -54,7 +54,7 @@ def result_of(
     names = [view.name for view in scene.views]
     return TrainResult(
         gaussians=state.gaussians.with_sh_degree(sh_degree),
-        curve=state.curve,
+        curve=TrainingCurve(tuple(state.curve)),
         curve_seconds=state.curve_seconds,
         counters=asdict(state.counters),
         near=scene.near,

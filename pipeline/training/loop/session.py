@@ -91,5 +91,5 @@ class Session:
         text = f"{len(self.state.gaussians)} Gaussians"
         if self.state.curve:
             last = self.state.curve[-1]
-            text = f"loss {last['loss']:.4f}, PSNR {last['psnr']:.2f} dB, {text}"
+            text = f"loss {last.loss:.4f}, PSNR {last.psnr:.2f} dB, {text}"
         return text

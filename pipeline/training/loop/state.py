@@ -13,6 +13,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import morton_order
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.density import Changes, Strategy
+from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
 
 CURVE_RECORDS = 100  # records of the curve in a run
@@ -73,7 +74,7 @@ class TrainState:
     clock: int = 0
     counters: Counters = field(default_factory=Counters)
     window: CurveWindow = field(default_factory=CurveWindow)
-    curve: list[dict[str, float]] = field(default_factory=list)
+    curve: list[CurveRecord] = field(default_factory=list)
     curve_seconds: list[float] = field(default_factory=list)
     seconds: float = 0.0
 
@@ -105,14 +106,14 @@ class TrainState:
     def record(self) -> None:
         """Add a record to the curve and begin a new window."""
         window = self.window
-        previous = self.curve[-1]["psnr"] if self.curve else 0.0
+        previous = self.curve[-1].psnr if self.curve else 0.0
         self.curve.append(
-            {
-                "step": self.step,
-                "loss": window.loss / max(1, window.steps),
-                "psnr": window.psnr / window.samples if window.samples else previous,
-                "num_gaussians": len(self.gaussians),
-            }
+            CurveRecord(
+                step=self.step,
+                loss=window.loss / max(1, window.steps),
+                psnr=window.psnr / window.samples if window.samples else previous,
+                num_gaussians=len(self.gaussians),
+            )
         )
         self.curve_seconds.append(self.seconds)
         self.window = CurveWindow()
@@ -135,7 +136,7 @@ class TrainState:
             "clock": self.clock,
             "counters": asdict(self.counters),
             "window": asdict(self.window),
-            "curve": self.curve,
+            "curve": [record.model_dump() for record in self.curve],
             "curve_seconds": self.curve_seconds,
             "seconds": self.seconds,
         }
@@ -156,7 +157,8 @@ class TrainState:
         counters = dict(values["counters"])
         self.counters = Counters(changes=Changes(**counters.pop("changes")), **counters)
         self.window = CurveWindow(**values["window"])
-        self.curve, self.curve_seconds = values["curve"], values["curve_seconds"]
+        self.curve = [CurveRecord.model_validate(record) for record in values["curve"]]
+        self.curve_seconds = values["curve_seconds"]
         self.seconds = values["seconds"]
 
 

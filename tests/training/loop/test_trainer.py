@@ -114,10 +114,10 @@ def test_training_recovers_the_scene(scene: TinyScene, tmp_path: Path) -> None:
     result = run(scene, tmp_path, tiny_config(500))
     assert result.steps == 500
     assert result.counters["changes"]["cloned"] + result.counters["changes"]["split"] > 0
-    assert result.curve[-1]["loss"] < 0.4 * result.curve[0]["loss"]
-    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 8
+    assert result.curve.root[-1].loss < 0.4 * result.curve.root[0].loss
+    assert result.curve.root[-1].psnr > result.curve.root[0].psnr + 8
     assert result.gaussians.sh_degree == 1
-    assert len(result.curve) == len(result.curve_seconds)
+    assert len(result.curve.root) == len(result.curve_seconds)
     view = scene.views[0]
     rendered = render_view(result.gaussians, view, RasterOptions(near=result.near)).rgb
     error = np.mean((rendered - np.asarray(Image.open(view.image)) / 255.0) ** 2)
@@ -180,11 +180,11 @@ def test_the_metrics_log_has_each_step_once_after_a_kill(
         half.write('{"time": 1, "step": 2')
     result = run(scene, tmp_path, log=file)
     lines = metrics_log.read_metrics_log(file)
-    assert [line["step"] for line in lines] == list(range(1, 41))
-    assert lines[-1]["share"] == 1
-    assert lines[-1]["psnr"] == result.curve[-1]["psnr"]
-    assert lines[-1]["num_gaussians"] == len(result.gaussians)
-    assert lines[-1]["seconds_left"] == 0 < lines[5]["seconds_left"]
+    assert [line.step for line in lines] == list(range(1, 41))
+    assert lines[-1].share == 1
+    assert lines[-1].psnr == result.curve.root[-1].psnr
+    assert lines[-1].num_gaussians == len(result.gaussians)
+    assert lines[-1].seconds_left == 0 < lines[5].seconds_left
     run(scene, tmp_path / "again", log=file)
     assert len(metrics_log.read_metrics_log(file)) == 40
 
@@ -199,11 +199,11 @@ def test_a_time_budget_passes_through_the_whole_schedule(
     result = run(scene, tmp_path, config)
     assert 2.0 <= result.seconds < 2.05
     assert 195 <= result.steps <= 205
-    assert len(result.curve) >= 20
+    assert len(result.curve.root) >= 20
     assert result.gaussians.sh_degree == 1
     assert len(result.gaussians) > 60, "density control took place"
-    assert result.curve[-1]["psnr"] > result.curve[0]["psnr"] + 3
-    steps = [record["step"] for record in result.curve]
+    assert result.curve.root[-1].psnr > result.curve.root[0].psnr + 3
+    steps = [record.step for record in result.curve.root]
     assert steps == sorted(steps)
     assert steps[-1] == result.steps
 
@@ -314,10 +314,10 @@ def test_gains_compensate_for_different_exposures(scene: TinyScene, tmp_path: Pa
         return train(inputs, *config, seed=0, threads=1, checkpoint_dir=tmp_path / name)
 
     with_gains, without = trained("a", gains), trained("b", None)
-    assert with_gains.curve[-1]["psnr"] > without.curve[-1]["psnr"] + 3
+    assert with_gains.curve.root[-1].psnr > without.curve.root[-1].psnr + 3
     # The scene itself is the brighter photographs', as if there had been no other.
     plain = run(scene, tmp_path / "c", config)
-    assert with_gains.curve[-1]["psnr"] > plain.curve[-1]["psnr"] - 1
+    assert with_gains.curve.root[-1].psnr > plain.curve.root[-1].psnr - 1
 
 
 def test_a_completely_masked_view_has_no_influence(scene: TinyScene, tmp_path: Path) -> None:

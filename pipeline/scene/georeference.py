@@ -1,0 +1,101 @@
+"""The world frame of the poses (``georeference.json``): where it lies on the earth or in the given
+world, and how well that is known."""
+
+from __future__ import annotations
+
+from typing import ClassVar, Literal
+
+from pydantic import Field
+
+from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix3, Vector3
+
+GIVEN_UNIT = "that of the given camera poses"
+Method = Literal["gcp", "gps", "level", "given"]
+
+METHODS = (
+    "gcp: ground control points; gps: EXIF positions; level: none, levelled by the cameras; given: "
+    "translated given poses."
+)
+
+
+class GeographicOrigin(JsonObject):
+    """An origin on the WGS84 ellipsoid."""
+
+    latitude: float = Field(description="Degrees north.")
+    longitude: float = Field(description="Degrees east.")
+    altitude: float = Field(description="Metres, as measured: not reduced to a geoid.")
+
+
+class CartesianOrigin(JsonObject):
+    """An origin in the projection of the ground control points (metres), or in the world and unit
+    of the given poses."""
+
+    x: float = Field(description="East in a projection.")
+    y: float = Field(description="North in a projection.")
+    z: float = Field(description="Up in a projection.")
+
+
+Origin = GeographicOrigin | CartesianOrigin
+
+
+class Residual(JsonObject):
+    """The residual of a photograph's GPS position or of a ground control point after the fit."""
+
+    name: str = Field(description="Of the photograph or the point.")
+    horizontal_m: float = Field(description="Distance in the plane of x and y, metres.")
+    vertical_m: float = Field(description="Model minus measurement along z, metres.")
+    used: bool = Field(description="Whether it is an inlier, which the fit uses.")
+
+
+class ResidualSummary(JsonObject):
+    """Residuals of the inliers."""
+
+    used: int = Field(ge=1, description="Number of inliers.")
+    left_out: int = Field(ge=0, description="Number of outliers.")
+    horizontal_median: float = Field(description="Metres.")
+    horizontal_max: float = Field(description="Metres.")
+    vertical_median: float = Field(description="Of the absolute values, metres.")
+    vertical_max: float = Field(description="Of the absolute values, metres.")
+
+
+class GeoreferenceSummary(JsonObject):
+    """Source, origin and residuals of the world frame."""
+
+    method: Method = Field(description=METHODS)
+    origin: Origin | None = Field(
+        description="Where the frame's origin is; null for a level frame."
+    )
+    residuals_m: ResidualSummary | None = Field(
+        description="null where nothing was measured: level frames, given poses."
+    )
+
+
+class Georeference(JsonFile, GeoreferenceSummary):
+    """The world frame of the poses, and the similarity that leads to it."""
+
+    file_name: ClassVar[str] = "georeference.json"
+
+    schema_version: Literal[1] = Field(1, description="Version of this file's format.")
+    axes: str = Field(description="Directions of the axes.")
+    unit: str = Field(description="Unit of length.")
+    projection: str | None = Field(
+        description="First line of `gcp_list.txt`; null without ground control points."
+    )
+    scale: float = Field(
+        gt=0,
+        description="A point x in the world of the mapper, or of the given poses, is at "
+        "scale * rotation @ x + translation.",
+    )
+    rotation: Matrix3 = Field(description="3 x 3, by rows.")
+    translation: Vector3 = Field(description="In the unit of the frame.")
+    residuals: tuple[Residual, ...] = Field(description="Of each photograph or point.")
+
+    @property
+    def is_metric(self) -> bool:
+        """Whether the unit is the metre."""
+        return self.method in ("gcp", "gps")
+
+    def summary(self) -> GeoreferenceSummary:
+        return GeoreferenceSummary(
+            method=self.method, origin=self.origin, residuals_m=self.residuals_m
+        )

@@ -20,7 +20,18 @@ from pipeline.metrics.pose import PoseError
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
-ERROR = PoseError(0.1, 0.1, 0.02, 0.02, 0.004, 5.0, 1.0, {1.0: 0.9, 5.0: 1.0, 10.0: 1.0}, 8, 8)
+ERROR = PoseError(
+    rotation_median_deg=0.1,
+    rotation_mean_deg=0.1,
+    centre_median=0.02,
+    centre_mean=0.02,
+    centre_relative_median=0.004,
+    radius=5.0,
+    scale=1.0,
+    auc={1.0: 0.9, 5.0: 1.0, 10.0: 1.0},
+    num_common=8,
+    num_truth=8,
+)
 
 
 def run(cpu: float, rotation: float | None, name: str = "fast/global/retrieval") -> Run:

@@ -12,16 +12,17 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 from scipy.stats import spearmanr
 
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import CoverageResult, Place
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Gradient, Init, Train
 from pipeline.coverage.probe_views import Renderer, render_probe
@@ -156,7 +157,7 @@ def quality(render: Renderer, views: Sequence[View]) -> float:
 
 def run_case(
     case: Case, studio: Studio, views: list[View], steps: int, draws: int
-) -> dict[str, Any]:
+) -> CoverageResult:
     """Train without the removed views, propose viewpoints, add the first one and train again."""
     used = range(RING + HIGH if case.above else RING)
     removed = [views[i] for i in case.removed]
@@ -187,27 +188,23 @@ def run_case(
             "removed": quality(better, removed) - before["removed"],
         }
 
-    return {
-        "case": case.name,
-        "training_views": len(training),
-        "trust": {name: float(values.mean()) for name, values in trust.items()},
-        "psnr": before,
-        "rank_correlation": float(spearmanr(*both).statistic),
-        "first": nearest(proposed[:1], removed),
-        "best_of_five": nearest(proposed, removed),
-        "random_first": median([nearest(found[:1], removed) for found in random_draws]),
-        "random_best_of_five": median([nearest(found, removed) for found in random_draws]),
-        "better_than_random": share_farther(proposed, random_draws, removed),
-        "added_first": gain_from(proposed[0], "first.png"),
-        "added_random": [
+    return CoverageResult(
+        case=case.name,
+        training_views=len(training),
+        trust={name: float(values.mean()) for name, values in trust.items()},
+        psnr=before,
+        rank_correlation=float(spearmanr(*both).statistic),
+        first=nearest(proposed[:1], removed),
+        best_of_five=nearest(proposed, removed),
+        random_first=median([nearest(found[:1], removed) for found in random_draws]),
+        random_best_of_five=median([nearest(found, removed) for found in random_draws]),
+        better_than_random=share_farther(proposed, random_draws, removed),
+        added_first=gain_from(proposed[0], "first.png"),
+        added_random=[
             gain_from(c[0], f"random_{i}.png") for i, c in enumerate(random_draws[:draws])
         ],
-        "surroundings": [
-            best.trust_before,
-            best.trust_after,
-            len(best.candidates),
-        ],
-    }
+        surroundings=[best.trust_before, best.trust_after, len(best.candidates)],
+    )
 
 
 def block_means(
@@ -233,7 +230,7 @@ def photograph(studio: Studio, viewpoint: Viewpoint, name: str) -> View:
     return studio.photograph(PosedImage(name, 1, pose[:3, :3], pose[:3, 3]))
 
 
-def nearest(viewpoints: Sequence[Viewpoint], removed: Sequence[View]) -> list[float]:
+def nearest(viewpoints: Sequence[Viewpoint], removed: Sequence[View]) -> Place:
     """Smallest distance (metres) between a viewpoint and a removed camera, and the angle between
     their viewing directions (degrees)."""
     pairs = [
@@ -251,7 +248,7 @@ def angle(a: Array, b: Array) -> float:
     return float(np.degrees(np.arccos(np.clip(a @ b, -1, 1))))
 
 
-def median(pairs: list[list[float]]) -> list[float]:
+def median(pairs: list[Place]) -> Place:
     return [float(v) for v in np.median(pairs, axis=0)]
 
 
@@ -269,18 +266,18 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=400)
     parser.add_argument("--draws", type=int, default=3, help="number of random draws to train with")
     parser.add_argument("--cases", type=int, nargs="*", default=[*range(len(CASES))])
-    parser.add_argument("--out", type=Path, help="JSON of the results")
+    add_record_options(parser)
     options = parser.parse_args()
     width, height = map(int, options.size.split("x"))
-    results: list[Any] = []
+    results: list[CoverageResult] = []
     with TemporaryDirectory() as folder:
         studio = Studio(Path(folder), width, height)
         views = [studio.photograph(posed) for posed in cameras()]
         for i in options.cases:
             results.append(run_case(CASES[i], studio, views, options.steps, options.draws))
-            print(json.dumps(results[-1], indent=1), flush=True)
-    if options.out:
-        options.out.write_text(json.dumps(results, indent=1))
+            print(json.dumps(asdict(results[-1]), indent=1), flush=True)
+    if options.json:
+        write_record(options.json, measured("coverage", options.note), results)
     return 0
 
 

@@ -10,17 +10,19 @@ from __future__ import annotations
 import argparse
 import os
 import sys
+from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
 import numpy as np
 from PIL import Image
 
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import MemoryResult
 from pipeline.config.experiments import DEFAULT
 from pipeline.config.schema import Gradient, Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.plan.training_memory import memory_mb
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.views import View, scene_extent
@@ -74,7 +76,7 @@ def main() -> int:
     parser.add_argument("--steps", type=int, default=40)
     parser.add_argument("--memory-mb", type=int, help="train.memory_mb: images are read from disk")
     parser.add_argument("--threads", type=int, default=usable_cores())
-    parser.add_argument("--json", type=Path, help="write the figures as data")
+    add_record_options(parser)
     args = parser.parse_args()
     width, height = args.size
     session.CHECKPOINT_SECONDS = 5.0
@@ -95,21 +97,21 @@ def main() -> int:
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))
     planned = memory_mb(args.views * width * height, args.gaussians)
-    figures = {
-        "gaussians": len(result.gaussians),
-        "most_gaussians": result.counters["max_gaussians"],
-        "views": args.views,
-        "width": width,
-        "height": height,
-        "seconds_a_step": round(result.seconds / result.steps, 3),
-        "checkpoints_mb": round(saved / 1e6),
-        "planned_mb": min(planned, args.memory_mb or planned),
-        "peak_mb": round(peak_memory_mb() * 2**20 / 1e6),
-    }
-    for key, value in figures.items():
+    figures = MemoryResult(
+        gaussians=len(result.gaussians),
+        most_gaussians=result.counters["max_gaussians"],
+        views=args.views,
+        width=width,
+        height=height,
+        seconds_a_step=round(result.seconds / result.steps, 3),
+        checkpoints_mb=round(saved / 1e6),
+        planned_mb=min(planned, args.memory_mb or planned),
+        peak_mb=round(peak_memory_mb() * 2**20 / 1e6),
+    )
+    for key, value in asdict(figures).items():
         print(f"{key:18} {value}")
     if args.json:
-        write_json(args.json, figures)
+        write_record(args.json, measured("memory", args.note), [figures])
     return 0
 
 

@@ -13,12 +13,16 @@ from dataclasses import asdict
 from pathlib import Path
 from tempfile import TemporaryDirectory
 
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import MeshResult
 from benchmarks.surface import align, measure, true_points
 from pipeline.config.schema import Split, Train, Views
 from pipeline.io.colmap import read_model
 from pipeline.io.npz import read_npz
 from pipeline.metrics.evaluate import choose_protocol
+from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import peak_memory_mb
+from pipeline.runtime.record import read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import load_views
 from pipeline.surface.depth import DepthMaps, RenderCache
@@ -31,9 +35,9 @@ def main() -> int:
     parser.add_argument("data", type=Path, help="the demo scene, for example data/demo")
     parser.add_argument("--voxel", type=float, help="as export.mesh_voxel")
     parser.add_argument("--threads", type=int, default=2)
+    add_record_options(parser)
     options = parser.parse_args()
-    stage = json.loads((options.results / "train" / "stage.json").read_text())
-    sections = stage["key"]["config"]
+    sections = read_stage(options.results / "train").key["config"]
     split = Split.model_validate(sections["split"])
     train = Train.model_validate(sections["train"])
     pinhole = options.results / "undistort"
@@ -56,17 +60,22 @@ def main() -> int:
         return 1
     frame = align(views, read_model(options.data / "sparse_gt"))
     found = measure(mesh.vertices, mesh.faces, true_points(views, frame), frame)
-    report = {
-        "triangles": len(mesh.faces),
-        "voxel_m": grid.voxel * frame.scale,
-        "voxels": len(grid.blocks) * 512,
-        "seconds": seconds,
-        "peak_mb": peak,
-        **{name: asdict(accuracy) for name, accuracy in found.items()},
-    }
-    print(json.dumps(report, indent=2))
+    result = MeshResult(
+        triangles=len(mesh.faces),
+        voxel_m=float(grid.voxel * frame.scale),
+        voxels=len(grid.blocks) * 512,
+        seconds=seconds,
+        peak_mb=peak,
+        **found,
+    )
+    print(json.dumps(asdict(result), indent=2))
+    if options.json:
+        write_record(options.json, measured("mesh", options.note), [result])
     return 0
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(f"error: {error}")

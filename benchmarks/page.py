@@ -21,12 +21,15 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import PageResult
 from pipeline.io.npz import read_npz
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.metrics.image import psnr
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render.views import render_view, to_bytes
 from pipeline.reporting.space import upright_camera
+from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
 
 FLAGS = [
@@ -49,7 +52,9 @@ def chromium() -> str | None:
 def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.page", description=__doc__)
     parser.add_argument("results", type=Path, help="a finished scene, for example results/demo")
-    results = parser.parse_args().results
+    add_record_options(parser)
+    options = parser.parse_args()
+    results = options.results
     browser = chromium()
     if browser is None:
         print("error: no Chromium on PATH", file=sys.stderr)
@@ -65,6 +70,7 @@ def main() -> int:
     ]
     page = results / "report.html"
     print(f"{page}: {page.stat().st_size / 1e6:.1f} MB, {len(gaussians)} Gaussians")
+    found = []
     with TemporaryDirectory() as folder:
         swapped = Path(folder) / "ply.html"
         ply = base64.b64encode((results / "export" / "point_cloud.ply").read_bytes()).decode()
@@ -72,7 +78,10 @@ def main() -> int:
         swapped.write_text(re.sub(r'(?<=id="splats">)[^<]+', ply, text), "utf-8")
         for what, file in (("the page's SPZ", page.resolve()), ("the PLY", swapped)):
             for view, own, theirs in zip(views, ours, drawn(browser, file, views), strict=True):
-                print(f"{what} {view.name}: {psnr(theirs / 255, own / 255):.2f} dB")
+                found.append(PageResult(what, view.name, psnr(theirs / 255, own / 255)))
+                print(f"{what} {view.name}: {found[-1].psnr:.2f} dB")
+    if options.json:
+        write_record(options.json, measured("page", options.note), found)
     return 0
 
 
@@ -94,4 +103,7 @@ def drawn(browser: str, page: Path, views: list[View]) -> Iterator[Any]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UserError as error:
+        sys.exit(f"error: {error}")

@@ -10,7 +10,6 @@ import argparse
 import os
 from collections.abc import Callable
 from dataclasses import dataclass, field, fields
-from pathlib import Path
 
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")  # torch's threads, of the reference
 
@@ -18,8 +17,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import StressResult
 from pipeline.render import RasterCamera, RasterOptions, backward, forward, reference
-from pipeline.runtime.atomic import write_json
 from pipeline.runtime.progress import Progress
 
 PER_CALL = 512  # Gaussians per call; each is a case
@@ -166,6 +166,19 @@ class Tally:
     def gradient(self, quantile: float) -> float:
         return float(np.quantile(self.gradients, quantile)) if self.gradients else 0.0
 
+    def result(self, family: str) -> StressResult:
+        return StressResult(
+            family=family,
+            cases=self.cases,
+            drawn=self.drawn,
+            dropped=self.dropped,
+            not_finite=self.not_finite,
+            colour=self.colour,
+            gradient_median=self.gradient(0.5),
+            gradient_p99=self.gradient(0.99),
+            gradient_worst=self.gradient(1.0),
+        )
+
 
 def run(name: str, call: int, tally: Tally) -> None:
     """One call: ``PER_CALL`` cases of a family, forward, backward and the reference."""
@@ -224,7 +237,7 @@ def main() -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--cases", type=int, default=20_000, help="Gaussians over all families")
-    parser.add_argument("--json", type=Path, help="write the same as data")
+    add_record_options(parser)
     args = parser.parse_args()
     torch.set_num_threads(1)
     calls = -(-args.cases // (PER_CALL * len(FAMILIES)))
@@ -238,24 +251,16 @@ def main() -> None:
         f"{'':32} {'cases':>8} {'drawn':>8} {'dropped':>8} {'not finite':>10} {'colour':>9} "
         f"{'gradient':>9} {'99 %':>9} {'worst':>9}"
     )
-    for name, t in tallies.items():
+    results = [tally.result(name) for name, tally in tallies.items()]
+    for r in results:
         print(
-            f"{name:32} {t.cases:8} {t.drawn:8} {t.dropped:8} {t.not_finite:10} {t.colour:9.1e} "
-            f"{t.gradient(0.5):9.1e} {t.gradient(0.99):9.1e} {t.gradient(1.0):9.1e}"
+            f"{r.family:32} {r.cases:8} {r.drawn:8} {r.dropped:8} {r.not_finite:10} "
+            f"{r.colour:9.1e} {r.gradient_median:9.1e} {r.gradient_p99:9.1e} "
+            f"{r.gradient_worst:9.1e}"
         )
-    print(f"not finite in all: {sum(t.not_finite for t in tallies.values())}")
+    print(f"not finite in all: {sum(r.not_finite for r in results)}")
     if args.json:
-        write_json(
-            args.json,
-            {
-                name: {
-                    "cases": t.cases, "drawn": t.drawn, "dropped": t.dropped,
-                    "not_finite": t.not_finite, "colour": t.colour,
-                    "gradient": [t.gradient(q) for q in (0.5, 0.99, 1.0)],
-                }
-                for name, t in tallies.items()
-            },
-        )  # fmt: skip
+        write_record(args.json, measured("raster_stress", args.note), results)
 
 
 if __name__ == "__main__":

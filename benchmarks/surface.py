@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from benchmarks.results import Accuracy
 from pipeline.demo.scene import OBJECTS, distance, trace
 from pipeline.geometry.similarity import umeyama
 from pipeline.scene.reconstruction import Reconstruction
@@ -42,22 +43,6 @@ class Similarity:
 
     def undo(self, points: Array) -> Array:
         return np.asarray((points - self.shift) @ self.rotation / self.scale)
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """One region of the scene.
-
-    Attributes:
-        size: the region's, metres.
-        median, p90: distances of the mesh from the true surface, by area, shares of ``size``.
-        completeness: share of the true surface that has mesh within 1 % of ``size``.
-    """
-
-    size: float
-    median: float
-    p90: float
-    completeness: float
 
 
 def align(views: list[View], truth: Reconstruction) -> Similarity:

@@ -16,8 +16,10 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
+from benchmarks import markdown, record_tables
 from benchmarks.raster.tables import steps_table, table
 from benchmarks.record import POSES
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "records"
@@ -64,7 +66,7 @@ def scenes(records: Sequence[Record]) -> str:
                 _memory(runs),
             ]
         )
-    return _markdown(rows)
+    return markdown.table(rows)
 
 
 def headline(records: Sequence[Record]) -> str:
@@ -85,17 +87,18 @@ def headline(records: Sequence[Record]) -> str:
                 _middle([sum(run["cpu_s"].values()) / 60 for run in runs], "{:.1f}"),
             ]
         )
-    return _markdown(rows)
+    return markdown.table(rows)
 
 
 def sources(records: Sequence[Record]) -> str:
-    """Where and how the records of a page were measured."""
-    rows = [["scene", "command", "commit", "processor", "instruction set", "remark"]]
+    """Where and how scenes, or the records of benchmarks, were measured."""
+    what = "scene" if "scene" in records[0] else "benchmark"
+    rows = [[what, "command", "commit", "processor", "instruction set", "remark"]]
     for record in records:
         processor = f"{record['processor']}, {record['cores']} cores"
         rows.append(
             [
-                record["scene"],
+                record[what],
                 f"`{record['command']}`",
                 record["commit"][:7],
                 processor,
@@ -103,7 +106,7 @@ def sources(records: Sequence[Record]) -> str:
                 record["note"],
             ]
         )
-    return _markdown(rows)
+    return markdown.table(rows)
 
 
 def stages(records: Sequence[Record]) -> str:
@@ -111,7 +114,7 @@ def stages(records: Sequence[Record]) -> str:
     (record,) = records
     run = record["runs"][0]
     rows = [["stage", "CPU s"], *([name, f"{value:.0f}"] for name, value in run["cpu_s"].items())]
-    return _markdown(rows)
+    return markdown.table(rows)
 
 
 def _memory(runs: Sequence[Record]) -> str:
@@ -135,12 +138,6 @@ def _middle(values: Sequence[float], form: str) -> str:
     return f"{middle} ±{form.format((max(values) - min(values)) / 2)}"
 
 
-def _markdown(rows: Sequence[Sequence[str]]) -> str:
-    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-    lines.insert(1, "|---" * len(rows[0]) + "|")
-    return "\n".join(lines) + "\n"
-
-
 KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "raster": table,
     "raster-steps": steps_table,
@@ -148,13 +145,28 @@ KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "headline": headline,
     "sources": sources,
     "stages": stages,
+    **record_tables.TABLES,
 }
-MARKER = re.compile(rf"<!-- ({'|'.join(KINDS)}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?")
+MARKER = re.compile(
+    rf"<!-- ({'|'.join(map(re.escape, KINDS))}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?"
+)
 FIGURE = re.compile(r"<!-- figure: (\S+) (\S+) -->.*?<!-- end -->", re.DOTALL)
 
 
 def read_record(name: str) -> Record:
-    record: Record = json.loads((RECORDS / name).read_text())
+    """A record of ``RECORDS``.
+
+    Raises:
+        UserError: it is missing, or not JSON.
+    """
+    try:
+        record: Record = json.loads((RECORDS / name).read_text())
+    except (OSError, ValueError) as error:
+        raise UserError(
+            f"expected a record: {error}",
+            file=RECORDS / name,
+            fix="write it by a benchmark's --json, or take its table off the page",
+        ) from error
     return record
 
 
@@ -196,4 +208,8 @@ def main() -> int:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        sys.exit(main())
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(EXIT_USER_ERROR)

@@ -3,22 +3,22 @@
 from __future__ import annotations
 
 import argparse
-import json
 import sys
 import tempfile
 import time
-from collections import Counter
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
+from benchmarks import record_tables
 from benchmarks.judge.cases import CASES, make
 from benchmarks.judge.pictures import PICTURES, Matched, match_folder, write_pictures
-from benchmarks.judge.truth import Grade, Truth, grade
+from benchmarks.judge.truth import Truth, grade
 from benchmarks.judge.world import write
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import JudgeResult
 from pipeline.config.schema import Sfm
 from pipeline.io.colmap import read_model
 from pipeline.sfm.attempts import Attempt, map_until_good
@@ -27,7 +27,6 @@ from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap
 
-GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
 # Printed fields of the evidence: name, heading, format.
 SHOWN = (
     ("explained_matches", "expl", "{:.2f}"),
@@ -41,23 +40,7 @@ SHOWN = (
 )
 
 
-@dataclass(frozen=True)
-class Row:
-    """Result of a case; ``truth`` is None without ground truth."""
-
-    case: str
-    seed: int
-    truth: Truth | None
-    verdict: Grade
-    reasons: list[str]
-    registered: int
-    total: int
-    attempts: int
-    cpu_s: float
-    evidence: dict[str, Any]
-
-
-def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) -> Row:
+def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) -> JudgeResult:
     """A case of ``cases.CASES``."""
     made = write(make(name, seed), folder / "database.db", seed)
     start = time.process_time()
@@ -69,7 +52,9 @@ def run_made(name: str, seed: int, mapper: Mapper, budget: int, folder: Path) ->
     return _row(name, seed, truth, best, total, len(records), time.process_time() - start)
 
 
-def run_folder(name: str, seed: int, found: Matched, mapper: Mapper | None, budget: int) -> Row:
+def run_folder(
+    name: str, seed: int, found: Matched, mapper: Mapper | None, budget: int
+) -> JudgeResult:
     """A folder of photographs, matched and mapped by the plan of the pipeline."""
     start = time.process_time()
     best, records = map_until_good(
@@ -91,9 +76,9 @@ def _model(best: Attempt, folder: Path) -> Any:
 
 def _row(
     name: str, seed: int, truth: Truth | None, best: Attempt, total: int, tried: int, cpu: float
-) -> Row:
+) -> JudgeResult:
     evidence = best.evidence.model_dump() if best.evidence else {}
-    return Row(
+    return JudgeResult(
         name,
         seed,
         truth,
@@ -103,11 +88,11 @@ def _row(
         total,
         tried,
         round(cpu, 1),
-        evidence,
+        {key: _finite(value) for key, value in evidence.items()},
     )
 
 
-def rows(args: argparse.Namespace) -> Iterator[Row]:
+def rows(args: argparse.Namespace) -> Iterator[JudgeResult]:
     names = [*CASES, *PICTURES] if args.cases is None else args.cases
     for seed in args.seeds:
         for name in names:
@@ -125,14 +110,14 @@ def rows(args: argparse.Namespace) -> Iterator[Row]:
             yield run_folder(photographs.name, args.seeds[0], found, None, args.budget)
 
 
-def show(row: Row) -> str:
+def show(row: JudgeResult) -> str:
     truth = "?" if row.truth is None else row.truth.grade
     facts = " ".join(
         f"{short} {form.format(row.evidence[key])}"
         for key, short, form in SHOWN
         if row.evidence.get(key) is not None
     )
-    wrong = "  <-- WRONG" if {truth, row.verdict} == {"good", "failed"} else ""
+    wrong = "  <-- WRONG" if row.wrong else ""
     share = "" if row.truth is None else f" {row.truth.share:.2f}"
     return (
         f"{row.case:<22} {row.seed:>2}  truth {truth:<6}{share}  verdict {row.verdict:<6} "
@@ -141,22 +126,13 @@ def show(row: Row) -> str:
     )
 
 
-def table(found: list[Row]) -> str:
-    """The confusion table, as Markdown."""
-    counts = Counter((row.truth.grade, row.verdict) for row in found if row.truth is not None)
-    lines = ["| truth | " + " | ".join(f"called {g}" for g in GRADES) + " |", "|---|---|---|---|"]
-    for true in GRADES:
-        lines.append(f"| {true} | " + " | ".join(str(counts[true, g]) for g in GRADES) + " |")
-    return "\n".join(lines)
-
-
 def _seeds(text: str) -> list[int]:
     first, _, last = text.partition("-")
     return list(range(int(first), int(last or first) + 1))
 
 
 def main() -> int:
-    parser = argparse.ArgumentParser(prog="benchmarks.judge", description=__doc__)
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.judge", description=__doc__)
     parser.add_argument("--cases", nargs="*", help=f"of {', '.join([*CASES, *PICTURES])}")
     parser.add_argument("--seeds", type=_seeds, default=[0], help="one, or first-last")
     parser.add_argument(
@@ -166,7 +142,7 @@ def main() -> int:
     parser.add_argument(
         "--budget", type=int, default=Sfm().max_attempts, help="largest number of attempts"
     )
-    parser.add_argument("--json", type=Path, help="write the results as JSON")
+    add_record_options(parser)
     args = parser.parse_args()
     unknown = set(args.cases or []) - {*CASES, *PICTURES}
     if unknown:
@@ -176,19 +152,19 @@ def main() -> int:
     for row in rows(args):
         found.append(row)
         print(show(row), flush=True)
-        if args.json:
-            text = json.dumps([asdict(r) for r in found], indent=1, default=_plain)
-            args.json.write_text(text)
-    print("\n" + table(found))
-    wrong = sum(
-        r.truth is not None and {r.truth.grade, r.verdict} == {"good", "failed"} for r in found
-    )
+    print("\n" + record_tables.verdicts(found), end="")
+    if args.json:
+        write_record(args.json, measured("judge", args.note), found)
+    wrong = sum(row.wrong for row in found)
     print(f"\n{len(found)} cases, {wrong} wrong")
     return 1 if wrong else 0
 
 
-def _plain(value: Any) -> Any:
-    return value.item() if isinstance(value, np.generic) else str(value)
+def _finite(value: Any) -> float | None:
+    """A number of the evidence as Python's; None where it is missing or not finite."""
+    if value is None or not np.isfinite(value):
+        return None
+    return float(value)
 
 
 if __name__ == "__main__":

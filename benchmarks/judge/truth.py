@@ -36,14 +36,14 @@ class Truth:
     share: of the views that have a pose and a true one, how many are right.
     common: their number.
     rotation_deg, centre: medians over all of these, after the robust similarity; the centre over
-        the true radius.
+        the true radius. None where no similarity was found.
     """
 
     grade: Grade
     share: float
     common: int
-    rotation_deg: float
-    centre: float
+    rotation_deg: float | None
+    centre: float | None
 
 
 def grade(
@@ -61,7 +61,7 @@ def grade(
         depth: typical distance of what the cameras saw, in the truth's unit; None where unknown.
     """
     if estimated is None:
-        return Truth("failed", 0.0, 0, np.inf, np.inf)
+        return Truth("failed", 0.0, 0, None, None)
     posed = estimated.by_name()
     index = NameIndex(posed)
     found = [
@@ -75,7 +75,7 @@ def grade(
     pairs = max(found, key=len)
     common = sum(len(each) for each in found)
     if len(pairs) < 2:
-        return Truth("failed", 0.0, common, np.inf, np.inf)
+        return Truth("failed", 0.0, common, None, None)
     r_found, r_true = (np.stack([p[k].rotation for p in pairs]) for k in (0, 1))
     c_found, c_true = (np.stack([p[k].centre for p in pairs]) for k in (0, 1))
     radius = float(np.sqrt(((c_true - c_true.mean(0)) ** 2).sum(1).mean()))
@@ -88,7 +88,13 @@ def grade(
     few = len(estimated.images) < LEAST_REGISTERED * total
     if share < FAILED_SHARE or still or few:
         verdict = "failed"
-    return Truth(verdict, share, common, float(np.median(rotation)), float(np.median(relative)))
+    return Truth(verdict, share, common, _median(rotation), _median(relative))
+
+
+def _median(values: Array) -> float | None:
+    """None for the infinite residuals without a similarity."""
+    middle = float(np.median(values))
+    return middle if np.isfinite(middle) else None
 
 
 def _residuals(r_found: Array, c_found: Array, r_true: Array, c_true: Array) -> tuple[Array, Array]:

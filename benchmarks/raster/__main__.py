@@ -18,9 +18,10 @@ from typing import Any
 # torch's threads (of the reference) must not spin: they would slow down the kernels.
 os.environ.setdefault("OMP_WAIT_POLICY", "passive")
 
+from benchmarks.measured import add_record_options, measured
 from benchmarks.raster.accuracy import Accuracy, accuracy, reference_ratio
 from benchmarks.raster.drawing import report_drawings
-from benchmarks.raster.library import Library, heading, measured_library, measured_on
+from benchmarks.raster.library import Library, heading, library_facts, measured_library
 from benchmarks.raster.measure import (
     BLOCK_OPERATIONS,
     Spread,
@@ -84,7 +85,7 @@ def _arguments() -> argparse.Namespace:
         help="another program to run in alternation; see benchmarks/raster/probe.py",
     )
     parser.add_argument("--turns", type=int, default=9, help="with --probe")
-    parser.add_argument("--json", type=Path, help="write the results as JSON")
+    add_record_options(parser)
     return parser.parse_args()
 
 
@@ -190,11 +191,12 @@ def main() -> None:
     print(heading(library))
     if args.draw:
         drawn = [report_drawings(make(), args.threads, args.seconds) for make in _scenes(args)]
-        record = {**measured_on(library), "results": drawn}
+        record: dict[str, Any] = {"results": drawn}
     else:
         record = _operators(args, library)
     if args.json:
-        write_json(args.json, record)
+        facts = measured("raster", args.note).model_dump() | library_facts(library)
+        write_json(args.json, facts | record)
 
 
 def _operators(args: argparse.Namespace, library: Library) -> dict[str, Any]:
@@ -225,7 +227,6 @@ def _operators(args: argparse.Namespace, library: Library) -> dict[str, Any]:
         for step, turns in zip(steps[1:], taken[1:], strict=True):
             speedups.append(_speedups(steps[0], taken[0], step, turns))
     return {
-        **measured_on(library),
         "peak": [{**asdict(p), "per_cycle": p.per_cycle} for p in peaks],
         "reference": ratios,
         "results": results,

@@ -45,10 +45,9 @@ def measured_library() -> Library:
     return Library(built.target, name, lanes, built.compiler)
 
 
-def measured_on(library: Library) -> dict[str, Any]:
-    """The machine and the library, as data."""
+def library_facts(library: Library) -> dict[str, Any]:
+    """The library, as data."""
     return {
-        "machine": machine_facts(),
         "target": library.target,
         "instruction_set": library.instruction_set,
         "compiler": library.compiler,

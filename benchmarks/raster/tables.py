@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
+from benchmarks import markdown
+
 PHASES = [
     *("projection, SH", "bin", "blend", "loss", "blend backward", "projection, SH backward"),
     *("Adam", "step"),
@@ -27,9 +29,7 @@ def table(records: Sequence[dict[str, Any]]) -> str:
     """One column for each scene and number of threads of each record."""
     columns = [["", *PHASES]]
     columns += [column(record, result) for record in records for result in record["results"]]
-    rows = ["| " + " | ".join(cells) + " |" for cells in zip(*columns, strict=True)]
-    rows.insert(1, "|---" * len(columns) + "|")
-    return "\n".join(rows) + "\n"
+    return markdown.table(list(zip(*columns, strict=True)))
 
 
 def steps_table(records: Sequence[dict[str, Any]]) -> str:
@@ -38,6 +38,4 @@ def steps_table(records: Sequence[dict[str, Any]]) -> str:
     builds: dict[str, dict[str, float]] = record["ms"]
     rows = [["", *builds]]
     rows += [[phase, *(f"{ms[phase]:.2f}" for ms in builds.values())] for phase in PHASES]
-    lines = ["| " + " | ".join(cells) + " |" for cells in rows]
-    lines.insert(1, "|---" * len(rows[0]) + "|")
-    return "\n".join(lines) + "\n"
+    return markdown.table(rows)

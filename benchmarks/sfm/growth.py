@@ -16,7 +16,11 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.sfm.measure import Cost, measured
+from benchmarks import markdown, record_tables
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import GrowthResult
+from benchmarks.sfm.measure import cost_of
+from benchmarks.sfm.summary import Cost
 from pipeline.config.schema import Sfm
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model
@@ -129,6 +133,11 @@ def mapping(folder: Path, count: int, mapper: str) -> None:
         raise UserError(f"{mapper} mapping of {count} photographs is {verdict}")
 
 
+def growth_power(last: GrowthResult, views: int, cpu_s: float) -> float:
+    """The exponent p of time proportional to views^p."""
+    return log(cpu_s / last.cpu_s) / log(views / last.views)
+
+
 def main(arguments: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.sfm.growth",
@@ -143,13 +152,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
         default=["incremental", "global"],
         choices=["incremental", "global"],
     )
+    add_record_options(parser)
     args = parser.parse_args(arguments)
     truth_camera = Camera(
         "SIMPLE_RADIAL", WIDTH, HEIGHT, np.array([FOCAL, WIDTH / 2, HEIGHT / 2, 0.0])
     )
-    print("| mapper | views | CPU s | grows as N^ | MiB | images | rotation, deg | centre, m |")
-    print("|---" * 8 + "|")
-    last: dict[str, tuple[int, float]] = {}
+    print(markdown.table([record_tables.GROWTH_HEADING]), end="")
+    results: list[GrowthResult] = []
     for count in args.views:
         images = {i: PosedImage(name_of(i), 1, *pose) for i, pose in enumerate(street(count))}
         truth = Reconstruction({1: truth_camera}, images)
@@ -157,19 +166,24 @@ def main(arguments: Sequence[str] | None = None) -> int:
             folder = Path(name)
             run_isolated(make_database, folder / "database.db", count, args.points)
             for mapper in args.mappers:
-                cost: Cost = run_isolated(measured, mapping, (folder, count, mapper))
+                cost: Cost = run_isolated(cost_of, mapping, (folder, count, mapper))
                 error = pose_error(read_model(folder / mapper / "sparse" / "0"), truth)
-                power = "-"
-                if mapper in last:
-                    views, seconds = last[mapper]
-                    power = f"{log(cost.cpu_s / seconds) / log(count / views):.2f}"
-                last[mapper] = count, cost.cpu_s
-                print(
-                    f"| {mapper} | {count} | {cost.cpu_s:.1f} | {power} | {cost.peak_mb:.0f} | "
-                    f"{error.num_common} | {error.rotation_median_deg:.3f} | "
-                    f"{error.centre_median:.3f} |",
-                    flush=True,
+                last = next((r for r in reversed(results) if r.mapper == mapper), None)
+                results.append(
+                    GrowthResult(
+                        mapper=mapper,
+                        views=count,
+                        cpu_s=cost.cpu_s,
+                        power=None if last is None else growth_power(last, count, cost.cpu_s),
+                        peak_mb=cost.peak_mb,
+                        registered=error.num_common,
+                        rotation_deg=error.rotation_median_deg,
+                        centre_m=error.centre_median,
+                    )
                 )
+                print(markdown.line(record_tables.growth_row(results[-1])), flush=True)
+    if args.json:
+        write_record(args.json, measured("sfm.growth", args.note, arguments), results)
     return 0
 
 

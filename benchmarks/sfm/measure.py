@@ -1,82 +1,22 @@
-"""Runs of a configuration in separate processes, and medians over several runs."""
+"""Runs of a configuration, each step in a separate process."""
 
 from __future__ import annotations
 
 import resource
-import statistics
 import tempfile
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from benchmarks.sfm.scenes import REFERENCE, Configuration, Scene
+from benchmarks.sfm.scenes import Configuration, Scene
+from benchmarks.sfm.summary import REFERENCE, STEPS, Cost, Run
 from pipeline.config.schema import Config
 from pipeline.io.colmap import read_model
-from pipeline.metrics.pose import PoseError, pose_error
+from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.isolate import run_isolated
-
-STEPS = ("features", "matches", "mapping")
-
-
-@dataclass(frozen=True)
-class Cost:
-    """CPU seconds of a step, without imports, and its peak memory, MiB."""
-
-    cpu_s: float
-    peak_mb: float
-
-
-@dataclass(frozen=True)
-class Run:
-    """Attributes:
-    costs: of each step.
-    registered: photographs with a pose.
-    error: against the scene's poses; None where there is no model.
-    failure: why not.
-    """
-
-    scene: str
-    configuration: str
-    planned: bool
-    costs: dict[str, Cost]
-    registered: int
-    error: PoseError | None
-    failure: str = ""
-
-    @property
-    def cpu_s(self) -> float:
-        return sum(cost.cpu_s for cost in self.costs.values())
-
-
-@dataclass(frozen=True)
-class Summary:
-    """Medians over the runs of a configuration on a scene, of those that gave a model.
-
-    Attributes:
-        cpu_s: of each step; ``total_s`` their sum.
-        rotation_deg, centre, centre_permille, auc1: median errors over the images in degrees,
-            the world's unit and thousandths of the cameras' radius; area under the curve of
-            relative pose errors up to one degree. None without any model.
-        runs, failed: how many, and how many of them without a model.
-    """
-
-    scene: str
-    configuration: str
-    planned: bool
-    cpu_s: dict[str, float]
-    total_s: float
-    peak_mb: float
-    registered: int
-    rotation_deg: float | None
-    centre: float | None
-    centre_permille: float | None
-    auc1: float | None
-    runs: int
-    failed: int
 
 
 def run_once(scene: Scene, configuration: Configuration | None, threads: int) -> Run:
@@ -98,7 +38,7 @@ def run_once(scene: Scene, configuration: Configuration | None, threads: int) ->
         costs, failure = {}, ""
         for step, (function, arguments) in zip(STEPS, calls, strict=True):
             try:
-                costs[step] = run_isolated(measured, function, arguments)
+                costs[step] = run_isolated(cost_of, function, arguments)
             except UserError as refusal:
                 failure = refusal.what
                 break
@@ -110,52 +50,10 @@ def run_once(scene: Scene, configuration: Configuration | None, threads: int) ->
         return Run(scene.name, title, planned, costs, registered, error)
 
 
-def summarise(runs: Sequence[Run]) -> Summary:
-    """Summary of at least one run of a configuration on a scene."""
-    done = [run for run in runs if run.error is not None]
-    timed = done or list(runs)
-
-    def middle(of: Callable[[PoseError], float | None]) -> float | None:
-        values = [value for run in done if (value := of(_error(run))) is not None]
-        return statistics.median(values) if values else None
-
-    steps = {
-        step: statistics.median(run.costs[step].cpu_s for run in timed if step in run.costs)
-        for step in STEPS
-        if any(step in run.costs for run in timed)
-    }
-    relative = middle(lambda error: error.centre_relative_median)
-    return Summary(
-        scene=runs[0].scene,
-        configuration=runs[0].configuration,
-        planned=runs[0].planned,
-        cpu_s=steps,
-        total_s=statistics.median(run.cpu_s for run in timed),
-        peak_mb=max((c.peak_mb for run in runs for c in run.costs.values()), default=0.0),
-        registered=int(statistics.median(run.registered for run in timed)),
-        rotation_deg=middle(lambda error: error.rotation_median_deg),
-        centre=middle(lambda error: error.centre_median),
-        centre_permille=None if relative is None else 1000 * relative,
-        auc1=middle(lambda error: None if error.auc is None else error.auc[1.0]),
-        runs=len(runs),
-        failed=len(runs) - len(done),
-    )
-
-
-def as_data(run: Run) -> dict[str, Any]:
-    """The run as JSON."""
-    return asdict(run) | {"cpu_s": run.cpu_s}
-
-
-def _error(run: Run) -> PoseError:
-    assert run.error is not None
-    return run.error
-
-
 # --- the steps, each in a separate process ------------------------------------------------
 
 
-def measured(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
+def cost_of(step: Callable[..., None], arguments: tuple[Any, ...]) -> Cost:
     """Run ``step`` in this process, which does nothing else, and report its cost."""
     # Libraries are imported before timing. cv2 comes first (see isolate).
     if step is our_features:

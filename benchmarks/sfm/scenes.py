@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from fnmatch import fnmatchcase
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 from pipeline.config.load import scene_config
 from pipeline.config.presets import PRESETS
@@ -22,7 +21,6 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 
-REFERENCE = "pycolmap"
 MAPPERS = ("incremental", "global")
 PAIRS = ("exhaustive", "sequential", "spatial", "retrieval")
 
@@ -111,12 +109,7 @@ def configurations(scene: Scene, patterns: Sequence[str]) -> list[Configuration]
     return found
 
 
-def settled(scene: Scene, raw: Mapping[str, Any]) -> Config:
-    """The plan of the scene with these options, with poses from structure from motion."""
-    config = scene_config({**raw, "poses": "ignore"}, scene.name)
-    return settle(scene.scan, config).config
-
-
 def _settled(scene: Scene, preset: str, mapper: str, pairs: str) -> Config:
+    """The plan of the scene with these options, with poses from structure from motion."""
     raw = {"preset": preset, "matches": {"pairs": pairs}, "sfm": {"mapper": mapper}}
-    return settled(scene, raw)
+    return settle(scene.scan, scene_config({**raw, "poses": "ignore"}, scene.name)).config

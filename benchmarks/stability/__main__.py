@@ -16,12 +16,13 @@ import re
 import subprocess
 import sys
 import tempfile
-import textwrap
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
+from benchmarks import record_tables
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import StabilityResult
 from benchmarks.stability.cases import CASES, Case, write_room
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -35,30 +36,9 @@ CONFIG: dict[str, Any] = {
 }
 
 
-@dataclass(frozen=True)
-class Outcome:
-    """Outcome of a case.
-
-    Attributes:
-        code: Snakemake's exit code.
-        psnr, ssim: of test views; None if the run failed.
-        gaussians: final number.
-        message: of the error, or the warnings of the result.
-        traceback: whether a traceback was printed.
-        right: whether the outcome is the expected one.
-    """
-
-    case: str
-    code: int
-    psnr: float | None
-    ssim: float | None
-    gaussians: int | None
-    message: str
-    traceback: bool
-    right: bool
-
-
-def run(name: str, case: Case, work: Path, references: Mapping[str, Outcome]) -> Outcome:
+def run(
+    name: str, case: Case, work: Path, references: Mapping[str, StabilityResult]
+) -> StabilityResult:
     """Run one case in ``work``, which contains the base scene."""
     folder = work / "data" / name
     folder.mkdir(parents=True)
@@ -82,17 +62,41 @@ def run(name: str, case: Case, work: Path, references: Mapping[str, Outcome]) ->
     if done.returncode:
         message = _message(done.stdout)
         right = case.expected == "error" and not traceback and bool(message)
-        return Outcome(name, done.returncode, None, None, None, message, traceback, right)
+        return StabilityResult(
+            case=name,
+            what=case.what,
+            code=done.returncode,
+            psnr=None,
+            ssim=None,
+            reference=None,
+            difference_db=None,
+            gaussians=None,
+            message=message,
+            traceback=traceback,
+            right=right,
+        )
     found = json.loads((work / "results" / name / "metrics.json").read_text())
     psnr = float(found["psnr"])
-    reference = references.get(case.reference)
     right = case.expected != "error" and psnr >= case.least and not traceback
-    if case.expected == "same" and name != case.reference:
-        known = reference is not None and reference.psnr is not None
-        right = known and abs(psnr - reference.psnr) <= TOLERANCE_DB  # type: ignore[union-attr,operator]
-    told = "; ".join(found["warnings"])
-    count = found["num_gaussians"]
-    return Outcome(name, 0, psnr, found["ssim"], count, told, traceback, right)
+    compared = case.expected == "same" and name != case.reference
+    difference = None
+    if compared:
+        reference = references[case.reference].psnr
+        difference = None if reference is None else psnr - reference
+        right &= difference is not None and abs(difference) <= TOLERANCE_DB
+    return StabilityResult(
+        case=name,
+        what=case.what,
+        code=0,
+        psnr=psnr,
+        ssim=found["ssim"],
+        reference=case.reference if compared else None,
+        difference_db=difference,
+        gaussians=found["num_gaussians"],
+        message="; ".join(found["warnings"]),
+        traceback=traceback,
+        right=right,
+    )
 
 
 def _merged(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
@@ -109,30 +113,6 @@ def _message(text: str) -> str:
     return " ".join(found[1].split()) if found else ""
 
 
-def table(outcomes: list[Outcome]) -> str:
-    """A Markdown table."""
-    lines = [
-        "| case | what | PSNR (dB) | against | SSIM | Gaussians | |",
-        "|---|---|---|---|---|---|---|",
-    ]
-    by_name = {outcome.case: outcome for outcome in outcomes}
-    for o in outcomes:
-        case = CASES[o.case]
-        message = textwrap.shorten(o.message, 200, placeholder=" ...")
-        if o.psnr is None:
-            rest = f"| error | | | | {message} |"
-        else:
-            reference = by_name.get(case.reference)
-            compared = case.expected == "same" and reference is not None and reference is not o
-            against = ""
-            if compared and reference is not None and reference.psnr is not None:
-                against = f"{o.psnr - reference.psnr:+.3f} ({case.reference})"
-            rest = f"| {o.psnr:.2f} | {against} | {o.ssim:.4f} | {o.gaussians} | {message} |"
-        wrong = "" if o.right else " **WRONG**"
-        lines.append(f"| {o.case}{wrong} | {case.what} {rest}")
-    return "\n".join(lines)
-
-
 def main() -> int:
     parser = argparse.ArgumentParser(
         prog="python -m benchmarks.stability",
@@ -141,7 +121,7 @@ def main() -> int:
     )
     parser.add_argument("cases", nargs="*", metavar="CASE", help=f"of {', '.join(CASES)}")
     parser.add_argument("--work", type=Path, help="an empty folder for the runs, which is kept")
-    parser.add_argument("--json", type=Path, help="write the outcomes as JSON")
+    add_record_options(parser)
     args = parser.parse_args()
     unknown = set(args.cases) - CASES.keys()
     if unknown:
@@ -149,7 +129,7 @@ def main() -> int:
     wanted = set(args.cases or CASES)
     # The references of the cases are run as well.
     wanted |= {CASES[name].reference for name in wanted if CASES[name].expected == "same"}
-    outcomes: dict[str, Outcome] = {}
+    outcomes: dict[str, StabilityResult] = {}
     with tempfile.TemporaryDirectory(prefix="stability-") as temporary:
         work = (args.work or Path(temporary)).resolve()
         write_room(work / "room")
@@ -158,9 +138,10 @@ def main() -> int:
             print(outcomes[name], flush=True)
     found = list(outcomes.values())
     if args.json:
-        args.json.write_text(json.dumps([asdict(o) for o in found], indent=1))
+        write_record(args.json, measured("stability", args.note), found)
     wrong = [o.case for o in found if not o.right]
-    print(f"\n{table(found)}\n\n{len(found)} cases, wrong: {', '.join(wrong) or 'none'}")
+    print(f"\n{record_tables.outcomes(found)}")
+    print(f"{len(found)} cases, wrong: {', '.join(wrong) or 'none'}")
     return 1 if wrong else 0
 
 

@@ -33,7 +33,7 @@ def run_record(
         **machine_facts(),
         **native_facts(),
         "versions": versions(),
-        "commit": _commit(),
+        "commit": commit(),
         "finished": time.strftime("%Y-%m-%dT%H:%M:%S%z"),
         **timings,
     }
@@ -61,7 +61,7 @@ def versions() -> dict[str, str]:
     return found
 
 
-def _commit() -> str | None:
+def commit() -> str | None:
     """The checkout's commit. An installed package may be inside another repository, hence None."""
     if not IS_CHECKOUT:
         return None

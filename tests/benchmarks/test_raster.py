@@ -8,8 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from benchmarks.measured import measured
 from benchmarks.raster.drawing import drawings
-from benchmarks.raster.library import heading, measured_library, measured_on
+from benchmarks.raster.library import heading, library_facts, measured_library
 from benchmarks.raster.measure import Step
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import synthetic, trained
@@ -45,11 +46,11 @@ def test_an_impossible_rate_is_reported() -> None:
 
 def test_tables_and_records_say_what_was_measured() -> None:
     library = measured_library()
-    record = measured_on(library)
-    for text in (record["machine"]["processor"], library.instruction_set, library.compiler):
+    facts = measured("raster", "")
+    for text in (facts.processor, library.instruction_set, library.compiler):
         assert text and text in heading(library)
-    assert record["instruction_set"] == library.instruction_set
-    assert record["compiler"] == library.compiler
+    assert facts.instruction_set == library_facts(library)["target"] == library.target
+    assert facts.compiler == library.compiler
 
 
 def test_half_of_the_gaussians_can_be_out_of_view() -> None:

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 
-from benchmarks.stability.__main__ import Outcome, table
+from benchmarks.record_tables import outcomes
+from benchmarks.results import StabilityResult
 from benchmarks.stability.cases import CASES, TURN, exposed, similar
 from pipeline.geometry.cameras import Camera
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
@@ -45,7 +48,7 @@ def test_brighter_than_white_is_white() -> None:
 
 
 def test_the_table_tells_what_is_wrong() -> None:
-    good = Outcome("posed", 0, 20.0, 0.7, 100, "", False, True)
-    off = Outcome("scale_1e4", 0, 19.5, 0.7, 100, "", False, False)
-    text = table([good, off])
+    good = StabilityResult("posed", "", 0, 20.0, 0.7, None, None, 100, "", False, True)
+    off = replace(good, case="scale_1e4", reference="posed", difference_db=-0.5, right=False)
+    text = outcomes([good, off])
     assert "-0.500 (posed)" in text and text.count("**WRONG**") == 1

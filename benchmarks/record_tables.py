@@ -1,0 +1,213 @@
+"""Tables of the benchmarks' records, for ``benchmarks.tables`` and the benchmarks' own output."""
+
+from __future__ import annotations
+
+import statistics
+import textwrap
+from collections import Counter
+from collections.abc import Callable, Mapping, Sequence
+from typing import Any
+
+from pydantic import ValidationError
+
+from benchmarks import markdown
+from benchmarks.judge.truth import Grade
+from benchmarks.markdown import cell
+from benchmarks.measured import Record, Result
+from benchmarks.results import (
+    CoverageResult,
+    GrowthResult,
+    JudgeResult,
+    MemoryResult,
+    MeshResult,
+    PageResult,
+    StabilityResult,
+    StressResult,
+)
+from benchmarks.sfm import summary
+from pipeline.runtime.errors import UserError
+
+GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
+GROWTH_HEADING = [
+    *("mapper", "views", "CPU s", "grows as N^", "MiB", "images", "rotation, deg", "centre, m"),
+]
+Stored = Mapping[str, Any]
+"""A record as read from JSON."""
+
+
+def results(records: Sequence[Stored], kind: type[Record[Result]]) -> list[Result]:
+    """The results of all records.
+
+    Raises:
+        UserError: a record has other fields.
+    """
+    found: list[Result] = []
+    for record in records:
+        try:
+            found += kind.model_validate(record).results
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(map(str, first["loc"]))
+            raise UserError(
+                f"the record of `{record.get('command')}` is not this version's: "
+                f"{field}: {first['msg']}",
+                fix="run its command again",
+            ) from error
+    return found
+
+
+def mesh(records: Sequence[Stored]) -> str:
+    rows = [
+        [
+            *("region", "size (m)", "voxel (mm)", "triangles", "median distance (mm)"),
+            *("90th percentile (mm)", "completeness"),
+        ]
+    ]
+    for result in results(records, Record[MeshResult]):
+        for name, region in (("foreground", result.foreground), ("room", result.room)):
+            rows.append(
+                [
+                    name,
+                    f"{region.size:.1f}",
+                    f"{1e3 * result.voxel_m:.1f}",
+                    f"{result.triangles / 1e3:.0f}k",
+                    f"{1e3 * region.size * region.median:.1f}",
+                    f"{1e3 * region.size * region.p90:.1f}",
+                    f"{region.completeness:.1%}",
+                ]
+            )
+    return markdown.table(rows)
+
+
+def coverage(records: Sequence[Stored]) -> str:
+    """Gains are of the removed views; of random viewpoints, the median over the draws."""
+    rows = [
+        [
+            *("removed views", "trust: test, removed", "PSNR: test, removed (dB)"),
+            *("rank correlation", "distance: proposed, random (m)"),
+            *("nearer than random draws", "gain: proposed, random (dB)"),
+        ]
+    ]
+    for r in results(records, Record[CoverageResult]):
+        gains = [gain["removed"] for gain in r.added_random]
+        rows.append(
+            [
+                r.case,
+                f"{r.trust['test']:.2f}, {r.trust['removed']:.2f}",
+                f"{r.psnr['test']:.2f}, {r.psnr['removed']:.2f}",
+                f"{r.rank_correlation:.2f}",
+                f"{r.first[0]:.2f}, {r.random_first[0]:.2f}",
+                f"{r.better_than_random:.0%}",
+                f"{r.added_first['removed']:+.2f}, "
+                + cell(statistics.median(gains) if gains else None, "+.2f"),
+            ]
+        )
+    return markdown.table(rows)
+
+
+def memory(records: Sequence[Stored]) -> str:
+    rows = [["Gaussians", "views, pixels", "planned (MB)", "peak (MB)", "planned / peak"]]
+    for r in results(records, Record[MemoryResult]):
+        rows.append(
+            [
+                f"{r.most_gaussians / 1e3:.0f}k",
+                f"{r.views}, {r.width}x{r.height}",
+                f"{r.planned_mb}",
+                f"{r.peak_mb}",
+                f"{r.planned_mb / r.peak_mb:.2f}",
+            ]
+        )
+    return markdown.table(rows)
+
+
+def sfm(records: Sequence[Stored]) -> str:
+    return summary.table(summary.summaries(results(records, Record[summary.Run])))
+
+
+def growth(records: Sequence[Stored]) -> str:
+    return markdown.table(
+        [GROWTH_HEADING, *map(growth_row, results(records, Record[GrowthResult]))]
+    )
+
+
+def growth_row(result: GrowthResult) -> list[str]:
+    return [
+        result.mapper,
+        f"{result.views}",
+        f"{result.cpu_s:.1f}",
+        cell(result.power, ".2f"),
+        f"{result.peak_mb:.0f}",
+        f"{result.registered}",
+        cell(result.rotation_deg, ".3f"),
+        cell(result.centre_m, ".3f"),
+    ]
+
+
+def judge(records: Sequence[Stored]) -> str:
+    return verdicts(results(records, Record[JudgeResult]))
+
+
+def verdicts(found: Sequence[JudgeResult]) -> str:
+    """The confusion table of true grades and verdicts."""
+    counts = Counter((row.truth.grade, row.verdict) for row in found if row.truth is not None)
+    rows = [["truth", *(f"called {grade}" for grade in GRADES)]]
+    rows += [[true, *(str(counts[true, called]) for called in GRADES)] for true in GRADES]
+    return markdown.table(rows)
+
+
+def stability(records: Sequence[Stored]) -> str:
+    return outcomes(results(records, Record[StabilityResult]))
+
+
+def outcomes(found: Sequence[StabilityResult]) -> str:
+    rows = [["case", "what", "PSNR (dB)", "against", "SSIM", "Gaussians", ""]]
+    for r in found:
+        against = ""
+        if r.difference_db is not None:
+            against = f"{r.difference_db:+.3f} ({r.reference})"
+        rows.append(
+            [
+                r.case if r.right else f"{r.case} **WRONG**",
+                r.what,
+                "error" if r.psnr is None else f"{r.psnr:.2f}",
+                against,
+                "" if r.ssim is None else f"{r.ssim:.4f}",
+                "" if r.gaussians is None else str(r.gaussians),
+                textwrap.shorten(r.message, 200, placeholder=" ..."),
+            ]
+        )
+    return markdown.table(rows)
+
+
+def page(records: Sequence[Stored]) -> str:
+    rows = [["splats", "view", "PSNR (dB)"]]
+    rows += [[r.file, r.view, f"{r.psnr:.2f}"] for r in results(records, Record[PageResult])]
+    return markdown.table(rows)
+
+
+def raster_stress(records: Sequence[Stored]) -> str:
+    rows = [
+        [
+            *("family", "cases", "drawn", "dropped", "not finite", "colour error"),
+            *("gradient error: median", "99 %", "worst"),
+        ]
+    ]
+    for r in results(records, Record[StressResult]):
+        counts = (r.cases, r.drawn, r.dropped, r.not_finite)
+        errors = (r.colour, r.gradient_median, r.gradient_p99, r.gradient_worst)
+        rows.append([r.family, *map(str, counts), *(f"{error:.1e}" for error in errors)])
+    return markdown.table(rows)
+
+
+TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
+    "mesh": mesh,
+    "coverage": coverage,
+    "memory": memory,
+    "sfm": sfm,
+    "sfm.growth": growth,
+    "judge": judge,
+    "stability": stability,
+    "page": page,
+    "raster_stress": raster_stress,
+}
+"""The table of each benchmark, by the ``benchmark`` of its record."""

@@ -1,0 +1,221 @@
+"""Results of the benchmarks, as printed and stored in records.
+
+The SfM benchmark's are in ``benchmarks.sfm.summary``.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from benchmarks.judge.truth import Grade, Truth
+
+# ---- benchmarks.mesh ----
+
+
+@dataclass(frozen=True)
+class Accuracy:
+    """One region of the scene.
+
+    Attributes:
+        size: the region's, metres.
+        median, p90: distances of the mesh from the true surface, by area, shares of ``size``.
+        completeness: share of the true surface that has mesh within 1 % of ``size``.
+    """
+
+    size: float
+    median: float
+    p90: float
+    completeness: float
+
+
+@dataclass(frozen=True)
+class MeshResult:
+    """Attributes:
+    voxel_m: side of a voxel, metres.
+    seconds: ``wall`` and ``cpu`` time of depth maps and mesh.
+    peak_mb: peak memory of the process, MiB.
+    foreground, room: see ``benchmarks.surface.measure``.
+    """
+
+    triangles: int
+    voxel_m: float
+    voxels: int
+    seconds: dict[str, float]
+    peak_mb: float
+    foreground: Accuracy
+    room: Accuracy
+
+
+# ---- benchmarks.coverage ----
+
+Place = list[float]
+"""Distance of a viewpoint from the nearest removed camera, metres, and the angle between their
+viewing directions, degrees."""
+
+
+@dataclass(frozen=True)
+class CoverageResult:
+    """One case. Keys ``test`` and ``removed`` are the test views and the removed views.
+
+    Attributes:
+        trust: mean trust. psnr: mean PSNR before a photograph is added, dB.
+        rank_correlation: of trust and squared error over blocks of all these views.
+        first, best_of_five: of the proposals. random_first, random_best_of_five: medians of random
+            draws from the candidates.
+        better_than_random: share of the random draws whose first viewpoint is farther.
+        added_first, added_random: gain in mean PSNR, dB, from a photograph at the first proposal,
+            and at the first viewpoint of each random draw.
+        surroundings: mean trust of the candidates before and after the proposals, and their number.
+    """
+
+    case: str
+    training_views: int
+    trust: dict[str, float]
+    psnr: dict[str, float]
+    rank_correlation: float
+    first: Place
+    best_of_five: Place
+    random_first: Place
+    random_best_of_five: Place
+    better_than_random: float
+    added_first: dict[str, float]
+    added_random: list[dict[str, float]]
+    surroundings: list[float]
+
+
+# ---- benchmarks.memory ----
+
+
+@dataclass(frozen=True)
+class MemoryResult:
+    """Attributes:
+    gaussians, most_gaussians: their number at the end, and the largest during training.
+    width, height: of each view, pixels.
+    checkpoints_mb: size of the checkpoints, MB.
+    planned_mb, peak_mb: the plan's estimate and the measured peak, MB.
+    """
+
+    gaussians: int
+    most_gaussians: int
+    views: int
+    width: int
+    height: int
+    seconds_a_step: float
+    checkpoints_mb: int
+    planned_mb: int
+    peak_mb: int
+
+
+# ---- benchmarks.sfm.growth ----
+
+
+@dataclass(frozen=True)
+class GrowthResult:
+    """Attributes:
+    cpu_s, peak_mb: of mapping alone; the memory in MiB.
+    power: exponent of the time's growth since the last number of views; None for the first.
+    registered: images with a pose.
+    rotation_deg, centre_m: median errors.
+    """
+
+    mapper: str
+    views: int
+    cpu_s: float
+    power: float | None
+    peak_mb: float
+    registered: int
+    rotation_deg: float | None
+    centre_m: float | None
+
+
+# ---- benchmarks.judge ----
+
+
+@dataclass(frozen=True)
+class JudgeResult:
+    """Result of a case; ``truth`` is None without ground truth."""
+
+    case: str
+    seed: int
+    truth: Truth | None
+    verdict: Grade
+    reasons: list[str]
+    registered: int
+    total: int
+    attempts: int
+    cpu_s: float
+    evidence: dict[str, float | None] = field(default_factory=dict)
+
+    @property
+    def wrong(self) -> bool:
+        """Whether a good model was called failed, or a failed one good."""
+        return self.truth is not None and {self.truth.grade, self.verdict} == {"good", "failed"}
+
+
+# ---- benchmarks.stability ----
+
+
+@dataclass(frozen=True)
+class StabilityResult:
+    """Outcome of a case.
+
+    Attributes:
+        what: the case in words.
+        code: Snakemake's exit code.
+        psnr, ssim: of test views; None if the run failed.
+        reference: the case whose quality it should have, if any.
+        difference_db: PSNR minus that of the reference; None where either is unknown.
+        gaussians: final number.
+        message: of the error, or the warnings of the result.
+        traceback: whether a traceback was printed.
+        right: whether the outcome is the expected one.
+    """
+
+    case: str
+    what: str
+    code: int
+    psnr: float | None
+    ssim: float | None
+    reference: str | None
+    difference_db: float | None
+    gaussians: int | None
+    message: str
+    traceback: bool
+    right: bool
+
+
+# ---- benchmarks.page ----
+
+
+@dataclass(frozen=True)
+class PageResult:
+    """One view: PSNR between the viewer's render of ``file`` and the rasterizer's, dB."""
+
+    file: str
+    view: str
+    psnr: float
+
+
+# ---- benchmarks.raster_stress ----
+
+
+@dataclass(frozen=True)
+class StressResult:
+    """A family of inputs.
+
+    Attributes:
+        cases, drawn, dropped: numbers of Gaussians.
+        not_finite: number of values of images and gradients that are not finite.
+        colour: see ``benchmarks.raster_stress.Tally``.
+        gradient_median, gradient_p99, gradient_worst: relative errors over calls.
+    """
+
+    family: str
+    cases: int
+    drawn: int
+    dropped: int
+    not_finite: int
+    colour: float
+    gradient_median: float
+    gradient_p99: float
+    gradient_worst: float

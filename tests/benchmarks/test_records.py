@@ -1,0 +1,174 @@
+"""Records of benchmarks hold their results, name their command, and become tables."""
+
+from __future__ import annotations
+
+import importlib.util
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from benchmarks import record_tables
+from benchmarks.judge.truth import Truth
+from benchmarks.measured import Record, command_line, measured, write_record
+from benchmarks.results import (
+    Accuracy,
+    CoverageResult,
+    GrowthResult,
+    JudgeResult,
+    MemoryResult,
+    MeshResult,
+    PageResult,
+    StabilityResult,
+    StressResult,
+)
+from benchmarks.sfm.summary import Cost, Run
+from benchmarks.tables import KINDS, MARKER, RECORDS, pages, rewritten
+from pipeline.metrics.pose import PoseError
+from pipeline.runtime.errors import UserError
+
+BOTH = {"test": 30.0, "removed": 20.0}
+EXAMPLES: dict[str, tuple[Any, Any, str]] = {
+    "mesh": (
+        Record[MeshResult],
+        MeshResult(
+            *(90_000, 0.02, 512, {"wall": 2.0, "cpu": 3.0}, 500.0),
+            foreground=Accuracy(2.5, 0.001, 0.004, 0.95),
+            room=Accuracy(10.0, 0.002, 0.01, 0.9),
+        ),
+        "| foreground | 2.5 | 20.0 | 90k | 2.5 | 10.0 | 95.0% |",
+    ),
+    "coverage": (
+        Record[CoverageResult],
+        CoverageResult(
+            *("two", 20, {"test": 0.8, "removed": 0.3}, BOTH, -0.6, [0.4, 9.0], [0.2, 5.0]),
+            *([1.2, 30.0], [0.9, 20.0], 0.97, {"test": 0.1, "removed": 1.5}),
+            added_random=[{"test": 0.0, "removed": gain} for gain in (0.2, 0.4, 0.9)],
+            surroundings=[0.3, 0.5, 40],
+        ),
+        "| two | 0.80, 0.30 | 30.00, 20.00 | -0.60 | 0.40, 1.20 | 97% | +1.50, +0.40 |",
+    ),
+    "memory": (
+        Record[MemoryResult],
+        MemoryResult(900_000, 1_000_000, 200, 1600, 1067, 1.5, 700, 5500, 5000),
+        "| 1000k | 200, 1600x1067 | 5500 | 5000 | 1.10 |",
+    ),
+    "sfm": (
+        Record[Run],
+        Run(
+            *("room", "fast/global/retrieval", True, {"mapping": Cost(2.0, 300.0)}, 8),
+            PoseError(
+                rotation_median_deg=0.1,
+                rotation_mean_deg=0.1,
+                centre_median=0.02,
+                centre_mean=0.02,
+                centre_relative_median=0.004,
+                radius=5.0,
+                scale=1.0,
+                auc={1.0: 0.9, 5.0: 1.0},
+                num_common=8,
+                num_truth=8,
+            ),
+        ),
+        "| room | **fast/global/retrieval** | - | - | 2.0 | 2.0 | - | 0.1000 | 0.02 | 4.000 | "
+        "0.900 | 8 | 300 |",
+    ),
+    "sfm.growth": (
+        Record[GrowthResult],
+        GrowthResult("incremental", 50, 12.0, None, 300.0, 50, 0.01, 0.002),
+        "| incremental | 50 | 12.0 | - | 300 | 50 | 0.010 | 0.002 |",
+    ),
+    "judge": (
+        Record[JudgeResult],
+        JudgeResult(
+            *("windows", 0, Truth("failed", 0.4, 10, 20.0, None), "weak", ["few points"], 9, 10),
+            *(2, 3.0, {"parallax": 0.01, "focal_off": None}),
+        ),
+        "| failed | 0 | 1 | 0 |",
+    ),
+    "stability": (
+        Record[StabilityResult],
+        StabilityResult("far", "moved", 0, 22.0, 0.8, "posed", 0.01, 6000, "", False, True),
+        "| far | moved | 22.00 | +0.010 (posed) | 0.8000 | 6000 |  |",
+    ),
+    "page": (
+        Record[PageResult],
+        PageResult("the PLY", "view_0.png", 45.678),
+        "| the PLY | view_0.png | 45.68 |",
+    ),
+    "raster_stress": (
+        Record[StressResult],
+        StressResult("needles", 512, 400, 3, 0, 1.2e-6, 1e-6, 2e-5, 3e-4),
+        "| needles | 512 | 400 | 3 | 0 | 1.2e-06 | 1.0e-06 | 2.0e-05 | 3.0e-04 |",
+    ),
+}
+
+
+@pytest.mark.parametrize("benchmark", record_tables.TABLES)
+def test_a_record_is_read_as_it_was_written_and_becomes_a_table(
+    benchmark: str, tmp_path: Path
+) -> None:
+    kind, result, row = EXAMPLES[benchmark]
+    facts = measured(benchmark, "a note", ["--json", "a.json"])
+    write_record(tmp_path / "a.json", facts, [result])
+    record = json.loads((tmp_path / "a.json").read_text())
+    read = kind.model_validate(record)
+    assert read.results == [result]
+    assert {name: getattr(read, name) for name in type(facts).model_fields} == facts.model_dump()
+    lines = record_tables.TABLES[benchmark]([record]).splitlines()
+    assert len({line.count("|") for line in lines}) == 1
+    assert row in lines
+
+
+def test_a_record_says_what_was_measured_on() -> None:
+    facts = measured("page", "alone", ["results/demo"])
+    assert facts.command == "python -m benchmarks.page results/demo --json FILE"
+    assert facts.note == "alone" and facts.date and facts.processor
+    assert facts.compiler and facts.instruction_set
+
+
+def test_the_command_has_neither_the_note_nor_the_name_of_the_file() -> None:
+    arguments = ["posed", "--json", "out/a.json", "--note=x y", "--work", "a b"]
+    assert command_line("stability", arguments) == (
+        "python -m benchmarks.stability posed --work 'a b' --json FILE"
+    )
+
+
+def test_a_record_with_other_fields_is_refused() -> None:
+    record = measured("page", "", []).model_dump() | {"results": [{"file": "a", "view": "b"}]}
+    with pytest.raises(UserError, match=r"results\.0\.psnr.*\n.*run its command again"):
+        record_tables.page([record])
+
+
+def test_a_missing_record_is_named(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setattr("benchmarks.tables.RECORDS", tmp_path)
+    with pytest.raises(UserError, match=r"none\.json: expected a record"):
+        rewritten("<!-- mesh: none.json -->\n")
+
+
+def test_every_table_is_of_a_benchmark() -> None:
+    assert set(record_tables.TABLES) == set(EXAMPLES)
+    for benchmark in record_tables.TABLES:
+        assert benchmark in KINDS
+        assert importlib.util.find_spec(f"benchmarks.{benchmark}") is not None
+
+
+STORED = [
+    (path.name, record["benchmark"])
+    for path in sorted(RECORDS.glob("*.json"))
+    if (record := json.loads(path.read_text())).get("benchmark") in record_tables.TABLES
+]
+
+
+@pytest.mark.parametrize(("name", "benchmark"), STORED)
+def test_a_stored_record_has_its_table_and_its_command_on_a_page(name: str, benchmark: str) -> None:
+    record = json.loads((RECORDS / name).read_text())
+    assert record_tables.TABLES[benchmark]([record]).count("\n") > 2
+    shown = {
+        kind
+        for page in pages()
+        for kind, names in MARKER.findall(page.read_text())
+        if name in names.split()
+    }
+    assert shown >= {benchmark, "sources"}

@@ -31,8 +31,13 @@ class NotComparable(ValueError):
     """Runs that one record cannot hold."""
 
 
-def scene_record(folders: Sequence[Path], command: str, note: str = "") -> dict[str, Any]:
+def scene_record(
+    folders: Sequence[Path], command: str, note: str = "", training: str = ""
+) -> dict[str, Any]:
     """What runs of one scene measured, as stored.
+
+    Args:
+        training: preset, or what else names the training in tables.
 
     Raises:
         NotComparable: the runs are of several scenes, commits, machines or protocols.
@@ -50,6 +55,7 @@ def scene_record(folders: Sequence[Path], command: str, note: str = "") -> dict[
         "photographs": first["photographs"],
         "command": command,
         "note": note,
+        "training": training,
         **first["where"],
         "protocol": first["protocol"],
         "runs": sorted((run["measured"] for run in every), key=lambda run: run["seed"]),
@@ -98,9 +104,10 @@ def main() -> int:
     parser.add_argument("-o", "--out", type=Path, required=True, metavar="FILE")
     parser.add_argument("--command", required=True, help="the command that made them")
     parser.add_argument("--note", default="", help="what else was running, for example")
+    parser.add_argument("--training", default="", help="its name in tables: preset fast")
     options = parser.parse_args()
     try:
-        record = scene_record(options.folders, options.command, options.note)
+        record = scene_record(options.folders, options.command, options.note, options.training)
     except (OSError, KeyError, ValueError) as error:
         print(
             f"error: expected finished scenes (results/NAME): {error!r}",

@@ -1,4 +1,5 @@
-"""Develop RAW files, with the same settings for all photographs of a scene.
+"""Develop RAW files, with the same settings for all photographs of a scene, and choose frames of
+videos.
 
 Outputs: ``images/``, ``images.json``; with given poses, ``sparse/0`` with the names of the
 developed images; and ``georeference.json`` if the given poses were translated.
@@ -8,10 +9,11 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Decode
+from pipeline.config.schema import Decode, Inspect, Video
 from pipeline.photos.counters import DecodeCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
+from pipeline.plan.video_files import contents
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -21,22 +23,34 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    if scan.num_raw == 0:
-        return StagePlan(run=False, reason="no RAW files")
-    config = settled.config.decode
+    reasons, decisions = [], []
+    if scan.num_raw:
+        reasons.append(f"{scan.num_raw} of {len(scan.photos)} photographs are RAW")
+        decisions.append(_developing(settled.config.decode))
+    for video in scan.videos:
+        length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
+        count = video.frames or "an unknown number of"
+        decisions.append(f"{video.name}: {count} frames of {video.width}x{video.height}{length}")
+    if scan.videos:
+        reasons.append(f"{contents(0, len(scan.videos))}: at most {len(scan.frames)} frames")
+    if not reasons:
+        return StagePlan(run=False, reason="no RAW files or videos")
+    return StagePlan(run=True, reason="; ".join(reasons), decisions=decisions)
+
+
+def _developing(config: Decode) -> str:
     depth = "16-bit linear" if config.linear else "8-bit sRGB"
     half = ", half size" if config.half_size else ""
-    text = (
+    return (
         f"{depth}, {config.demosaic} demosaicking{half}, one white balance "
         f"({config.white_balance}) for all"
     )
-    reason = f"{scan.num_raw} of {len(scan.photos)} photographs are RAW"
-    return StagePlan(run=True, reason=reason, decisions=[text])
 
 
 def work(job: Job) -> None:
     from pipeline.io.colmap import write_model
     from pipeline.photos.raw import develop
+    from pipeline.photos.video import extract_frames
     from pipeline.plan.given_poses import renamed
 
     manifest = inputs.read_manifest(job, "photos")
@@ -46,6 +60,17 @@ def work(job: Job) -> None:
         write_model(job.out / "sparse" / "0", given)
     inputs.copy_georeference(job, "photos")
     job.record(DecodeCounters(developed=len(report.manifest.photos)), [], report.warnings)
+    if report.manifest.videos:
+        found = extract_frames(
+            report.manifest,
+            job.section(Video),
+            job.out,
+            threads=job.threads,
+            min_photos=job.section(Inspect).min_images,
+        )
+        frames = {"frames_chosen": found.chosen, "frames_decoded": found.total}
+        counters = DecodeCounters(developed=len(report.manifest.photos), **frames)
+        job.record(counters, found.decisions, found.warnings)
 
 
 SPEC = StageSpec(
@@ -54,6 +79,6 @@ SPEC = StageSpec(
     decide=decide,
     counters=DecodeCounters,
     inputs={"photos": ("inspect",)},
-    options=("decode",),
-    packages=("rawpy",),
+    options=("decode", "video", "inspect.min_images"),
+    packages=("rawpy", "opencv-contrib-python-headless"),
 )

@@ -1,4 +1,4 @@
-"""Check that all photographs can be decoded, and read the given poses.
+"""Check that all photographs and videos can be decoded, and read the given poses.
 
 Outputs: ``images.json`` (the manifest); ``sparse/0`` if poses are given; ``truth`` if the scene has
 ``sparse_gt``; ``gcp_list.txt`` if the scene has one; ``georeference.json`` if the given poses were
@@ -14,6 +14,7 @@ from pipeline.config.schema import Config
 from pipeline.photos.counters import InspectCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
+from pipeline.plan.video_files import contents
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
 from pipeline.runtime.section import read_section
@@ -24,14 +25,14 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    reason = f"{len(scan.photos)} photographs"
+    reason = contents(len(scan.photos), len(scan.videos))
     return StagePlan(run=True, reason=reason, decisions=[scan.image_folder_reason])
 
 
 def work(job: Job) -> None:
     from pipeline.io.colmap import read_model, write_model
     from pipeline.io.gcp import GCP_FILE, read_ground_control
-    from pipeline.photos.verify import verify_photos
+    from pipeline.photos.verify import verify_photos, verify_videos
     from pipeline.plan.given_poses import load_given
     from pipeline.plan.scan import scan
 
@@ -39,12 +40,13 @@ def work(job: Job) -> None:
     folder = Path(job.key["folder"])
     found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
     found.check_unchanged(job.key["fingerprint"], folder)
-    manifest, warnings = verify_photos(
-        found.manifest, threads=job.threads, min_photos=config.inspect.min_images
-    )
-    job.add_messages([], [*found.warnings, *warnings])
+    manifest, warnings = verify_videos(found.manifest)
+    min_photos = 0 if manifest.videos else config.inspect.min_images
+    manifest, damaged = verify_photos(manifest, threads=job.threads, min_photos=min_photos)
+    job.add_messages([], [*found.warnings, *warnings, *damaged])
     manifest.write(job.out / "images.json")
     count, given_counts = len(manifest.photos), {}
+    videos = len(manifest.videos) if found.videos else None
     if (poses := found.poses) is not None:
         given = load_given(
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
@@ -52,7 +54,9 @@ def work(job: Job) -> None:
         job.add_messages(given.write(job.out), [])
         images, points = given.model.images, given.model.points
         given_counts = {"given_poses": len(images), "given_points": len(points)}
-    job.counters = InspectCounters(photos=count, left_out=len(found.listed) - count, **given_counts)
+    job.counters = InspectCounters(
+        photos=count, left_out=len(found.listed) - count, videos=videos, **given_counts
+    )
     if found.ground_control is not None and found.poses is None:
         # A malformed file is reported before the hours of later stages.
         read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])

@@ -89,6 +89,17 @@ class Decode(Section):
     )
 
 
+class Video(Section):
+    """The frames of videos that are used as photographs."""
+
+    max_frames: Annotated[int, Field(ge=2), Unit("frames")] = Field(
+        150,
+        description="Maximum number of frames of all videos together. One frame is chosen for "
+        "each twentieth of the long side that the image moves, for less motion in slow videos, for "
+        "more in long ones.",
+    )
+
+
 class Features(Section):
     """SIFT features."""
 
@@ -374,6 +385,7 @@ class Config(Section):
     views: Views = Field(default_factory=Views)
     split: Split = Field(default_factory=Split)
     decode: Decode = Field(default_factory=Decode)
+    video: Video = Field(default_factory=Video)
     features: Features = Field(default_factory=Features)
     matches: Matches = Field(default_factory=Matches)
     sfm: Sfm = Field(default_factory=Sfm)

@@ -1,13 +1,19 @@
-"""Finding photographs in folders, and their masks and depth maps."""
+"""Finding photographs and videos in folders, and their masks and depth maps."""
 
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path, PurePosixPath
 
-from pipeline.io.names import PHOTO_SUFFIXES, PICTURE_SUFFIXES, UNREAD_SUFFIXES, suffix_of
+from pipeline.io.names import (
+    PHOTO_SUFFIXES,
+    PICTURE_SUFFIXES,
+    UNREAD_SUFFIXES,
+    VIDEO_SUFFIXES,
+    suffix_of,
+)
 
 # Folders of a scene with images that are not photographs, also with a suffix such as "_2".
 COMPANION_FOLDERS = frozenset({"masks", "depths", "sparse", "sparse_gt", "colmap", "stereo"})
@@ -46,9 +52,43 @@ def pictures_in(
         path: a folder, relative to ``scene``.
         warnings: warnings are added to this list; they name files relative to ``scene``.
     """
-    folder = scene / path
     names: list[str] = []
     unread: list[str] = []
+    for where, name in _files_in(scene / path, recursive):
+        if not _is_utf8(name):
+            shown = os.fsencode(name).decode(errors="replace")
+            file = (Path(path) / where / shown).as_posix()
+            warnings.append(f"{file} is not used: its name is not UTF-8; rename it")
+            continue
+        suffix = suffix_of(name)
+        if name[0] != "." and suffix in PHOTO_SUFFIXES:
+            names.append((where / name).as_posix())
+        elif suffix in UNREAD_SUFFIXES:
+            unread.append((Path(path) / where / name).as_posix())
+    if unread:
+        kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
+        warnings.append(
+            f"{len(unread)} {kinds} images are not used (first: {min(unread)}): "
+            "convert them to JPEG or PNG with their EXIF data (HEIC can be read if pillow-heif is "
+            "installed)"
+        )
+    return sorted(names)
+
+
+def videos_in(folder: Path, *, recursive: bool = True) -> list[str]:
+    """Names of the files with a video's suffix, relative to ``folder``, sorted.
+
+    The same folders as of ``pictures_in`` are searched. Names that are not UTF-8 are ignored.
+    """
+    return sorted(
+        (where / name).as_posix()
+        for where, name in _files_in(folder, recursive)
+        if name[0] != "." and suffix_of(name) in VIDEO_SUFFIXES and _is_utf8(name)
+    )
+
+
+def _files_in(folder: Path, recursive: bool) -> Iterator[tuple[Path, str]]:
+    """Folder relative to ``folder``, and name of each file; not in hidden and companion folders."""
     seen: set[str] = set()
     for where, subfolders, files in os.walk(folder, followlinks=True):
         real = os.path.realpath(where)
@@ -60,26 +100,8 @@ def pictures_in(
         if real in seen:  # A symbolic link to a folder that was visited.
             continue
         seen.add(real)
-        prefix = Path(where).relative_to(folder)
         for name in files:
-            if not _is_utf8(name):
-                shown = os.fsencode(name).decode(errors="replace")
-                file = (Path(where).relative_to(scene) / shown).as_posix()
-                warnings.append(f"{file} is not used: its name is not UTF-8; rename it")
-                continue
-            suffix = suffix_of(name)
-            if name[0] != "." and suffix in PHOTO_SUFFIXES:
-                names.append((prefix / name).as_posix())
-            elif suffix in UNREAD_SUFFIXES:
-                unread.append((Path(where).relative_to(scene) / name).as_posix())
-    if unread:
-        kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in unread}))
-        warnings.append(
-            f"{len(unread)} {kinds} images are not used (first: {min(unread)}): "
-            "convert them to JPEG or PNG with their EXIF data (HEIC can be read if pillow-heif is "
-            "installed)"
-        )
-    return sorted(names)
+            yield Path(where).relative_to(folder), name
 
 
 def _is_utf8(name: str) -> bool:

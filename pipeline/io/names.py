@@ -1,4 +1,4 @@
-"""File names of photographs: supported suffixes, and matching of names without suffix."""
+"""File names of photographs and videos: supported suffixes, and names without suffix."""
 
 from __future__ import annotations
 
@@ -18,6 +18,7 @@ RAW_SUFFIXES = frozenset(
 _HEIF = heif.HEIF_SUFFIXES if heif.installed() else frozenset[str]()
 # Image formats that cannot be read; they are reported in a warning.
 UNREAD_SUFFIXES = (heif.HEIF_SUFFIXES | {".avif", ".jxl", ".jp2", ".gif"}) - _HEIF
+VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm"})
 PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES | _HEIF
 
 

@@ -1,4 +1,4 @@
-"""Counters of the stages that check, develop and undistort photographs."""
+"""Counters of the stages that check, decode and undistort photographs."""
 
 from __future__ import annotations
 
@@ -16,6 +16,9 @@ class InspectCounters(StageCounters):
         description="Number of photographs that are left out: files that cannot be read, and one "
         "of each pair of a RAW file and another file.",
     )
+    videos: int | None = Field(
+        None, ge=0, description="Number of videos that are used; absent without videos."
+    )
     given_poses: int | None = Field(
         None, ge=0, description="Number of given poses that are used; absent without given poses."
     )
@@ -30,6 +33,16 @@ class DecodeCounters(StageCounters):
     developed: int = Field(
         ge=0,
         description="Number of photographs after development, with those that are not RAW files.",
+    )
+    frames_chosen: dict[str, int] | None = Field(
+        None,
+        description="Name of each video to the number of its frames that are used; absent without "
+        "videos.",
+    )
+    frames_decoded: dict[str, int] | None = Field(
+        None,
+        description="Name of each video to the number of frames that can be decoded; absent "
+        "without videos.",
     )
 
 

@@ -95,10 +95,11 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
         for photo in manifest.photos
         if not photo.raw or photo.name in new
     ]
-    developed = Manifest(
-        scene=manifest.scene,
-        photos=tuple(sorted(photos, key=lambda photo: photo.name)),
-        warnings=(*manifest.warnings, *warnings),
+    developed = manifest.model_copy(
+        update={
+            "photos": tuple(sorted(photos, key=lambda photo: photo.name)),
+            "warnings": (*manifest.warnings, *warnings),
+        }
     )
     developed.write(out / "images.json")
     return DecodeReport(developed, tuple(warnings))

@@ -1,4 +1,4 @@
-"""Check that every photograph can be decoded."""
+"""Check that every photograph and the first frame of every video can be decoded."""
 
 from __future__ import annotations
 
@@ -12,6 +12,8 @@ from PIL import Image
 from pipeline.io import heif
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import ChangedFileError, read_recorded
+from pipeline.io.videofile import FIX as FIX_VIDEO
+from pipeline.io.videofile import opened_video
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
@@ -55,6 +57,37 @@ def verify_photos(
         )
     warnings += _copies(good)
     update = {"photos": good, "warnings": (*manifest.warnings, *warnings)}
+    return manifest.model_copy(update=update), warnings
+
+
+def verify_videos(manifest: Manifest) -> tuple[Manifest, list[str]]:
+    """Decode the first frame of each video and remove the damaged videos from the manifest.
+
+    Returns:
+        The manifest without the damaged videos and with the new warnings, and these warnings.
+
+    Raises:
+        UserError: there are no photographs, and no video can be decoded.
+    """
+    good, warnings = [], []
+    for video in manifest.videos:
+        try:
+            with opened_video(Path(video.path)) as capture:
+                fault = None if capture.read()[0] else "no frame can be decoded"
+        except UserError as error:
+            fault = error.what
+        if fault is None:
+            good.append(video)
+        else:
+            warnings.append(f"{Path(video.path).name}: left out: {fault}")
+    if manifest.videos and not good and not manifest.photos:
+        raise UserError(
+            f"none of the {len(manifest.videos)} videos can be decoded"
+            + "".join(f"\n  {line}" for line in warnings),
+            file=Path(manifest.videos[0].path).parent,
+            fix=FIX_VIDEO,
+        )
+    update = {"videos": tuple(good), "warnings": (*manifest.warnings, *warnings)}
     return manifest.model_copy(update=update), warnings
 
 

@@ -36,7 +36,7 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     if pixels == "auto":
         pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET
     by_view = width * height / pixels
-    by_scene = width * height * len(scan.photos) / TRAINING_PIXELS_PER_GAUSSIAN
+    by_scene = width * height * len(scan.planned) / TRAINING_PIXELS_PER_GAUSSIAN
     by_time = math.inf if minutes is None else GAUSSIANS_PER_MINUTE * minutes
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_time)))
     if density.strategy == "original" and density.pixels_per_gaussian == "auto":
@@ -80,7 +80,7 @@ def training_memory_mb(scan: Scan, config: Config) -> int:
 
 
 def _pixels(scan: Scan, config: Config) -> int:
-    sizes = [view_size(p.width, p.height, config.views.max_long_side_px) for p in scan.photos]
+    sizes = [view_size(p.width, p.height, config.views.max_long_side_px) for p in scan.planned]
     return sum(width * height for width, height in sizes)
 
 

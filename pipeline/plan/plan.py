@@ -17,6 +17,7 @@ from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, SceneFacts
+from pipeline.plan.video_files import contents
 from pipeline.scene.views import view_size
 
 # Limits the length of lists in the plan, which is passed on command lines.
@@ -31,6 +32,7 @@ def make_plan(
     Raises:
         UserError: see ``settle``.
     """
+    scan = scan.with_frames(config.video.max_frames)
     settled = settle(scan, config)
     decided = {name: spec.decide(scan, settled) for name, spec in stages.items()}
     running = {name for name, stage in decided.items() if stage.run}
@@ -72,7 +74,7 @@ def plan_record(plan: Plan) -> PlanRecord:
 
 def describe(plan: Plan) -> str:
     """The plan as a table for the terminal."""
-    lines = [f"{plan.scene}: {plan.facts.photographs} photographs"]
+    lines = [f"{plan.scene}: {contents(plan.facts.photographs, plan.facts.videos)}"]
     for name, stage in plan.stages.items():
         lines.append(f"  {name:<10} {'run ' if stage.run else 'skip'}  {stage.reason}")
         if stage.run:
@@ -96,12 +98,14 @@ def _most_frequent(counts: Counter[str]) -> dict[str, int]:
 
 
 def _facts(scan: Scan, config: Config) -> SceneFacts:
-    photos = scan.photos
+    photos = scan.planned
     sizes = Counter(f"{photo.width}x{photo.height}" for photo in photos)
     groups = Counter(photo.camera_group for photo in photos)
     poses = scan.poses
     return SceneFacts(
-        photographs=len(photos),
+        photographs=len(scan.photos),
+        videos=len(scan.videos),
+        max_frames=len(scan.frames),
         raw=scan.num_raw,
         alpha=scan.num_alpha,
         masks=scan.num_masks,

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
+from typing import NoReturn
 
 from pydantic import BaseModel, ConfigDict
 
@@ -30,10 +31,13 @@ from pipeline.io.posefiles import (
 from pipeline.io.recorded import digest_of
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.sequence import why_ordered
+from pipeline.plan.video_files import find_videos, planned_frames, read_videos
 from pipeline.runtime.errors import UserError
-from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.manifest import Manifest, Photo, VideoFile
 
-_ADD_PHOTOS = "put the photographs into images/ inside the scene folder"
+_ADD_PHOTOS = (
+    "put photographs into images/ inside the scene folder, or a video into the scene folder"
+)
 
 
 class Scan(BaseModel):
@@ -41,7 +45,8 @@ class Scan(BaseModel):
 
     Attributes:
         folder: the scene folder.
-        manifest: the photographs that are used; names are relative to ``image_folder``.
+        manifest: the photographs and videos that are used; names of photographs are relative to
+            ``image_folder``.
         image_folder: relative to ``folder``, "." for itself.
         base_folder: the folder that the given poses refer to ("images" for "images_4").
         image_folder_reason: why it was chosen.
@@ -50,8 +55,8 @@ class Scan(BaseModel):
         ordered: the reason to treat the photographs as a sequence, or None.
         ground_control: the scene's ``gcp_list.txt``, if any.
         truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
-        fingerprint: digest of the names and contents of photographs, masks, depth maps, pose files
-            and ground control points; independent of times and of the folder's location.
+        fingerprint: digest of the names and contents of photographs, videos, masks, depth maps,
+            pose files and ground control points; independent of times and of the folder's location.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -68,10 +73,25 @@ class Scan(BaseModel):
     truth: Path | None
     truth_digest: str | None
     fingerprint: str
+    frames: tuple[Photo, ...] = ()
+    """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
+
+    def with_frames(self, max_frames: int) -> Scan:
+        """The scan with placeholders for up to ``max_frames`` frames of the videos."""
+        return self.model_copy(update={"frames": planned_frames(self.videos, max_frames)})
 
     @property
     def photos(self) -> tuple[Photo, ...]:
         return self.manifest.photos
+
+    @property
+    def videos(self) -> tuple[VideoFile, ...]:
+        return self.manifest.videos
+
+    @property
+    def planned(self) -> tuple[Photo, ...]:
+        """The photographs and ``frames``: the plan settles options by their number and size."""
+        return (*self.photos, *self.frames)
 
     @property
     def warnings(self) -> tuple[str, ...]:
@@ -118,7 +138,7 @@ class Scan(BaseModel):
     @property
     def sizes(self) -> list[tuple[int, int]]:
         """Distinct (width, height), the most frequent first."""
-        counts = Counter((photo.width, photo.height) for photo in self.photos)
+        counts = Counter((photo.width, photo.height) for photo in self.planned)
         return [size for size, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
 
 
@@ -126,7 +146,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     """Scan a scene folder.
 
     Args:
-        folder: the scene folder: photographs, and optionally poses, masks, depth maps.
+        folder: the scene folder: photographs or videos, and optionally poses, masks, depth maps.
         scene: the scene's name.
         config: of which ``inspect``, ``views``, ``features`` and ``poses`` are used.
         cache: JSON file that caches facts about files; None for no cache. A file that cannot be
@@ -147,9 +167,19 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
     facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
     facts = {name: facts[name] for name in _without_raw_pairs(sorted(facts), poses, warnings)}
-    if not facts:
-        raise UserError("no photograph found", file=folder, fix=_ADD_PHOTOS)
-    if len(facts) < config.inspect.min_images:
+    listed_videos = find_videos(
+        folder, chosen.path, recursive=not chosen.names and chosen.path == "."
+    )
+    if poses is not None and listed_videos:
+        warnings.append(
+            f"{len(listed_videos)} videos are not used, because poses are given (first: "
+            f"{listed_videos[0]}); poses: ignore uses them"
+        )
+        listed_videos = []
+    videos = read_videos(folder, listed_videos, facts, facts_cache, warnings)
+    if not facts and not videos:
+        _no_photographs(folder, [*chosen.names, *listed_videos], warnings)
+    if not videos and len(facts) < config.inspect.min_images:
         raise UserError(
             f"only {len(facts)} readable photographs, at least {config.inspect.min_images} are "
             "needed" + "".join(f"\n  {line}" for line in warnings),
@@ -170,21 +200,29 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         )
         for name in sorted(facts)
     ]
+    manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
     truth = truth_folder(folder)
     control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
     result = Scan(
         folder=folder,
-        manifest=Manifest(scene=scene, photos=tuple(photos), warnings=tuple(warnings)),
+        manifest=manifest,
         image_folder=chosen.path,
         base_folder=chosen.base,
-        image_folder_reason=chosen.reason,
+        image_folder_reason=chosen.reason if facts else "no photographs",
         listed=tuple(chosen.names),
         poses=poses,
-        ordered=why_ordered(photos),
+        ordered=why_ordered(photos, len(videos)),
         ground_control=control,
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
-        fingerprint=_fingerprint(folder, photos, sorted(chosen.names), poses, control, facts_cache),
+        fingerprint=_fingerprint(
+            folder,
+            manifest,
+            [*sorted(chosen.names), *listed_videos],
+            poses,
+            control,
+            facts_cache,
+        ),
     )
     facts_cache.save()
     return result
@@ -205,6 +243,17 @@ def _check_folder(folder: Path) -> None:
         "no such scene folder" if not folder.exists() else "expected a scene folder, found a file",
         file=folder,
         fix=f"choose one of the scenes in {root}: {', '.join(scenes) or 'none'}",
+    )
+
+
+def _no_photographs(folder: Path, listed: Sequence[str], warnings: Sequence[str]) -> NoReturn:
+    if not listed:
+        raise UserError("no photograph and no video found", file=folder, fix=_ADD_PHOTOS)
+    raise UserError(
+        f"none of the {len(listed)} photographs and videos can be read"
+        + "".join(f"\n  {line}" for line in warnings),
+        file=folder,
+        fix="replace the files by intact copies, or convert them to a supported format",
     )
 
 
@@ -353,18 +402,20 @@ def _digest(path: Path, cache: FactCache) -> str:
 
 def _fingerprint(
     folder: Path,
-    photos: Sequence[Photo],
+    manifest: Manifest,
     listed: Sequence[str],
     poses: GivenPoses | None,
     control: Path | None,
     cache: FactCache,
 ) -> str:
+    photos = manifest.photos
+    files: list[Photo | VideoFile] = [*photos, *manifest.videos]
     others = [Path(p) for photo in photos for p in (photo.mask, photo.depth) if p is not None]
     if poses is not None:
         others += pose_files(folder / poses.path)
     if control is not None:
         others.append(control)
-    lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in photos]
+    lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in files]
     # Unreadable files are included by name, because warnings mention them.
     lines += [*listed, _digest_files(folder, others, cache)]
     return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()

@@ -17,11 +17,16 @@ MAX_GAP_SECONDS = 10.0
 _FRAME_PREFIX = re.compile(r"(frame|video|vid)[ _-]?$")
 
 
-def why_ordered(photos: Sequence[Photo]) -> str | None:
-    """The reason to treat ``photos`` (sorted by name) as a sequence, or None.
+def why_ordered(photos: Sequence[Photo], num_videos: int = 0) -> str | None:
+    """The reason to treat ``photos`` (sorted by name) and the frames of videos as a sequence, or
+    None.
 
     EXIF times decide if every photograph has one, otherwise names.
     """
+    if num_videos:
+        if photos and why_ordered(photos) is None:
+            return None
+        return "frames of a video" if num_videos == 1 else f"frames of {num_videos} videos"
     if len(photos) < 3:
         return None
     moments = [datetime.fromisoformat(photo.taken) for photo in photos if photo.taken]

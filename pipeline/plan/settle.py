@@ -88,7 +88,7 @@ def settle(scan: Scan, config: Config) -> Settled:
 
 
 def _pairs(scan: Scan, config: Config) -> Choice:
-    count, wanted = len(scan.photos), config.matches.pairs
+    count, wanted = len(scan.planned), config.matches.pairs
     if wanted != "auto":
         return wanted, f"{wanted} pairs, as configured"
     if count <= MAX_EXHAUSTIVE_PHOTOS:
@@ -135,7 +135,7 @@ def _mapper(config: Config) -> Choice:
 
 def _camera_model(scan: Scan, config: Config) -> Choice:
     wanted = config.sfm.camera_model
-    priors = f"focal length from EXIF in {scan.num_focal} of {len(scan.photos)} photographs"
+    priors = f"focal length from EXIF in {scan.num_focal} of {len(scan.planned)} photographs"
     if wanted != "auto":
         return wanted, f"{wanted} cameras, as configured; {priors}"
     if any("fisheye" in photo.camera_group.casefold() for photo in scan.photos):
@@ -147,9 +147,9 @@ def _share_cameras(scan: Scan, config: Config) -> Choice:
     wanted = config.sfm.share_cameras
     if wanted != "auto":
         return wanted, f"cameras shared by {wanted}, as configured"
-    groups = {photo.camera_group for photo in scan.photos}
+    groups = {photo.camera_group for photo in scan.planned}
     bodies = {group.split(" | ")[0] for group in groups if " | " in group}
-    count = len(scan.photos)
+    count = len(scan.planned)
     if len(bodies) >= MIXED_BODIES:
         return "image", f"one camera per image: photographs by {len(bodies)} different cameras"
     if count > 2 and len(groups) > MIXED_GROUP_SHARE * count:
@@ -162,7 +162,7 @@ def _background(scan: Scan, config: Config) -> Choice:
     wanted = config.train.background
     if wanted != "auto":
         return wanted, f"{wanted} background, as configured"
-    if 2 * scan.num_alpha > len(scan.photos):
+    if 2 * scan.num_alpha > len(scan.planned):
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
     few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
     return "black", f"black background: {few}"
@@ -182,7 +182,7 @@ def _depth_loss_weight(scan: Scan, config: Config) -> tuple[float, str]:
     if scan.num_depths:
         text = f"{scan.num_depths} depth maps: the loss on depths has weight {DEPTH_MAP_WEIGHT:g}"
         return DEPTH_MAP_WEIGHT, text
-    if len(scan.photos) > FEW_PHOTOS:
+    if len(scan.planned) > FEW_PHOTOS:
         return 0.0, ""
     weight = SPARSE_DEPTH_WEIGHT
     return weight, f"few photographs: the loss on sparse points' depths has weight {weight:g}"

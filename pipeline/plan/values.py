@@ -25,6 +25,12 @@ class SceneFacts(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     photographs: int = Field(description="Number of photographs that can be read.")
+    videos: int = Field(0, description="Number of videos that can be read.")
+    max_frames: int = Field(
+        0,
+        description="Number of frames that are chosen of them at most; counted in `bits`, `sizes`, "
+        "`camera_groups` and `training_memory_mb`.",
+    )
     raw: int = Field(description="Number of RAW files among them.")
     alpha: int = Field(description="Number of photographs with transparent pixels.")
     masks: int = Field(description="Number of photographs with a mask.")
@@ -59,8 +65,8 @@ class SceneFacts(BaseModel):
     truth: str | None = Field(description="Folder of ground truth poses; null without any.")
     truth_digest: str | None = Field(description="Digest of the ground truth poses.")
     fingerprint: str = Field(
-        description="Digest of the names and contents of photographs, masks, depth maps, pose "
-        "files and ground control points."
+        description="Digest of the names and contents of photographs, videos, masks, depth maps, "
+        "pose files and ground control points."
     )
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from pipeline.metrics.evaluation import Evaluation, SceneQuality
-from pipeline.photos.counters import InspectCounters
+from pipeline.photos.counters import DecodeCounters, InspectCounters
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.counters import read_counters
@@ -44,6 +44,8 @@ def collect_metrics(
     inspect = read_counters(folder / "inspect", InspectCounters)
     sfm = read_counters(folder / "sfm", SfmCounters) if "sfm" in ran else None
     refined = read_counters(folder / "refine", RefineCounters) if "refine" in ran else None
+    decoded = read_counters(folder / "decode", DecodeCounters) if "decode" in ran else None
+    frames = sum((decoded.frames_chosen or {}).values()) if decoded else 0
     error_px = refined.error_px if refined else None
     return Metrics.model_validate(
         {
@@ -51,7 +53,7 @@ def collect_metrics(
             **{name: getattr(evaluation, name) for name in SceneQuality.model_fields},
             "num_gaussians": read_counters(folder / "train", TrainCounters).num_gaussians,
             "registered_images": sfm.registered if sfm else inspect.given_poses,
-            "total_images": inspect.photos + inspect.left_out,
+            "total_images": inspect.photos + inspect.left_out + frames,
             "reprojection_error_px": sfm.mean_reprojection_error_px if sfm else error_px,
             "sfm_verdict": sfm.verdict if sfm else None,
             "georeference": sfm.georeference if sfm else None,

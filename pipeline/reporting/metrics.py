@@ -34,7 +34,9 @@ class Metrics(JsonFile, SceneQuality):
     seed: int | None = Field(description="Of the run.")
     num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
     registered_images: int | None = Field(description="Photographs that have a pose.")
-    total_images: int = Field(description="Photographs in the scene folder.")
+    total_images: int = Field(
+        description="Photographs in the scene folder, and frames chosen of its videos."
+    )
     reprojection_error_px: float | None = Field(
         description="Mean over the sparse points; null if no stage computed it."
     )

@@ -1,4 +1,4 @@
-"""The list of a scene's photographs that stages exchange (``images.json``)."""
+"""The list of a scene's photographs and videos that stages exchange (``images.json``)."""
 
 from __future__ import annotations
 
@@ -63,8 +63,38 @@ class Photo(BaseModel):
         return self
 
 
+class VideoFile(BaseModel):
+    """A video, of which the decode stage makes photographs."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
+
+    name: str
+    """The folder of its frames in the names of photographs; unique."""
+    path: str
+    """The file, relative to the working directory or absolute."""
+    width: int
+    """Pixels, with the rotation of the header applied."""
+    height: int
+    """Pixels, with the rotation of the header applied."""
+    frames: int
+    """Number of frames according to the header, which may be wrong; 0 if unknown."""
+    fps: float
+    """Frames per second according to the header; 0 if unknown."""
+    digest: str
+    """Hex digest of the file's bytes."""
+
+    @property
+    def camera_group(self) -> str:
+        """That of the frames (``Photo.camera_group``)."""
+        return f"{self.name} {self.width}x{self.height}"
+
+    def frame_name(self, index: int) -> str:
+        """The name of the photograph made of a frame (numbered from 0), in the order of frames."""
+        return f"{self.name}/{index:06d}.png"
+
+
 class Manifest(BaseModel):
-    """A scene's photographs, sorted by name."""
+    """A scene's photographs, sorted by name, and the videos that are not decoded yet."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
 
@@ -72,6 +102,8 @@ class Manifest(BaseModel):
     """The run's name: a scene, alone or with configuration and seed."""
     photos: tuple[Photo, ...]
     """The photographs that are used."""
+    videos: tuple[VideoFile, ...] = ()
+    """The videos that are not decoded yet."""
     warnings: tuple[str, ...] = ()
     """What the user should know."""
 

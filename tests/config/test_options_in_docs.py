@@ -23,7 +23,7 @@ def test_options_exist(page: Path) -> None:
     sections = {path.split(".")[0] for path in known if "." in path}
     inner = {".".join(path.split(".")[:n]) for path in known for n in range(1, path.count(".") + 1)}
     named = re.findall(r"`([a-z_]+(?:\.[a-zA-Z_0-9]+)+)(?::[^`]*)?`", page.read_text())
-    files = re.compile(r"\.(json|md|png|py|html|csv|ply|spz|txt|log|toml)$")
+    files = re.compile(r"\.(json|md|png|py|html|csv|ply|spz|txt|log|toml|mp4)$")
     options = {n for n in named if n.split(".")[0] in sections and not files.search(n)}
     missing = {n for n in options - known - inner if not _is_there(n)}
     assert not missing, "renamed or removed options"

@@ -5,11 +5,13 @@ from __future__ import annotations
 import json
 import shutil
 
+import cv2
 import pytest
 
 from pipeline.io.colmap import read_model
 from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
 from tests.once import made_once
+from tests.videos import write_video
 
 pytestmark = pytest.mark.slow
 
@@ -63,6 +65,19 @@ def test_the_plan_runs_what_the_scene_needs(project, masked, scene, options, exp
     assert found["registered_images"] == found["total_images"]
     assert found["psnr"] > 18
     assert found["pose_error"]["rotation_median_deg"] < 0.3
+
+
+def test_frames_of_a_video_become_a_scene(project, masked):
+    """A photograph is one frame of the video; the camera moves far between them."""
+    views = [cv2.imread(str(path)) for path in sorted((masked / "images").iterdir())]
+    write_video(project / "data" / "video" / "walk.mp4", views)
+    done = snakemake(project, "results/video/metrics.json", config=TINY)
+    assert rules_run(done) == ALWAYS | SFM | {"decode", "undistort"}
+    found = json.loads((project / "results/video/metrics.json").read_text())
+    assert found["total_images"] == len(views)
+    assert found["registered_images"] >= 0.9 * len(views)
+    plan = json.loads((project / "results/video/plan.json").read_text())
+    assert plan["stages"]["decode"]["reason"] == f"1 video: at most {len(views)} frames"
 
 
 def test_given_poses_can_be_ignored(project, masked):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import pytest
 
+from pipeline.photos.counters import DecodeCounters
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.values import StagePlan
 from pipeline.reporting.collect import collect_metrics
@@ -88,6 +89,13 @@ def test_given_poses_count_as_registered_and_have_the_error_of_their_adjustment(
     (tmp_path / "refine" / "stage.json").unlink()
     del ran["refine"]
     assert collect(tmp_path, record_of(ran)).reprojection_error_px is None
+
+
+def test_chosen_frames_of_videos_count_as_images_of_the_scene(tmp_path):
+    frames = DecodeCounters(developed=0, frames_chosen={"a": 20, "b": 11}, frames_decoded={})
+    write_records(tmp_path, {**COUNTERS, "decode": frames})
+    ran = {name: StagePlan(run=True, reason="") for name in (*COUNTERS, "decode")}
+    assert collect(tmp_path, record_of(ran)).total_images == 8 + 31
 
 
 @pytest.mark.parametrize("name", ["inspect", "sfm", "train"])

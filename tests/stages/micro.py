@@ -15,6 +15,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import cv2
+
 from pipeline.config.schema import Config
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.plan.keys import stage_key
@@ -26,6 +28,7 @@ from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.record import content_digest, identity, output_digests
 from stages.workflow.registry import STAGES
 from tests.plans import make_plan
+from tests.videos import write_video
 
 Options = Mapping[str, Any]
 
@@ -42,6 +45,8 @@ def write_scenes(folder: Path) -> None:
         write_demo(folder / name, spec)
     photos = folder / "photos"
     shutil.copytree(photos / "images", photos / "others")
+    views = [cv2.imread(str(path)) for path in sorted((photos / "images").iterdir())]
+    write_video(folder / "video" / "clip.avi", views)
 
 
 def with_option(options: Options, path: str, value: Any) -> dict[str, Any]:

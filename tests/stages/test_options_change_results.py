@@ -77,6 +77,7 @@ FLIPS = {
             ("white_balance", "daylight"),
         )
     },
+    "video.max_frames": Flip(3, POSED, "video"),
     "features.backend": Flip("colmap", ESTIMATED),
     "features.max_features": Flip(50, ESTIMATED),
     "features.max_long_side_px": Flip(150, ESTIMATED),

@@ -1,0 +1,105 @@
+"""Reading video files with OpenCV's FFmpeg: header facts, and frames one after the other."""
+
+from __future__ import annotations
+
+import os
+import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from pydantic import BaseModel, ConfigDict
+
+from pipeline.io.recorded import digest_of
+from pipeline.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    import cv2
+
+# Read by OpenCV when it opens a file. FFmpeg recognises files by their content and would follow a
+# playlist of that suffix to other files or the network; its messages do not name the file.
+os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
+os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+
+FIX = "convert the video to H.264 in an MP4 file, or remove it from the folder"
+
+
+class VideoFacts(BaseModel):
+    """Facts from the header of a video file.
+
+    Attributes:
+        digest: hex digest of the file's bytes.
+        width, height: pixels of a frame as it is shown, with the rotation of the header applied.
+        frames: number of frames according to the header, 0 if it has none. Headers may be wrong.
+        fps: frames per second according to the header, 0 if it has none.
+    """
+
+    model_config = ConfigDict(frozen=True)
+
+    digest: str
+    width: int
+    height: int
+    frames: int
+    fps: float
+
+
+def read_video_facts(path: Path) -> VideoFacts:
+    """Read a video's header.
+
+    Raises:
+        UserError: not a regular file, or not a video in a supported format.
+    """
+    if not stat.S_ISREG(os.stat(path).st_mode):
+        raise UserError("cannot be read as a video: not a regular file", file=path, fix=FIX)
+    digest = digest_of(path)
+    with opened_video(path) as capture:
+        import cv2  # Slow to import.
+
+        width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
+        height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
+        frames, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+    if width <= 0 or height <= 0:
+        raise UserError("cannot be read as a video: its frames have no size", file=path, fix=FIX)
+    # The values of damaged headers may be negative, infinite or NaN.
+    known = 0 < frames < 2**31
+    return VideoFacts(
+        digest=digest,
+        width=width,
+        height=height,
+        frames=int(frames) if known else 0,
+        fps=float(fps) if 0 < fps < 1e6 else 0.0,
+    )
+
+
+@contextmanager
+def opened_video(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
+    """An open video, whose frames are rotated as the header says.
+
+    Args:
+        threads: number of threads of the decoder.
+
+    Raises:
+        UserError: the file is not a video in a supported format.
+    """
+    import cv2  # Slow to import.
+
+    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+    try:
+        # An absolute path, because FFmpeg takes the part before a colon for a protocol.
+        capture = cv2.VideoCapture(
+            str(path.absolute()), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, max(threads, 1)]
+        )
+    finally:
+        cv2.utils.logging.setLogLevel(level)
+    try:
+        if not capture.isOpened():
+            raise UserError(
+                "cannot be read as a video: its format is not supported, or its header is damaged",
+                file=path,
+                fix=FIX,
+            )
+        capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
+        yield capture
+    finally:
+        capture.release()

@@ -1,0 +1,103 @@
+"""The videos of a scene folder, and the number of their frames that the plan expects."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Collection, Sequence
+from pathlib import Path, PurePosixPath
+
+from pipeline.io.fact_cache import FactCache
+from pipeline.io.folders import videos_in
+from pipeline.io.videofile import VideoFacts, read_video_facts
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Photo, VideoFile
+
+# A folder of videos beside images/.
+VIDEO_FOLDER = "videos"
+
+
+def find_videos(folder: Path, image_folder: str, *, recursive: bool) -> list[str]:
+    """Names of the videos in the scene folder itself, in the folder of the photographs and in
+    ``videos/``, relative to the scene folder, sorted.
+
+    Args:
+        folder: the scene folder.
+        image_folder: relative to it.
+        recursive: search all subfolders of the scene folder.
+    """
+    names = set(videos_in(folder, recursive=recursive))
+    for place in {image_folder, VIDEO_FOLDER} - {"."}:
+        if (folder / place).is_dir():
+            names |= {f"{place}/{name}" for name in videos_in(folder / place)}
+    return sorted(names)
+
+
+def read_videos(
+    folder: Path,
+    names: Sequence[str],
+    photos: Collection[str],
+    cache: FactCache,
+    warnings: list[str],
+) -> tuple[VideoFile, ...]:
+    """The videos whose header can be read; the others add a warning each.
+
+    Args:
+        names: files relative to ``folder``, the scene folder.
+        photos: names of the photographs, which the names of frames must differ from.
+    """
+    found: dict[str, VideoFacts] = {}
+    for name in names:
+        path = folder / name
+
+        def read(path: Path = path) -> dict:
+            try:
+                return read_video_facts(path).model_dump()
+            except UserError as error:
+                return {"unreadable": error.what}
+
+        try:
+            facts = cache.get(path, "video", read)
+        except OSError as error:
+            facts = {"unreadable": f"cannot be read: {error.strerror}"}
+        if "unreadable" in facts:
+            warnings.append(f"{name}: left out: {facts['unreadable']}")
+        else:
+            found[name] = VideoFacts.model_validate(facts)
+    taken = {str(parent) for photo in photos for parent in PurePosixPath(photo).parents}
+    stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
+    count = Counter(stems.values())
+    return tuple(
+        VideoFile(
+            name=stem if count[stem] == 1 and stem not in taken else name,
+            path=str(folder / name),
+            **found[name].model_dump(),
+        )
+        for name, stem in stems.items()
+    )
+
+
+def contents(photos: int, videos: int) -> str:
+    """The numbers of photographs and videos, in words: "12 photographs, 1 video"."""
+    counted = [f"{photos} photographs"] if photos or not videos else []
+    if videos:
+        counted.append("1 video" if videos == 1 else f"{videos} videos")
+    return ", ".join(counted)
+
+
+def planned_frames(videos: Sequence[VideoFile], max_frames: int) -> tuple[Photo, ...]:
+    """Placeholders for the frames that the decode stage may choose: at most ``max_frames``, at
+    least one of each video, shared in proportion to the numbers of frames."""
+    available = [video.frames or max_frames for video in videos]
+    share = min(1.0, max_frames / max(sum(available), 1))
+    return tuple(
+        Photo(
+            name=video.frame_name(index),
+            path=video.path,
+            width=video.width,
+            height=video.height,
+            digest=video.digest,
+            camera_group=video.camera_group,
+        )
+        for video, frames in zip(videos, available, strict=True)
+        for index in range(max(1, int(share * frames)))
+    )

@@ -13,7 +13,7 @@ from pipeline.config.schema import Decode, Inspect, Video
 from pipeline.photos.counters import DecodeCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
-from pipeline.plan.video_files import contents
+from pipeline.plan.video_files import contents, description
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -27,11 +27,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     if scan.num_raw:
         reasons.append(f"{scan.num_raw} of {len(scan.photos)} photographs are RAW")
         decisions.append(_developing(settled.config.decode))
-    for video in scan.videos:
-        length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
-        count = video.frames or "an unknown number of"
-        decisions.append(f"{video.name}: {count} frames of {video.width}x{video.height}{length}")
     if scan.videos:
+        decisions += [description(video) for video in scan.videos]
         reasons.append(f"{contents(0, len(scan.videos))}: at most {len(scan.frames)} frames")
     if not reasons:
         return StagePlan(run=False, reason="no RAW files or videos")
@@ -59,18 +56,15 @@ def work(job: Job) -> None:
         given = renamed(inputs.input_model(job, "photos"), report.manifest)
         write_model(job.out / "sparse" / "0", given)
     inputs.copy_georeference(job, "photos")
-    job.record(DecodeCounters(developed=len(report.manifest.photos)), [], report.warnings)
+    counters = DecodeCounters(developed=len(report.manifest.photos))
+    job.record(counters, [], report.warnings)
     if report.manifest.videos:
+        least = job.section(Inspect).min_images
         found = extract_frames(
-            report.manifest,
-            job.section(Video),
-            job.out,
-            threads=job.threads,
-            min_photos=job.section(Inspect).min_images,
+            report.manifest, job.section(Video), job.out, threads=job.threads, min_photos=least
         )
         frames = {"frames_chosen": found.chosen, "frames_decoded": found.total}
-        counters = DecodeCounters(developed=len(report.manifest.photos), **frames)
-        job.record(counters, found.decisions, found.warnings)
+        job.record(counters.model_copy(update=frames), found.decisions, found.warnings)
 
 
 SPEC = StageSpec(

@@ -1,8 +1,7 @@
 """Check that all photographs and videos can be decoded, and read the given poses.
 
-Outputs: ``images.json`` (the manifest); ``sparse/0`` if poses are given; ``truth`` if the scene has
-``sparse_gt``; ``gcp_list.txt`` if the scene has one; ``georeference.json`` if the given poses were
-translated.
+Outputs: ``images.json`` (the manifest); where the scene has them ``sparse/0`` (given poses),
+``truth`` and ``gcp_list.txt``; ``georeference.json`` if the given poses were translated.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.io.colmap import read_model, write_model
     from pipeline.io.gcp import GCP_FILE, read_ground_control
-    from pipeline.photos.verify import verify_photos, verify_videos
+    from pipeline.photos.verify import verify_manifest
     from pipeline.plan.given_poses import load_given
     from pipeline.plan.scan import scan
 
@@ -40,10 +39,10 @@ def work(job: Job) -> None:
     folder = Path(job.key["folder"])
     found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
     found.check_unchanged(job.key["fingerprint"], folder)
-    manifest, warnings = verify_videos(found.manifest)
-    min_photos = 0 if manifest.videos else config.inspect.min_images
-    manifest, damaged = verify_photos(manifest, threads=job.threads, min_photos=min_photos)
-    job.add_messages([], [*found.warnings, *warnings, *damaged])
+    manifest, warnings = verify_manifest(
+        found.manifest, threads=job.threads, min_photos=config.inspect.min_images
+    )
+    job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
     count, given_counts = len(manifest.photos), {}
     videos = len(manifest.videos) if found.videos else None
@@ -52,8 +51,8 @@ def work(job: Job) -> None:
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
         job.add_messages(given.write(job.out), [])
-        images, points = given.model.images, given.model.points
-        given_counts = {"given_poses": len(images), "given_points": len(points)}
+        model = given.model
+        given_counts = {"given_poses": len(model.images), "given_points": len(model.points)}
     job.counters = InspectCounters(
         photos=count, left_out=len(found.listed) - count, videos=videos, **given_counts
     )
@@ -66,11 +65,8 @@ def work(job: Job) -> None:
 
 
 def facts(plan: Plan) -> dict[str, Any]:
-    return {
-        "folder": plan.folder,
-        "fingerprint": plan.facts.fingerprint,
-        "truth": plan.facts.truth_digest,
-    }
+    scene = plan.facts
+    return {"folder": plan.folder, "fingerprint": scene.fingerprint, "truth": scene.truth_digest}
 
 
 SPEC = StageSpec(

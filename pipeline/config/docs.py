@@ -31,8 +31,7 @@ PAGE, EXPERIMENTS_PAGE = (ROOT / name for name in REFERENCE)
 DEFAULTS = ROOT / "config" / "config.yaml"
 SCHEMAS = ROOT / "docs" / "schemas"
 
-# File of the results -> its model. These and the declarations of the stages are imported by name:
-# no module of the library imports one above it.
+# File of the results -> its model, imported by name: no module of the library imports one above it.
 _RECORDS = {
     "stage.json": "pipeline.runtime.record:StageRecord",
     "run.json": "pipeline.runtime.record:RunRecord",
@@ -44,6 +43,23 @@ _RECORDS = {
     "georeference.json": "pipeline.scene.georeference:Georeference",
     "frame.json": "pipeline.io.frame_json:Frame",
     "path.json": "pipeline.surface.path:PathFile",
+}
+
+# Stage -> the model of its counters; a test compares them with the declarations.
+COUNTERS = {
+    "inspect": "pipeline.photos.counters:InspectCounters",
+    "decode": "pipeline.photos.counters:DecodeCounters",
+    "features": "pipeline.sfm.counters:FeaturesCounters",
+    "matches": "pipeline.sfm.counters:MatchesCounters",
+    "refine": "pipeline.sfm.counters:RefineCounters",
+    "sfm": "pipeline.sfm.counters:SfmCounters",
+    "undistort": "pipeline.photos.counters:UndistortCounters",
+    "init": "pipeline.splats.counters:InitCounters",
+    "train": "pipeline.training.loop.counters:TrainCounters",
+    "evaluate": "pipeline.metrics.counters:EvaluateCounters",
+    "coverage": "pipeline.runtime.counters:NoCounters",
+    "export": "pipeline.export.counters:ExportCounters",
+    "report": "pipeline.runtime.counters:NoCounters",
 }
 
 _INTRO = f"""# Configuration
@@ -231,9 +247,7 @@ def json_schemas() -> dict[Path, str]:
     """The JSON schemas (draft 2020-12) of the files of the results, by path."""
     found = {}
     for name, place in _RECORDS.items():
-        module, _, attribute = place.partition(":")
-        model = getattr(import_module(module), attribute)
-        found[SCHEMAS / name.replace(".json", ".schema.json")] = _schema(model)
+        found[SCHEMAS / name.replace(".json", ".schema.json")] = _schema(_model(place))
     return found | {SCHEMAS / "counters.schema.json": _schema(_counters())}
 
 
@@ -243,12 +257,18 @@ def _schema(model: type[BaseModel]) -> str:
     return json.dumps(schema, indent=2) + "\n"
 
 
+def _model(place: str) -> type[BaseModel]:
+    module, _, name = place.partition(":")
+    model: type[BaseModel] = getattr(import_module(module), name)
+    return model
+
+
 def _counters() -> type[BaseModel]:
     """A model with the counters of each stage as a field."""
-    stages = import_module("stages.workflow.registry").STAGES
+    models = {stage: _model(place) for stage, place in COUNTERS.items()}
     # The default: a scene has the counters of the stages that ran.
     fields: dict[str, Any] = {
-        name: (spec.counters, Field(default_factory=spec.counters)) for name, spec in stages.items()
+        name: (model, Field(default_factory=model)) for name, model in models.items()
     }
     about = "The `counters` in `stage.json`, by stage."
     return create_model("Counters", __doc__=about, **fields)

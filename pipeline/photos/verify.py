@@ -19,6 +19,20 @@ from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
 
 
+def verify_manifest(
+    manifest: Manifest, *, threads: int, min_photos: int
+) -> tuple[Manifest, list[str]]:
+    """``verify_videos``, then ``verify_photos``.
+
+    Args:
+        min_photos: smallest number of photographs; 0 if there are videos, which add frames.
+    """
+    manifest, warnings = verify_videos(manifest)
+    least = 0 if manifest.videos else min_photos
+    manifest, damaged = verify_photos(manifest, threads=threads, min_photos=least)
+    return manifest, [*warnings, *damaged]
+
+
 def verify_photos(
     manifest: Manifest, *, threads: int, min_photos: int = 1
 ) -> tuple[Manifest, list[str]]:

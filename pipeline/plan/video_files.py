@@ -84,6 +84,13 @@ def contents(photos: int, videos: int) -> str:
     return ", ".join(counted)
 
 
+def description(video: VideoFile) -> str:
+    """The number of frames, size and length of a video by its header, in words."""
+    count = video.frames or "an unknown number of"
+    length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
+    return f"{video.name}: {count} frames of {video.width}x{video.height}{length}"
+
+
 def planned_frames(videos: Sequence[VideoFile], max_frames: int) -> tuple[Photo, ...]:
     """Placeholders for the frames that the decode stage may choose: at most ``max_frames``, at
     least one of each video, shared in proportion to the numbers of frames."""

@@ -6,6 +6,7 @@ from typing import Any
 
 import pytest
 
+from pipeline.config.docs import COUNTERS
 from pipeline.config.options import option_paths, select
 from pipeline.config.schema import Config, Split, Train, Views
 from pipeline.plan.keys import stage_key
@@ -148,6 +149,11 @@ def test_declarations_import_nothing_heavy():
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert done.stdout.strip() == "[]"
+
+
+def test_the_schema_of_counters_has_the_model_that_each_stage_declares():
+    declared = {name: spec.counters for name, spec in STAGES.items()}
+    assert {n: f"{m.__module__}:{m.__name__}" for n, m in declared.items()} == COUNTERS
 
 
 @pytest.mark.parametrize("model", [spec.counters for spec in STAGES.values()] + [PlanRecord])

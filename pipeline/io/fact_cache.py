@@ -6,12 +6,17 @@ import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
+
+from pydantic import BaseModel
 
 from pipeline.runtime.atomic import write_text
+from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
 _VERSION = 4
+
+M = TypeVar("M", bound=BaseModel)
 
 
 class FactCache:
@@ -40,6 +45,21 @@ class FactCache:
         # cp -p and rsync preserve the modification time, but nothing sets the change time.
         state = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
         return self.get_for_state(f"{kind}:{path}", state, compute)
+
+    def read(self, path: Path, kind: str, model: type[M], read: Callable[[Path], M]) -> M | str:
+        """``read(path)``, or its cached value; if the file cannot be read, the reason."""
+
+        def compute() -> dict[str, Any]:
+            try:
+                return read(path).model_dump()
+            except UserError as error:
+                return {"unreadable": error.what}
+
+        try:
+            found = self.get(path, kind, compute)
+        except OSError as error:
+            return f"cannot be read: {error.strerror}"
+        return str(found["unreadable"]) if "unreadable" in found else model.model_validate(found)
 
     def get_for_state(self, key: str, state: Any, compute: Callable[[], Any]) -> Any:
         """``compute()``, or its cached value if ``state`` equals the state cached with it."""

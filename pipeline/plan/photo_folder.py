@@ -150,20 +150,9 @@ def read_all(
     """Name -> metadata of the photographs that can be read; the others add a warning each."""
     facts: dict[str, FileFacts] = {}
     for name in names:
-        path = folder / image_folder / name
-
-        def read(path: Path = path) -> dict:
-            try:
-                return read_facts(path).model_dump()
-            except UserError as error:
-                return {"unreadable": error.what}
-
-        try:
-            found = cache.get(path, "photo", read)
-        except OSError as error:
-            found = {"unreadable": f"cannot be read: {error.strerror}"}
-        if "unreadable" in found:
-            warnings.append(f"{name}: left out: {found['unreadable']}")
+        found = cache.read(folder / image_folder / name, "photo", FileFacts, read_facts)
+        if isinstance(found, str):
+            warnings.append(f"{name}: left out: {found}")
         else:
-            facts[name] = FileFacts.model_validate(found)
+            facts[name] = found
     return facts

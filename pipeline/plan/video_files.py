@@ -9,7 +9,6 @@ from pathlib import Path, PurePosixPath
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import videos_in
 from pipeline.io.videofile import VideoFacts, read_video_facts
-from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo, VideoFile
 
 # A folder of videos beside images/.
@@ -47,22 +46,11 @@ def read_videos(
     """
     found: dict[str, VideoFacts] = {}
     for name in names:
-        path = folder / name
-
-        def read(path: Path = path) -> dict:
-            try:
-                return read_video_facts(path).model_dump()
-            except UserError as error:
-                return {"unreadable": error.what}
-
-        try:
-            facts = cache.get(path, "video", read)
-        except OSError as error:
-            facts = {"unreadable": f"cannot be read: {error.strerror}"}
-        if "unreadable" in facts:
-            warnings.append(f"{name}: left out: {facts['unreadable']}")
+        facts = cache.read(folder / name, "video", VideoFacts, read_video_facts)
+        if isinstance(facts, str):
+            warnings.append(f"{name}: left out: {facts}")
         else:
-            found[name] = VideoFacts.model_validate(facts)
+            found[name] = facts
     taken = {str(parent) for photo in photos for parent in PurePosixPath(photo).parents}
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
     count = Counter(stems.values())

@@ -1,5 +1,5 @@
-"""Develop RAW files, with the same settings for all photographs of a scene, and choose frames of
-videos.
+"""Develop RAW and EXR files with the same settings for all photographs of a scene, and choose frames
+of videos.
 
 Outputs: ``images/``, ``images.json``; with given poses, ``sparse/0`` with the names of the
 developed images; and ``georeference.json`` if the given poses were translated.
@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     reasons, decisions = [], []
-    if scan.num_raw:
-        reasons.append(f"{scan.num_raw} of {len(scan.photos)} photographs are RAW")
+    if scan.num_linear:
+        reasons.append(f"{scan.num_linear} of {len(scan.photos)} photographs are RAW or EXR")
         decisions.append(_developing(settled.config.decode))
     if scan.videos:
         decisions += [description(video) for video in scan.videos]
         reasons.append(f"{contents(0, len(scan.videos))}: at most {len(scan.frames)} frames")
     if not reasons:
-        return StagePlan(run=False, reason="no RAW files or videos")
+        return StagePlan(run=False, reason="no RAW or EXR files, no videos")
     return StagePlan(run=True, reason="; ".join(reasons), decisions=decisions)
 
 
@@ -46,7 +46,7 @@ def _developing(config: Decode) -> str:
 
 def work(job: Job) -> None:
     from pipeline.io.colmap import write_model
-    from pipeline.photos.raw import develop
+    from pipeline.photos.develop import develop
     from pipeline.photos.video import extract_frames
     from pipeline.plan.given_poses import renamed
 

@@ -40,7 +40,10 @@ def work(job: Job) -> None:
     found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
     found.check_unchanged(job.key["fingerprint"], folder)
     manifest, warnings = verify_manifest(
-        found.manifest, threads=job.threads, min_photos=config.inspect.min_images
+        found.manifest,
+        threads=job.threads,
+        min_photos=config.inspect.min_images,
+        keep_duplicates=config.inspect.keep_duplicates or found.poses is not None,
     )
     job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")

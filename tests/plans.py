@@ -11,7 +11,7 @@ from stages.workflow.registry import STAGES
 
 FACTS = SceneFacts(
     photographs=20,
-    raw=0,
+    linear=0,
     alpha=0,
     masks=0,
     depths=0,

@@ -40,6 +40,11 @@ class Inspect(Section):
         "poses are estimated, below features.max_long_side_px).",
     )
     min_images: Count = Field(2, description="Fewer readable photographs are an error.")
+    keep_duplicates: bool = Field(
+        False,
+        description="Keep photographs that show the same as another: copies, reduced copies and "
+        "bursts. They are always kept if poses are given.",
+    )
 
 
 class Views(Section):
@@ -143,11 +148,12 @@ class Sfm(Section):
         description="COLMAP's camera model. auto: SIMPLE_RADIAL; OPENCV_FISHEYE if EXIF names a "
         "fisheye lens.",
     )
-    share_cameras: Literal["auto", "single", "group", "image"] = Field(
+    share_cameras: Literal["auto", "single", "group", "folder", "image"] = Field(
         "auto",
         description="Which images share intrinsics. single: all; group: those of one body, lens, "
-        "focal length and size; image: none; auto: group, or image for collections from many "
-        "cameras.",
+        "focal length and size; folder: those of a group in the same folder; image: none; auto: "
+        "group, folder if the photographs are in several folders, or image for collections from "
+        "many cameras.",
     )
     refine_radial: Literal["auto", "no"] = Field(
         "auto",

@@ -17,6 +17,8 @@ from pipeline.io.names import (
 
 # Folders of a scene with images that are not photographs, also with a suffix such as "_2".
 COMPANION_FOLDERS = frozenset({"masks", "depths", "sparse", "sparse_gt", "colmap", "stereo"})
+# Folders of previews that cameras, network drives and archives add.
+PREVIEW_FOLDERS = frozenset({"thumbs", "thumbnails", "previews", "@eadir", "__macosx"})
 _DEPTH_SUFFIXES = PICTURE_SUFFIXES | {".npy", ".npz", ".exr", ".pfm"}
 
 
@@ -44,8 +46,8 @@ def pictures_in(
 ) -> list[str]:
     """Names of the files with a photograph's suffix, relative to ``path``, sorted.
 
-    Hidden files and folders, and subfolders of masks, depth maps and models, are ignored. Images
-    in formats that cannot be read add one warning.
+    Hidden files and folders, and subfolders of previews, masks, depth maps and models, are
+    ignored. Images in formats that cannot be read add one warning.
 
     Args:
         scene: the scene folder.
@@ -144,7 +146,7 @@ def companions(folder: Path, candidates: Sequence[str], names: Sequence[str]) ->
 def _is_companion(name: str) -> bool:
     stem, _, step = name.rpartition("_")
     plain = stem if stem and step.isdecimal() else name
-    return plain.casefold() in COMPANION_FOLDERS
+    return plain.casefold() in COMPANION_FOLDERS | PREVIEW_FOLDERS
 
 
 def _key(name: str) -> str:

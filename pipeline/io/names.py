@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterable
 from pathlib import PurePosixPath
 
-from pipeline.io import heif
+from pipeline.io import pillow_formats
+from pipeline.io.exr import EXR_SUFFIXES
 
 PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
 # RAW formats that LibRaw reads.
@@ -15,11 +16,14 @@ RAW_SUFFIXES = frozenset(
     .mdc .mef .mos .mrw .nef .nrw .orf .pef .ptx .raf .raw .rw2 .rwl .rwz .sr2 .srf .srw .x3f
     """.split()  # noqa: SIM905
 )
-_HEIF = heif.HEIF_SUFFIXES if heif.installed() else frozenset[str]()
+# Photographs of linear light, which the decode stage develops.
+LINEAR_SUFFIXES = RAW_SUFFIXES | EXR_SUFFIXES
 # Image formats that cannot be read; they are reported in a warning.
-UNREAD_SUFFIXES = (heif.HEIF_SUFFIXES | {".avif", ".jxl", ".jp2", ".gif"}) - _HEIF
+UNREAD_SUFFIXES = (
+    pillow_formats.HEIF_SUFFIXES | {".jxl", ".jp2", ".gif", ".hdr"}
+) - pillow_formats.SUFFIXES
 VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm"})
-PHOTO_SUFFIXES = PICTURE_SUFFIXES | RAW_SUFFIXES | _HEIF
+PHOTO_SUFFIXES = PICTURE_SUFFIXES | LINEAR_SUFFIXES | pillow_formats.SUFFIXES
 
 
 def suffix_of(name: str) -> str:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import ExifTags, Image
 from pydantic import BaseModel, ConfigDict
 
-from pipeline.io import heif
+from pipeline.io import exr, pillow_formats
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
@@ -43,7 +43,7 @@ class FileFacts(BaseModel):
     digest: str
     width: int
     height: int
-    raw: bool = False
+    linear: bool = False
     alpha: bool = False
     bits: int = 8
     orientation: int = 1
@@ -71,10 +71,12 @@ def read_facts(path: Path) -> FileFacts:
     """
     try:
         digest = digest_of(path)
-        if suffix_of(path.name) in RAW_SUFFIXES:
+        suffix = suffix_of(path.name)
+        if suffix in RAW_SUFFIXES:
             return _raw_facts(path, digest)
-        if suffix_of(path.name) in heif.HEIF_SUFFIXES:
-            heif.register()
+        if suffix in exr.EXR_SUFFIXES:
+            return _exr_facts(path, digest)
+        pillow_formats.register(suffix)
         with _quiet(), Image.open(path) as image:
             width, height = image.size
             if _bits(image) > 16:
@@ -124,7 +126,20 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
     if facts["taken"] is None and stamp.year > 1980:
         facts["taken"] = stamp.isoformat()
     facts["lens"] = facts["lens"] or lens
-    return FileFacts(digest=digest, width=width, height=height, raw=True, bits=16, **facts)
+    return FileFacts(digest=digest, width=width, height=height, linear=True, bits=16, **facts)
+
+
+def _exr_facts(path: Path, digest: str) -> FileFacts:
+    with open(path, "rb") as file:
+        header = exr.read_header(file)
+    return FileFacts(
+        digest=digest,
+        width=header.width,
+        height=header.height,
+        linear=True,
+        alpha=header.alpha,
+        bits=16,
+    )
 
 
 def _has_transparency(image: Image.Image) -> bool:

@@ -22,7 +22,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io import heif
+from pipeline.io import pillow_formats
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
@@ -204,14 +204,15 @@ def read_picture(path: str | Path, digest: str | None = None) -> Picture:
     if _is_truncated(data):
         raise UserError("the image is truncated or damaged", file=path, fix=FIX)
     picture: Picture | None = None
-    if suffix_of(path.name) in heif.HEIF_SUFFIXES:
+    suffix = suffix_of(path.name)
+    if suffix in pillow_formats.SUFFIXES:
         with contextlib.suppress(OSError, ValueError):
-            picture = heif.read_pixels(io.BytesIO(data))
+            picture = pillow_formats.read_pixels(io.BytesIO(data), suffix)
     else:
         picture = _decode(data)
     if picture is None:
         raise UserError(
-            "not a readable image (expected JPEG, PNG, TIFF or WebP)", file=path, fix=FIX
+            "not a readable image (expected JPEG, PNG, TIFF, WebP or AVIF)", file=path, fix=FIX
         )
     if picture.dtype not in (np.uint8, np.uint16):
         raise UserError(

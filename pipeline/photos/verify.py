@@ -1,26 +1,29 @@
-"""Check that every photograph and the first frame of every video can be decoded."""
+"""Check that every photograph and the first frame of every video can be decoded, and that no
+photograph is there twice."""
 
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Sequence
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 from PIL import Image
 
-from pipeline.io import heif
+from pipeline.io import exr, pillow_formats
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import ChangedFileError, read_recorded
 from pipeline.io.videofile import FIX as FIX_VIDEO
 from pipeline.io.videofile import opened_video
+from pipeline.photos.duplicates import Signature, find_duplicates, signature
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
 
 
 def verify_manifest(
-    manifest: Manifest, *, threads: int, min_photos: int
+    manifest: Manifest, *, threads: int, min_photos: int, keep_duplicates: bool
 ) -> tuple[Manifest, list[str]]:
     """``verify_videos``, then ``verify_photos``.
 
@@ -29,48 +32,56 @@ def verify_manifest(
     """
     manifest, warnings = verify_videos(manifest)
     least = 0 if manifest.videos else min_photos
-    manifest, damaged = verify_photos(manifest, threads=threads, min_photos=least)
-    return manifest, [*warnings, *damaged]
+    manifest, left_out = verify_photos(
+        manifest, threads=threads, min_photos=least, keep_duplicates=keep_duplicates
+    )
+    return manifest, [*warnings, *left_out]
 
 
 def verify_photos(
-    manifest: Manifest, *, threads: int, min_photos: int = 1
+    manifest: Manifest, *, threads: int, min_photos: int = 1, keep_duplicates: bool = False
 ) -> tuple[Manifest, list[str]]:
-    """Decode all photographs and remove the damaged ones from the manifest.
+    """Decode all photographs and remove damaged ones and duplicates from the manifest.
 
     Args:
         manifest: the photographs to decode.
         threads: number of threads; does not change the result.
         min_photos: smallest number of photographs that can be decoded.
+        keep_duplicates: keep photographs that show the same as others; copies of files are a
+            warning then.
 
     Returns:
-        The manifest without the damaged photographs and with the new warnings, and these warnings:
-        one for each damaged photograph, and one if photographs are copies of others.
+        The manifest without these photographs and with the new warnings, and these warnings: one
+        for each damaged photograph, and one for all duplicates.
 
     Raises:
-        UserError: fewer than ``min_photos`` can be decoded (the message names the damaged ones), or
-            a photograph has changed since it was scanned.
+        UserError: fewer than ``min_photos`` remain (the message says why), or a photograph has
+            changed since it was scanned.
     """
     with ThreadPoolExecutor(max(threads, 1)) as pool:
-        results = pool.map(_fault_of, manifest.photos)
-        faults = list(track(results, "checking photographs", len(manifest.photos), "photos"))
-    good = tuple(
-        photo for photo, fault in zip(manifest.photos, faults, strict=True) if fault is None
-    )
+        results = pool.map(_check, manifest.photos)
+        found = list(track(results, "checking photographs", len(manifest.photos), "photos"))
+    checked = dict(zip((photo.name for photo in manifest.photos), found, strict=True))
+    good = [photo for photo in manifest.photos if checked[photo.name].fault is None]
     warnings = [
-        f"{photo.name}: left out: {fault}"
-        for photo, fault in zip(manifest.photos, faults, strict=True)
-        if fault is not None
+        f"{name}: left out: {check.fault}" for name, check in checked.items() if check.fault
     ]
+    if keep_duplicates:
+        warnings += _copies(good)
+    else:
+        signatures = {photo.name: checked[photo.name].signature for photo in good}
+        replaced = find_duplicates({n: s for n, s in signatures.items() if s is not None})
+        good = [photo for photo in good if photo.name not in replaced]
+        warnings += _duplicates(replaced)
     if len(good) < min_photos:
         raise UserError(
-            f"only {len(good)} of {len(faults)} photographs can be decoded, at least "
+            f"only {len(good)} of {len(checked)} photographs can be used, at least "
             f"{min_photos} are needed" + "".join(f"\n  {line}" for line in warnings),
             file=Path(manifest.photos[0].path).parent if manifest.photos else None,
-            fix="replace the damaged files, or lower inspect.min_images",
+            fix="replace damaged files, add photographs from other positions, or lower "
+            "inspect.min_images",
         )
-    warnings += _copies(good)
-    update = {"photos": good, "warnings": (*manifest.warnings, *warnings)}
+    update = {"photos": tuple(good), "warnings": (*manifest.warnings, *warnings)}
     return manifest.model_copy(update=update), warnings
 
 
@@ -122,30 +133,51 @@ def _copies(photos: Sequence[Photo]) -> list[str]:
     ]
 
 
-def _fault_of(photo: Photo) -> str | None:
-    """Why the photograph cannot be decoded; None if it can."""
-    decode: Callable[[Photo], None] = _decode_raw if photo.raw else _decode
+def _duplicates(replaced: Mapping[str, str]) -> list[str]:
+    """A warning if photographs were left out."""
+    if not replaced:
+        return []
+    pairs = [f"{name} = {kept}" for name, kept in replaced.items()]
+    some = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
+    return [
+        f"{len(pairs)} photographs are left out, because they show the same as others ({some}): "
+        "copies, or a camera that stood still (inspect.keep_duplicates)"
+    ]
+
+
+@dataclass(frozen=True)
+class _Check:
+    """Why a photograph cannot be decoded, or its signature (None for RAW files)."""
+
+    fault: str | None = None
+    signature: Signature | None = None
+
+
+def _check(photo: Photo) -> _Check:
     try:
-        decode(photo)
+        return _Check(signature=_decode(photo))
     except (MemoryError, ChangedFileError):
         raise
     # PIL's decoders raise OSError, SyntaxError, ValueError, struct.error, zlib.error and others;
     # LibRaw has its own exceptions.
     except Exception as error:
         text = str(error).strip() or type(error).__name__
-        return f"cannot be decoded ({text})"
-    return None
+        return _Check(f"cannot be decoded ({text})")
 
 
-def _decode(photo: Photo) -> None:
-    if suffix_of(photo.path) in heif.HEIF_SUFFIXES:
-        heif.register()
-    with Image.open(io.BytesIO(read_recorded(photo.path, photo.digest))) as image:
+def _decode(photo: Photo) -> Signature | None:
+    data = io.BytesIO(read_recorded(photo.path, photo.digest))
+    suffix = suffix_of(photo.path)
+    if suffix in exr.EXR_SUFFIXES:
+        exr.read_pixels(data)
+        return None
+    if photo.linear:
+        import rawpy  # Imported only if the scene has RAW files.
+
+        with rawpy.imread(data) as raw:
+            raw.unpack()
+        return None
+    pillow_formats.register(suffix)
+    with Image.open(data) as image:
         image.load()
-
-
-def _decode_raw(photo: Photo) -> None:
-    import rawpy  # Imported only if the scene has RAW files.
-
-    with rawpy.imread(io.BytesIO(read_recorded(photo.path, photo.digest))) as raw:
-        raw.unpack()
+        return signature(image)

@@ -2,7 +2,7 @@
 
 Consecutive frames of a video show almost the same. A frame is chosen for each step of motion of the
 image: a slow camera gives few frames per second, a fast one many, a standing one a single frame.
-Near each step the sharpest frame is chosen, because frames of a moving camera are often blurred.
+Of the frames near each step a sharp one is chosen: frames of a moving camera are often blurred.
 
 A video is decoded twice, one frame at a time: once at reduced size to measure all frames, once to
 write the chosen ones.
@@ -34,9 +34,11 @@ STEP = 0.05
 # With fewer frames than this the step is lowered, down to MIN_STEP: one pixel of MEASURED_PX, below
 # which motion cannot be told from noise.
 FEW_FRAMES, MIN_STEP = 40, 0.003
-# Width of the window around a position from which the sharpest frame is chosen, in steps. Windows
-# are apart, so that neighbours are at least half a step apart.
-WINDOW = 0.5
+# Smallest and largest distance between chosen frames, in steps: neighbours show different images,
+# and overlap.
+MIN_GAP, MAX_GAP = 0.5, 1.5
+# Number of frames per step among which the choice is made, the sharpest of its part of the step.
+CELLS = 8
 # Motion is measured from an anchor frame, which is replaced after this share of the long side:
 # errors of tracking do not add up while the camera stands.
 ANCHOR = 0.02
@@ -175,24 +177,50 @@ def choose_all(videos: Sequence[Measured], max_frames: int) -> tuple[float, list
 
 
 def choose_frames(video: Measured, step: float) -> list[int]:
-    """Frames about ``step`` of motion apart, at least half of it, in ascending order.
+    """Sharp frames, half a step to one and a half steps of motion apart, in ascending order.
 
-    For each multiple of ``step`` the sharpest frame of the window around it, or the nearest frame
-    if there is none in the window.
+    The path through the video with the smallest cost, by dynamic programming. A chosen frame costs
+    its blur, log2 of the largest sharpness within a step of motion over its own, and the squared
+    deviation of the distance from its predecessor from one step; both are multiplied by that
+    distance, so that few frames are not cheaper than many. Where the image jumps, distances are
+    larger.
     """
-    motion, sharpness = video.motion, video.sharpness
-    position = np.rint(motion / step)
-    off = np.abs(motion / step - position)
-    starts = np.flatnonzero(np.diff(position, prepend=-1.0))
-    stops = np.append(starts[1:], len(motion))
-    chosen: list[int] = []
-    for start, stop in zip(starts, stops, strict=True):
-        near = off[start:stop]
-        candidates = np.flatnonzero(near <= max(WINDOW / 2, near.min()))
-        best = start + candidates[np.argmax(sharpness[start:stop][candidates])]
-        if not chosen or motion[best] - motion[chosen[-1]] >= WINDOW * step:
-            chosen.append(int(best))
-    return chosen
+    position, frames = _candidates(video, step)
+    sharpness = np.log2(np.maximum(video.sharpness[frames], 1e-12))
+    blur = np.array(
+        [
+            sharpness[np.searchsorted(position, p - 1) : np.searchsorted(position, p + 1, "right")]
+            .max()
+            for p in position
+        ]
+    ) - sharpness  # fmt: skip
+    cost, before = np.zeros(len(frames)), np.full(len(frames), -1)
+    for i, p in enumerate(position):
+        stop = int(np.searchsorted(position, p - MIN_GAP, "right"))
+        if stop == 0:
+            cost[i] = blur[i]
+            continue
+        start = min(int(np.searchsorted(position, p - MAX_GAP)), stop - 1)
+        gap = np.minimum(p - position[start:stop], MAX_GAP)
+        total = cost[start:stop] + gap * (blur[i] + (gap - 1) ** 2)
+        best = int(np.argmin(total))
+        cost[i], before[i] = total[best], start + best
+    last = int(np.searchsorted(position, position[-1] - MIN_GAP))
+    at = last + int(np.argmin(cost[last:]))
+    chosen = []
+    while at >= 0:
+        chosen.append(int(frames[at]))
+        at = int(before[at])
+    return chosen[::-1]
+
+
+def _candidates(video: Measured, step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Positions in steps and numbers of the sharpest frames of each ``1 / CELLS`` of a step."""
+    position = video.motion / step
+    cell = np.floor(position * CELLS)
+    order = np.lexsort((np.arange(len(cell)), -video.sharpness, cell))
+    frames = np.sort(order[np.flatnonzero(np.diff(cell[order], prepend=-1.0))])
+    return position[frames], frames
 
 
 # --- measurement --------------------------------------------------------------------------

@@ -106,7 +106,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         photographs=len(scan.photos),
         videos=len(scan.videos),
         max_frames=len(scan.frames),
-        raw=scan.num_raw,
+        linear=scan.num_linear,
         alpha=scan.num_alpha,
         masks=scan.num_masks,
         depths=scan.num_depths,

@@ -19,7 +19,7 @@ from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, companions
 from pipeline.io.gcp import GCP_FILE
-from pipeline.io.names import RAW_SUFFIXES, NameIndex, stem_key, suffix_of
+from pipeline.io.names import LINEAR_SUFFIXES, NameIndex, stem_key, suffix_of
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
     GivenPoses,
@@ -112,8 +112,8 @@ class Scan(BaseModel):
             )
 
     @property
-    def num_raw(self) -> int:
-        return sum(photo.raw for photo in self.photos)
+    def num_linear(self) -> int:
+        return sum(photo.linear for photo in self.photos)
 
     @property
     def num_alpha(self) -> int:
@@ -166,7 +166,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
 
     chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
     facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
-    facts = {name: facts[name] for name in _without_raw_pairs(sorted(facts), poses, warnings)}
+    facts = {name: facts[name] for name in _without_linear_pairs(sorted(facts), poses, warnings)}
     listed_videos = find_videos(
         folder, chosen.path, recursive=not chosen.names and chosen.path == "."
     )
@@ -257,23 +257,23 @@ def _no_photographs(folder: Path, listed: Sequence[str], warnings: Sequence[str]
     )
 
 
-def _without_raw_pairs(
+def _without_linear_pairs(
     names: Sequence[str], poses: GivenPoses | None, warnings: list[str]
 ) -> list[str]:
-    """If a photograph exists both as RAW and as another file, keep the RAW file, unless the poses
-    name the other one."""
+    """If a photograph exists both as RAW or EXR and as another file, keep the former, unless the
+    poses name the other one."""
     posed = set(poses.names) if poses is not None else set()
-    raw = {stem_key(name): name for name in names if suffix_of(name) in RAW_SUFFIXES}
+    linear = {stem_key(name): name for name in names if suffix_of(name) in LINEAR_SUFFIXES}
     dropped = set()
     for name in names:
-        raw_name = raw.get(stem_key(name))
-        if raw_name is not None and suffix_of(name) not in RAW_SUFFIXES:
-            dropped.add(raw_name if name in posed else name)
+        other = linear.get(stem_key(name))
+        if other is not None and suffix_of(name) not in LINEAR_SUFFIXES:
+            dropped.add(other if name in posed else name)
     if dropped:
         first = sorted(dropped)[0]
         warnings.append(
-            f"{len(dropped)} photographs exist both as RAW and as another file; one of each pair "
-            f"is left out (first: {first})"
+            f"{len(dropped)} photographs exist both as RAW or EXR and as another file; one of each "
+            f"pair is left out (first: {first})"
         )
     return [name for name in names if name not in dropped]
 
@@ -371,7 +371,7 @@ def _photo(
         width=facts.width,
         height=facts.height,
         digest=facts.digest,
-        raw=facts.raw,
+        linear=facts.linear,
         alpha=facts.alpha,
         bits=facts.bits,
         orientation=facts.orientation,

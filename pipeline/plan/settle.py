@@ -7,11 +7,14 @@ a settled config changes nothing.
 from __future__ import annotations
 
 import math
+import posixpath
+from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
 from pipeline.config.schema import Config
+from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget
 from pipeline.plan.scan import Scan
 
@@ -154,6 +157,9 @@ def _share_cameras(scan: Scan, config: Config) -> Choice:
         return "image", f"one camera per image: photographs by {len(bodies)} different cameras"
     if count > 2 and len(groups) > MIXED_GROUP_SHARE * count:
         return "image", f"one camera per image: {len(groups)} groups in {count} photographs"
+    folders = Counter(posixpath.dirname(photo.name) for photo in scan.planned)
+    if len(folders) > 1 and min(folders.values()) >= MIN_IMAGES_PER_CAMERA:
+        return "folder", f"cameras shared within each of {len(folders)} folders"
     each = "one camera" if len(groups) == 1 else f"{len(groups)} cameras"
     return "group", f"{each}, shared by body, lens, focal length and size"
 

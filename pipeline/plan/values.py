@@ -31,7 +31,7 @@ class SceneFacts(BaseModel):
         description="Number of frames that are chosen of them at most; counted in `bits`, `sizes`, "
         "`camera_groups` and `training_memory_mb`.",
     )
-    raw: int = Field(description="Number of RAW files among them.")
+    linear: int = Field(description="Number of RAW and EXR files among them.")
     alpha: int = Field(description="Number of photographs with transparent pixels.")
     masks: int = Field(description="Number of photographs with a mask.")
     depths: int = Field(description="Number of photographs with a depth map.")

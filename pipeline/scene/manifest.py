@@ -31,8 +31,8 @@ class Photo(BaseModel):
     """Pixels."""
     digest: str
     """Hex digest of the file's bytes (``pipeline.io.recorded``), checked whenever it is read."""
-    raw: bool = False
-    """Whether the file is a camera's RAW file."""
+    linear: bool = False
+    """Whether the file is of linear light (RAW, EXR), which the decode stage develops."""
     alpha: bool = False
     """Whether any pixel is transparent."""
     bits: int = 8

@@ -6,6 +6,7 @@ Matching and verification are cached pair by pair.
 from __future__ import annotations
 
 import hashlib
+import posixpath
 import shutil
 import sqlite3
 import tempfile
@@ -73,10 +74,9 @@ def plan_cameras(
         The cameras (ids from 1, in order of their first photograph) and photograph name -> camera
         id.
     """
-    members: dict[tuple[str, int, int], list[Photo]] = defaultdict(list)
+    members: dict[tuple[tuple[str, ...], int, int], list[Photo]] = defaultdict(list)
     for photo in manifest.photos:
-        group = {"single": "", "image": photo.name}.get(sfm.share_cameras, photo.camera_group)
-        members[group, photo.width, photo.height].append(photo)
+        members[_sharing(photo, sfm.share_cameras), photo.width, photo.height].append(photo)
     model = "SIMPLE_RADIAL" if sfm.camera_model == "auto" else sfm.camera_model
     cameras, camera_of = [], {}
     for index, ((_, width, height), photos) in enumerate(members.items(), start=1):
@@ -90,6 +90,19 @@ def plan_cameras(
         cameras.append(camera)
         camera_of.update({p.name: index for p in photos})
     return cameras, camera_of
+
+
+def _sharing(photo: Photo, share: str) -> tuple[str, ...]:
+    """Equal for photographs of one size that share a camera."""
+    match share:
+        case "single":
+            return ()
+        case "image":
+            return (photo.name,)
+        case "folder":
+            return (posixpath.dirname(photo.name), photo.camera_group)
+        case _:
+            return (photo.camera_group,)
 
 
 def build_database(

@@ -23,8 +23,8 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import project, unproject
 from pipeline.io.colmap import read_model
 from pipeline.io.recorded import digest_of
+from pipeline.photos.develop import develop
 from pipeline.photos.load import load_mask, load_rgb, load_rgba
-from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction

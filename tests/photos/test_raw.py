@@ -15,8 +15,8 @@ from pipeline.demo.scene import OBJECTS
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng
 from pipeline.geometry.cameras import Camera
 from pipeline.io.recorded import digest_of
+from pipeline.photos.develop import develop
 from pipeline.photos.load import load_rgb
-from pipeline.photos.raw import develop
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from tests.tools import need_data
@@ -32,7 +32,7 @@ def manifest(paths: list[Path], width: int, height: int) -> Manifest:
             width=width,
             height=height,
             digest=digest_of(path),
-            raw=True,
+            linear=True,
             bits=16,
             focal_px=100.0,
             camera_group="one",
@@ -93,7 +93,7 @@ def test_manifest_of_developed_files(tmp_path: Path, light: np.ndarray) -> None:
     for photo, name in zip(report.manifest.photos, ("a.png", "b.png"), strict=True):
         assert (photo.name, photo.width, photo.height) == (name, 48, 32)
         assert load_rgb(photo.path).shape == (32, 48, 3)
-        assert photo.focal_px == 50.0 and not photo.raw and photo.camera_group == "one"
+        assert photo.focal_px == 50.0 and not photo.linear and photo.camera_group == "one"
         assert photo.orientation == 6  # recorded, not applied
     (tmp_path / "out").rename(tmp_path / "moved")
     moved = Manifest.read(tmp_path / "moved" / "images.json")
@@ -112,9 +112,12 @@ def test_damaged_raw_files_are_left_out_and_all_damaged_is_an_error(
     assert [photo.name for photo in report.manifest.photos] == ["a.png"]
     assert len(report.warnings) == 2 and report.manifest.warnings == report.warnings
     for name in ("b.dng", "c.dng"):
-        assert sum(text.startswith(f"{name}: RAW file left out") for text in report.warnings) == 1
+        assert (
+            sum(text.startswith(f"{name}: left out, it cannot be read") for text in report.warnings)
+            == 1
+        )
     broken = manifest([tmp_path / "b.dng", tmp_path / "c.dng"], 96, 64)
-    with pytest.raises(UserError, match="none of the 2 RAW files"):
+    with pytest.raises(UserError, match="none of the 2 RAW and EXR files"):
         develop(broken, Decode(), tmp_path / "out2", threads=2)
 
 

@@ -47,13 +47,26 @@ def test_too_few_photographs_is_an_error_that_names_the_damaged_ones(manifest):
     assert "cut_a.jpg" in str(error.value)
 
 
-def test_copies_are_a_warning(tmp_path):
+def test_copies_are_left_out_or_a_warning(tmp_path):
     """A test view with a copy among the training views makes the metrics too good."""
     files = photos(tmp_path, 3)
     (tmp_path / "q.jpg").write_bytes(files[1].read_bytes())
     manifest = scan(tmp_path, "s", Config(), cache=None).manifest
-    (warning,) = verify_photos(manifest, threads=1)[1]
+    once, (warning,) = verify_photos(manifest, threads=1)
+    assert "(q.jpg = p01.jpg)" in warning and "left out" in warning
+    assert [photo.name for photo in once.photos] == ["p00.jpg", "p01.jpg", "p02.jpg"]
+    kept, (warning,) = verify_photos(manifest, threads=1, keep_duplicates=True)
     assert "q.jpg = p01.jpg" in warning and warning.startswith("copies of other photographs: 1 (")
+    assert len(kept.photos) == 4
+
+
+def test_a_camera_that_stood_still_is_named_as_the_reason(tmp_path):
+    files = photos(tmp_path, 1)
+    for name in ("q.jpg", "r.jpg"):
+        (tmp_path / name).write_bytes(files[0].read_bytes())
+    manifest = scan(tmp_path, "s", Config(), cache=None).manifest
+    with pytest.raises(UserError, match=r"only 1 of 3 photographs[\s\S]*stood still"):
+        verify_photos(manifest, threads=1, min_photos=2)
 
 
 def test_a_photograph_replaced_after_the_scan_is_an_error(tmp_path):

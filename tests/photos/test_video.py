@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import os
 import struct
 from pathlib import Path
@@ -17,7 +18,8 @@ from pipeline.io.recorded import ChangedFileError
 from pipeline.io.videofile import read_video_facts
 from pipeline.photos.verify import verify_videos
 from pipeline.photos.video import (
-    WINDOW,
+    MAX_GAP,
+    MIN_GAP,
     FramesReport,
     Measured,
     choose_all,
@@ -61,20 +63,32 @@ MEASURED = st.lists(st.tuples(STEPS, st.floats(0, 100)), min_size=1, max_size=80
 def test_chosen_frames_are_apart_and_leave_no_gap(video, step):
     chosen = choose_frames(video, step)
     motion = video.motion[chosen]
-    assert np.all(np.diff(motion) >= WINDOW * step)
-    # Nowhere is the nearest chosen frame farther than the scene between the frames requires.
-    nearest = np.abs(video.motion[:, None] - motion[None]).min(axis=1)
-    assert np.all(nearest <= 1.5 * step)
+    tolerance = 1e-9
+    assert np.all(np.diff(motion) >= (MIN_GAP - tolerance) * step)
+    # A larger distance only where no frame is in between.
+    for before, after in itertools.pairwise(motion):
+        between = (video.motion > before + MIN_GAP * step + tolerance) & (video.motion < after)
+        between &= video.motion <= before + (MAX_GAP - MIN_GAP) * step
+        assert after - before <= (MAX_GAP + MIN_GAP) * step or not between.any()
+    assert motion[0] - video.motion[0] <= MIN_GAP * step
+    assert video.motion[-1] - motion[-1] <= MIN_GAP * step + tolerance
 
 
 @settings(max_examples=300, deadline=None, derandomize=True)
 @given(MEASURED, st.floats(0.003, 0.2))
-def test_a_chosen_frame_is_the_sharpest_of_its_window(video, step):
+def test_no_sharper_frame_shows_the_same(video, step):
     for index in choose_frames(video, step):
-        position = round(video.motion[index] / step)
-        window = np.abs(video.motion / step - position) <= WINDOW / 2
-        if window[index]:
-            assert video.sharpness[index] == video.sharpness[window].max()
+        same = video.motion == video.motion[index]
+        assert video.sharpness[index] == video.sharpness[same].max()
+
+
+def test_blurred_frames_are_avoided_and_frames_are_as_dense_as_the_step():
+    rng = np.random.default_rng(0)
+    sharp = rng.random(600) < 0.2
+    video = Measured(np.linspace(0, 3, 600), np.where(sharp, 100.0, rng.uniform(5, 50, 600)))
+    chosen = choose_frames(video, 0.05)
+    assert sharp[chosen].mean() > 0.8  # of 0.2 in all
+    assert 50 <= len(chosen) <= 70
 
 
 @settings(max_examples=200, deadline=None, derandomize=True)

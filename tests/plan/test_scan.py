@@ -15,6 +15,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
 from pipeline.plan.given_poses import GivenModel, load_given
 from pipeline.plan.scan import Scan, scan
+from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from tests.io.test_llff import llff_row
@@ -78,6 +79,10 @@ def test_images_folder_with_subfolders(tmp_path):
     picture(tmp_path / "images" / "a.jpeg")
     picture(tmp_path / "images" / ".hidden.jpg")
     (tmp_path / "images" / "notes.txt").write_text("no picture")
+    for preview in ("@eaDir", "Thumbnails", ".thumbs", "__MACOSX"):
+        picture(tmp_path / "images" / preview / "a.jpeg")
+    for side_car in ("a.xmp", "a.jpeg.pp3", "a.thm", "._a.jpeg"):
+        (tmp_path / "images" / side_car).write_text("facts about a.jpeg")
     result = look(tmp_path)
     assert (names(result), result.image_folder) == (["a.jpeg", "b/x.PNG"], "images")
     assert (result.poses, result.truth, result.warnings) == (None, None, ())
@@ -95,9 +100,10 @@ def test_plain_folder_of_photographs(tmp_path):
 
 def test_unused_subfolders_are_a_warning(tmp_path):
     photos(tmp_path, 2)
+    photos(tmp_path / "others", 1)
     photos(tmp_path / "thumbs", 1)
     (warning,) = look(tmp_path).warnings
-    assert "thumbs" in warning
+    assert "others" in warning and "thumbs" not in warning
 
 
 def test_photographs_in_subfolders(tmp_path):
@@ -112,6 +118,35 @@ def test_a_single_subfolder_with_another_name_is_used(tmp_path):
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", "p01.jpg"], (64, 48))
     result = look(tmp_path)
     assert (result.image_folder, names(result)) == ("input", ["p00.jpg", "p01.jpg"])
+
+
+ODD_NAMES = [
+    "two words.jpg",
+    "-rf.jpg",
+    "{scene}.jpg",
+    'it\'s "quoted".jpg',
+    "a#b;c&d.jpg",
+    "Größe 写真.jpg",
+    "aa/aa/aa.jpg",
+    "100%.jpg",
+    "$HOME.jpg",
+]
+
+
+def test_photographs_with_odd_names_are_used(tmp_path):
+    for name in ODD_NAMES:
+        picture(tmp_path / "images" / name)
+    result = look(tmp_path)
+    assert (names(result), result.warnings) == (sorted(ODD_NAMES), ())
+
+
+def test_photographs_in_several_folders_share_cameras_by_folder(tmp_path):
+    """Two cameras of one model have the same EXIF data, but not the same lens distortion."""
+    for folder in ("left", "right"):
+        photos(tmp_path / "images" / folder, 6)
+    assert settle(look(tmp_path), config()).config.sfm.share_cameras == "folder"
+    picture(tmp_path / "images" / "one" / "p.jpg")  # too few to determine a camera
+    assert settle(look(tmp_path), config()).config.sfm.share_cameras == "group"
 
 
 @pytest.mark.parametrize(
@@ -463,7 +498,7 @@ def test_of_raw_and_jpeg_pairs_one_is_used(tmp_path):
         write_dng(tmp_path / "images" / name)
     picture(tmp_path / "images" / "a.JPG")
     result = look(tmp_path)
-    assert (names(result), result.num_raw) == (["a.dng", "b.DNG"], 2)
+    assert (names(result), result.num_linear) == (["a.dng", "b.DNG"], 2)
     photo = result.photos[0]
     assert (photo.width, photo.height, photo.bits) == (64, 48, 16)
     assert photo.camera_group == "Maker Model 1 | ? | 35 mm | 64x48"

@@ -59,7 +59,7 @@ def test_the_plan_counts_at_most_max_frames(tmp_path):
     names = [frame.name for frame in found.frames]
     assert names == [f"b/{i:06d}.png" for i in range(5)] + [f"walk/{i:06d}.png" for i in range(25)]
     assert found.ordered == "frames of 2 videos"
-    assert settle(found, Config()).why["sfm.share_cameras"].startswith("2 cameras")
+    assert settle(found, Config()).why["sfm.share_cameras"].endswith("each of 2 folders")
 
 
 def test_photographs_and_videos_are_both_used(tmp_path):

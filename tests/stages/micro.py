@@ -45,6 +45,9 @@ def write_scenes(folder: Path) -> None:
         write_demo(folder / name, spec)
     photos = folder / "photos"
     shutil.copytree(photos / "images", photos / "others")
+    shutil.copytree(photos / "images", folder / "copies")
+    first = min((folder / "copies").iterdir())
+    shutil.copyfile(first, first.with_stem("zz"))
     views = [cv2.imread(str(path)) for path in sorted((photos / "images").iterdir())]
     write_video(folder / "video" / "clip.avi", views)
 

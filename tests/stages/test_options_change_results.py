@@ -65,6 +65,7 @@ FLIPS = {
     "seed": Flip(1, POSED),
     "inspect.image_folder": Flip("others", POSED),
     "inspect.min_images": Flip(100, POSED),
+    "inspect.keep_duplicates": Flip(True, ESTIMATED, "copies"),
     "views.max_long_side_px": Flip(48, POSED),
     "views.masks": Flip("ignore", POSED),
     "split.test_every": Flip(5, POSED),

@@ -1,6 +1,7 @@
-"""HEIC and HEIF images, read if the package ``pillow-heif`` is installed.
+"""Image formats that Pillow decodes instead of OpenCV: AVIF; HEIC and HEIF if the package
+``pillow-heif`` is installed.
 
-pillow-heif applies the EXIF orientation and converts to 8 bits when it decodes; the decoded pixels
+Pillow decodes them to 8 bits. pillow-heif also applies the EXIF orientation; the decoded pixels
 count as the stored ones, with orientation 1.
 """
 
@@ -13,28 +14,36 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
+AVIF_SUFFIXES = frozenset({".avif"})
 HEIF_SUFFIXES = frozenset({".heic", ".heif"})
 
 
-def installed() -> bool:
+def heif_installed() -> bool:
     """Whether HEIF images can be read."""
     return find_spec("pillow_heif") is not None
 
 
-def register() -> None:
-    """Enable PIL to open HEIF images. Repeated calls have no effect."""
-    import pillow_heif  # Optional dependency.
-
-    pillow_heif.register_heif_opener()
+SUFFIXES = AVIF_SUFFIXES | (HEIF_SUFFIXES if heif_installed() else frozenset())
 
 
-def read_pixels(file: IO[bytes]) -> NDArray[np.uint8]:
+def register(suffix: str) -> None:
+    """Enable Pillow to open images with this suffix. Repeated calls have no effect."""
+    if suffix in HEIF_SUFFIXES:
+        import pillow_heif  # Optional dependency.
+
+        pillow_heif.register_heif_opener()
+
+
+def read_pixels(file: IO[bytes], suffix: str) -> NDArray[np.uint8]:
     """(H, W, 3) BGR or (H, W, 4) BGRA, as OpenCV reads other pictures.
+
+    Args:
+        suffix: of the file, one of ``SUFFIXES``.
 
     Raises:
         OSError, ValueError: no picture that can be decoded.
     """
-    register()
+    register(suffix)
     with Image.open(file) as image:
         mode = "RGBA" if "A" in image.mode else "RGB"
         pixels = np.asarray(image.convert(mode))

@@ -33,7 +33,7 @@ MEASURED_PX = 320
 STEP = 0.05
 # With fewer frames than this the step is lowered, down to MIN_STEP: one pixel of MEASURED_PX, below
 # which motion cannot be told from noise.
-FEW_FRAMES, MIN_STEP = 40, 0.003
+FEW_FRAMES, MIN_STEP = 60, 0.003
 # Smallest and largest distance between chosen frames, in steps: neighbours show different images,
 # and overlap.
 MIN_GAP, MAX_GAP = 0.5, 1.5

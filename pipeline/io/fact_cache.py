@@ -14,7 +14,7 @@ from pipeline.runtime.atomic import write_text
 from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
-_VERSION = 4
+_VERSION = 5
 
 M = TypeVar("M", bound=BaseModel)
 

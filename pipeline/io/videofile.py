@@ -1,4 +1,7 @@
-"""Reading video files with OpenCV's FFmpeg: header facts, and frames one after the other."""
+"""Reading video files with OpenCV's FFmpeg: header facts, and frames one after the other.
+
+FFmpeg converts HDR video (PQ and HLG) to standard dynamic range when OpenCV asks for 8-bit BGR.
+"""
 
 from __future__ import annotations
 
@@ -30,7 +33,8 @@ class VideoFacts(BaseModel):
 
     Attributes:
         digest: hex digest of the file's bytes.
-        width, height: pixels of a frame as it is shown, with the rotation of the header applied.
+        width, height: pixels of a frame as it is shown, with the rotation and the pixel aspect
+            ratio of the header applied.
         frames: number of frames according to the header, 0 if it has none. Headers may be wrong.
         fps: frames per second according to the header, 0 if it has none.
     """
@@ -59,8 +63,14 @@ def read_video_facts(path: Path) -> VideoFacts:
         width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
         height = int(capture.get(cv2.CAP_PROP_FRAME_HEIGHT))
         frames, fps = capture.get(cv2.CAP_PROP_FRAME_COUNT), capture.get(cv2.CAP_PROP_FPS)
+        aspect = _pixel_aspect(capture)
+        turned = capture.get(cv2.CAP_PROP_ORIENTATION_META) % 180 == 90
     if width <= 0 or height <= 0:
         raise UserError("cannot be read as a video: its frames have no size", file=path, fix=FIX)
+    if turned:
+        height = round(height * aspect)
+    else:
+        width = round(width * aspect)
     # The values of damaged headers may be negative, infinite or NaN.
     known = 0 < frames < 2**31
     return VideoFacts(
@@ -70,6 +80,15 @@ def read_video_facts(path: Path) -> VideoFacts:
         frames=int(frames) if known else 0,
         fps=float(fps) if 0 < fps < 1e6 else 0.0,
     )
+
+
+def _pixel_aspect(capture: cv2.VideoCapture) -> float:
+    """Width over height of a stored pixel; 1 if the header has none or an implausible one."""
+    import cv2  # Slow to import.
+
+    across, down = capture.get(cv2.CAP_PROP_SAR_NUM), capture.get(cv2.CAP_PROP_SAR_DEN)
+    aspect = across / down if down > 0 else 1.0
+    return aspect if 0.25 <= aspect <= 4 else 1.0
 
 
 @contextmanager

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Video
 from pipeline.io.recorded import ChangedFileError, digest_of
 from pipeline.io.videofile import opened_video
+from pipeline.photos.video_frames import FrameFormat, is_combed
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
@@ -31,12 +32,16 @@ MEASURED_PX = 320
 # Motion between chosen frames as a share of the long side. Neighbours overlap by 95 %, so that
 # features are matched over several frames; larger steps lose frames of cameras that turn quickly.
 STEP = 0.05
+# Share of combed frames from which a video is interlaced: where nothing moves, none are.
+COMBED_SHARE = 0.2
+INTERLACED = "; of interlaced frames one field is used"
 # With fewer frames than this the step is lowered, down to MIN_STEP: one pixel of MEASURED_PX, below
-# which motion cannot be told from noise.
-FEW_FRAMES, MIN_STEP = 60, 0.003
+# which motion cannot be told from noise; and not so far that blurred frames are chosen, whose mean
+# log2 of the largest sharpness within half of STEP over their own exceeds MAX_BLUR.
+FEW_FRAMES, MIN_STEP, MAX_BLUR = 60, 0.003, 0.25
 # Smallest and largest distance between chosen frames, in steps: neighbours show different images,
 # and overlap.
-MIN_GAP, MAX_GAP = 0.5, 1.5
+MIN_GAP, MAX_GAP = 0.3, 2.0
 # Number of frames per step among which the choice is made, the sharpest of its part of the step.
 CELLS = 8
 # Motion is measured from an anchor frame, which is replaced after this share of the long side:
@@ -64,10 +69,12 @@ class Measured:
         motion: (N,) accumulated motion of the image from the first frame, as a share of its long
             side; does not decrease.
         sharpness: (N,) variance of the Laplacian; comparable between similar frames only.
+        interlaced: whether even and odd rows were recorded one after the other.
     """
 
     motion: NDArray[np.float64]
     sharpness: NDArray[np.float64]
+    interlaced: bool = False
 
 
 @dataclass(frozen=True)
@@ -114,12 +121,13 @@ def extract_frames(
     photos = list(manifest.photos)
     decisions, warnings = [], []
     for (video, found), frames in zip(measured.items(), chosen, strict=True):
-        photos += _write_frames(video, frames, out / "images", threads)
+        stored = FrameFormat((video.width, video.height), found.interlaced)
+        photos += _write_frames(video, frames, stored, out / "images", threads)
         total = len(found.motion)
         decisions.append(
             f"{video.name}: {len(frames)} of {total} frames chosen: the sharpest for each "
             f"{step:.1%} of its long side that the image moves, {found.motion[-1]:.1f} times the "
-            "long side in all"
+            "long side in all" + (INTERLACED if found.interlaced else "")
         )
         if total < COMPLETE * video.frames:
             warnings.append(
@@ -168,16 +176,30 @@ def choose_all(videos: Sequence[Measured], max_frames: int) -> tuple[float, list
 
     step, frames = STEP, chosen(STEP)
     while count(frames) < min(FEW_FRAMES, max_frames) and step > MIN_STEP:
-        step = max(step / 1.1, MIN_STEP)
-        frames = chosen(step)
+        smaller = max(step / 1.1, MIN_STEP)
+        more = chosen(smaller)
+        if _mean_blur(videos, more) > max(MAX_BLUR, _mean_blur(videos, frames)):
+            break
+        step, frames = smaller, more
     while count(frames) > max(max_frames, len(videos)):
         step *= 1.02
         frames = chosen(step)
     return step, frames
 
 
+def _mean_blur(videos: Sequence[Measured], chosen: Sequence[Sequence[int]]) -> float:
+    blur = []
+    for video, frames in zip(videos, chosen, strict=True):
+        sharpness = np.log2(np.maximum(video.sharpness, 1e-12))
+        starts = np.searchsorted(video.motion, video.motion[frames] - STEP / 2)
+        stops = np.searchsorted(video.motion, video.motion[frames] + STEP / 2, "right")
+        for frame, start, stop in zip(frames, starts, stops, strict=True):
+            blur.append(sharpness[start:stop].max() - sharpness[frame])
+    return float(np.mean(blur))
+
+
 def choose_frames(video: Measured, step: float) -> list[int]:
-    """Sharp frames, half a step to one and a half steps of motion apart, in ascending order.
+    """Sharp frames, 0.3 to 2 steps of motion apart, in ascending order.
 
     The path through the video with the smallest cost, by dynamic programming. A chosen frame costs
     its blur, log2 of the largest sharpness within a step of motion over its own, and the squared
@@ -229,7 +251,7 @@ def _candidates(video: Measured, step: float) -> tuple[NDArray[np.float64], NDAr
 def measure(video: VideoFile, threads: int = 1) -> Measured:
     """Motion and sharpness of all frames of a video."""
     tracker = _Tracker()
-    motion, sharpness = [], []
+    motion, sharpness, combed = [], [], 0
     scale = min(1.0, MEASURED_PX / max(video.width, video.height))
     size = max(1, round(scale * video.width)), max(1, round(scale * video.height))
     progress = Progress(f"measuring {video.name}", video.frames, "frames")
@@ -240,12 +262,14 @@ def measure(video: VideoFile, threads: int = 1) -> Measured:
         # Also frames of another size than the header's become equally large.
         small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
+        combed += is_combed(frame)
         motion.append(tracker.motion(grey))
         sharpness.append(float(np.var(cv2.Laplacian(grey, cv2.CV_32F), dtype=np.float64)))
         progress.advance()
     if not motion:
         raise UserError("no frame can be decoded", file=Path(video.path), fix="copy it again")
-    return Measured(np.array(motion), np.array(sharpness))
+    interlaced = combed >= COMBED_SHARE * len(motion)
+    return Measured(np.array(motion), np.array(sharpness), interlaced)
 
 
 class _Tracker:
@@ -319,7 +343,7 @@ def _frames(path: Path, threads: int) -> Iterator[NDArray[np.uint8]]:
 
 
 def _write_frames(
-    video: VideoFile, chosen: Sequence[int], folder: Path, threads: int
+    video: VideoFile, chosen: Sequence[int], stored: FrameFormat, folder: Path, threads: int
 ) -> list[Photo]:
     """Write the frames with these numbers, and describe them as photographs."""
     wanted = set(chosen)
@@ -333,7 +357,8 @@ def _write_frames(
             if index not in wanted:
                 continue
             _, frame = capture.retrieve()
-            photos.append(_write_frame(video, index, np.asarray(frame, np.uint8), folder))
+            picture = stored.photograph(np.asarray(frame, np.uint8))
+            photos.append(_write_frame(video, index, picture, folder))
             progress.advance()
     if digest_of(Path(video.path)) != video.digest or len(photos) != len(chosen):
         raise ChangedFileError(

@@ -73,9 +73,9 @@ class VideoFile(BaseModel):
     path: str
     """The file, relative to the working directory or absolute."""
     width: int
-    """Pixels, with the rotation of the header applied."""
+    """Pixels, with the rotation and the pixel aspect ratio of the header applied."""
     height: int
-    """Pixels, with the rotation of the header applied."""
+    """As ``width``."""
     frames: int
     """Number of frames according to the header, which may be wrong; 0 if unknown."""
     fps: float

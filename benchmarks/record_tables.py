@@ -23,6 +23,7 @@ from benchmarks.results import (
     PageResult,
     StabilityResult,
     StressResult,
+    VideoFrames,
 )
 from benchmarks.sfm import summary
 from pipeline.runtime.errors import UserError
@@ -199,6 +200,18 @@ def raster_stress(records: Sequence[Stored]) -> str:
     return markdown.table(rows)
 
 
+def video(records: Sequence[Stored]) -> str:
+    rows = [["video", "frames", "chosen", "sharpness", "of evenly spaced frames", "ratio"]]
+    for r in results(records, Record[VideoFrames]):
+        rows.append(
+            [
+                *(r.video, str(r.frames), str(r.chosen), f"{r.chosen_sharpness:.0f}"),
+                *(f"{r.even_sharpness:.0f}", f"{r.chosen_sharpness / r.even_sharpness:.2f}"),
+            ]
+        )
+    return markdown.table(rows)
+
+
 TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "mesh": mesh,
     "coverage": coverage,
@@ -209,5 +222,6 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "stability": stability,
     "page": page,
     "raster_stress": raster_stress,
+    "video": video,
 }
 """The table of each benchmark, by the ``benchmark`` of its record."""

@@ -219,3 +219,23 @@ class StressResult:
     gradient_median: float
     gradient_p99: float
     gradient_worst: float
+
+
+# ---- benchmarks.video ----
+
+
+@dataclass(frozen=True)
+class VideoFrames:
+    """The choice of frames of a video.
+
+    Attributes:
+        frames, chosen: numbers of frames of the video, and of those chosen.
+        chosen_sharpness, even_sharpness: medians of the variance of the Laplacian at full
+            resolution, of the chosen frames and of as many evenly spaced ones.
+    """
+
+    video: str
+    frames: int
+    chosen: int
+    chosen_sharpness: float
+    even_sharpness: float

@@ -22,6 +22,7 @@ from benchmarks.results import (
     PageResult,
     StabilityResult,
     StressResult,
+    VideoFrames,
 )
 from benchmarks.sfm.summary import Cost, Run
 from benchmarks.tables import KINDS, MARKER, RECORDS, pages, rewritten
@@ -30,6 +31,11 @@ from pipeline.runtime.errors import UserError
 
 BOTH = {"test": 30.0, "removed": 20.0}
 EXAMPLES: dict[str, tuple[Any, Any, str]] = {
+    "video": (
+        Record[VideoFrames],
+        VideoFrames("walk.mp4", 900, 60, 120.4, 100.0),
+        "| walk.mp4 | 900 | 60 | 120 | 100 | 1.20 |",
+    ),
     "mesh": (
         Record[MeshResult],
         MeshResult(

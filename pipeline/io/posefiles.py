@@ -30,6 +30,7 @@ MIN_IMAGES_PER_CAMERA = 5
 
 
 PoseKind = Literal["colmap", "transforms", "llff"]
+_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}
 
 
 class PoseSummary(BaseModel):
@@ -53,6 +54,12 @@ class PoseSummary(BaseModel):
         description=f"Whether a camera of {MIN_IMAGES_PER_CAMERA} or more images has its principal "
         "point exactly at the image centre, as if it had not been estimated."
     )
+
+    @property
+    def label(self) -> str:
+        """Kind, place and number of the poses, in words."""
+        where = "transforms*.json" if self.path == "." else self.path
+        return f"{_KINDS[self.kind]} {where}, {self.num_images} cameras"
 
 
 class GivenPoses(PoseSummary):

@@ -16,8 +16,8 @@ from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
+from pipeline.plan.summary import found
 from pipeline.plan.values import Plan, SceneFacts
-from pipeline.plan.video_files import contents
 from pipeline.scene.views import view_size
 
 # Limits the length of lists in the plan, which is passed on command lines.
@@ -74,7 +74,7 @@ def plan_record(plan: Plan) -> PlanRecord:
 
 def describe(plan: Plan) -> str:
     """The plan as a table for the terminal."""
-    lines = [f"{plan.scene}: {contents(plan.facts.photographs, plan.facts.videos)}"]
+    lines = [f"{plan.scene}: {found(plan.facts)}"]
     for name, stage in plan.stages.items():
         lines.append(f"  {name:<10} {'run ' if stage.run else 'skip'}  {stage.reason}")
         if stage.run:
@@ -106,6 +106,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         photographs=len(scan.photos),
         videos=len(scan.videos),
         max_frames=len(scan.frames),
+        video_frames=sum(video.frames for video in scan.videos),
         linear=scan.num_linear,
         alpha=scan.num_alpha,
         masks=scan.num_masks,

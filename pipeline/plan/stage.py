@@ -15,17 +15,12 @@ if TYPE_CHECKING:
     from pipeline.runtime.job import Job
 
 
-_POSE_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}
-
-
 def unless_posed(scan: Scan, reason: str, decisions: list[str]) -> StagePlan:
     """The plan of a stage that runs only if no poses are given."""
     poses = scan.poses
     if poses is None:
         return StagePlan(run=True, reason=reason, decisions=decisions)
-    where = "transforms*.json" if poses.path == "." else poses.path
-    given = f"poses are given: {_POSE_KINDS[poses.kind]} {where}, {poses.num_images} cameras"
-    return StagePlan(run=False, reason=given)
+    return StagePlan(run=False, reason=f"poses are given: {poses.label}")
 
 
 def _none(plan: Plan) -> dict[str, Any]:

@@ -31,7 +31,10 @@ class SceneFacts(BaseModel):
         description="Number of frames that are chosen of them at most; counted in `bits`, `sizes`, "
         "`camera_groups` and `training_memory_mb`.",
     )
-    linear: int = Field(description="Number of RAW and EXR files among them.")
+    video_frames: int = Field(
+        0, description="Number of frames of the videos according to their headers; 0 if unknown."
+    )
+    linear: int = Field(description="Number of RAW and EXR files among the photographs.")
     alpha: int = Field(description="Number of photographs with transparent pixels.")
     masks: int = Field(description="Number of photographs with a mask.")
     depths: int = Field(description="Number of photographs with a depth map.")

@@ -7,6 +7,7 @@ from pathlib import Path
 from pipeline.metrics.evaluation import Evaluation, SceneQuality
 from pipeline.photos.counters import DecodeCounters, InspectCounters
 from pipeline.plan.record import PlanRecord
+from pipeline.plan.summary import found
 from pipeline.reporting.metrics import Metrics
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.record import read_stage
@@ -39,8 +40,8 @@ def collect_metrics(
     ran = [name for name, step in plan.stages.items() if step.run and name != "report"]
     warnings = list(plan.warnings)
     for name in ran:
-        found = read_stage(folder / name).warnings
-        warnings += [f"{name}: {text}" for text in found if text not in plan.warnings]
+        told = read_stage(folder / name).warnings
+        warnings += [f"{name}: {text}" for text in told if text not in plan.warnings]
     inspect = read_counters(folder / "inspect", InspectCounters)
     sfm = read_counters(folder / "sfm", SfmCounters) if "sfm" in ran else None
     refined = read_counters(folder / "refine", RefineCounters) if "refine" in ran else None
@@ -50,6 +51,7 @@ def collect_metrics(
     return Metrics.model_validate(
         {
             "scene": scene,
+            "input": found(plan.facts, frames if decoded and plan.facts.videos else None),
             **{name: getattr(evaluation, name) for name in SceneQuality.model_fields},
             "num_gaussians": read_counters(folder / "train", TrainCounters).num_gaussians,
             "registered_images": sfm.registered if sfm else inspect.given_poses,

@@ -31,6 +31,7 @@ class Metrics(JsonFile, SceneQuality):
 
     schema_version: Literal[1] = Field(1, description="Version of this file's format.")
     scene: str = Field(description="The run's name: a scene, alone or with configuration and seed.")
+    input: str = Field(description="What the scene folder holds, in one line.")
     seed: int | None = Field(description="Of the run.")
     num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
     registered_images: int | None = Field(description="Photographs that have a pose.")

@@ -81,7 +81,8 @@ def _lead(data: ReportData) -> str:
     resolution = protocol.get("resolution")
     sizes = [resolution] if isinstance(resolution, str) else list(resolution or [])
     views = len(data.metrics.get("per_view") or [])
-    parts = [f"Measured on {count(views)} {'view' if views == 1 else 'views'}"]
+    parts = [str(data.metrics["input"])] if data.metrics.get("input") else []
+    parts += [f"Measured on {count(views)} {'view' if views == 1 else 'views'}"]
     if sizes:
         parts.append(str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}")
     if protocol.get("split"):

@@ -1,0 +1,31 @@
+"""One line that says what was found in a scene folder."""
+
+from __future__ import annotations
+
+from pipeline.plan.values import SceneFacts
+
+
+def found(facts: SceneFacts, frames_chosen: int | None = None) -> str:
+    """What was found, in words: "1 video, at most 38 of 412 frames; 12 photographs; poses: none".
+
+    Args:
+        frames_chosen: number of frames of the videos that are used; None before they are chosen.
+    """
+    parts = []
+    if facts.videos:
+        videos = "1 video" if facts.videos == 1 else f"{facts.videos} videos"
+        total = facts.video_frames or "an unknown number of"
+        if frames_chosen is None:
+            parts.append(f"{videos}, at most {facts.max_frames} of {total} frames")
+        else:
+            parts.append(f"{videos}, {frames_chosen} of {total} frames chosen")
+    if facts.photographs or not facts.videos:
+        linear = f" ({facts.linear} RAW or EXR)" if facts.linear else ""
+        parts.append(f"{facts.photographs} photographs{linear}")
+    counts = {"masks": facts.masks, "depth maps": facts.depths, "GPS positions": facts.gps}
+    parts += [f"{name}: {count}" for name, count in counts.items() if count]
+    if facts.ground_control:
+        parts.append("ground control points")
+    poses = facts.given_poses
+    parts.append("poses: none" if poses is None else f"poses: {poses.label}")
+    return "; ".join(parts)

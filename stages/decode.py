@@ -1,5 +1,5 @@
-"""Develop RAW and EXR files with common settings for all photographs of a scene, and choose frames of
-videos.
+"""Develop RAW and EXR files with common settings for all photographs of a scene, and choose frames
+of videos.
 
 Outputs: ``images/``, ``images.json``; with given poses, ``sparse/0`` with the names of the
 developed images; and ``georeference.json`` if the given poses were translated.

@@ -13,7 +13,7 @@ from PIL import Image
 
 from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
-from pipeline.io.splat_files import check_suffix, read_gaussians, write_gaussians
+from pipeline.io.splat_files import check_suffix, is_exported, read_gaussians, write_gaussians
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.plan.posed_scene import posed_scene
@@ -95,7 +95,7 @@ def render(
     Raises:
         UserError: a file that cannot be read, or no view with one of the names.
     """
-    posed = read_cameras(cameras)
+    posed = read_cameras(cameras, exported=is_exported(model))
     views = camera_views(posed, how.max_side)
     if not views:
         raise UserError("expected cameras, found none", file=cameras, fix="use another model")
@@ -147,7 +147,7 @@ def evaluate(
     """
     warnings: list[str] = []
     gaussians = read_gaussians(model, warnings)
-    posed = posed_scene(scene, how.max_side, every)
+    posed = posed_scene(scene, how.max_side, every, exported=is_exported(model))
     changed: dict[str, Any] = {"sh_degree": 3}
     if how.background is not None:
         changed["background"] = how.background

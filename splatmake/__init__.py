@@ -169,8 +169,8 @@ def load(
         UserError: a scene or a file that is missing, unfinished or cannot be read.
     """
     folder = Path(folder)
-    posed = posed_scene(folder, max_side, None)
     file = folder / "train" / "gaussians.npz" if model is None else Path(model)
+    posed = posed_scene(folder, max_side, None, exported=splat_files.is_exported(file))
     if model is None and not file.is_file():
         raise UserError(
             "expected a finished scene (results/NAME), found no train/gaussians.npz",

@@ -15,14 +15,17 @@ from pipeline.config.schema import Config, ExportFormat
 from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
+from pipeline.io.camera_files import read_cameras
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.npz import write_npz
 from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
+from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.surface.outputs import RENDERED_FORMATS
 from stages.export import work
@@ -105,6 +108,56 @@ def test_every_format_the_schema_offers_is_written(scene):
         assert len(model.images) == 9 and len(model.points) == 1
     assert (out / "sparse_text" / "cameras.txt").is_file()
     assert b"element vertex 1\n" in (out / "points.ply").read_bytes()[:100]
+
+
+GIVEN = Normalization(0.001, np.array([4e6, 5e5, 300.0]))
+
+
+@pytest.fixture
+def far_scene(scene: Path) -> Path:
+    """The scene with given poses in millimetres, thousands of kilometres from their origin."""
+    folder = scene / "undistort"
+    model = read_model(folder / "sparse" / "0")
+    georeference = GivenModel(model, GIVEN).georeference()
+    assert georeference is not None
+    georeference.write(folder)
+    return scene
+
+
+def test_cameras_and_points_are_exported_in_the_given_world(far_scene):
+    out, _ = export(far_scene, formats=["colmap", "transforms", "points", "ply"])
+    local = read_model(far_scene / "undistort" / "sparse" / "0")
+    expected = GIVEN.model_to_given(local).by_name()
+    for found in (read_model(out / "sparse" / "0"), read_cameras_without_origin(out)):
+        for image in found.images.values():
+            truth = next(v for k, v in expected.items() if image.name.endswith(k))
+            np.testing.assert_allclose(image.centre, truth.centre, rtol=1e-12)
+    header, body = (out / "points.ply").read_bytes().split(b"end_header\n")
+    assert b"property double x" in header
+    xyz = np.frombuffer(body[:24], "<f8")
+    np.testing.assert_allclose(xyz, GIVEN.to_given(local.points.xyz[0]), rtol=1e-15)
+
+
+def read_cameras_without_origin(out: Path) -> Reconstruction:
+    frames = read_frames(out / "transforms.json")
+    return read_transforms(out / "transforms.json", {frame.path: (180, 120) for frame in frames})
+
+
+def test_gaussians_are_exported_in_the_given_unit_near_the_origin(far_scene):
+    out, _ = export(far_scene, formats=["ply", "colmap"], morton_order=False)
+    trained, found = sample(50), read_gaussians(out / "point_cloud.ply", [])
+    np.testing.assert_allclose(found.means, trained.means * 1000, rtol=1e-6)
+    np.testing.assert_allclose(found.log_scales, trained.log_scales + np.log(1000), atol=1e-6)
+    frame = json.loads((out / "frame.json").read_text())
+    assert frame["unit"] == "that of the given camera poses"
+    assert list(frame["georeference"]["origin"].values()) == GIVEN.origin.tolist()
+    assert "origin" in frame["axes_of"]["sparse/0"]
+    assert "point_cloud.ply" not in frame["axes_of"]
+    # The program's own renderer shows the Gaussians from these cameras.
+    local = read_model(far_scene / "undistort" / "sparse" / "0")
+    for image in read_cameras(out).images.values():
+        centre = local.by_name()[image.name].centre
+        np.testing.assert_allclose(image.centre, centre * 1000, atol=1e-5)
 
 
 def test_rendered_formats_are_written_on_demand(scene):

@@ -14,6 +14,7 @@ from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.json_file import JsonFile
 from pipeline.scene.georeference import GeographicOrigin, Georeference, Residual
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.sfm.georeference import summary
 from pipeline.surface.path import describe_path
@@ -21,7 +22,9 @@ from tests.metrics.test_evaluation import ERROR
 from tests.reporting.made import coverage, evaluation, gaussians, ring
 from tests.reporting.test_page import NO_SURFACE
 
-GIVEN = GivenModel(Reconstruction({}, {}), np.array([1e6, -0.5, 0.1])).georeference()
+GIVEN = GivenModel(
+    Reconstruction({}, {}), Normalization(0.1, np.array([1e6, -0.5, 0.1]))
+).georeference()
 RESIDUALS = tuple(
     Residual(name=f"{i}.jpg", horizontal_m=0.1 * i, vertical_m=-0.2, used=i < 3) for i in range(4)
 )

@@ -46,6 +46,7 @@ from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.progress import track
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
 
@@ -101,19 +102,30 @@ class WorldFrame:
     Attributes:
         up: (3,) unit vector.
         unit: name of the unit of length; None if the scale is arbitrary.
+        normalization: from the world of the given poses, in which results are recorded, to that
+            of the views.
     """
 
     up: Doubles
     unit: str | None
+    normalization: Normalization = IDENTITY
+
+    @property
+    def digits(self) -> int:
+        """Further decimals of recorded lengths, if the given unit is large."""
+        return max(0, round(np.log10(self.normalization.scale)))
 
 
 def world_frame(
     views: Sequence[View], manifest: Manifest, georeference: Georeference | None
 ) -> WorldFrame:
     """The world frame: ``up`` from the orientation of the photographs, ``unit`` from the
-    georeference, None for untranslated given poses."""
-    is_metric = georeference is not None and georeference.is_metric
-    return WorldFrame(scene_up(views, manifest), "m" if is_metric else None)
+    georeference, None for given poses in their own world."""
+    up = scene_up(views, manifest)
+    if georeference is None:
+        return WorldFrame(up, None)
+    unit = "m" if georeference.is_metric else None
+    return WorldFrame(up, unit, georeference.normalization)
 
 
 def measure_coverage(
@@ -181,7 +193,7 @@ def measure_coverage(
             "error": _error_by_trust(tested),
             "floaters": FloaterCoverage(
                 num_gaussians=floaters.count,
-                search_distance=floaters.within,
+                search_distance=floaters.within / world.normalization.scale,
                 by_camera=floaters.cameras,
             ),
             "surroundings": Surroundings(
@@ -336,15 +348,17 @@ def _proposals(
     maps = trust_maps(shown, probes, background_depth, threads)
     found = []
     for i, (proposal, (trust, _)) in enumerate(zip(best.proposals, maps, strict=True)):
-        view = proposal.viewpoint.view
+        view = world.normalization.view_to_given(proposal.viewpoint.view)
+        subject = world.normalization.to_given(np.asarray(proposal.viewpoint.subject))
+        digits = 6 + world.digits
         images = _write_images(out, f"next_{i + 1}", proposal.probe, trust)
         found.append(
             ProposedViewpoint(
                 description=describe(proposal.viewpoint, probes, world.up, world.unit),
-                position=_rounded(view.centre, 6),
+                position=_rounded(view.centre, digits),
                 direction=_rounded(view.world_to_camera[2, :3], 6),
-                look_at=_rounded(proposal.viewpoint.subject, 6),
-                world_to_camera=_rounded(view.world_to_camera, 9),
+                look_at=_rounded(subject, digits),
+                world_to_camera=_rounded(view.world_to_camera, digits + 3),
                 unknown_percent=_rounded(100 * proposal.unknown, 1),
                 gain_percent=_rounded(100 * proposal.gain / missing, 1),
                 render=images.render,

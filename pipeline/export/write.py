@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 from pipeline.config.experiments import ExportExperiments
@@ -19,6 +19,7 @@ from pipeline.io.transforms import write_transforms
 from pipeline.metrics.evaluate import choose_protocol
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
@@ -40,7 +41,7 @@ class ExportScene:
         manifest: the photographs of the views.
         views: all views, at the size of the photographs.
         training_size_views: the same views at the size used in training.
-        georeference: frame of the poses; None for untranslated given poses.
+        georeference: frame of the poses; None for given poses in their own world.
         folder: final folder of the exported files.
     """
 
@@ -51,6 +52,11 @@ class ExportScene:
     training_size_views: list[View]
     georeference: Georeference | None
     folder: Path
+
+    @property
+    def normalization(self) -> Normalization:
+        """From the world of the given poses to the scene's."""
+        return IDENTITY if self.georeference is None else self.georeference.normalization
 
 
 @dataclass
@@ -64,10 +70,31 @@ class ExportReport:
 
 @dataclass(frozen=True)
 class _Files:
+    """What the writers write.
+
+    Attributes:
+        scene: in the unit of the given poses, with the scene's origin, which suits float32.
+        gaussians: those of ``scene``, reduced.
+        model, views: those of ``scene`` in the given world: formats in double precision.
+        antialias: whether the Gaussians were trained with opacity compensation.
+        points: name of the file of points, None without one.
+    """
+
     scene: ExportScene
     gaussians: Gaussians
+    model: Reconstruction
+    views: list[View]
     antialias: bool
     points: str | None
+
+    @property
+    def moved(self) -> bool:
+        """Whether the given world has another origin than the scene's."""
+        return bool(self.scene.normalization.origin.any())
+
+    def write_points(self, path: Path) -> None:
+        points = self.model.points
+        write_points_ply(path, points.xyz, points.rgb, double=self.moved)
 
 
 # Format -> name of the file or folder, and its writer.
@@ -76,17 +103,16 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "spz": ("point_cloud.spz", lambda path, f: write_spz(path, f.gaussians, antialias=f.antialias)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
-    "points": (
-        "points.ply",
-        lambda path, f: write_points_ply(path, f.scene.model.points.xyz, f.scene.model.points.rgb),
-    ),
-    "colmap": ("sparse/0", lambda path, f: write_model(path, f.scene.model)),
-    "colmap_text": ("sparse_text", lambda path, f: write_model(path, f.scene.model, text=True)),
+    "points": ("points.ply", lambda path, f: f.write_points(path)),
+    "colmap": ("sparse/0", lambda path, f: write_model(path, f.model)),
+    "colmap_text": ("sparse_text", lambda path, f: write_model(path, f.model, text=True)),
     "transforms": (
         "transforms.json",
-        lambda path, f: write_transforms(path, f.scene.views, f.scene.folder, points=f.points),
+        lambda path, f: write_transforms(path, f.views, f.scene.folder, points=f.points),
     ),
 }
+# Formats in double precision, whose coordinates are those of the given world.
+_GIVEN_WORLD = ("points", "colmap", "colmap_text", "transforms")
 
 
 def export_scene(
@@ -99,11 +125,16 @@ def export_scene(
     threads: int,
 ) -> ExportReport:
     """Write the configured formats and ``frame.json`` into ``out``."""
+    given = scene.normalization
+    model = given.model_to_given(scene.model)
+    views = [given.view_to_given(view) for view in scene.views]
+    scene = _in_given_unit(scene)
     gaussians = reduce_gaussians(
         scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
     )
     has_points = "points" in config.formats and len(scene.model.points) > 0
-    files = _Files(scene, gaussians, train.antialias, WRITERS["points"][0] if has_points else None)
+    points = WRITERS["points"][0] if has_points else None
+    files = _Files(scene, gaussians, model, views, train.antialias, points)
     written = []
     for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]
@@ -116,6 +147,20 @@ def export_scene(
     if not set(config.formats) <= WRITERS.keys():
         _write_rendered_formats(out, scene, config, train, split, threads, report)
     return report
+
+
+def _in_given_unit(scene: ExportScene) -> ExportScene:
+    unit = scene.normalization.without_origin()
+    if scene.georeference is None or scene.normalization.is_identity:
+        return scene
+    return replace(
+        scene,
+        trained=scene.trained.scaled(1 / unit.scale),
+        model=unit.model_to_given(scene.model),
+        views=[unit.view_to_given(view) for view in scene.views],
+        training_size_views=[unit.view_to_given(view) for view in scene.training_size_views],
+        georeference=scene.georeference.in_given_unit(),
+    )
 
 
 def _warnings(files: _Files, config: Export) -> list[str]:
@@ -145,7 +190,10 @@ def _write_frame(out: Path, files: _Files, written: list[str], train: Train, spl
         background=protocol.background, near=protocol.near, antialias=files.antialias
     )
     up = scene_up(scene.views, scene.manifest)
-    describe_frame(files.gaussians, scene.views, up, render, written, scene.georeference).write(out)
+    given = [WRITERS[name][0] for name in _GIVEN_WORLD] if files.moved else []
+    describe_frame(
+        files.gaussians, scene.views, up, render, written, scene.georeference, given
+    ).write(out)
 
 
 def _write_rendered_formats(

@@ -2,24 +2,34 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Iterable
 from pathlib import Path
 
+from pipeline.io import frame_json
 from pipeline.io.colmap import has_model, read_model
 from pipeline.io.names import PICTURE_SUFFIXES, NameIndex
 from pipeline.io.photofile import read_facts
 from pipeline.io.transforms import Frame, find_transforms, read_frames, read_transforms
 from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import CartesianOrigin, Georeference
+from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
+# Those that have the given poses.
+GIVEN_STAGES = ("refine", "decode", "inspect")
 STAGES_WITH_MODEL = ("train", "undistort", "sfm", "refine", "decode", "inspect")
 
 
-def read_cameras(path: Path) -> Reconstruction:
+def read_cameras(path: Path, *, exported: bool = False) -> Reconstruction:
     """Read cameras; photographs are not needed.
 
+    Cameras of an export folder are returned in the world of the Gaussians there.
+
     Args:
+        exported: for a results' folder, whether the model is an exported file: in the unit of the
+            given poses. Otherwise the cameras are in the world that the scene was trained in.
         path: the folder of a COLMAP model, a scene's or results' folder with a model in
             ``sparse/0``, or a ``transforms.json`` or its folder.
 
@@ -31,16 +41,37 @@ def read_cameras(path: Path) -> Reconstruction:
     for root in roots:
         for folder in (root, root / "sparse" / "0", root / "sparse"):
             if has_model(folder):
-                return read_model(folder)
+                model = read_model(folder)
+                if is_results:
+                    unit = results_normalization(path) if exported else IDENTITY
+                    return unit.without_origin().model_to_given(model)
+                return _exported_origin(folder).model_to_scene(model)
     if path.is_file() or find_transforms(path):
         sizes = {frame.path: _size(frame) for frame in read_frames(path)}
-        return read_transforms(path, sizes)
+        return _exported_origin(path).model_to_scene(read_transforms(path, sizes))
     raise UserError(
         "expected a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) or a "
         "transforms.json, found neither",
         file=path,
         fix="name the folder or file that holds the cameras",
     )
+
+
+def results_normalization(results: Path) -> Normalization:
+    """From the world of the given poses to that of a scene's results."""
+    folder = next((results / name for name in GIVEN_STAGES if (results / name).is_dir()), results)
+    return Georeference.normalization_of(folder)
+
+
+def _exported_origin(path: Path) -> Normalization:
+    """From the world of exported cameras to that of the Gaussians beside them."""
+    for folder in (path, path.parent, path.parent.parent):
+        # Another program's file of this name is none of an export.
+        with contextlib.suppress(UserError, OSError):
+            found = frame_json.Frame.read(folder).georeference
+            if found and found.method == "given" and isinstance(found.origin, CartesianOrigin):
+                return Normalization(1.0, found.origin.array)
+    return IDENTITY
 
 
 def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[View]:

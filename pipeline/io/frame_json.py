@@ -21,7 +21,7 @@ AXES = (
 )
 OTHER_AXES = {
     "point_cloud.glb": "rotated by 180 degrees about z (x and y negated), because glTF is y up",
-    "transforms.json": "the same world; camera axes are OpenGL's (x right, y up, z backward)",
+    "transforms.json": "camera axes are OpenGL's (x right, y up, z backward)",
 }
 
 
@@ -70,7 +70,9 @@ class Frame(JsonFile, JsonObject):
     axes_of: dict[str, str] = Field(description="File to its axes, if they differ from `axes`.")
     up: Vector3 = Field(description="Unit vector, world.")
     unit: str = Field(description="Unit of length.")
-    georeference: FrameGeoreference | None = Field(description="null for untranslated given poses.")
+    georeference: FrameGeoreference | None = Field(
+        description="null for given poses in their own world."
+    )
     cameras: FrameCameras = Field(description="The cameras of all views.")
     gaussians: FrameGaussians = Field(description="The exported Gaussians.")
     colour: str = Field(description="Colour space of the Gaussians.")
@@ -84,6 +86,7 @@ def describe_frame(
     render: RenderSettings,
     files: Sequence[str],
     georeference: Georeference | None = None,
+    given_world: Sequence[str] = (),
 ) -> Frame:
     """The content of ``frame.json``.
 
@@ -91,14 +94,15 @@ def describe_frame(
         views: all views of the scene.
         up: (3,) up direction in the world.
         files: names of the exported files.
-        georeference: None for untranslated given poses.
+        georeference: None for given poses in their own world.
+        given_world: files whose coordinates are those of the given poses' world.
     """
     centres = np.stack([view.centre for view in views])
     x, y, z = (_rounded(value) for value in centres.mean(0))
     world = georeference
     return Frame(
         axes=f"{AXES}; {world.axes}" if world else AXES,
-        axes_of={name: OTHER_AXES[name] for name in files if name in OTHER_AXES},
+        axes_of={name: text for name in files if (text := _axes_of(name, given_world))},
         up=np.round(up, 6).tolist(),
         unit=world.unit if world else GIVEN_UNIT,
         georeference=world
@@ -112,6 +116,13 @@ def describe_frame(
         colour="sRGB: 0.5 + spherical harmonics, blended without conversion to linear",
         render=render,
     )
+
+
+def _axes_of(name: str, given_world: Sequence[str]) -> str:
+    """How a file's coordinates differ from those of the Gaussians; empty if they do not."""
+    moved = "the world of the given poses: `georeference.origin` is added"
+    parts = [moved] if name in given_world else []
+    return "; ".join([*parts, *([OTHER_AXES[name]] if name in OTHER_AXES else [])])
 
 
 def _rounded(value: float) -> float:

@@ -68,6 +68,8 @@ def write_points_ply(
     xyz: NDArray[Any],
     rgb: NDArray[np.uint8],
     normals: NDArray[Any] | None = None,
+    *,
+    double: bool = False,
 ) -> None:
     """Write a coloured point cloud for mesh programs atomically: float32 positions (and normals),
     uchar red, green, blue.
@@ -75,8 +77,9 @@ def write_points_ply(
     Args:
         xyz, rgb: (P, 3).
         normals: (P, 3) or None.
+        double: write float64 positions, for coordinates that do not fit into float32.
     """
-    columns = [("float", "f4", _POSITION, xyz)]
+    columns = [("double", "f8", _POSITION, xyz) if double else ("float", "f4", _POSITION, xyz)]
     if normals is not None:
         columns.append(("float", "f4", _NORMAL, normals))
     columns.append(("uchar", "u1", ("red", "green", "blue"), rgb))

@@ -36,6 +36,12 @@ SUFFIXES = tuple(_READERS)
 _LARGE = 30.0
 
 
+def is_exported(path: Path) -> bool:
+    """Whether a file of Gaussians is in the unit of the given poses, as exports and files of other
+    programs are. The pipeline's own files are in the world that the scene was trained in."""
+    return path.suffix.lower() != ".npz"
+
+
 def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     """Read Gaussians from a file in any supported format, ready for rendering.
 

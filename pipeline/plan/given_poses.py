@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
@@ -18,6 +17,7 @@ from pipeline.io.transforms import read_transforms
 from pipeline.runtime.errors import UserError
 from pipeline.scene.georeference import GIVEN_UNIT, CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 # Relative difference of the aspect ratios of a photograph and its camera; rounding in reduced
@@ -26,58 +26,70 @@ _ASPECT_TOLERANCE = 0.02
 # Gaussians are float32 with 24 bits. A scene farther from the origin than this many times its own
 # size has fewer than 17 bits left: a hundredth of a pixel at a focal length of 1000 pixels.
 _MAX_DISTANCE = 100.0
+# Scenes are scaled by a power of 1000 to a size (median distance of the points, or the cameras,
+# from the mean camera) from this up to 1000 times this. Millimetres, metres and kilometres
+# therefore give the same numbers, and scenes of moderate size are not scaled.
+_MIN_SIZE = 0.1
 # Accepted focal lengths divided by the longer side: fields of view of 175 to 0.06 degrees.
 _FOCAL_RANGE = (0.02, 1000.0)
 
 
 @dataclass(frozen=True)
 class GivenModel:
-    """A scene's given poses and points, near the origin.
+    """A scene's given poses and points, near the origin and of moderate size.
 
     Attributes:
-        model: in the given world translated by ``-origin``.
-        origin: (3,) float64, the new origin in the given world: a rounded position near the
-            cameras if the scene is too far from the given origin for float32, else zeros.
+        model: in the scene's world.
+        normalization: from the given world to the scene's; the identity if the given poses are
+            near their origin and of moderate size.
     """
 
     model: Reconstruction
-    origin: NDArray[np.float64]
+    normalization: Normalization
 
     def georeference(self) -> Georeference | None:
-        """The content of ``georeference.json``; None if the world was not translated."""
-        if not self.origin.any():
+        """The content of ``georeference.json``; None if the scene's world is the given one."""
+        if self.normalization.is_identity:
             return None
-        x, y, z = self.origin.tolist()
+        scale, (x, y, z) = self.normalization.scale, self.normalization.origin.tolist()
         return Georeference(
             method="given",
             axes="those of the given poses",
-            unit=GIVEN_UNIT,
+            unit=GIVEN_UNIT if scale == 1 else f"{1 / scale:g} times {GIVEN_UNIT}",
             origin=CartesianOrigin(x=x, y=y, z=z),
             projection=None,
-            scale=1.0,
+            scale=scale,
             rotation=np.eye(3).tolist(),
-            translation=(-self.origin).tolist(),
+            translation=(-scale * self.normalization.origin).tolist(),
             residuals_m=None,
             residuals=(),
         )
 
     def write(self, folder: Path) -> list[str]:
-        """Write ``sparse/0`` and, if the world was translated, ``georeference.json`` into
-        ``folder``.
+        """Write ``sparse/0`` and, if the scene's world is not the given one,
+        ``georeference.json`` into ``folder``.
 
         Returns:
-            Messages about the translation.
+            Messages about the translation and the scale.
         """
         write_model(folder / "sparse" / "0", self.model)
         georeference = self.georeference()
         if georeference is None:
             return []
         georeference.write(folder)
-        origin = ", ".join(f"{value:.9g}" for value in self.origin)
-        return [
-            "the given poses are too far from their origin for float32: the scene is translated, "
-            f"and its origin is {origin} in the given world (frame.json)"
-        ]
+        messages = []
+        if self.normalization.origin.any():
+            origin = ", ".join(f"{value:.9g}" for value in self.normalization.origin)
+            messages.append(
+                "the given poses are too far from their origin for float32: the scene is "
+                f"translated, and its origin is {origin} in the given world (frame.json)"
+            )
+        if self.normalization.scale != 1:
+            messages.append(
+                f"the scene is computed in a unit of {1 / self.normalization.scale:g} given "
+                "units; exported files are in the given unit"
+            )
+        return messages
 
 
 def load_given(
@@ -119,27 +131,39 @@ def load_given(
         model, _ = read_poses_bounds(path, listed)
     else:
         model = read_model(path)
-    return _near_origin(fit_to_photos(model, by_name, str(path)))
+    fitted = fit_to_photos(model, by_name, str(path))
+    normalization = _normalization(fitted, path)
+    return GivenModel(normalization.model_to_scene(fitted), normalization)
 
 
-def _near_origin(model: Reconstruction) -> GivenModel:
+def _normalization(model: Reconstruction, path: Path) -> Normalization:
+    """The normalization of a model that is far from its origin or in an extreme unit.
+
+    Raises:
+        UserError: positions that overflow.
+    """
     if not model.images:
-        return GivenModel(model, np.zeros(3))
+        return Normalization()
     centres = np.stack([image.centre for image in model.images.values()])
-    mean = centres.mean(0)
     extent = model.points.xyz if len(model.points) else centres
-    size = float(np.median(np.linalg.norm(extent - mean, axis=1)))
-    if size == 0 or np.abs(mean).max() <= _MAX_DISTANCE * size:
-        return GivenModel(model, np.zeros(3))
+    with np.errstate(over="ignore", invalid="ignore"):
+        mean = centres.mean(0)
+        size = float(np.median(np.linalg.norm(extent - mean, axis=1)))
+    if not (np.isfinite(mean).all() and np.isfinite(size)):
+        raise UserError(
+            f"expected camera positions of moderate size, found {np.abs(centres).max():g}",
+            file=path,
+            fix="give the poses in another unit, or set poses: ignore",
+        )
+    # Cameras in one place without points: rounding errors are no size.
+    if size <= 1e-12 * np.abs(mean).max():
+        return Normalization()
     # Rounded, so that it is readable and rarely changes when photographs are added.
     step = 10.0 ** np.ceil(np.log10(size))
-    origin = np.round(mean / step) * step
-    images = {
-        number: replace(image, translation=image.rotation @ (origin - image.centre))
-        for number, image in model.images.items()
-    }
-    points = replace(model.points, xyz=model.points.xyz - origin)
-    return GivenModel(Reconstruction(model.cameras, images, points), origin)
+    far = np.abs(mean).max() > _MAX_DISTANCE * size
+    origin = np.round(mean / step) * step if far else np.zeros(3)
+    thousands = int(np.floor(np.log10(size / _MIN_SIZE) / 3))
+    return Normalization(float(1000.0**-thousands), origin)
 
 
 def fit_to_photos(

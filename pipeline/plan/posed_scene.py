@@ -9,7 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.config.schema import Config, Split, Train, Views
-from pipeline.io.camera_files import STAGES_WITH_MODEL
+from pipeline.io.camera_files import STAGES_WITH_MODEL, results_normalization
 from pipeline.io.colmap import read_model
 from pipeline.plan.given_poses import load_given
 from pipeline.plan.record import read_plan
@@ -19,6 +19,7 @@ from pipeline.runtime.json_file import first_error, mismatch
 from pipeline.runtime.record import STAGE, read_stage
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.normalization import IDENTITY
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
@@ -54,7 +55,9 @@ class _Settings(BaseModel):
     train: Train
 
 
-def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
+def posed_scene(
+    folder: Path, max_long_side: int | None, every: int | None, *, exported: bool = False
+) -> PosedScene:
     """The views to evaluate a model on.
 
     Args:
@@ -64,13 +67,15 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             photographs.
         every: every this-many-th view is a test view, 0: none; None: as in the finished scene,
             else the default.
+        exported: whether the model is an exported file: in the unit of the given poses. Otherwise
+            the views are in the world that the scene was trained in.
 
     Raises:
         UserError: no such scene, an unfinished one, damaged records of a finished one, no poses,
             cameras with lens distortion.
     """
     if any((folder / name).exists() for name in _RESULTS):
-        return _finished(folder, max_long_side, every)
+        return _finished(folder, max_long_side, every, exported)
     side = Views(max_long_side_px=max_long_side or 2**31)
     split = Split() if every is None else Split(test_every=every)
     found = scan(folder, folder.name, Config(views=side), cache=None)
@@ -81,20 +86,24 @@ def posed_scene(folder: Path, max_long_side: int | None, every: int | None) -> P
             file=folder,
             fix="add them, or give a finished scene's results folder",
         )
-    model = load_given(
+    given = load_given(
         folder / found.poses.path,
         found.poses.kind,
         found.photos,
         listed=found.listed,
         base_folder=found.base_folder,
-    ).model
+    )
+    unit = given.normalization.without_origin() if exported else IDENTITY
+    model = unit.model_to_given(given.model)
     _check_pinhole(model, folder)
     views = load_views(found.manifest, model, side, split)
     train = Train(background="white" if found.num_alpha else "black")
     return PosedScene(views, split, train, NO_GAINS, found.warnings)
 
 
-def _finished(folder: Path, max_long_side: int | None, every: int | None) -> PosedScene:
+def _finished(
+    folder: Path, max_long_side: int | None, every: int | None, exported: bool
+) -> PosedScene:
     trained = folder / "train"
     for missing in ("plan.json", f"train/{STAGE}"):
         if not (folder / missing).is_file():
@@ -111,6 +120,8 @@ def _finished(folder: Path, max_long_side: int | None, every: int | None) -> Pos
         split = split.model_copy(update={"test_every": every})
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
     model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"))
+    if exported:
+        model = results_normalization(folder).without_origin().model_to_given(model)
     _check_pinhole(model, folder)
     # Paths of photographs may be relative to the folder in which Snakemake ran.
     root = folder.absolute().parent.parent

@@ -139,7 +139,8 @@ def _above(viewpoints: Sequence[ProposedViewpoint], scene: TrainedScene | None) 
     frame = upright_frame(np.stack([view.world_to_camera[:3, :3] for view in scene.views]))
     plan = frame[[0, 2]]
     cameras = np.stack([view.centre for view in scene.views]) @ plan.T
-    places = np.array([v.position for v in viewpoints]) @ plan.T
+    positions = np.array([v.position for v in viewpoints])
+    places = scene.normalization.to_scene(positions) @ plan.T
     both = np.concatenate([cameras, places])
     low, size = both.min(axis=0), float(np.ptp(both, axis=0).max())
     scale = (_ABOVE - 2 * _MARGIN) / size if size > 0 else 1.0

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
+from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop.curve import CurveRecord
@@ -51,6 +52,8 @@ class TrainedScene:
         views: training and test views.
         orientations: name of a view -> EXIF orientation of its photograph; 1 if there is none.
         background: RGB in [0, 1] behind the Gaussians. antialias, near: as in training.
+        normalization: from the world of the given poses, which positions of proposed viewpoints
+            refer to, to that of the views.
     """
 
     gaussians: Gaussians
@@ -59,6 +62,7 @@ class TrainedScene:
     background: tuple[float, float, float]
     antialias: bool
     near: float
+    normalization: Normalization = IDENTITY
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,7 @@ from pipeline.reporting.data import (
 )
 from pipeline.runtime.json_file import mismatch
 from pipeline.runtime.record import read_run, read_stage
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
@@ -38,7 +39,7 @@ class SceneResults:
 
     Attributes:
         metrics: the content of ``metrics.json`` with the times of the stages.
-        folders: role -> the stage's folder: inspect, train, evaluate and coverage.
+        folders: role -> the stage's folder: inspect, poses, train, evaluate and coverage.
         manifest: photographs of the views.
         model: cameras (refined, if training refines them) and sparse points.
         protocol: of the evaluation. antialias: as in training.
@@ -81,6 +82,7 @@ def report_data(results: SceneResults, evaluation: Evaluation, shown: int) -> Re
             background=results.protocol.background,
             antialias=results.antialias,
             near=results.protocol.near,
+            normalization=Georeference.normalization_of(results.folders["poses"]),
         ),
         coverage=_coverage(results.folders["coverage"]),
         points_xyz=points.xyz,

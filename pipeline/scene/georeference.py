@@ -3,18 +3,22 @@ world, and how well that is known."""
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import ClassVar, Literal
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import Field
 
 from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix3, Vector3
+from pipeline.scene.normalization import IDENTITY, Normalization
 
 GIVEN_UNIT = "that of the given camera poses"
 Method = Literal["gcp", "gps", "level", "given"]
 
 METHODS = (
     "gcp: ground control points; gps: EXIF positions; level: none, levelled by the cameras; given: "
-    "translated given poses."
+    "given poses, translated or scaled."
 )
 
 
@@ -33,6 +37,11 @@ class CartesianOrigin(JsonObject):
     x: float = Field(description="East in a projection.")
     y: float = Field(description="North in a projection.")
     z: float = Field(description="Up in a projection.")
+
+    @property
+    def array(self) -> NDArray[np.float64]:
+        """(3,)."""
+        return np.array([self.x, self.y, self.z])
 
 
 Origin = GeographicOrigin | CartesianOrigin
@@ -94,6 +103,27 @@ class Georeference(JsonFile, GeoreferenceSummary):
     def is_metric(self) -> bool:
         """Whether the unit is the metre."""
         return self.method in ("gcp", "gps")
+
+    @property
+    def normalization(self) -> Normalization:
+        """From the given world to the scene's; the identity unless ``method`` is "given"."""
+        if self.method != "given" or not isinstance(self.origin, CartesianOrigin):
+            return IDENTITY
+        return Normalization(self.scale, self.origin.array)
+
+    def in_given_unit(self) -> Georeference | None:
+        """Of exported Gaussians: the given poses' unit, the scene's origin. None if that is the
+        given world."""
+        origin = self.normalization.origin
+        if not origin.any():
+            return None
+        update = {"unit": GIVEN_UNIT, "scale": 1.0, "translation": tuple((-origin).tolist())}
+        return self.model_copy(update=update)
+
+    @classmethod
+    def normalization_of(cls, folder: Path) -> Normalization:
+        """``normalization`` of the file in ``folder``; the identity without a file."""
+        return cls.read(folder).normalization if (folder / cls.file_name).is_file() else IDENTITY
 
     def summary(self) -> GeoreferenceSummary:
         return GeoreferenceSummary(

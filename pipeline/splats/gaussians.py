@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import numpy as np
 import torch
@@ -36,6 +37,15 @@ class Gaussians:
 
     def __len__(self) -> int:
         return len(self.means)
+
+    def scaled(self, factor: float) -> Gaussians:
+        """The same Gaussians in a world whose coordinates are ``factor`` times as large; the
+        tensors that do not change are shared."""
+        if factor == 1:
+            return self
+        means = (self.means.double() * factor).float()
+        log_scales = (self.log_scales.double() + math.log(factor)).float()
+        return replace(self, means=means, log_scales=log_scales)
 
     @property
     def sh_degree(self) -> int:

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from pipeline.io.camera_files import read_cameras
-from pipeline.io.splat_files import read_gaussians
+from pipeline.io.splat_files import is_exported, read_gaussians
 from pipeline.render.views import near_plane
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import camera_views, scene_extent
@@ -50,7 +50,8 @@ class Source:
             raise UserError(
                 "a file of Gaussians contains no cameras", file=path, fix="give --cameras"
             )
-        self.views = camera_views(read_cameras(cameras or path), None)
+        exported = path.is_file() and is_exported(path)
+        self.views = camera_views(read_cameras(cameras or path, exported=exported), None)
         self.near = near_plane(scene_extent(self.views))
         self.shown = self._read(None)
 

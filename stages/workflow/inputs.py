@@ -11,6 +11,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
@@ -42,6 +43,11 @@ def georeference(job: Job) -> Georeference | None:
     """The frame of the poses, None if their stage has none."""
     folder = job.inputs["poses"]
     return Georeference.read(folder) if (folder / Georeference.file_name).is_file() else None
+
+
+def normalization(job: Job) -> Normalization:
+    """From the world of the given poses to the scene's; the identity for estimated poses."""
+    return Georeference.normalization_of(job.inputs["poses"])
 
 
 def copy_georeference(job: Job, role: str) -> None:

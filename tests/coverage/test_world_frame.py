@@ -10,11 +10,14 @@ from pipeline.geometry.similarity import Similarity
 from pipeline.plan.given_poses import GivenModel
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 from pipeline.sfm.georeference import WorldFrame
 
-MOVED = GivenModel(Reconstruction({}, {}), np.array([1e5, 0.0, 0.0])).georeference()
+MOVED = GivenModel(
+    Reconstruction({}, {}), Normalization(1.0, np.array([1e5, 0.0, 0.0]))
+).georeference()
 LEVEL, GPS = (
     WorldFrame(method, Similarity(1.0, np.eye(3), np.zeros(3))).georeference()
     for method in ("level", "gps")

@@ -17,6 +17,7 @@ from pipeline.plan.given_poses import GivenModel, load_given
 from pipeline.plan.scan import Scan, scan
 from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
+from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from tests.io.test_llff import llff_row
 from tests.io.test_transforms import frame, write
@@ -258,16 +259,47 @@ def test_poses_far_from_the_origin_are_translated(tmp_path, away, moved):
     points = dataclasses.replace(near.points, xyz=near.points.xyz + shift)
     write_model(folder, Reconstruction(near.cameras, images, points))
     given = given_model(look(tmp_path))
-    assert bool(given.origin.any()) == moved == (given.georeference() is not None)
+    origin = given.normalization.origin
+    assert bool(origin.any()) == moved == (given.georeference() is not None)
     for i, image in given.model.images.items():
         local = image.rotation @ given.model.points.xyz[0] + image.translation
         np.testing.assert_allclose(local, near.images[i].translation, atol=1e-15 * away + 1e-12)
     if moved:
         assert np.abs(given.model.points.xyz).max() < 10
-        assert (given.origin == np.round(given.origin)).all()
-        back = given.model.points.xyz[0] + given.origin
+        assert (origin == np.round(origin)).all()
+        back = given.model.points.xyz[0] + origin
         np.testing.assert_allclose(back, shift, rtol=1e-12)
-        assert [*given.georeference().origin.model_dump().values()] == given.origin.tolist()
+        assert [*given.georeference().origin.model_dump().values()] == origin.tolist()
+
+
+@pytest.mark.parametrize(
+    ("unit", "scale"), [(1.0, 1.0), (20.0, 1.0), (1e3, 1e-3), (1e-3, 1e3), (1e-6, 1e6), (1e9, 1e-9)]
+)
+def test_poses_in_an_extreme_unit_are_scaled_by_a_power_of_1000(tmp_path, unit, scale):
+    """Millimetres give the same numbers as metres; poses of moderate size keep their bits."""
+    files = photos(tmp_path / "images", 4)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    metres = read_model(folder)
+    there = Normalization(1 / unit)
+    write_model(folder, there.model_to_given(metres))
+    given = given_model(look(tmp_path))
+    assert given.normalization.scale == pytest.approx(scale, rel=1e-15)
+    assert (given.georeference() is None) == (scale == 1)
+    for i, image in given.model.images.items():
+        expected = metres.images[i].translation * unit * scale
+        np.testing.assert_allclose(image.translation, expected, rtol=1e-14)
+        if unit == 1:
+            assert (image.translation == metres.images[i].translation).all()
+
+
+def test_positions_that_overflow_are_a_user_error(tmp_path):
+    files = photos(tmp_path / "images", 3)
+    folder = tmp_path / "sparse" / "0"
+    write_sparse(folder, [path.name for path in files], (64, 48))
+    write_model(folder, Normalization(1e-200).model_to_given(read_model(folder)))
+    with pytest.raises(UserError, match="moderate size"):
+        given_model(look(tmp_path))
 
 
 @pytest.mark.parametrize(("focal", "ok"), [(1.0, False), (2.0, True), (6e4, True), (1e9, False)])

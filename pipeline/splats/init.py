@@ -26,6 +26,9 @@ SH_C0 = 0.28209479177387814
 NEIGHBOURS = 3
 # Number of neighbours, with the point itself, that determine the surface normal.
 NORMAL_NEIGHBOURS = 12
+# Axes of Gaussians point into the half space of this direction. No plane that contains simple
+# directions is orthogonal to it.
+SIGN_DIRECTION = np.array([1.0, 0.7548, 0.5698])
 # Range of the standard deviation as seen from the nearest camera, radians: from a tenth of a pixel
 # (at a focal length of 1000) to half a view. A lower maximum leaves holes between sparse points; a
 # higher one lets outliers cover the scene.
@@ -216,6 +219,8 @@ def _normal_rotations(
     neighbours (N, k), so that a Gaussian on a surface flattens along an axis."""
     centred = xyz[neighbours] - xyz[neighbours].mean(1, keepdims=True)
     axes = np.linalg.eigh(np.einsum("nki,nkj->nij", centred, centred))[1]
+    # An eigenvector's sign is arbitrary, and rounding would decide it.
+    axes *= np.where(np.einsum("nij,i->nj", axes, SIGN_DIRECTION) < 0, -1.0, 1.0)[:, None, :]
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return rotation_to_quat(axes)
 

@@ -169,3 +169,14 @@ def test_random_gaussians_of_forward_facing_cameras_are_in_front_of_them() -> No
     result = gaussians_random(views, 0, 1, InitExperiments(num_random=300))
     assert_valid(result)
     assert (result.means[:, 2] > 0).all()
+
+
+def test_rounding_turns_no_gaussian():
+    """The signs of normals do not depend on the last bits, so that a scene in another unit starts
+    with the same Gaussians."""
+    rng = np.random.default_rng(0)
+    sheets = [rng.uniform(-1, 1, (200, 2)) for _ in range(3)]
+    xyz = np.concatenate([np.insert(sheet, k, 0.3 * k, axis=1) for k, sheet in enumerate(sheets)])
+    first = gaussians_from_points(points_at(xyz), CENTRES, Init(), 0)
+    there = gaussians_from_points(points_at(xyz * 1000 * 0.001), CENTRES, Init(), 0)
+    np.testing.assert_allclose(there.quats, first.quats, atol=1e-6)

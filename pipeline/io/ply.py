@@ -9,13 +9,13 @@ reorder properties, so they are read by name.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.ply_header import PlyHeader, read_header, wrong
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
@@ -26,21 +26,6 @@ _SCALE = tuple(f"scale_{i}" for i in range(3))
 _ROTATION = tuple(f"rot_{i}" for i in range(4))
 _DC = tuple(f"f_dc_{i}" for i in range(3))
 _REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
-
-_TYPES = {
-    **dict.fromkeys(("char", "int8"), "i1"),
-    **dict.fromkeys(("uchar", "uint8"), "u1"),
-    **dict.fromkeys(("short", "int16"), "i2"),
-    **dict.fromkeys(("ushort", "uint16"), "u2"),
-    **dict.fromkeys(("int", "int32"), "i4"),
-    **dict.fromkeys(("uint", "uint32"), "u4"),
-    **dict.fromkeys(("float", "float32"), "f4"),
-    **dict.fromkeys(("double", "float64"), "f8"),
-}
-_BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
-# Bytes. Headers have fewer than a hundred lines; a longer one belongs to another kind of file.
-_MAX_HEADER = 1 << 16
-_FIX = "write the file again, or get an intact copy of it"
 
 
 def write_splat_ply(path: Path, gaussians: Gaussians) -> None:
@@ -112,7 +97,7 @@ def read_splat_ply(path: Path) -> Gaussians:
     """
     try:
         with open(path, "rb") as file:
-            header = _read_header(file, path)
+            header = read_header(file, path)
             rest = sorted(n for n in header.fields if n.startswith("f_rest_"))
             missing = [name for name in _REQUIRED if name not in header.fields]
             bands = len(rest) // 3 + 1
@@ -121,9 +106,9 @@ def read_splat_ply(path: Path) -> Gaussians:
                     n for n in (f"f_rest_{i}" for i in range(len(rest))) if n not in header.fields
                 ]
             if missing:
-                raise _wrong(path, f"expected the properties of Gaussians, found no {missing[0]}")
+                raise wrong(path, f"expected the properties of Gaussians, found no {missing[0]}")
             if len(rest) not in (0, 9, 24, 45):
-                raise _wrong(path, f"expected 0, 9, 24 or 45 f_rest properties, found {len(rest)}")
+                raise wrong(path, f"expected 0, 9, 24 or 45 f_rest properties, found {len(rest)}")
             table = _read_body(file, header, path)
     except OSError as error:
         raise UserError(
@@ -151,66 +136,7 @@ def read_splat_ply(path: Path) -> Gaussians:
     )
 
 
-@dataclass(frozen=True)
-class _Header:
-    """The header of a PLY file whose first element is ``vertex``.
-
-    Attributes:
-        count: number of vertices.
-        fields: property name -> numpy type code.
-        byte_order: "<", ">", or "" for ASCII.
-        more: whether other elements follow.
-    """
-
-    count: int
-    fields: dict[str, str]
-    byte_order: str
-    more: bool
-
-
-def _wrong(path: Path, what: str) -> UserError:
-    return UserError(what, file=path, fix=_FIX)
-
-
-def _read_header(file: BinaryIO, path: Path) -> _Header:
-    lines: list[list[str]] = []
-    size = 0
-    while not lines or lines[-1] != ["end_header"]:
-        line = file.readline(_MAX_HEADER)
-        size += len(line)
-        if not lines and line.rstrip() != b"ply":
-            raise _wrong(path, f"expected a PLY file, found one that begins with {line[:16]!r}")
-        if not line.endswith(b"\n") or size > _MAX_HEADER:
-            raise _wrong(path, "expected a PLY header, found no end of it (end_header)")
-        lines.append(line.decode("ascii", "replace").split())
-    byte_order = None
-    elements: list[tuple[str, str]] = []
-    fields: dict[str, str] = {}
-    for words in lines[1:-1]:
-        match words:
-            case [] | ["comment" | "obj_info", *_]:
-                pass
-            case ["format", kind, "1.0"] if kind in _BYTE_ORDERS:
-                byte_order = _BYTE_ORDERS[kind]
-            case ["element", name, count]:
-                elements.append((name, count))
-            case ["property", kind, name] if kind in _TYPES and elements:
-                if len(elements) == 1:
-                    if name in fields:
-                        raise _wrong(path, f"expected each property once, found {name} twice")
-                    fields[name] = _TYPES[kind]
-            case ["property", "list", _, _, _] if len(elements) > 1:
-                pass
-            case _:
-                raise _wrong(path, f"expected a PLY header line, found {' '.join(words)[:80]!r}")
-    if byte_order is None:
-        raise _wrong(path, "expected a format line in the PLY header, found none")
-    if not elements or elements[0][0] != "vertex" or not elements[0][1].isdecimal():
-        raise _wrong(path, "expected 'element vertex COUNT' as the first element, found none")
-    return _Header(int(elements[0][1]), fields, byte_order, len(elements) > 1)
-
-
-def _read_body(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray[Any]]:
+def _read_body(file: BinaryIO, header: PlyHeader, path: Path) -> dict[str, NDArray[Any]]:
     """(count,) values of each property."""
     if not header.byte_order:
         return _read_ascii(file, header, path)
@@ -218,7 +144,7 @@ def _read_body(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray
     start = file.tell()
     found, expected = file.seek(0, 2) - start, header.count * dtype.itemsize
     if found < expected or (found > expected and not header.more):
-        raise _wrong(
+        raise wrong(
             path,
             f"expected {expected} bytes of {header.count} Gaussians after the header, "
             f"found {found}",
@@ -228,13 +154,13 @@ def _read_body(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray
     return {name: table[name] for name in header.fields}
 
 
-def _read_ascii(file: BinaryIO, header: _Header, path: Path) -> dict[str, NDArray[Any]]:
+def _read_ascii(file: BinaryIO, header: PlyHeader, path: Path) -> dict[str, NDArray[Any]]:
     rows = file.read().splitlines()
     if len(rows) < header.count or (len(rows) > header.count and not header.more):
-        raise _wrong(path, f"expected {header.count} lines of Gaussians, found {len(rows)}")
+        raise wrong(path, f"expected {header.count} lines of Gaussians, found {len(rows)}")
     try:
         values = np.array([row.split() for row in rows[: header.count]], np.float64)
         values = values.reshape(header.count, len(header.fields))
     except ValueError:
-        raise _wrong(path, f"expected {len(header.fields)} numbers in each line") from None
+        raise wrong(path, f"expected {len(header.fields)} numbers in each line") from None
     return dict(zip(header.fields, values.T, strict=True))

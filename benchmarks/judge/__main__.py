@@ -21,8 +21,8 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import JudgeResult
 from pipeline.config.schema import Sfm
 from pipeline.io.colmap import read_model
+from pipeline.runtime.isolate import run_isolated
 from pipeline.sfm.attempts import Attempt, map_until_good
-from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap

@@ -13,10 +13,10 @@ from pipeline.io.posefiles import truth_folder
 from pipeline.plan.scan import scan
 from pipeline.plan.settle import settle
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.record import read_stage
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.features import extract_features
-from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.mappers import Mapper
 
 Look = Literal["as_it_is", "bare", "blurred"]

@@ -26,9 +26,9 @@ from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
-from pipeline.sfm.isolate import run_isolated
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,9 @@ from pipeline.config.schema import Config
 from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.isolate import run_isolated
 
 
 def run_once(scene: Scene, configuration: Configuration | None, threads: int) -> Run:

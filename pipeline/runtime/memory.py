@@ -2,6 +2,7 @@
 
 import resource
 import sys
+from pathlib import Path
 
 
 def peak_memory_mb() -> float:
@@ -9,3 +10,14 @@ def peak_memory_mb() -> float:
     usages = [resource.getrusage(kind) for kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes on macOS, KiB on Linux
     return max(usage.ru_maxrss for usage in usages) / unit
+
+
+def limit_address_space(size: int) -> None:
+    """Let allocations beyond ``size`` bytes more than now fail in this process (Linux)."""
+    statm = Path("/proc/self/statm")
+    if not statm.exists():
+        return
+    used = int(statm.read_text().split()[0]) * resource.getpagesize()
+    hard = resource.getrlimit(resource.RLIMIT_AS)[1]
+    wanted = used + size if hard == resource.RLIM_INFINITY else min(used + size, hard)
+    resource.setrlimit(resource.RLIMIT_AS, (wanted, hard))

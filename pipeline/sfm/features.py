@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import schema
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.counters import FeaturesCounters
-from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
 # Part of the cache key: increase it when a change of the code changes keypoints.

@@ -12,8 +12,8 @@ import numpy as np
 from pipeline.config import schema
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.keypoints import keypoint_file
 
 

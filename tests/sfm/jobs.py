@@ -1,5 +1,5 @@
 """Functions that tests run in separate processes: pycolmap is incompatible with torch (see
-``pipeline.sfm.isolate``)."""
+``pipeline.runtime.isolate``)."""
 
 from __future__ import annotations
 
@@ -113,6 +113,6 @@ def sleep_long(started: Path) -> None:
 
 
 def wait_for_sleeper(started: Path) -> None:
-    from pipeline.sfm.isolate import run_isolated
+    from pipeline.runtime.isolate import run_isolated
 
     run_isolated(sleep_long, started)

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.sfm.isolate import run_isolated
 from tests.sfm import corner
 from tests.sfm.test_georeference import geodetic
 

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from pipeline.sfm.isolate import run_isolated
+from pipeline.runtime.isolate import run_isolated
 
 # Fast cases; all of them: python -m benchmarks.judge.
 GOOD = ("three_views", "prior_x3.0", "duplicates")

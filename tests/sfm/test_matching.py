@@ -21,11 +21,11 @@ from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import upstream
 from pipeline.plan.scan import scan
 from pipeline.runtime import processor, targets
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
 from pipeline.sfm import nearest as near
 from pipeline.sfm.features import extract_features
-from pipeline.sfm.isolate import run_isolated
 from stages.workflow.registry import STAGES
 from tests.plans import make_plan
 from tests.sfm import corner, jobs

@@ -13,8 +13,8 @@ from pipeline.config import schema
 from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.sfm.features import extract_features
-from pipeline.sfm.isolate import run_isolated
 from pipeline.sfm.judge import judge
 from pipeline.sfm.triangulation import triangulate
 from tests.counters import GOOD

@@ -13,8 +13,8 @@ from pipeline.config.schema import Sfm
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
+from pipeline.runtime.isolate import run_isolated
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
-from pipeline.sfm.isolate import run_isolated
 from tests.sfm import corner
 from tests.sfm.jobs import digests
 

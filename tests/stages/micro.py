@@ -1,6 +1,7 @@
 """Runs stages in this process on scenes of a few tiny photographs.
 
-Must not import torch: pycolmap's stages run in a process of their own (``pipeline.sfm.isolate``).
+Must not import torch: pycolmap's stages run in a process of their own
+(``pipeline.runtime.isolate``).
 """
 
 from __future__ import annotations

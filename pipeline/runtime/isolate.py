@@ -1,7 +1,8 @@
 """Run a function in a separate process.
 
 pycolmap crashes in a process that has loaded torch, or that imports cv2 after pycolmap (both bundle
-libpng and zlib). Functions that use incompatible libraries run in separate processes.
+libpng and zlib). Functions that use incompatible libraries run in separate processes, and so do
+native readers that crash on damaged files.
 """
 
 from __future__ import annotations
@@ -23,6 +24,10 @@ from pipeline.runtime.errors import UserError
 T = TypeVar("T")
 
 
+class ProcessDied(RuntimeError):
+    """The process of a function ended without a result: a crash of native code."""
+
+
 def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
     """Call ``function(*args, **kwargs)`` in a new (spawned) process and return its value.
 
@@ -32,8 +37,8 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
 
     Raises:
         UserError: raised by the function.
-        RuntimeError: the function raised another exception (the message has its traceback), or the
-            process died.
+        RuntimeError: the function raised another exception; the message has its traceback.
+        ProcessDied: the process died.
     """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
@@ -49,7 +54,7 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
         status, value = receiver.recv()
     except EOFError:
         process.join()
-        raise RuntimeError(f"{function.__qualname__} {_death(process.exitcode)}") from None
+        raise ProcessDied(f"{function.__qualname__} {_death(process.exitcode)}") from None
     finally:
         if sys.exc_info()[0] is KeyboardInterrupt:
             process.terminate()

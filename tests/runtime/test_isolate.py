@@ -9,7 +9,7 @@ import time
 import pytest
 
 from pipeline.runtime.errors import UserError
-from pipeline.sfm.isolate import run_isolated
+from pipeline.runtime.isolate import run_isolated
 from tests.sfm import jobs
 
 

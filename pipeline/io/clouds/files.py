@@ -1,0 +1,116 @@
+"""Reading point clouds of any supported format; the suffix decides."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.io.clouds.e57_points import read_e57
+from pipeline.io.clouds.las_points import count_las, read_las
+from pipeline.io.clouds.ply_points import count_ply, read_ply
+from pipeline.io.clouds.sampling import VoxelSampler, thinned
+from pipeline.io.clouds.text_points import read_text
+from pipeline.io.clouds.values import Chunks, PointCloud, damaged
+from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import ProcessDied, run_isolated
+from pipeline.runtime.memory import limit_address_space
+
+_READERS: dict[str, Callable[[Path], Chunks]] = {
+    ".ply": read_ply,
+    ".las": read_las,
+    ".laz": read_las,
+    ".e57": read_e57,
+    ".xyz": read_text,
+    ".csv": read_text,
+    ".pts": read_text,
+}
+CLOUD_SUFFIXES = tuple(_READERS)
+# Native readers crash on damaged files, and allocate what headers claim.
+_NATIVE = (".las", ".laz", ".e57")
+_NATIVE_BYTES = 6 << 30
+# Points that are kept of all files together: 27 bytes each.
+MAX_POINTS = 1_000_000
+
+
+def is_cloud(name: str) -> bool:
+    """Whether a file has the suffix of a point cloud."""
+    return Path(name).suffix.lower() in _READERS
+
+
+def count_points(path: Path) -> int | None:
+    """Number of points according to the file's header; None if the format has no such number.
+
+    Raises:
+        UserError: a damaged header.
+    """
+    suffix = path.suffix.lower()
+    try:
+        if suffix == ".ply":
+            return count_ply(path)
+        return count_las(path) if suffix in (".las", ".laz") else None
+    except OSError as error:
+        raise damaged(path, f"cannot be read: {error.strerror}") from None
+
+
+def read_clouds(paths: Sequence[Path], limit: int = MAX_POINTS) -> PointCloud:
+    """The points of some files, at most ``limit`` of them, one a voxel.
+
+    Memory is proportional to ``limit``, not to the files.
+
+    Raises:
+        UserError: a file that is damaged or has no point, or pye57 is needed and missing.
+    """
+    clouds = [_read(path, limit) for path in paths]
+    xyz = np.concatenate([cloud.xyz for cloud in clouds])
+    kept = thinned(xyz, limit)
+    return PointCloud(
+        xyz[kept],
+        np.concatenate([cloud.rgb for cloud in clouds])[kept],
+        np.concatenate([cloud.coloured for cloud in clouds])[kept],
+        sum(cloud.num_read for cloud in clouds),
+        sum(cloud.num_invalid for cloud in clouds),
+    )
+
+
+def _read(path: Path, limit: int) -> PointCloud:
+    if path.suffix.lower() not in _NATIVE:
+        return _sampled(path, limit)
+    try:
+        return run_isolated(_sampled_natively, path, limit)
+    except ProcessDied:
+        raise damaged(path, "its reader crashed: the file is damaged") from None
+
+
+def _sampled_natively(path: Path, limit: int) -> PointCloud:
+    limit_address_space(_NATIVE_BYTES)
+    return _sampled(path, limit)
+
+
+def _sampled(path: Path, limit: int) -> PointCloud:
+    sampler = VoxelSampler(limit)
+    try:
+        for chunk in _READERS[path.suffix.lower()](path):
+            sampler.add(chunk)
+    except OSError as error:
+        raise damaged(path, f"cannot be read: {error.strerror or error}") from None
+    except MemoryError:
+        raise damaged(path, "needs more memory than such a file should: it is damaged") from None
+    cloud = sampler.result()
+    if not len(cloud):
+        what = f"expected points, found none with finite coordinates (of {cloud.num_read})"
+        raise damaged(path, what)
+    return cloud
+
+
+def check_suffix(path: Path) -> None:
+    """Raise a ``UserError`` unless the file has the suffix of a point cloud."""
+    if not is_cloud(path.name):
+        raise UserError(
+            f"expected a point cloud ({', '.join(CLOUD_SUFFIXES)}), found the suffix "
+            f"{os.path.splitext(path.name)[1]!r}",
+            file=path,
+            fix="convert it, or set init.points_file: none",
+        )

@@ -1,0 +1,70 @@
+"""Points of LAS and LAZ files (ASPRS LAS 1.0 to 1.4), by laspy and lazrs.
+
+Headers are read here: importing laspy takes long, and its reader trusts the number of points.
+"""
+
+from __future__ import annotations
+
+import struct
+from pathlib import Path
+
+import numpy as np
+
+from pipeline.io.clouds.values import CHUNK_POINTS, Chunk, Chunks, damaged, stacked
+
+# Compression to a fraction of a byte a point happens in artificial files only.
+_MAX_POINTS_PER_BYTE = 4
+# Reading more takes hours.
+_MAX_POINTS = 20_000_000_000
+# Offsets in the public header block of LAS 1.4.
+_VERSION, _DATA_OFFSET, _FORMAT, _RECORD, _LEGACY_COUNT, _COUNT = 24, 96, 104, 105, 107, 247
+_HEADER = 375
+
+
+def count_las(path: Path) -> int:
+    """Number of points according to the header.
+
+    Raises:
+        UserError: not a LAS or LAZ file, or more points than the file can hold.
+    """
+    with open(path, "rb") as file:
+        header = file.read(_HEADER)
+        size = file.seek(0, 2)
+    if header[:4] != b"LASF" or len(header) < 227:
+        begin = header[:4]
+        raise damaged(path, f"expected a LAS or LAZ file, found one that begins with {begin!r}")
+    (offset,) = struct.unpack_from("<I", header, _DATA_OFFSET)
+    (record,) = struct.unpack_from("<H", header, _RECORD)
+    (count,) = struct.unpack_from("<I", header, _LEGACY_COUNT)
+    if header[_VERSION] == 1 and header[_VERSION + 1] >= 4 and len(header) >= _COUNT + 8:
+        (count,) = struct.unpack_from("<Q", header, _COUNT)
+    body = max(0, size - offset)
+    compressed = bool(header[_FORMAT] & 0x80)
+    room = body * _MAX_POINTS_PER_BYTE if compressed else body // max(record, 1)
+    if count > min(room, _MAX_POINTS):
+        what = f"expected at most {min(room, _MAX_POINTS)} points in a file of this size"
+        raise damaged(path, f"{what}, found {count} in its header")
+    return int(count)
+
+
+def read_las(path: Path) -> Chunks:
+    """The points of a LAS or LAZ file; runs native code that may crash on damaged files.
+
+    Raises:
+        UserError: a damaged file.
+    """
+    import laspy
+
+    count_las(path)
+    try:
+        with laspy.open(path) as reader:
+            for points in reader.chunk_iterator(CHUNK_POINTS):
+                xyz = stacked([points.x, points.y, points.z], np.float64)
+                if "red" not in set(points.point_format.dimension_names):
+                    yield Chunk(xyz)
+                    continue
+                colour = stacked([points.red, points.green, points.blue], np.float32)
+                # 16 bits by the standard; files with 8 bits are common.
+                yield Chunk(xyz, colour)
+    except (laspy.LaspyException, ValueError, OverflowError, EOFError, RuntimeError) as error:
+        raise damaged(path, f"the points cannot be read: {str(error)[:200]}") from None

@@ -1,4 +1,5 @@
-"""The initial Gaussians, from sparse points or random. Output: ``gaussians.npz``."""
+"""The initial Gaussians, from the scene's point cloud, from sparse points or random. Output:
+``gaussians.npz``."""
 
 from __future__ import annotations
 
@@ -6,6 +7,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Features, Init, Matches
+from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION, PointCloudFiles
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -13,6 +15,7 @@ from pipeline.splats.counters import InitCounters
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
+    from pipeline.io.posefiles import GivenPoses
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
 
@@ -24,6 +27,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     if config.method == "random":
         count = settled.config.experiments.init.num_random
         return StagePlan(run=True, reason=f"{count} random Gaussians")
+    if scan.cloud is not None:
+        return _from_cloud(scan.cloud, scan.poses, config.max_points)
     if scan.poses is None:
         return StagePlan(run=True, reason="Gaussians from the sparse points of sfm")
     if count := scan.poses.num_points:
@@ -33,17 +38,36 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     return StagePlan(run=True, reason=reason, decisions=[pairs])
 
 
+def _from_cloud(cloud: PointCloudFiles, poses: GivenPoses | None, max_points: int) -> StagePlan:
+    reason = f"Gaussians from {cloud.text}, subsampled to at most {max_points:,} that a view sees"
+    frame = IN_PROJECTION if poses is None else IN_POSES
+    decisions = [f"the point cloud is taken to be in {frame} (init.points_file: none ignores it)"]
+    if poses is None or poses.num_points:
+        decisions.append("sparse points are still used for depths and exposures")
+    return StagePlan(run=True, reason=reason, decisions=decisions)
+
+
 def work(job: Job) -> None:
     from pipeline.io.arrays import write_arrays
+    from pipeline.io.clouds.stored import read_cloud
     from pipeline.io.colmap import read_model
+    from pipeline.photos.cloud import NOT_PLACED, placed_points
     from pipeline.sfm.triangulation import triangulate
     from pipeline.splats.first import first_gaussians
 
     config, experiments = job.section(Init), job.section(Experiments)
     training = inputs.training_views(job)
     points = inputs.input_model(job).points
-    extra = {}
-    if config.method != "random" and len(points) == 0:
+    extra, source = {}, "points"
+    cloud = read_cloud(job.inputs["inspect"]) if config.method != "random" else None
+    placed = None
+    if cloud is not None:
+        placed = placed_points(cloud, inputs.georeference(job), training, config)
+        if placed is None:
+            job.warn(NOT_PLACED)
+    if placed is not None:
+        points, source = placed, "the point cloud"
+    elif config.method != "random" and len(points) == 0:
         job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
         report = triangulate(
@@ -59,7 +83,7 @@ def work(job: Job) -> None:
         job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
         extra = {"triangulated_points": len(points)}
-    first = first_gaussians(points, training, config, experiments.init, job.seed)
+    first = first_gaussians(points, training, config, experiments.init, job.seed, source)
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
 
@@ -69,7 +93,12 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=InitCounters,
-    inputs={"views": inputs.VIEWS, "model": inputs.MODEL},
+    inputs={
+        "views": inputs.VIEWS,
+        "model": inputs.MODEL,
+        "poses": inputs.POSES,
+        "inspect": ("inspect",),
+    },
     options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,

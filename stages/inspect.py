@@ -1,7 +1,8 @@
 """Check that all photographs and videos can be decoded, and read the given poses.
 
 Outputs: ``images.json`` (the manifest); where the scene has them ``sparse/0`` (given poses),
-``truth`` and ``gcp_list.txt``; ``georeference.json`` if the given poses were translated.
+``truth`` and ``gcp_list.txt``; ``georeference.json`` if the given poses were translated or scaled;
+``cloud.npz``, a subsample of the scene's point cloud.
 """
 
 from __future__ import annotations
@@ -29,10 +30,12 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.io.clouds.stored import write_cloud
     from pipeline.io.colmap import read_model, write_model
     from pipeline.io.gcp import GCP_FILE, read_ground_control
     from pipeline.photos.verify import verify_manifest
     from pipeline.plan.given_poses import load_given
+    from pipeline.plan.point_cloud import read_point_cloud
     from pipeline.plan.scan import scan
 
     config = read_section(Config, job.key["config"])
@@ -47,15 +50,20 @@ def work(job: Job) -> None:
     )
     job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
-    count, given_counts = len(manifest.photos), {}
+    count, given_counts, normalization = len(manifest.photos), {}, None
     videos = len(manifest.videos) if found.videos else None
     if (poses := found.poses) is not None:
         given = load_given(
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
         job.add_messages(given.write(job.out), [])
-        model = given.model
+        model, normalization = given.model, given.normalization
         given_counts = {"given_poses": len(model.images), "given_points": len(model.points)}
+    if found.cloud is not None:
+        cloud = read_point_cloud(folder, found.cloud, found.poses, normalization)
+        write_cloud(job.out, cloud)
+        given_counts |= {"cloud_points": cloud.num_read}
+        job.add_messages([f"{found.cloud.path}: {cloud.text}"], [])
     job.counters = InspectCounters(
         photos=count, left_out=len(found.listed) - count, videos=videos, **given_counts
     )
@@ -77,6 +85,6 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=InspectCounters,
-    options=("poses", "inspect", "views.masks"),
+    options=("poses", "inspect", "views.masks", "init.points_file", "sfm.georeference"),
     facts=facts,
 )

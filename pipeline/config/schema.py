@@ -206,6 +206,13 @@ class Init(Section):
         description="More sparse points are thinned to this number, or to half of "
         "train.density.max_gaussians, to leave room for densification.",
     )
+    points_file: str = Field(
+        "auto",
+        description="Point cloud that the Gaussians are initialised from, relative to the scene "
+        "folder: a file (.ply, .las, .laz, .e57, .xyz, .csv, .pts) or a folder of them, in the "
+        "frame and unit of the given poses. auto: points.* or points/, else the ply_file_path of "
+        "transforms.json; none: the sparse points.",
+    )
 
 
 class DensityControl(Section):

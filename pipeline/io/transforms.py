@@ -110,6 +110,36 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     return Reconstruction(by_id, images)
 
 
+@dataclass(frozen=True)
+class PointsEntry:
+    """The point cloud that a pose file names.
+
+    Attributes:
+        path: relative to the folder of the json; None if it names none.
+        to_world: (4, 4) similarity from the coordinates of the file's matrices, and of its points,
+            to those of ``read_frames``.
+    """
+
+    path: str | None
+    to_world: NDArray[np.float64]
+
+
+def read_points_entry(path: Path) -> PointsEntry:
+    """The point cloud of a pose file, or of the files in a scene folder.
+
+    Raises:
+        UserError: as ``read_frames``.
+    """
+    frames = read_frames(path)
+    if not frames:
+        return PointsEntry(None, np.eye(4))
+    fields, file = frames[0].fields, frames[0].file
+    name = fields.get("ply_file_path")
+    named = _relative(file, name) if isinstance(name, str) and name else None
+    to_world = np.linalg.inv(_applied_transform(file, fields))
+    return PointsEntry(named, to_world.astype(np.float64))
+
+
 def write_transforms(
     path: Path, views: Sequence[View], folder: Path, *, points: str | None = None
 ) -> None:

@@ -25,6 +25,9 @@ class InspectCounters(StageCounters):
     given_points: int | None = Field(
         None, ge=0, description="Number of given sparse points; absent without given poses."
     )
+    cloud_points: int | None = Field(
+        None, ge=0, description="Number of points in the point cloud; absent without one."
+    )
 
 
 class DecodeCounters(StageCounters):

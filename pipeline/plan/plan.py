@@ -113,6 +113,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         depths=scan.num_depths,
         gps=scan.num_gps,
         ground_control=scan.ground_control is not None,
+        point_cloud=scan.cloud,
         gps_extent_m=round(gps_extent_m(scan), 1),
         focal_priors=scan.num_focal,
         turned_by_exif=sum(photo.orientation != 1 for photo in photos),

@@ -30,6 +30,7 @@ from pipeline.io.posefiles import (
 )
 from pipeline.io.recorded import digest_of
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
+from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
 from pipeline.runtime.errors import UserError
@@ -54,9 +55,11 @@ class Scan(BaseModel):
         poses: None without given poses, or if they are ignored (``poses: ignore``).
         ordered: the reason to treat the photographs as a sequence, or None.
         ground_control: the scene's ``gcp_list.txt``, if any.
+        cloud: the point cloud that the Gaussians are initialised from, or None.
         truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
         fingerprint: digest of the names and contents of photographs, videos, masks, depth maps,
-            pose files and ground control points; independent of times and of the folder's location.
+            pose files, ground control points and point cloud; independent of times and of the
+            folder's location.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -70,6 +73,7 @@ class Scan(BaseModel):
     poses: GivenPoses | None
     ordered: str | None
     ground_control: Path | None
+    cloud: PointCloudFiles | None
     truth: Path | None
     truth_digest: str | None
     fingerprint: str
@@ -148,13 +152,15 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     Args:
         folder: the scene folder: photographs or videos, and optionally poses, masks, depth maps.
         scene: the scene's name.
-        config: of which ``inspect``, ``views``, ``features`` and ``poses`` are used.
+        config: of which ``inspect``, ``views``, ``features``, ``poses``,
+            ``init.points_file`` and ``sfm.georeference`` are used.
         cache: JSON file that caches facts about files; None for no cache. A file that cannot be
             written is no error.
 
     Raises:
         UserError: no such folder, too few photographs, malformed pose files, poses of other
-            photographs, masks of another size than their photographs.
+            photographs, masks of another size than their photographs, a point cloud that cannot be
+            used.
     """
     _check_folder(folder)
     facts_cache = FactCache(cache)
@@ -200,9 +206,10 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         )
         for name in sorted(facts)
     ]
-    manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
     truth = truth_folder(folder)
     control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
+    cloud = find_point_cloud(folder, config, poses, control is not None, facts_cache, warnings)
+    manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
     result = Scan(
         folder=folder,
         manifest=manifest,
@@ -213,6 +220,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         poses=poses,
         ordered=why_ordered(photos, len(videos)),
         ground_control=control,
+        cloud=cloud,
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
         fingerprint=_fingerprint(
@@ -221,6 +229,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
             [*sorted(chosen.names), *listed_videos],
             poses,
             control,
+            [folder / file for file in cloud.files] if cloud else [],
             facts_cache,
         ),
     )
@@ -406,6 +415,7 @@ def _fingerprint(
     listed: Sequence[str],
     poses: GivenPoses | None,
     control: Path | None,
+    clouds: Sequence[Path],
     cache: FactCache,
 ) -> str:
     photos = manifest.photos
@@ -415,6 +425,7 @@ def _fingerprint(
         others += pose_files(folder / poses.path)
     if control is not None:
         others.append(control)
+    others += clouds
     lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in files]
     # Unreadable files are included by name, because warnings mention them.
     lines += [*listed, _digest_files(folder, others, cache)]

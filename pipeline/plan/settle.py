@@ -77,6 +77,7 @@ def settle(scan: Scan, config: Config) -> Settled:
             "init": {
                 "method": "points" if config.init.method == "auto" else config.init.method,
                 "max_points": min(config.init.max_points, max(1, budget // 2)),
+                "points_file": scan.cloud.path if scan.cloud else "none",
             },
             "train": {
                 "background": value["train.background"],

@@ -6,6 +6,7 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
+from pipeline.plan.point_cloud import PointCloudFiles
 
 
 class StagePlan(BaseModel):
@@ -40,6 +41,10 @@ class SceneFacts(BaseModel):
     depths: int = Field(description="Number of photographs with a depth map.")
     gps: int = Field(description="Number of photographs with a GPS position.")
     ground_control: bool = Field(description="Whether the scene has a `gcp_list.txt`.")
+    point_cloud: PointCloudFiles | None = Field(
+        None,
+        description="The point cloud that the Gaussians are initialised from; null without one.",
+    )
     gps_extent_m: float = Field(
         description="Diagonal of the GPS positions' bounding box, metres; 0 without positions."
     )
@@ -69,7 +74,7 @@ class SceneFacts(BaseModel):
     truth_digest: str | None = Field(description="Digest of the ground truth poses.")
     fingerprint: str = Field(
         description="Digest of the names and contents of photographs, videos, masks, depth maps, "
-        "pose files and ground control points."
+        "pose files, ground control points and point cloud."
     )
 
 

@@ -111,6 +111,14 @@ class Georeference(JsonFile, GeoreferenceSummary):
             return IDENTITY
         return Normalization(self.scale, self.origin.array)
 
+    @property
+    def projected_origin(self) -> NDArray[np.float64] | None:
+        """(3,) the frame's origin in the projection of the ground control points; None for other
+        frames."""
+        if self.method != "gcp" or not isinstance(self.origin, CartesianOrigin):
+            return None
+        return self.origin.array
+
     def in_given_unit(self) -> Georeference | None:
         """Of exported Gaussians: the given poses' unit, the scene's origin. None if that is the
         given world."""

@@ -11,7 +11,9 @@ class InitCounters(StageCounters):
     """Counters of the init stage."""
 
     num_gaussians: int = Field(ge=0, description="Number of initial Gaussians.")
-    points: int = Field(ge=0, description="Number of sparse points.")
+    points: int = Field(
+        ge=0, description="Number of sparse points, or points of the point cloud in a view."
+    )
     dropped: int = Field(
         ge=0,
         description="Number of points left out because they are not finite, too near or too far.",

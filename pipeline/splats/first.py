@@ -34,6 +34,7 @@ def first_gaussians(
     config: Init,
     experiments: InitExperiments,
     seed: int,
+    source: str = "points",
 ) -> FirstGaussians:
     """Initialise Gaussians from the sparse ``points``, or at random if ``config.method`` is
     "random" or there are fewer than ``MIN_POINTS``.
@@ -41,6 +42,7 @@ def first_gaussians(
     Args:
         training: the training views, for random initialisation and the scale of the scene.
         seed: of random initialisation.
+        source: what ``points`` are, for messages.
     """
     method, warnings = config.method, []
     if method != "random" and len(points) < MIN_POINTS:
@@ -51,7 +53,7 @@ def first_gaussians(
     else:
         centres = np.array([view.centre for view in training])
         first = gaussians_from_points(points, centres, config, 0, experiments)
-    source = "random positions" if method == "random" else "points"
+    source = "random positions" if method == "random" else source
     counters = InitCounters(
         num_gaussians=len(first),
         points=len(points),

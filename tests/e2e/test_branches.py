@@ -6,9 +6,11 @@ import json
 import shutil
 
 import cv2
+import numpy as np
 import pytest
 
-from pipeline.io.colmap import read_model
+from pipeline.io.colmap import read_model, write_model
+from pipeline.scene.normalization import Normalization
 from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
 from tests.once import made_once
 from tests.videos import write_video
@@ -65,6 +67,26 @@ def test_the_plan_runs_what_the_scene_needs(project, masked, scene, options, exp
     assert found["registered_images"] == found["total_images"]
     assert found["psnr"] > 18
     assert found["pose_error"]["rotation_median_deg"] < 0.3
+
+
+def test_a_cloud_and_poses_in_millimetres_far_away_become_a_scene(project, masked):
+    """Gaussians start from the cloud, and exported cameras are where the given ones are."""
+    folder = project / "data" / "far"
+    shutil.copytree(masked, folder)
+    there = Normalization(1e-3, np.array([1e9, -1e9, 1e9]))
+    given = there.model_to_given(read_model(folder / "sparse" / "0"))
+    write_model(folder / "sparse" / "0", given)
+    rows = np.column_stack([given.points.xyz, given.points.rgb])
+    np.savetxt(folder / "points.xyz", rows, fmt="%.4f %.4f %.4f %d %d %d")
+    done = snakemake(project, "results/far/metrics.json", config=TINY | {"poses": "keep"})
+    assert "0 MB" not in done.stdout
+    results = project / "results" / "far"
+    reason = json.loads((results / "plan.json").read_text())["stages"]["init"]["reason"]
+    assert reason.startswith("Gaussians from") and "points.xyz" in reason
+    assert json.loads((results / "metrics.json").read_text())["psnr"] > 18
+    found = read_model(results / "export" / "sparse" / "0").by_name()
+    for image in given.images.values():
+        np.testing.assert_allclose(found[image.name].centre, image.centre, rtol=1e-9)
 
 
 def test_frames_of_a_video_become_a_scene(project, masked):

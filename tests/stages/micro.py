@@ -20,6 +20,7 @@ import cv2
 
 from pipeline.config.schema import Config
 from pipeline.demo.write import DemoSpec, write_demo
+from pipeline.io.colmap import read_model
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import upstream
 from pipeline.plan.scan import scan
@@ -49,6 +50,9 @@ def write_scenes(folder: Path) -> None:
     shutil.copytree(photos / "images", folder / "copies")
     first = min((folder / "copies").iterdir())
     shutil.copyfile(first, first.with_stem("zz"))
+    # On the surfaces, but not the model's points.
+    xyz = read_model(photos / "sparse" / "0").points.xyz
+    (photos / "scan.csv").write_text("".join(f"{x},{y},{z}\n" for x, y, z in xyz[::2].tolist()))
     views = [cv2.imread(str(path)) for path in sorted((photos / "images").iterdir())]
     write_video(folder / "video" / "clip.avi", views)
 

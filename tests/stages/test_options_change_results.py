@@ -94,6 +94,7 @@ FLIPS = {
     "undistort.jpeg_quality": Flip(50, POSED),
     "init.method": Flip("random", POSED),
     "init.max_points": Flip(100, POSED),
+    "init.points_file": Flip("scan.csv", POSED),
     "experiments.init.opacity": Flip(0.2, POSED),
     "experiments.init.num_random": Flip(400, RANDOM),
     "train.steps": Flip(41, POSED),

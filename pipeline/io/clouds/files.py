@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
 
@@ -14,7 +13,6 @@ from pipeline.io.clouds.ply_points import count_ply, read_ply
 from pipeline.io.clouds.sampling import VoxelSampler, thinned
 from pipeline.io.clouds.text_points import read_text
 from pipeline.io.clouds.values import Chunks, PointCloud, damaged
-from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import ProcessDied, run_isolated
 from pipeline.runtime.memory import limit_address_space
 
@@ -103,14 +101,3 @@ def _sampled(path: Path, limit: int) -> PointCloud:
         what = f"expected points, found none with finite coordinates (of {cloud.num_read})"
         raise damaged(path, what)
     return cloud
-
-
-def check_suffix(path: Path) -> None:
-    """Raise a ``UserError`` unless the file has the suffix of a point cloud."""
-    if not is_cloud(path.name):
-        raise UserError(
-            f"expected a point cloud ({', '.join(CLOUD_SUFFIXES)}), found the suffix "
-            f"{os.path.splitext(path.name)[1]!r}",
-            file=path,
-            fix="convert it, or set init.points_file: none",
-        )

@@ -54,6 +54,13 @@ class PointCloud:
     def __len__(self) -> int:
         return len(self.xyz)
 
+    @property
+    def text(self) -> str:
+        """How many points were read and kept."""
+        invalid = f" ({self.num_invalid:,} are not finite)" if self.num_invalid else ""
+        kept = f", one a voxel: {len(self):,}" if len(self) < self.num_read else ""
+        return f"{self.num_read:,} points read{invalid}{kept}"
+
 
 def damaged(path: Path, what: str) -> UserError:
     """The error for a file that is not a point cloud of its format."""

@@ -1,0 +1,135 @@
+"""Point clouds of other programs as sparse points: those that the views see, with colours."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.config.schema import Init
+from pipeline.io.clouds.sampling import thinned
+from pipeline.io.clouds.values import PointCloud
+from pipeline.photos.load import load_view
+from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION
+from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import Georeference
+from pipeline.scene.reconstruction import Points
+from pipeline.scene.views import View
+
+# A cloud with fewer points in the views is somewhere else.
+MIN_POINTS = 100
+# Views that points without colour are compared with.
+_COLOUR_VIEWS = 60
+# Occlusion: side of the cells of a coarse depth map in pixels, and the share by which a visible
+# point may be behind the nearest one in its cell.
+_CELL, _BEHIND = 8, 1.05
+_GREY = 128
+
+
+NOT_PLACED = (
+    "the point cloud is not used: the estimated poses could not be georeferenced by ground control "
+    "points in a projection; Gaussians are initialised from the sparse points"
+)
+
+
+def placed_points(
+    cloud: PointCloud, georeference: Georeference | None, views: Sequence[View], config: Init
+) -> Points | None:
+    """The points of a cloud that views see, in the scene's world; None if the cloud cannot be
+    placed there.
+
+    Args:
+        cloud: in the scene's world, if poses are given, else in the projection of the ground
+            control points.
+        georeference: of the poses; None for given poses in their own world.
+
+    Raises:
+        UserError: the views see too few points: the cloud is in another frame.
+    """
+    xyz, frame = cloud.xyz, IN_POSES
+    if georeference is not None and georeference.method != "given":
+        origin = georeference.projected_origin
+        if origin is None:
+            return None
+        xyz, frame = xyz - origin, IN_PROJECTION
+    points = points_of_cloud(cloud, xyz, views, config.max_points)
+    if len(points) < min(MIN_POINTS, config.max_points):
+        raise UserError(
+            f"expected a point cloud in {frame}, found {len(points)} of its points in the views",
+            file=config.points_file,
+            fix="transform the cloud to that frame and unit, or set init.points_file: none",
+        )
+    return points
+
+
+def points_of_cloud(
+    cloud: PointCloud, xyz: NDArray[np.float64], views: Sequence[View], max_points: int
+) -> Points:
+    """At most ``max_points`` points of a cloud that are in the frustum of a view, one a voxel.
+
+    Points without a colour get that of the nearest view that sees them, else grey.
+
+    Args:
+        xyz: (N, 3) the cloud's points in the world of the views.
+    """
+    seen = np.flatnonzero(_in_frustums(xyz, views))
+    chosen = seen[thinned(xyz[seen], max_points)]
+    xyz, rgb = xyz[chosen], cloud.rgb[chosen].copy()
+    missing = ~cloud.coloured[chosen]
+    if missing.any():
+        rgb[missing] = _colours(xyz, views)[missing]
+    count = len(xyz)
+    return Points(
+        xyz,
+        rgb,
+        np.full(count, -1.0),
+        np.zeros(count + 1, np.int64),
+        np.zeros(0, np.int64),
+        np.zeros((0, 2)),
+    )
+
+
+def _in_frustums(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.bool_]:
+    """(N,) whether a view's image contains the point, be it occluded or not."""
+    seen = np.zeros(len(xyz), bool)
+    for view in views:
+        rest = np.flatnonzero(~seen)
+        seen[rest] = _projected(xyz[rest], view)[2]
+    return seen
+
+
+def _projected(
+    xyz: NDArray[np.float64], view: View
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
+    """Pixels (N, 2), camera z (N,), and whether the point is in the image (N,)."""
+    local = xyz @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
+    z = local[:, 2]
+    front = z > 0
+    safe = np.where(front, z, 1.0)
+    with np.errstate(over="ignore"):
+        uv = local[:, :2] / safe[:, None] * (view.fx, view.fy) + (view.cx, view.cy)
+    inside = front & ((uv >= 0) & (uv < (view.width, view.height))).all(1)
+    return uv, z, inside
+
+
+def _colours(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.uint8]:
+    """(N, 3) colours from the photographs: of the nearest view in which a point is not hidden."""
+    rgb = np.full((len(xyz), 3), _GREY, np.uint8)
+    nearest = np.full(len(xyz), np.inf)
+    count = min(len(views), _COLOUR_VIEWS)
+    for i in np.linspace(0, len(views) - 1, count).round().astype(int):
+        view = views[i]
+        uv, z, inside = _projected(xyz, view)
+        rows = np.flatnonzero(inside & (z < nearest))
+        column, row = uv[rows].astype(np.intp).T
+        # Nearer points hide others, also those that another view has coloured.
+        every = np.flatnonzero(inside)
+        depth = np.full((view.height // _CELL + 1, view.width // _CELL + 1), np.inf)
+        cells = (uv[every] // _CELL).astype(np.intp)
+        np.minimum.at(depth, (cells[:, 1], cells[:, 0]), z[every])
+        visible = z[rows] < _BEHIND * depth[row // _CELL, column // _CELL]
+        rows, row, column = rows[visible], row[visible], column[visible]
+        rgb[rows] = load_view(view).rgb[row, column]
+        nearest[rows] = z[rows]
+    return rgb

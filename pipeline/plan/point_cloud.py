@@ -1,0 +1,197 @@
+"""The scene's point cloud, which the Gaussians are initialised from instead of sparse points."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from functools import partial
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel, ConfigDict, Field
+
+from pipeline.config.schema import Config
+from pipeline.io.clouds.files import CLOUD_SUFFIXES, count_points, is_cloud, read_clouds
+from pipeline.io.clouds.values import PointCloud
+from pipeline.io.fact_cache import FactCache
+from pipeline.io.posefiles import GivenPoses
+from pipeline.io.transforms import read_points_entry
+from pipeline.runtime.errors import UserError
+from pipeline.scene.normalization import Normalization
+
+_STEM = "points"
+_NONE = "set init.points_file: none"
+IN_POSES = "the frame and unit of the given poses"
+IN_PROJECTION = "the projection of gcp_list.txt"
+
+
+class PointCloudFiles(BaseModel):
+    """The files of a scene's point cloud."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    path: str = Field(description="File or folder, relative to the scene folder.")
+    files: tuple[str, ...] = Field(description="The files, relative to the scene folder.")
+    points: int | None = Field(
+        description="Number of points according to the headers; null where a file has no such "
+        "number."
+    )
+    megabytes: float = Field(description="Size of the files, MB.")
+
+    @property
+    def text(self) -> str:
+        """Number of points and name."""
+        what = f"{self.megabytes:g} MB of" if self.points is None else f"{self.points:,} points of"
+        many = f" ({len(self.files)} files)" if len(self.files) > 1 else ""
+        return f"{what} {self.path}{many}"
+
+
+def find_point_cloud(
+    folder: Path,
+    config: Config,
+    poses: GivenPoses | None,
+    has_control: bool,
+    cache: FactCache,
+    warnings: list[str],
+) -> PointCloudFiles | None:
+    """The scene's point cloud according to ``init.points_file``.
+
+    Args:
+        config: of which ``init.points_file`` and ``sfm.georeference`` are used.
+        has_control: whether the scene has ground control points.
+        warnings: a warning is added for a cloud that cannot be used.
+
+    Raises:
+        UserError: several clouds; a configured one that does not exist or cannot be placed; a
+            damaged header.
+    """
+    wanted = config.init.points_file
+    if wanted == "none":
+        return None
+    path = (
+        _found(folder, poses, cache, warnings) if wanted == "auto" else _configured(folder, wanted)
+    )
+    if path is None:
+        return None
+    placed = has_control and config.sfm.georeference in ("auto", "gcp")
+    if poses is None and not placed:
+        what = (
+            "the point cloud cannot be placed: poses are estimated in a frame of their own, "
+            "without ground control points"
+        )
+        fix = f"give poses in the frame of the cloud, or gcp_list.txt in its projection, or {_NONE}"
+        if wanted != "auto":
+            raise UserError(what, file=folder / path, fix=fix)
+        warnings.append(f"{path} is not used: {what}; {fix}")
+        return None
+    files = _files(folder, path)
+    counts = [
+        cache.get(folder / file, "points", partial(count_points, folder / file)) for file in files
+    ]
+    size = sum((folder / file).stat().st_size for file in files)
+    known = None if None in counts else sum(counts)
+    return PointCloudFiles(
+        path=path, files=files, points=known, megabytes=float(f"{size / 1e6:.3g}")
+    )
+
+
+def read_point_cloud(
+    folder: Path,
+    cloud: PointCloudFiles,
+    poses: GivenPoses | None,
+    normalization: Normalization | None,
+) -> PointCloud:
+    """A subsample of the cloud in the scene's world, if poses are given; else as stored.
+
+    Args:
+        normalization: of the given poses; None without given poses.
+
+    Raises:
+        UserError: see ``read_clouds``.
+    """
+    read = read_clouds([folder / file for file in cloud.files])
+    if poses is None or normalization is None:
+        return read
+    xyz = read.xyz
+    if poses.kind == "transforms":
+        xyz = _transformed(xyz, read_points_entry(folder / poses.path).to_world)
+    return replace(read, xyz=normalization.to_scene(xyz))
+
+
+def _transformed(xyz: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    if (matrix == np.eye(4)).all():
+        return xyz
+    return np.asarray(xyz @ matrix[:3, :3].T + matrix[:3, 3])
+
+
+def _found(
+    folder: Path, poses: GivenPoses | None, cache: FactCache, warnings: list[str]
+) -> str | None:
+    """``points.*`` or ``points/``, else the cloud that the pose file names."""
+    found = sorted(
+        entry.name
+        for entry in folder.iterdir()
+        if (entry.is_file() and is_cloud(entry.name) and entry.stem.casefold() == _STEM)
+        or (entry.is_dir() and entry.name == _STEM and _files(folder, entry.name))
+    )
+    if len(found) > 1:
+        raise UserError(
+            f"expected one point cloud, found {len(found)}: {', '.join(found[:5])}",
+            file=folder,
+            fix=f"remove the others, or set init.points_file: {found[0]}",
+        )
+    if found or poses is None or poses.kind != "transforms":
+        return found[0] if found else None
+    return _named(folder, poses, cache, warnings)
+
+
+def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str]) -> str | None:
+    """``ply_file_path`` of transforms.json; a warning if there is no such file in the scene."""
+    source = folder / poses.path
+    if source.is_dir():  # Splits of a synthetic scene, whose files name no cloud.
+        return None
+    name = cache.get(source, "ply_file_path", lambda: read_points_entry(source).path)
+    if name is None:
+        return None
+    if not _is_inside(name) or not is_cloud(name) or not (folder / name).is_file():
+        warnings.append(
+            f"{poses.path}: its ply_file_path is not used: expected a point cloud in the scene "
+            f"folder, found {name[:80]}"
+        )
+        return None
+    return str(name)
+
+
+def _configured(folder: Path, wanted: str) -> str:
+    path = folder / wanted
+    if not _is_inside(wanted) or not path.exists():
+        raise UserError(
+            f"init.points_file: expected a file or folder in the scene folder, found {wanted!r}",
+            file=folder,
+            fix=f"put the point cloud into the scene folder, or {_NONE}",
+        )
+    if not _files(folder, wanted):
+        raise UserError(
+            f"init.points_file: expected a point cloud ({', '.join(CLOUD_SUFFIXES)})",
+            file=path,
+            fix=f"convert it, or {_NONE}",
+        )
+    return PurePosixPath(wanted).as_posix()
+
+
+def _is_inside(name: str) -> bool:
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
+def _files(folder: Path, path: str) -> tuple[str, ...]:
+    """The point clouds at ``path``, a file or a folder, relative to the scene folder."""
+    if (folder / path).is_file():
+        return (path,) if is_cloud(path) else ()
+    names: Sequence[str] = sorted(
+        entry.name
+        for entry in (folder / path).iterdir()
+        if entry.is_file() and entry.name[0] != "." and is_cloud(entry.name)
+    )
+    return tuple(f"{path}/{name}" for name in names)

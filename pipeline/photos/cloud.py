@@ -19,8 +19,8 @@ from pipeline.scene.views import View
 
 # A cloud with fewer points in the views is somewhere else.
 MIN_POINTS = 100
-# Views that points without colour are compared with.
-_COLOUR_VIEWS = 60
+# Views that points without colour are compared with, and views that decide the size of voxels.
+_COLOUR_VIEWS, _RESOLUTION_VIEWS = 60, 30
 # Occlusion: side of the cells of a coarse depth map in pixels, and the share by which a visible
 # point may be behind the nearest one in its cell.
 _CELL, _BEHIND = 8, 1.05
@@ -66,7 +66,8 @@ def placed_points(
 def points_of_cloud(
     cloud: PointCloud, xyz: NDArray[np.float64], views: Sequence[View], max_points: int
 ) -> Points:
-    """At most ``max_points`` points of a cloud that are in the frustum of a view, one a voxel.
+    """At most ``max_points`` points of a cloud that are in the frustum of a view, one a voxel;
+    voxels are smaller where views see more detail.
 
     Points without a colour get that of the nearest view that sees them, else grey.
 
@@ -74,7 +75,7 @@ def points_of_cloud(
         xyz: (N, 3) the cloud's points in the world of the views.
     """
     seen = np.flatnonzero(_in_frustums(xyz, views))
-    chosen = seen[thinned(xyz[seen], max_points)]
+    chosen = seen[thinned(xyz[seen], max_points, 1 / _resolution(xyz[seen], views))]
     xyz, rgb = xyz[chosen], cloud.rgb[chosen].copy()
     missing = ~cloud.coloured[chosen]
     if missing.any():
@@ -99,6 +100,24 @@ def _in_frustums(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.
     return seen
 
 
+def _resolution(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.float64]:
+    """(N,) pixels of the views per unit of length at each point: the root of the sum of squares
+    over a sample of the views, occlusion ignored. Voxels in inverse proportion to it have about
+    equally many pixels each."""
+    total = np.zeros(len(xyz))
+    for view in _evenly(views, _RESOLUTION_VIEWS):
+        _, z, inside = _projected(xyz, view)
+        total[inside] += view.fx * view.fy / z[inside] ** 2
+    known = total[total > 0]
+    least = float(known.min()) if len(known) else 1.0
+    return np.sqrt(np.where(total > 0, total, least))
+
+
+def _evenly(views: Sequence[View], count: int) -> list[View]:
+    chosen = np.linspace(0, len(views) - 1, min(len(views), count)).round().astype(int)
+    return [views[i] for i in chosen]
+
+
 def _projected(
     xyz: NDArray[np.float64], view: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
@@ -117,9 +136,7 @@ def _colours(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.uint
     """(N, 3) colours from the photographs: of the nearest view in which a point is not hidden."""
     rgb = np.full((len(xyz), 3), _GREY, np.uint8)
     nearest = np.full(len(xyz), np.inf)
-    count = min(len(views), _COLOUR_VIEWS)
-    for i in np.linspace(0, len(views) - 1, count).round().astype(int):
-        view = views[i]
+    for view in _evenly(views, _COLOUR_VIEWS):
         uv, z, inside = _projected(xyz, view)
         rows = np.flatnonzero(inside & (z < nearest))
         column, row = uv[rows].astype(np.intp).T

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import struct
+import sys
 import time
 from pathlib import Path
 
@@ -11,6 +12,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.io.clouds.e57_points import read_e57
 from pipeline.io.clouds.files import count_points, read_clouds
 from pipeline.io.clouds.text_points import MAX_LINE
 from pipeline.runtime.errors import UserError
@@ -197,3 +199,9 @@ def test_a_damaged_body_does_not_end_the_program(tmp_path, suffix):
         except UserError:
             continue
         assert np.isfinite(cloud.xyz).all()
+
+
+def test_the_message_names_the_missing_package(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "pye57", None)
+    with pytest.raises(UserError, match="pip install pye57"):
+        next(read_e57(tmp_path / "p.e57"))

@@ -57,6 +57,18 @@ def test_thinning_comes_near_the_limit():
         assert 0.8 * limit < len(thinned(xyz, limit)) <= limit
 
 
+def test_voxels_may_differ_in_size():
+    """On a surface, the number of voxels goes with the inverse square of their side."""
+    xyz = np.random.default_rng(0).uniform(0, 1, (100_000, 3)) * (1, 1, 0)
+    right = xyz[:, 0] > 0.5
+    kept = thinned(xyz, 2000, np.where(right, 1.0, 4.0))
+    assert len(kept) <= 2000
+    share = right[kept].mean()
+    assert 0.9 < share < 0.97
+    extreme = np.exp(np.random.default_rng(0).normal(0, 100, len(xyz)))
+    assert 0 < len(thinned(xyz, 2000, extreme)) <= 2000
+
+
 def test_points_in_one_place_are_one():
     assert len(sampled(np.full((100, 3), 7.5), 10, [100])) == 1
     assert len(thinned(np.full((100, 3), 7.5), 10)) >= 1

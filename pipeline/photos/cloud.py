@@ -16,14 +16,12 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
+from pipeline.scene.visibility import projected, visible
 
 # A cloud with fewer points in the views is somewhere else.
 MIN_POINTS = 100
 # Views that points without colour are compared with, and views that decide the size of voxels.
 _COLOUR_VIEWS, _RESOLUTION_VIEWS = 60, 30
-# Occlusion: side of the cells of a coarse depth map in pixels, and the share by which a visible
-# point may be behind the nearest one in its cell.
-_CELL, _BEHIND = 8, 1.05
 _GREY = 128
 
 
@@ -96,7 +94,7 @@ def _in_frustums(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.
     seen = np.zeros(len(xyz), bool)
     for view in views:
         rest = np.flatnonzero(~seen)
-        seen[rest] = _projected(xyz[rest], view)[2]
+        seen[rest] = projected(xyz[rest], view).inside
     return seen
 
 
@@ -106,7 +104,7 @@ def _resolution(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.f
     equally many pixels each."""
     total = np.zeros(len(xyz))
     for view in _evenly(views, _RESOLUTION_VIEWS):
-        _, z, inside = _projected(xyz, view)
+        _, z, inside = projected(xyz, view)
         total[inside] += view.fx * view.fy / z[inside] ** 2
     known = total[total > 0]
     least = float(known.min()) if len(known) else 1.0
@@ -118,35 +116,15 @@ def _evenly(views: Sequence[View], count: int) -> list[View]:
     return [views[i] for i in chosen]
 
 
-def _projected(
-    xyz: NDArray[np.float64], view: View
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_]]:
-    """Pixels (N, 2), camera z (N,), and whether the point is in the image (N,)."""
-    local = xyz @ view.world_to_camera[:3, :3].T + view.world_to_camera[:3, 3]
-    z = local[:, 2]
-    front = z > 0
-    safe = np.where(front, z, 1.0)
-    with np.errstate(over="ignore"):
-        uv = local[:, :2] / safe[:, None] * (view.fx, view.fy) + (view.cx, view.cy)
-    inside = front & ((uv >= 0) & (uv < (view.width, view.height))).all(1)
-    return uv, z, inside
-
-
 def _colours(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.uint8]:
     """(N, 3) colours from the photographs: of the nearest view in which a point is not hidden."""
     rgb = np.full((len(xyz), 3), _GREY, np.uint8)
     nearest = np.full(len(xyz), np.inf)
     for view in _evenly(views, _COLOUR_VIEWS):
-        uv, z, inside = _projected(xyz, view)
-        rows = np.flatnonzero(inside & (z < nearest))
-        column, row = uv[rows].astype(np.intp).T
-        # Nearer points hide others, also those that another view has coloured.
-        every = np.flatnonzero(inside)
-        depth = np.full((view.height // _CELL + 1, view.width // _CELL + 1), np.inf)
-        cells = (uv[every] // _CELL).astype(np.intp)
-        np.minimum.at(depth, (cells[:, 1], cells[:, 0]), z[every])
-        visible = z[rows] < _BEHIND * depth[row // _CELL, column // _CELL]
-        rows, row, column = rows[visible], row[visible], column[visible]
+        found = projected(xyz, view)
+        rows = visible(found, view)
+        rows = rows[found.z[rows] < nearest[rows]]
+        column, row = found.xy[rows].astype(np.intp).T
         rgb[rows] = load_view(view).rgb[row, column]
-        nearest[rows] = z[rows]
+        nearest[rows] = found.z[rows]
     return rgb

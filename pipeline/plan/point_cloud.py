@@ -122,7 +122,8 @@ def read_point_cloud(
 def _transformed(xyz: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     if (matrix == np.eye(4)).all():
         return xyz
-    return np.asarray(xyz @ matrix[:3, :3].T + matrix[:3, 3])
+    # einsum, not a matrix product: BLAS may round differently with the number of threads.
+    return np.asarray(np.einsum("ij,nj->ni", matrix[:3, :3], xyz) + matrix[:3, 3])
 
 
 def _found(

@@ -26,6 +26,8 @@ def found(facts: SceneFacts, frames_chosen: int | None = None) -> str:
     parts += [f"{name}: {count}" for name, count in counts.items() if count]
     if facts.ground_control:
         parts.append("ground control points")
+    if facts.point_cloud is not None:
+        parts.append(f"point cloud: {facts.point_cloud.text}")
     poses = facts.given_poses
     parts.append("poses: none" if poses is None else f"poses: {poses.label}")
     return "; ".join(parts)

@@ -22,7 +22,12 @@ from pipeline.training.cameras.intrinsics import describe_intrinsics, with_intri
 from pipeline.training.cameras.poses import describe_poses, with_common_motion
 from pipeline.training.data.depth_maps import add_maps
 from pipeline.training.data.inputs import Inputs
-from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
+from pipeline.training.data.known_depths import (
+    KnownDepths,
+    gaussian_depths,
+    point_depths,
+    scene_scale,
+)
 from pipeline.training.density.floaters import empty_depths
 from pipeline.training.loop import metrics_log
 from pipeline.training.loop.counters import TrainCounters
@@ -162,25 +167,35 @@ def _inputs(
         scale=scene_scale(extent, points),
         gains=np.array([gains.of(view.name) for view in training]) if gains else None,
         depths=(
-            _known_depths(training, manifest, points, notes) if config.depth_loss_weight else None
+            _known_depths(training, manifest, points, initial, notes)
+            if config.depth_loss_weight
+            else None
         ),
         empty_depths=empty_depths(points),
     )
 
 
 def _known_depths(
-    views: list[View], manifest: Manifest, points: list[KnownDepths], notes: _Notes
+    views: list[View],
+    manifest: Manifest,
+    points: list[KnownDepths],
+    initial: Gaussians,
+    notes: _Notes,
 ) -> list[KnownDepths]:
     """Depths of the sparse points and of the user's depth maps, by view."""
-    maps = {p.name: (p.depth, p.depth_digest) if p.depth else None for p in manifest.photos}
-    known, kinds, refused = add_maps(views, points, [maps[view.name] for view in views])
+    files = {p.name: (p.depth, p.depth_digest) if p.depth else None for p in manifest.photos}
+    maps = [files[view.name] for view in views]
+    fitted_to, source = points, "sparse points"
+    if any(maps) and not any(map(len, points)):
+        fitted_to, source = gaussian_depths(views, initial.means.double().numpy()), "Gaussians"
+    known, kinds, refused = add_maps(views, points, maps, fitted_to)
     if kinds:
         fits = ", ".join(f"{count} as {FITS[kind]}" for kind, count in kinds.items())
-        notes.decisions.append(f"depth maps fitted to the sparse points: {fits}")
+        notes.decisions.append(f"depth maps fitted to the {source}: {fits}")
     if refused:
         notes.warnings.append(
-            f"depth maps of {len(refused)} views are not used, because they do not fit the sparse "
-            f"points or contain too few of them: {', '.join(refused[:5])}"
+            f"depth maps of {len(refused)} views are not used, because they do not fit the "
+            f"{source} or contain too few of them: {', '.join(refused[:5])}"
         )
     notes.counters["depth_maps"] = sum(kinds.values())
     return known

@@ -3,6 +3,7 @@
 import pytest
 
 from pipeline.io.posefiles import PoseSummary
+from pipeline.plan.point_cloud import PointCloudFiles
 from pipeline.plan.summary import found
 from tests.plans import FACTS
 
@@ -16,6 +17,7 @@ POSES = PoseSummary(
     tracked=0,
     centred=False,
 )
+CLOUD = PointCloudFiles(path="points.laz", files=("points.laz",), points=1234567, megabytes=9.5)
 
 
 @pytest.mark.parametrize(
@@ -37,6 +39,12 @@ POSES = PoseSummary(
             None,
             "20 photographs (3 RAW or EXR); masks: 20; GPS positions: 7; "
             "poses: COLMAP model sparse/0, 12 cameras",
+        ),
+        (
+            {"point_cloud": CLOUD, "ground_control": True},
+            None,
+            "20 photographs; ground control points; point cloud: 1,234,567 points of points.laz; "
+            "poses: none",
         ),
     ],
 )

@@ -56,7 +56,8 @@ def _scan(header: Any, file: Any, path: Path) -> Chunks:
         xyz = stacked([read[name] for name in names], np.float64)
         if names is _SPHERICAL:
             xyz = _cartesian(xyz)
-        xyz = xyz @ np.asarray(rotation, np.float64).T + np.asarray(translation, np.float64)
+        # einsum, not a matrix product: BLAS may round differently with the number of threads.
+        xyz = np.einsum("ij,nj->ni", rotation, xyz) + translation
         if state in read:
             xyz = np.where((read[state] == 0)[:, None], xyz, np.nan)
         colour = stacked([read[name] for name in colours], np.float32) if colours else None

@@ -127,22 +127,24 @@ def add_maps(
     views: Sequence[View],
     points: Sequence[KnownDepths],
     maps: Sequence[tuple[str, str | None] | None],
+    fitted_to: Sequence[KnownDepths],
 ) -> tuple[list[KnownDepths], dict[str, int], list[str]]:
     """``points`` with the samples of the views' depth maps.
 
     Args:
         maps: each view's file and its recorded digest; None for a view without a depth map.
+        fitted_to: the depths that maps are fitted to: ``points``, or others if there are none.
 
     Returns:
         known depths by view; the number of maps by kind of fit; names of views whose maps do not
-        fit the points.
+        fit.
     """
     known, kinds, refused = list(points), dict.fromkeys(("factor", "depth", "inverse"), 0), []
     for index, (view, file) in enumerate(zip(views, maps, strict=True)):
         if file is None:
             continue
         path, digest = file
-        samples, fit = map_depths(view, path, points[index], digest)
+        samples, fit = map_depths(view, path, fitted_to[index], digest)
         if samples is None or fit is None:
             refused.append(view.name)
             continue

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
+from pipeline.scene.visibility import projected, visible
 
 #: Upper limit of the scene's scale, in median depths of the sparse points.
 SCALE_SHARE = 0.5
@@ -60,6 +61,21 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
         weight /= max(float(weight.mean()), 1e-6) if len(weight) else 1.0
         found.append(KnownDepths(xy[inside], z[inside].astype(np.float32), weight))
     return found
+
+
+def gaussian_depths(views: Sequence[View], means: NDArray[np.float64]) -> list[KnownDepths]:
+    """The depths of Gaussians in each of ``views``, of those that no other one hides.
+
+    Args:
+        means: (N, 3) centres in the world.
+    """
+    known = []
+    for view in views:
+        found = projected(means, view)
+        rows = visible(found, view)
+        ones = np.ones(len(rows), np.float32)
+        known.append(KnownDepths(found.xy[rows], found.z[rows].astype(np.float32), ones))
+    return known
 
 
 def scene_scale(extent: float, known: Sequence[KnownDepths]) -> float:

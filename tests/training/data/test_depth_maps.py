@@ -9,11 +9,13 @@ import numpy as np
 import pytest
 
 from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
 from pipeline.training.data.depth_maps import add_maps, fit_map, map_depths
-from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.data.known_depths import KnownDepths, gaussian_depths
 from tests.training.conftest import camera_at
 
 VIEW = replace(camera_at(0.0), width=80, height=60, name="a.png")
+AHEAD = View("a.png", "", None, 80, 60, 60.0, 60.0, 40.0, 30.0, np.eye(4), False)
 KINDS = {
     "factor": lambda z: 1000.0 * z,
     "depth": lambda z: 40.0 * z + 300.0,
@@ -70,7 +72,8 @@ def test_maps_that_do_not_fit_or_have_no_points_are_not_used(tmp_path):
     np.save(tmp_path / "map.npy", z)
     views = [VIEW, replace(VIEW, name="b.png"), replace(VIEW, name="c.png")]
     maps = [(str(tmp_path / "noise.npy"), None), (str(tmp_path / "map.npy"), None), None]
-    known, kinds, refused = add_maps(views, [sparse(z), few, few], maps)
+    points = [sparse(z), few, few]
+    known, kinds, refused = add_maps(views, points, maps, points)
     assert refused == ["a.png", "b.png"] and kinds == {}
     assert [len(k) for k in known] == [60, 3, 3]
 
@@ -99,3 +102,17 @@ def test_a_file_that_is_not_a_depth_map_is_an_error_that_names_it(tmp_path, name
     with pytest.raises(UserError) as error:
         map_depths(VIEW, str(tmp_path / name), sparse(scene_depth()))
     assert name in str(error.value)
+
+
+def test_maps_are_fitted_to_gaussians_where_no_point_has_a_track(tmp_path):
+    """Poses of depth cameras come without sparse points. A wall hides the Gaussians behind it."""
+    rng = np.random.default_rng(0)
+    wall = np.column_stack([rng.uniform(-3, 3, (4000, 2)), np.full(4000, 4.0)])
+    (found,) = gaussian_depths([AHEAD], np.concatenate([wall, wall * 2, -wall]))
+    assert len(found) > 1000
+    assert (found.z == 4).mean() > 0.95
+    np.save(tmp_path / "map.npy", np.full((60, 80), 4000.0))
+    none = KnownDepths(np.zeros((0, 2)), np.zeros(0, np.float32), np.zeros(0, np.float32))
+    known, kinds, _ = add_maps([AHEAD], [none], [(str(tmp_path / "map.npy"), None)], [found])
+    assert kinds == {"factor": 1}
+    np.testing.assert_allclose(known[0].z, 4, rtol=1e-3)

@@ -133,7 +133,7 @@ def _found(
     found = sorted(
         entry.name
         for entry in folder.iterdir()
-        if (entry.is_file() and is_cloud(entry.name) and entry.stem.casefold() == _STEM)
+        if (_is_usable(entry) and entry.stem.casefold() == _STEM)
         or (entry.is_dir() and entry.name == _STEM and _files(folder, entry.name))
     )
     if len(found) > 1:
@@ -181,6 +181,12 @@ def _configured(folder: Path, wanted: str) -> str:
     return PurePosixPath(wanted).as_posix()
 
 
+def _is_usable(entry: Path) -> bool:
+    """Whether this is a cloud with a name that JSON can hold."""
+    name = entry.name
+    return entry.is_file() and name[0] != "." and name.isprintable() and is_cloud(name)
+
+
 def _is_inside(name: str) -> bool:
     path = PurePosixPath(name)
     return not path.is_absolute() and ".." not in path.parts and "\0" not in name
@@ -191,8 +197,6 @@ def _files(folder: Path, path: str) -> tuple[str, ...]:
     if (folder / path).is_file():
         return (path,) if is_cloud(path) else ()
     names: Sequence[str] = sorted(
-        entry.name
-        for entry in (folder / path).iterdir()
-        if entry.is_file() and entry.name[0] != "." and is_cloud(entry.name)
+        entry.name for entry in (folder / path).iterdir() if _is_usable(entry)
     )
     return tuple(f"{path}/{name}" for name in names)

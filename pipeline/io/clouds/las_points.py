@@ -17,8 +17,10 @@ _MAX_POINTS_PER_BYTE = 4
 # Reading more takes hours.
 _MAX_POINTS = 20_000_000_000
 # Offsets in the public header block of LAS 1.4.
-_VERSION, _DATA_OFFSET, _FORMAT, _RECORD, _LEGACY_COUNT, _COUNT = 24, 96, 104, 105, 107, 247
-_HEADER = 375
+_VERSION, _HEADER_SIZE, _DATA_OFFSET, _FORMAT, _RECORD = 24, 94, 96, 104, 105
+_LEGACY_COUNT, _EXTENDED, _COUNT, _HEADER = 107, 235, 247, 375
+# Bytes of the headers of variable length records.
+_RECORD_HEADER, _EXTENDED_HEADER = 54, 60
 
 
 def count_las(path: Path) -> int:
@@ -33,10 +35,11 @@ def count_las(path: Path) -> int:
     if header[:4] != b"LASF" or len(header) < 227:
         begin = header[:4]
         raise damaged(path, f"expected a LAS or LAZ file, found one that begins with {begin!r}")
+    _check_records(path, header, size)
     (offset,) = struct.unpack_from("<I", header, _DATA_OFFSET)
     (record,) = struct.unpack_from("<H", header, _RECORD)
     (count,) = struct.unpack_from("<I", header, _LEGACY_COUNT)
-    if header[_VERSION] == 1 and header[_VERSION + 1] >= 4 and len(header) >= _COUNT + 8:
+    if _is_1_4(header):
         (count,) = struct.unpack_from("<Q", header, _COUNT)
     body = max(0, size - offset)
     compressed = bool(header[_FORMAT] & 0x80)
@@ -45,6 +48,24 @@ def count_las(path: Path) -> int:
         what = f"expected at most {min(room, _MAX_POINTS)} points in a file of this size"
         raise damaged(path, f"{what}, found {count} in its header")
     return int(count)
+
+
+def _is_1_4(header: bytes) -> bool:
+    return header[_VERSION] == 1 and header[_VERSION + 1] >= 4 and len(header) >= _HEADER
+
+
+def _check_records(path: Path, header: bytes, size: int) -> None:
+    """Check the numbers of variable length records, before and after the points, which laspy reads
+    one by one."""
+    (length,) = struct.unpack_from("<H", header, _HEADER_SIZE)
+    offset, number = struct.unpack_from("<II", header, _DATA_OFFSET)
+    found = [(length, offset, number, _RECORD_HEADER)]
+    if _is_1_4(header):
+        start, number = struct.unpack_from("<QI", header, _EXTENDED)
+        found.append((start if number else 0, size, number, _EXTENDED_HEADER))
+    for first, last, number, least in found:
+        if not (first <= last <= size and number * least <= last - first):
+            raise damaged(path, f"expected variable length records in the file, found {number}")
 
 
 def read_las(path: Path) -> Chunks:

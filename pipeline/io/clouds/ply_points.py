@@ -72,13 +72,15 @@ def _ascii(file: BinaryIO, header: PlyHeader, path: Path):  # type: ignore[no-un
         if not missing:
             return
         lines = list(islice((line for line in block if line.strip()), missing))
+        if not lines:
+            continue
         missing -= len(lines)
         values: NDArray[np.float64] = parsed(lines, None, path)
-        if len(lines) and values.shape[1] != len(header.fields):
+        if values.shape[1] != len(header.fields):
             raise damaged(
                 path, f"expected {len(header.fields)} numbers a line, found {values.shape[1]}"
             )
-        yield dict(zip(header.fields, values.T, strict=True)) if len(lines) else {}
+        yield dict(zip(header.fields, values.T, strict=True))
     if missing:
         raise damaged(
             path, f"expected {header.count} lines of points, found {header.count - missing}"

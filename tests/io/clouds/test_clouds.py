@@ -158,6 +158,31 @@ def test_a_las_that_claims_more_points_than_it_has(tmp_path, suffix, count):
         read_clouds([path])
 
 
+@pytest.mark.parametrize("suffix", [".las", ".laz"])
+@pytest.mark.parametrize(
+    ("field", "offset", "value"),
+    [
+        ("<I", 96, 0),  # where the points begin
+        ("<I", 100, 2**32 - 1),  # number of variable length records
+        ("<H", 94, 65535),  # size of the header
+        ("<H", 105, 0),  # size of a point
+        ("<B", 104, 63),  # format of the points
+        ("<I", 243, 2**32 - 1),  # number of extended records
+        ("<Q", 247, 2**63),  # number of points
+    ],
+)
+def test_a_las_header_that_lies_is_one_error_at_once(tmp_path, suffix, field, offset, value):
+    path = tmp_path / f"p{suffix}"
+    write_las(path, XYZ, None, version="1.4")
+    data = bytearray(path.read_bytes())
+    struct.pack_into(field, data, offset, value)
+    path.write_bytes(data)
+    start = time.monotonic()
+    with pytest.raises(UserError):
+        read_clouds([path])
+    assert time.monotonic() - start < 30
+
+
 def test_a_small_laz_that_expands_to_much_is_refused(tmp_path):
     same = np.zeros((300_000, 3))
     write_las(tmp_path / "p.laz", same, None)

@@ -33,10 +33,10 @@ def write_ply(
     path.write_bytes("\n".join([*header, "end_header", ""]).encode() + body)
 
 
-def write_las(path: Path, xyz: XYZ, rgb: RGB | None, bits: int = 16) -> None:
+def write_las(path: Path, xyz: XYZ, rgb: RGB | None, bits: int = 16, version: str = "1.2") -> None:
     import laspy
 
-    header = laspy.LasHeader(point_format=0 if rgb is None else 2, version="1.2")
+    header = laspy.LasHeader(point_format=0 if rgb is None else 2, version=version)
     header.scales, header.offsets = np.full(3, 1e-4), np.floor(xyz.min(0))
     las = laspy.LasData(header)
     las.x, las.y, las.z = xyz.T

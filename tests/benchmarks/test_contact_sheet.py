@@ -35,6 +35,7 @@ def batch(folder: Path) -> Path:
         metrics = Metrics(
             **{name: getattr(evaluation(*views), name) for name in SceneQuality.model_fields},
             scene="room",
+            input="3 photographs; poses: none",
             seed=0,
             num_gaussians=1000,
             registered_images=3,

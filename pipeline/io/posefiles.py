@@ -125,8 +125,9 @@ def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder |
     """
     if not find_transforms(folder) or (warnings is None and has_any_model(folder)):
         return None
+    repeated: list[str] = []
     try:
-        frames = {frame.path: frame for frame in read_frames(folder)}
+        frames = {frame.path: frame for frame in read_frames(folder, repeated)}
     except UserError:
         if warnings is not None:
             raise
@@ -145,13 +146,33 @@ def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder |
         return None
     base = os.path.commonpath([os.path.dirname(name) or "." for name in found]) or "."
     masks = {os.path.relpath(name, base): frame.mask for name, frame in found.items()}
+    listed = {name: mask for name, mask in masks.items() if mask is not None}
+    usable = {name: mask for name, mask in listed.items() if _is_inside(folder, mask)}
+    if warnings is not None:
+        warnings += _frame_warnings(repeated, sorted(set(listed.values()) - set(usable.values())))
     return PhotoFolder(
-        base,
-        base,
-        "the photographs that transforms*.json lists",
-        sorted(masks),
-        {name: mask for name, mask in masks.items() if mask is not None},
+        base, base, "the photographs that transforms*.json lists", sorted(masks), usable
     )
+
+
+def _is_inside(folder: Path, name: str) -> bool:
+    """Whether ``name`` is a file below ``folder`` by its path; links are followed."""
+    return not name.startswith(("/", "../")) and (folder / name).is_file()
+
+
+def _frame_warnings(repeated: list[str], lost_masks: list[str]) -> list[str]:
+    warnings = []
+    if repeated:
+        warnings.append(
+            f"{len(repeated)} frames of transforms*.json name the file of an earlier frame and are "
+            f"left out (first: {repeated[0]})"
+        )
+    if lost_masks:
+        warnings.append(
+            f"{len(lost_masks)} masks that transforms*.json lists are not used: they are missing, "
+            f"or outside of the scene folder (first: {lost_masks[0]})"
+        )
+    return warnings
 
 
 def has_any_model(folder: Path) -> bool:

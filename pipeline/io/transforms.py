@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.io.bounded import MIB, read_bounded
 from pipeline.io.names import NameIndex
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
@@ -32,6 +33,9 @@ _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV"
 _FIX = "correct the file, export it again, or set poses: ignore"
 # Matrices printed with few digits deviate this much from a rotation.
 _ROTATION_TOLERANCE = 1e-2
+# Scales of nerfstudio's world relative to COLMAP's. Their cubes are far from a float's range.
+_SCALES = (1e-12, 1e12)
+_MAX_BYTES = 512 * MIB
 
 
 @dataclass(frozen=True)
@@ -55,6 +59,10 @@ class Frame:
     file: Path
     source: str
 
+    def is_same_camera(self, other: Frame) -> bool:
+        """Whether pose and intrinsics are equal."""
+        return self.fields == other.fields and np.array_equal(self.translation, other.translation)
+
 
 def find_transforms(folder: Path) -> list[Path]:
     """The pose files of a scene: transforms.json, else transforms_{train,test,val}.json."""
@@ -65,8 +73,12 @@ def find_transforms(folder: Path) -> list[Path]:
     return [path for path in split if path.is_file()]
 
 
-def read_frames(path: Path) -> list[Frame]:
-    """All frames of a file or of the files in a scene folder, each photograph once.
+def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
+    """All frames of a file or of the files in a scene folder, each path once: its first frame.
+
+    Args:
+        repeated: the paths of the other frames are added to this list, except for equal frames in
+            other files: files of several splits may list the same frames.
 
     Raises:
         UserError: no file, malformed JSON, missing fields, matrices that are not finite poses.
@@ -75,9 +87,11 @@ def read_frames(path: Path) -> list[Frame]:
     if not files:
         raise UserError("expected a transforms.json, found none", file=path, fix=_FIX)
     frames: dict[str, Frame] = {}
-    for file in files:
-        for frame in _frames_of(file):
-            frames.setdefault(frame.path, frame)
+    for frame in (frame for file in files for frame in _frames_of(file)):
+        first = frames.setdefault(frame.path, frame)
+        is_copy = first.file != frame.file and first.is_same_camera(frame)
+        if first is not frame and not is_copy and repeated is not None:
+            repeated.append(frame.path)
     return list(frames.values())
 
 
@@ -100,7 +114,10 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     cameras: dict[tuple, int] = {}
     by_id: dict[int, Camera] = {}
     images: dict[int, PosedImage] = {}
-    found = {name: frame for frame in read_frames(path) if (name := index.find(frame.path))}
+    found: dict[str, Frame] = {}
+    for frame in read_frames(path):
+        if name := index.find(frame.path):
+            found.setdefault(name, frame)
     for number, (name, frame) in enumerate(sorted(found.items()), 1):
         camera = _camera(frame, *sizes[name])
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
@@ -215,8 +232,9 @@ def frame_camera_model(frame: Frame) -> str:
 
 
 def _frames_of(file: Path) -> list[Frame]:
+    data = read_bounded(file, _MAX_BYTES, fix=_FIX)
     try:
-        content = json.loads(file.read_bytes())
+        content = json.loads(data)
     except UnicodeDecodeError as error:
         raise UserError(f"expected UTF-8 text: {error}", file=file, fix=_FIX) from None
     except json.JSONDecodeError as error:
@@ -227,6 +245,11 @@ def _frames_of(file: Path) -> list[Frame]:
         ) from None
     except RecursionError:
         raise UserError("not valid JSON (nested too deeply)", file=file, fix=_FIX) from None
+    except ValueError:
+        # Python refuses to convert longer ones, which takes quadratic time.
+        raise UserError(
+            "expected numbers, found an integer of thousands of digits", file=file, fix=_FIX
+        ) from None
     listed = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(listed, list):
         raise UserError("expected an object with a list 'frames'", file=file, fix=_FIX)
@@ -239,11 +262,10 @@ def _frame(
     file: Path, i: int, entry: Any, shared: Mapping[str, Any], applied: NDArray[np.float64]
 ) -> Frame:
     source = f"frames[{i}]"
-    path = entry.get("file_path") if isinstance(entry, dict) else None
-    if not isinstance(path, str) or not path:
-        raise UserError(f"{source}.file_path: expected a file name", file=file, fix=_FIX)
+    fields = entry if isinstance(entry, dict) else {}
+    path = _file_name(file, f"{source}.file_path", fields.get("file_path"))
     source = f"{source} ({path})"
-    matrix = _matrix(file, f"{source}.transform_matrix", entry.get("transform_matrix"))
+    matrix = _matrix(file, f"{source}.transform_matrix", fields.get("transform_matrix"))
     scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
     to_world = np.linalg.inv(applied) @ matrix
     # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
@@ -257,15 +279,30 @@ def _frame(
             fix=_FIX,
         )
     rotation = _FLIP_YZ @ nearest.T
-    mask = entry.get("mask_path")
+    mask = fields.get("mask_path") or None
+    if mask is not None:
+        mask = _relative(file, _file_name(file, f"{source}.mask_path", mask))
     return Frame(
         path=_relative(file, path),
-        mask=_relative(file, mask) if isinstance(mask, str) and mask else None,
+        mask=mask,
         rotation=rotation,
         translation=-rotation @ to_world[:3, 3],
-        fields={**shared, **entry},
+        fields={**shared, **fields},
         file=file,
         source=source,
+    )
+
+
+def _file_name(file: Path, where: str, value: Any) -> str:
+    if isinstance(value, str) and value and "\0" not in value:
+        try:
+            value.encode()
+        except UnicodeEncodeError:  # A lone surrogate: JSON allows it, file systems do not.
+            pass
+        else:
+            return value
+    raise UserError(
+        f"{where}: expected a file name, found {ascii(value)[:80]}", file=file, fix=_FIX
     )
 
 
@@ -302,10 +339,18 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     scale = content.get("applied_scale", 1.0)
     if not _is_number(scale) or scale <= 0:
         raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
+    # The largest element of the axes: between their length and its third.
+    size = float(np.abs(applied[:3, :3]).max())
+    if not (_SCALES[0] <= scale * size <= _SCALES[1] and _SCALES[0] <= size <= _SCALES[1]):
+        raise UserError(
+            f"applied_scale, applied_transform: expected a scale of {_SCALES[0]:g} to "
+            f"{_SCALES[1]:g}, found {scale * size:g}",
+            file=file,
+            fix=_FIX,
+        )
     applied[:3] *= scale
     # The determinant is a volume, so it is compared with the axes' length cubed.
-    size = float(np.abs(applied[:3, :3]).max())
-    if not np.linalg.det(applied[:3, :3]) > 1e-6 * size**3:
+    if not np.linalg.det(applied[:3, :3]) > 1e-6 * (scale * size) ** 3:
         raise UserError("applied_transform: expected a similarity", file=file, fix=_FIX)
     return applied
 

@@ -9,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.distortion import unproject
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.llff import read_poses_bounds
 from pipeline.io.names import NameIndex
@@ -32,6 +33,12 @@ _MAX_DISTANCE = 100.0
 _MIN_SIZE = 0.1
 # Accepted focal lengths divided by the longer side: fields of view of 175 to 0.06 degrees.
 _FOCAL_RANGE = (0.02, 1000.0)
+# Accepted distance of the principal point from the image's centre divided by the longer side: a
+# crop from the border of a much larger image has one outside of it.
+_MAX_SHIFT = 10.0
+# Accepted distance of a camera from the origin. Beyond it, float64 resolves less than a
+# ten-thousandth of a unit.
+_MAX_COORDINATE = 1e12
 
 
 @dataclass(frozen=True)
@@ -196,8 +203,10 @@ def fit_to_photos(
         taken.add(name)
         photo, camera = photos[name], model.cameras[image.camera_id]
         _check_camera(photo, camera, source)
+        _check_centre(image, source)
         key = (image.camera_id, photo.width, photo.height)
         if key not in ids:
+            _check_distortion(photo, camera, source)
             if image.camera_id in cameras:
                 last_id += 1
             ids[key] = last_id if image.camera_id in cameras else image.camera_id
@@ -212,7 +221,8 @@ def fit_to_photos(
 
 
 def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
-    longer = max(camera.width, camera.height)
+    size = camera.width, camera.height
+    longer = max(size)
     relative = [focal / longer for focal in camera.pinhole[:2]]
     if not (_FOCAL_RANGE[0] <= min(relative) and max(relative) <= _FOCAL_RANGE[1]):
         raise UserError(
@@ -220,6 +230,14 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
             f"{camera.pinhole[0]:g} pixels at {camera.width}x{camera.height}",
             file=source,
             fix="give focal lengths in pixels of the images, or set poses: ignore",
+        )
+    shift = max(abs(x - s / 2) for x, s in zip(camera.pinhole[2:], size, strict=True))
+    if not shift <= _MAX_SHIFT * longer:
+        raise UserError(
+            f"{photo.name}: its given camera has an impossible principal point of "
+            f"{camera.pinhole[2]:g}, {camera.pinhole[3]:g} pixels at {size[0]}x{size[1]}",
+            file=source,
+            fix="give principal points in pixels of the images, or set poses: ignore",
         )
     expected, found = camera.width / camera.height, photo.width / photo.height
     # Either side of a reduced copy may be rounded by one pixel.
@@ -231,6 +249,38 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
             file=source,
             fix="use the photographs that the poses were computed from (stored orientation, not "
             "cropped), or set poses: ignore",
+        )
+
+
+def _check_centre(image: PosedImage, source: str) -> None:
+    with np.errstate(over="ignore", invalid="ignore"):
+        distance = float(np.abs(image.centre).max())
+    if not distance <= _MAX_COORDINATE:  # NaN from an overflow is not.
+        raise UserError(
+            f"{image.name}: expected a camera at most {_MAX_COORDINATE:g} units from the origin, "
+            f"found {distance:g}",
+            file=source,
+            fix=f"correct its translation or remove {image.name} from the file, or set poses: "
+            "ignore",
+        )
+
+
+def _check_distortion(photo: Photo, camera: Camera, source: str) -> None:
+    """Check that the distortion can be undone in a tenth of the image; undistorted images would be
+    blank, and masked everywhere."""
+    if camera.is_pinhole:
+        return
+    share = (np.arange(9) + 0.5) / 9
+    grid = np.stack(np.meshgrid(share * camera.width, share * camera.height), axis=-1)
+    with np.errstate(all="ignore"):
+        undone = np.isfinite(unproject(camera, grid)).all(-1)
+    if undone.mean() < 0.1:
+        found = ", ".join(f"{value:g}" for value in camera.params[len(camera.intrinsics_names) :])
+        raise UserError(
+            f"{photo.name}: its given camera has an impossible lens distortion ({camera.model}: "
+            f"{found}): it cannot be undone",
+            file=source,
+            fix="correct the distortion coefficients, or set poses: ignore",
         )
 
 

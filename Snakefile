@@ -6,9 +6,10 @@ import sys
 
 sys.path.insert(0, workflow.basedir)
 
-from stages.workflow.project import SnakemakeProject
+from stages.workflow.project import SnakemakeProject, check_config
 
 if os.path.exists("config/config.yaml"):
+    check_config("config/config.yaml")
 
     configfile: "config/config.yaml"
 

@@ -17,6 +17,7 @@ from pipeline.plan.values import Plan, StagePlan
 from pipeline.plan.video_files import contents
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.job import Job
+from pipeline.runtime.layout import SCAN_CACHE
 from pipeline.runtime.section import read_section
 
 if TYPE_CHECKING:
@@ -40,7 +41,7 @@ def work(job: Job) -> None:
 
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])
-    found = scan(folder, folder.name, config, cache=job.out.parents[2] / "scan.json")
+    found = scan(folder, folder.name, config, cache=job.out.parents[3] / SCAN_CACHE)
     found.check_unchanged(job.key["fingerprint"], folder)
     manifest, warnings = verify_manifest(
         found.manifest,

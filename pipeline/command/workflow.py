@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from pipeline.config.runs import name_fault
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import WORKFLOW
 
@@ -41,12 +42,16 @@ def snakemake_command(
             file=scene,
             fix="name the folder that holds the photographs of one scene",
         )
+    # Not resolved: a symbolic link's name is the scene's name.
+    folder = Path(os.path.abspath(scene))
+    fault = name_fault(folder.name)
+    if fault is not None:
+        what = f"this name of a scene cannot be used: {fault}"
+        raise UserError(what, file=ascii(str(scene))[1:-1], fix="rename the folder")
     if importlib.util.find_spec("snakemake") is None:
         raise UserError(
             "snakemake is not installed", fix="install splatmake with its dependencies (pip)"
         )
-    # Not resolved: a symbolic link's name is the scene's name.
-    folder = Path(os.path.abspath(scene))
     # Snakemake reads values as YAML: a quoted path stays one string. The spaces keep the quotes,
     # which it would strip.
     entries = [f"data_root= {json.dumps(str(folder.parent), ensure_ascii=False)} "]

@@ -11,6 +11,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import product
 
+# File systems allow 255; temporary names are longer.
+MAX_NAME_BYTES = 200
 _SEED = re.compile(r"seed(\d+)")
 
 
@@ -58,6 +60,22 @@ def parse_run(name: str, configs: Collection[str], scenes: Collection[str] = ())
 def is_config_name(name: str) -> bool:
     """Whether ``name`` is valid in a folder's name and different from a seed."""
     return re.fullmatch(r"[A-Za-z0-9][\w.+-]*", name) is not None and not _SEED.fullmatch(name)
+
+
+def name_fault(name: str) -> str | None:
+    """Why no folder of results can have this name; None if one can.
+
+    Snakemake takes braces and angle brackets for its own syntax, and a repeated end for a cycle.
+    """
+    if not name.isprintable():
+        return "it is not UTF-8 or has control characters"
+    if found := re.search(r"[{}<>]", name):
+        return f"it has the character {found[0]}"
+    if len(name.encode()) > MAX_NAME_BYTES:
+        return f"it is longer than {MAX_NAME_BYTES} bytes"
+    if found := re.search(r"(.+)\1{19}$", name):
+        return f"it ends with {found[1][:20]} twenty times"
+    return None
 
 
 def all_runs(

@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
+from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic_core import core_schema
 
 
 class Section(BaseModel):
@@ -16,9 +17,25 @@ class Section(BaseModel):
 
 @dataclass(frozen=True)
 class Unit:
-    """The unit of a number, for the reference pages."""
+    """The unit of a number, for the reference pages. Every number has one.
+
+    As pydantic's annotation, it refuses booleans, and numbers out of the range of 32 bits.
+    """
 
     name: str
+
+    def __get_pydantic_core_schema__(
+        self, source: Any, handler: GetCoreSchemaHandler
+    ) -> core_schema.CoreSchema:
+        return core_schema.no_info_before_validator_function(_not_wild, handler(source))
+
+
+def _not_wild(value: Any) -> Any:
+    if isinstance(value, bool):
+        raise ValueError("Input should be a number, not true or false")
+    if isinstance(value, int | float) and abs(value) > 2**31:
+        raise ValueError("Input should be a number between -2147483648 and 2147483648")
+    return value
 
 
 Seed = Annotated[int, Field(ge=0, lt=2**31), Unit("number")]

@@ -2,13 +2,31 @@
 
 from __future__ import annotations
 
+import errno
 import os
 import stat
+from collections.abc import Iterator
+from contextlib import contextmanager
+from io import BufferedReader
 from pathlib import Path
 
 from pipeline.runtime.errors import UserError
 
 MIB = 1 << 20
+
+
+@contextmanager
+def opened_regular(path: Path) -> Iterator[BufferedReader]:
+    """An open regular file.
+
+    Raises:
+        OSError: it cannot be opened, or is a device or a pipe, which may have no end.
+    """
+    # Without O_NONBLOCK, opening a pipe waits for a writer.
+    with open(os.open(path, os.O_RDONLY | os.O_NONBLOCK), "rb") as file:
+        if not stat.S_ISREG(os.fstat(file.fileno()).st_mode):
+            raise OSError(errno.EINVAL, "not a regular file", str(path))
+        yield file
 
 
 def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
@@ -19,22 +37,14 @@ def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
         fix: what to do about a file that cannot be read.
 
     Raises:
-        UserError: it is not a regular file (a device or a pipe would never end), is larger than
-            ``limit``, or cannot be read.
+        UserError: it cannot be read, is a device or a pipe, or is larger than ``limit``.
     """
     try:
-        # Without O_NONBLOCK, opening a pipe waits for a writer.
-        descriptor = os.open(path, os.O_RDONLY | os.O_NONBLOCK)
-        with open(descriptor, "rb") as file:
-            status = os.fstat(descriptor)
-            if not stat.S_ISREG(status.st_mode):
-                raise UserError("expected a regular file, found another kind", file=path, fix=fix)
-            if status.st_size > limit:
-                raise UserError(
-                    f"expected at most {limit // MIB} MiB, found {status.st_size // MIB} MiB",
-                    file=path,
-                    fix=fix,
-                )
-            return file.read(limit)
+        with opened_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size <= limit:
+                return file.read(limit)
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=fix) from None
+    what = f"expected at most {limit // MIB} MiB, found {size // MIB} MiB"
+    raise UserError(what, file=path, fix=fix)

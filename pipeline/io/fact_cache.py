@@ -1,22 +1,24 @@
-"""Cache of facts about files, valid as long as a file's size and times stay the same."""
+"""Cache of facts about files, valid as long as a file's size, times and inode stay the same."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, TypeVar, cast
 
-from pydantic import BaseModel
+from pydantic import BaseModel, TypeAdapter, ValidationError
 
 from pipeline.runtime.atomic import write_text
 from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
-_VERSION = 5
+_VERSION = 6
 
 M = TypeVar("M", bound=BaseModel)
+T = TypeVar("T")
 
 
 class FactCache:
@@ -36,38 +38,46 @@ class FactCache:
             content = json.loads(path.read_bytes())
             if content["version"] == _VERSION:
                 self._entries = dict(content["files"])
-        except (OSError, ValueError, KeyError, TypeError):
+        except (OSError, ValueError, KeyError, TypeError, RecursionError):
             pass
 
-    def get(self, path: Path, kind: str, compute: Callable[[], Any]) -> Any:
-        """``compute()``, or its cached value if the file's size and times have not changed."""
+    def get(self, path: Path, kind: str, model: type[T], compute: Callable[[], T]) -> T:
+        """``compute()``, or its cached value if the file has not changed: it has the same size,
+        times and inode.
+
+        Args:
+            model: type of the values, whose JSON it can read.
+        """
         status = os.stat(path)
-        # cp -p and rsync preserve the modification time, but nothing sets the change time.
-        state = [status.st_size, status.st_mtime_ns, status.st_ctime_ns]
-        return self.get_for_state(f"{kind}:{path}", state, compute)
+        # cp -p and rsync preserve the modification time, but nothing sets the change time. Some
+        # network file systems have none; a file that replaces another has another inode.
+        state = [status.st_size, status.st_mtime_ns, status.st_ctime_ns, status.st_ino]
+        return self.get_for_state(f"{kind}:{path}", state, model, compute)
 
     def read(self, path: Path, kind: str, model: type[M], read: Callable[[Path], M]) -> M | str:
         """``read(path)``, or its cached value; if the file cannot be read, the reason."""
 
-        def compute() -> dict[str, Any]:
+        def compute() -> M | str:
             try:
-                return read(path).model_dump()
+                return read(path)
             except UserError as error:
-                return {"unreadable": error.what}
+                return error.what
 
         try:
-            found = self.get(path, kind, compute)
+            return self.get(path, kind, cast("type[M | str]", model | str), compute)
         except OSError as error:
             return f"cannot be read: {error.strerror}"
-        return str(found["unreadable"]) if "unreadable" in found else model.model_validate(found)
 
-    def get_for_state(self, key: str, state: Any, compute: Callable[[], Any]) -> Any:
+    def get_for_state(self, key: str, state: Any, model: type[T], compute: Callable[[], T]) -> T:
         """``compute()``, or its cached value if ``state`` equals the state cached with it."""
+        adapter = TypeAdapter(model)
         entry = self._entries.get(key)
         if isinstance(entry, list) and len(entry) == 2 and entry[0] == state:
-            return entry[1]
+            # A value that does not fit was not written by this version of the program.
+            with contextlib.suppress(ValidationError):
+                return adapter.validate_python(entry[1])
         value = compute()
-        self._entries[key] = [state, value]
+        self._entries[key] = [state, adapter.dump_python(value, mode="json")]
         self._changed = True
         return value
 

@@ -56,11 +56,13 @@ def pictures_in(
     """
     names: list[str] = []
     unread: list[str] = []
-    for where, name in _files_in(scene / path, recursive):
-        if not _is_utf8(name):
-            shown = os.fsencode(name).decode(errors="replace")
-            file = (Path(path) / where / shown).as_posix()
-            warnings.append(f"{file} is not used: its name is not UTF-8; rename it")
+    for where, name in _files_in(scene / path, recursive, warnings):
+        full = (Path(path) / where / name).as_posix()
+        if not full.isprintable():  # Bytes that are not UTF-8 are surrogates, which are not.
+            shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in full)
+            warnings.append(
+                f"{shown} is not used: its name is not UTF-8 or has control characters; rename it"
+            )
             continue
         suffix = suffix_of(name)
         if name[0] != "." and suffix in PHOTO_SUFFIXES:
@@ -84,15 +86,28 @@ def videos_in(folder: Path, *, recursive: bool = True) -> list[str]:
     """
     return sorted(
         (where / name).as_posix()
-        for where, name in _files_in(folder, recursive)
-        if name[0] != "." and suffix_of(name) in VIDEO_SUFFIXES and _is_utf8(name)
+        for where, name in _files_in(folder, recursive, [])
+        if name[0] != "." and suffix_of(name) in VIDEO_SUFFIXES and str(where / name).isprintable()
     )
 
 
-def _files_in(folder: Path, recursive: bool) -> Iterator[tuple[Path, str]]:
-    """Folder relative to ``folder``, and name of each file; not in hidden and companion folders."""
+def _files_in(folder: Path, recursive: bool, warnings: list[str]) -> Iterator[tuple[Path, str]]:
+    """Folder relative to ``folder``, and name of each file; not in hidden and companion folders.
+
+    A subfolder that cannot be read adds a warning.
+
+    Raises:
+        OSError: ``folder`` itself cannot be read.
+    """
+
+    def failed(error: OSError) -> None:
+        if Path(error.filename) == folder:
+            raise error
+        name = Path(error.filename).relative_to(folder).as_posix()
+        warnings.append(f"{name}/ is not used: it cannot be read: {error.strerror}")
+
     seen: set[str] = set()
-    for where, subfolders, files in os.walk(folder, followlinks=True):
+    for where, subfolders, files in os.walk(folder, onerror=failed, followlinks=True):
         real = os.path.realpath(where)
         subfolders[:] = [
             name
@@ -104,14 +119,6 @@ def _files_in(folder: Path, recursive: bool) -> Iterator[tuple[Path, str]]:
         seen.add(real)
         for name in files:
             yield Path(where).relative_to(folder), name
-
-
-def _is_utf8(name: str) -> bool:
-    try:
-        name.encode()
-    except UnicodeEncodeError:
-        return False
-    return True
 
 
 def relative_folders(folder: Path) -> list[str]:
@@ -127,13 +134,20 @@ def companions(folder: Path, candidates: Sequence[str], names: Sequence[str]) ->
     """Photograph -> its mask or depth map, from the first folder of ``candidates`` that exists.
 
     The file of ``a/b.jpg`` is ``a/b.png`` (any suffix) or, as in COLMAP, ``a/b.jpg.png``.
+
+    Raises:
+        OSError: the folder or a subfolder cannot be read.
     """
+
+    def failed(error: OSError) -> None:
+        raise error
+
     for candidate in candidates:
         root = folder / candidate
         if not root.is_dir():
             continue
         index: dict[str, Path] = {}
-        for where, _, files in os.walk(root):
+        for where, _, files in os.walk(root, onerror=failed):
             for file in sorted(files):
                 if file[0] != "." and suffix_of(file) in _DEPTH_SUFFIXES:
                     path = Path(where) / file

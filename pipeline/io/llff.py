@@ -14,9 +14,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.io.arrays import read_array
+from pipeline.io.bounded import MIB, read_bounded
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
+_MAX_BYTES = 64 * MIB
 _FIX = "export the poses again with as many rows as photographs, or set poses: ignore"
 
 
@@ -76,9 +79,8 @@ def read_rows(path: Path) -> NDArray[np.float64]:
         UserError: not a ``poses_bounds.npy``, or values that are not finite.
     """
     try:
-        rows = np.load(path, allow_pickle=False)
-        rows = np.asarray(rows, np.float64)
-    except (ValueError, TypeError, OSError, EOFError, SyntaxError) as error:
+        rows = np.asarray(read_array(read_bounded(path, _MAX_BYTES, fix=_FIX)), np.float64)
+    except ValueError as error:
         raise UserError(f"not a NumPy array of numbers ({error})", file=path, fix=_FIX) from None
     if rows.ndim != 2 or rows.shape[1] != 17:
         raise UserError(f"expected N x 17 numbers, found shape {rows.shape}", file=path, fix=_FIX)

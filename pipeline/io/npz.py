@@ -5,17 +5,13 @@ The stages exchange this format.
 
 from __future__ import annotations
 
-import zipfile
-import zlib
 from pathlib import Path
 
-import numpy as np
-
-from pipeline.io.arrays import write_arrays
+from pipeline.io.arrays import read_archive, write_arrays
+from pipeline.io.bounded import opened_regular
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.record import owner_of, rerun
 from pipeline.splats.gaussians import Gaussians
-
-FIX = "delete the file and run again"
 
 
 def write_npz(path: Path, gaussians: Gaussians) -> None:
@@ -30,16 +26,17 @@ def read_npz(path: Path) -> Gaussians:
         UserError: the file is missing, damaged, or not a file of Gaussians.
     """
     try:
-        with np.load(path) as archive:
-            gaussians = Gaussians.from_arrays({name: archive[name] for name in archive.files})
-        n, k = gaussians.means.shape[0], (min(gaussians.sh_degree, 3) + 1) ** 2
-    except (
-        *(OSError, ValueError, KeyError, IndexError, EOFError, TypeError),
-        *(zipfile.BadZipFile, zlib.error),
-    ) as error:
-        raise UserError(
-            f"expected a file of Gaussians, could not read it: {error}", file=path, fix=FIX
-        ) from error
+        with opened_regular(path) as file:
+            arrays = read_archive(file)
+        gaussians = Gaussians.from_arrays(arrays)
+    except KeyError as error:
+        raise _wrong(path, f"expected a file of Gaussians, found no array {error}") from None
+    except OSError as error:
+        raise _wrong(path, f"cannot be read: {error.strerror}") from None
+    except ValueError as error:
+        raise _wrong(path, f"expected a file of Gaussians, could not read it: {error}") from None
+    n = len(gaussians) if gaussians.means.ndim else 0
+    k = (min(max(gaussians.sh_degree, 0), 3) + 1) ** 2 if gaussians.sh.ndim > 1 else 1
     shapes = {name: tuple(tensor.shape) for name, tensor in gaussians.tensors().items()}
     expected = {
         "means": (n, 3),
@@ -49,9 +46,11 @@ def read_npz(path: Path) -> Gaussians:
         "sh": (n, k, 3),
     }
     if shapes != expected:
-        raise UserError(
-            f"expected arrays of Gaussians of shapes {expected}, found {shapes}",
-            file=path,
-            fix=FIX,
-        )
+        raise _wrong(path, f"expected arrays of Gaussians of shapes {expected}, found {shapes}")
     return gaussians
+
+
+def _wrong(path: Path, what: str) -> UserError:
+    folder = owner_of(path)
+    fix = "write the file again, or get an intact copy of it" if folder is None else rerun(folder)
+    return UserError(what, file=path, fix=fix)

@@ -5,13 +5,14 @@ from __future__ import annotations
 import contextlib
 import datetime
 import math
+import os
 import warnings
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
-from PIL import ExifTags, Image
+from PIL import ExifTags, Image, UnidentifiedImageError
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import exr, pillow_formats
@@ -19,8 +20,15 @@ from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 
-# PIL's limit protects servers from malicious files; large photographs are legitimate here.
+# ``check_size`` takes the place of PIL's limit, which is lower than some photographs are large.
 Image.MAX_IMAGE_PIXELS = None
+MAX_PIXELS = 1 << 29
+"""Largest number of pixels of a photograph or of a video's frame: 1.5 GiB when it is decoded."""
+MAX_BYTES = 4 << 30
+"""Largest file of a photograph: ``MAX_PIXELS`` of 16-bit RGB and alpha."""
+# The formats of the supported suffixes. PIL recognises a file by its content, and has decoders that
+# run other programs.
+_FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
 _BASE, _GPS, _IFD = ExifTags.Base, ExifTags.GPS, ExifTags.IFD
 FULL_FRAME_DIAGONAL_MM = 43.27
@@ -70,14 +78,15 @@ def read_facts(path: Path) -> FileFacts:
         UserError: the file cannot be read, or is not an image in a supported format.
     """
     try:
+        if os.stat(path).st_size > MAX_BYTES:
+            raise ValueError(f"its file is larger than {MAX_BYTES >> 30} GiB")
         digest = digest_of(path)
         suffix = suffix_of(path.name)
         if suffix in RAW_SUFFIXES:
             return _raw_facts(path, digest)
         if suffix in exr.EXR_SUFFIXES:
             return _exr_facts(path, digest)
-        pillow_formats.register(suffix)
-        with _quiet(), Image.open(path) as image:
+        with _quiet(), opened_image(path, path.name) as image:
             width, height = image.size
             if _bits(image) > 16:
                 raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
@@ -90,15 +99,54 @@ def read_facts(path: Path) -> FileFacts:
                 bits=_bits(image),
                 **_exif_facts(exif, width, height),
             )
+    except UnidentifiedImageError:
+        reason = f"no header of its format found ({', '.join(_formats(path.name))})"
     except OSError as error:
-        reason = error.strerror or "no image header found"
-    except (ValueError, SyntaxError, OverflowError) as error:
-        reason = str(error)
+        reason = error.strerror or str(error)
+    except MemoryError:
+        reason = "its header asks for more memory than there is"
+    # PIL and LibRaw raise exceptions of many types on damaged files.
+    except Exception as error:
+        reason = str(error) or type(error).__name__
     raise UserError(
         f"cannot be read as a photograph: {reason}",
         file=path,
         fix="replace the file by an intact copy, or remove it from the folder",
     )
+
+
+def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
+    """An image file, opened by PIL; its pixels are not decoded yet.
+
+    Args:
+        file: a path, or its bytes.
+        name: of the file; its suffix decides which formats are tried.
+
+    Raises:
+        OSError: no image of these formats.
+        ValueError: too many pixels; PIL's exceptions of any type for damaged files.
+    """
+    pillow_formats.register(suffix_of(name))
+    image = Image.open(file, formats=_formats(name))
+    try:
+        check_size(*image.size)
+    except ValueError:
+        image.close()
+        raise
+    return image
+
+
+def check_size(width: int, height: int) -> None:
+    """Raises: ValueError: more pixels than a photograph or a video has."""
+    if width * height > MAX_PIXELS:
+        raise ValueError(
+            f"{width}x{height} pixels are more than {MAX_PIXELS // 10**6} megapixels; reduce it"
+        )
+
+
+def _formats(name: str) -> tuple[str, ...]:
+    suffix = suffix_of(name)
+    return (pillow_formats.format_of(suffix),) if suffix in pillow_formats.SUFFIXES else _FORMATS
 
 
 def _raw_facts(path: Path, digest: str) -> FileFacts:
@@ -107,6 +155,7 @@ def _raw_facts(path: Path, digest: str) -> FileFacts:
     try:
         with rawpy.imread(str(path)) as raw:
             width, height = int(raw.sizes.iwidth), int(raw.sizes.iheight)
+            check_size(width, height)
             focal_mm, stamp = float(raw.other.focal_length), raw.other.timestamp
             lens = str(raw.lens.model).strip()
     except rawpy.LibRawError as error:
@@ -248,7 +297,7 @@ def _float(value: Any) -> float:
     """``value`` as a float, NaN if it is not a number."""
     try:
         return float(value)
-    except (TypeError, ValueError, ZeroDivisionError):
+    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return math.nan
 
 
@@ -260,7 +309,8 @@ def _body(make: str, model: str) -> str:
 
 
 def _text(value: Any) -> str:
-    return str(value).replace("\0", "").strip() if isinstance(value, str) else ""
+    """``value`` without control characters and other ones that cannot be printed."""
+    return "".join(c for c in value if c.isprintable()).strip() if isinstance(value, str) else ""
 
 
 def _taken(tags: Mapping[int, Any]) -> str | None:
@@ -270,7 +320,7 @@ def _taken(tags: Mapping[int, Any]) -> str | None:
         except ValueError:
             continue
         digits = _text(tags.get(_BASE.SubsecTimeOriginal))
-        fraction = f".{digits}" if digits.isdecimal() else ""
+        fraction = f".{digits[:6]}" if digits.isascii() and digits.isdecimal() else ""
         return moment.isoformat() + fraction
     return None
 

@@ -34,6 +34,11 @@ def register(suffix: str) -> None:
         pillow_heif.register_heif_opener()
 
 
+def format_of(suffix: str) -> str:
+    """Pillow's name of the format of files with this suffix, one of ``SUFFIXES``."""
+    return "AVIF" if suffix in AVIF_SUFFIXES else "HEIF"
+
+
 def read_pixels(file: IO[bytes], suffix: str) -> NDArray[np.uint8]:
     """(H, W, 3) BGR or (H, W, 4) BGRA, as OpenCV reads other pictures.
 
@@ -44,7 +49,7 @@ def read_pixels(file: IO[bytes], suffix: str) -> NDArray[np.uint8]:
         OSError, ValueError: no picture that can be decoded.
     """
     register(suffix)
-    with Image.open(file) as image:
+    with Image.open(file, formats=[format_of(suffix)]) as image:
         mode = "RGBA" if "A" in image.mode else "RGB"
         pixels = np.asarray(image.convert(mode))
     order = [2, 1, 0, 3] if mode == "RGBA" else [2, 1, 0]

@@ -182,15 +182,17 @@ def has_any_model(folder: Path) -> bool:
 def _summary(folder: Path, kind: str, path: str, cache: FactCache) -> GivenPoses:
     """Summarise the poses; cached by the files' digests, because large models take seconds."""
     digests = [
-        [file.name, cache.get(file, "digest", partial(digest_of, file))]
+        [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
         for file in pose_files(folder / path)
     ]
     read = {"colmap": _colmap, "transforms": _transforms, "llff": _llff}[kind]
     key = f"poses:{folder / path}"
-    facts = cache.get_for_state(
-        key, digests, lambda: {"kind": kind, "path": path, **read(folder, path)}
+    return cache.get_for_state(
+        key,
+        digests,
+        GivenPoses,
+        lambda: GivenPoses.model_validate({"kind": kind, "path": path, **read(folder, path)}),
     )
-    return GivenPoses.model_validate(facts)
 
 
 def _colmap(folder: Path, path: str) -> dict[str, Any]:

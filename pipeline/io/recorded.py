@@ -5,19 +5,20 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from pipeline.runtime.errors import UserError
+from pipeline.io.bounded import opened_regular
+from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.record import changed, owner_of, rerun
 
 _DIGEST_BYTES = 16
 
 
-class ChangedFileError(UserError):
-    """A file is not the one whose digest was recorded."""
-
-
 def digest_of(path: Path) -> str:
-    """Hex digest of a file's bytes."""
-    with open(path, "rb") as file:
+    """Hex digest of a file's bytes.
+
+    Raises:
+        OSError: it cannot be read, or is not a regular file.
+    """
+    with opened_regular(path) as file:
         return hashlib.file_digest(file, _hash).hexdigest()
 
 
@@ -35,7 +36,8 @@ def read_recorded(path: str | Path, digest: str | None) -> bytes:
     """
     path = Path(path)
     try:
-        data = path.read_bytes()
+        with opened_regular(path) as file:
+            data = file.read()
     except OSError as error:
         raise UserError(
             f"cannot be read: {error.strerror}",

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict
 
+from pipeline.io.photofile import check_size
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 
@@ -71,6 +72,10 @@ def read_video_facts(path: Path) -> VideoFacts:
         height = round(height * aspect)
     else:
         width = round(width * aspect)
+    try:
+        check_size(width, height)
+    except ValueError as error:
+        raise UserError(f"cannot be read as a video: {error}", file=path, fix=FIX) from None
     # The values of damaged headers may be negative, infinite or NaN.
     known = 0 < frames < 2**31
     return VideoFacts(

@@ -12,7 +12,6 @@ from __future__ import annotations
 import contextlib
 import io
 import struct
-import zipfile
 import zlib
 from dataclasses import dataclass
 from pathlib import Path
@@ -23,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io import pillow_formats
+from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
@@ -91,12 +91,13 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
     path = Path(path)
     data = read_recorded(path, digest)
     try:
-        if path.suffix in (".npy", ".npz"):
-            stored = np.load(io.BytesIO(data), allow_pickle=False)
-            depth: Picture | None = stored if path.suffix == ".npy" else stored[stored.files[0]]
+        if path.suffix == ".npy":
+            depth: Picture | None = read_array(data)
+        elif path.suffix == ".npz":
+            depth = next(iter(read_archive(io.BytesIO(data)).values()), None)
         else:
             depth = _decode(data)
-    except (OSError, ValueError, EOFError, IndexError, zipfile.BadZipFile):
+    except ValueError:
         depth = None
     if depth is None:
         raise UserError(

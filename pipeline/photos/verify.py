@@ -9,15 +9,14 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-from PIL import Image
-
-from pipeline.io import exr, pillow_formats
+from pipeline.io import exr
 from pipeline.io.names import suffix_of
-from pipeline.io.recorded import ChangedFileError, read_recorded
+from pipeline.io.photofile import opened_image
+from pipeline.io.recorded import read_recorded
 from pipeline.io.videofile import FIX as FIX_VIDEO
 from pipeline.io.videofile import opened_video
 from pipeline.photos.duplicates import Signature, find_duplicates, signature
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
 
@@ -177,7 +176,6 @@ def _decode(photo: Photo) -> Signature | None:
         with rawpy.imread(data) as raw:
             raw.unpack()
         return None
-    pillow_formats.register(suffix)
-    with Image.open(data) as image:
+    with opened_image(data, photo.path) as image:
         image.load()
         return signature(image)

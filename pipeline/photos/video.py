@@ -19,10 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Video
-from pipeline.io.recorded import ChangedFileError, digest_of
+from pipeline.io.recorded import digest_of
 from pipeline.io.videofile import opened_video
 from pipeline.photos.video_frames import FrameFormat, is_combed
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
 

@@ -33,7 +33,7 @@ from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
 
 _ADD_PHOTOS = (
@@ -108,7 +108,7 @@ class Scan(BaseModel):
             UserError: they differ.
         """
         if self.fingerprint != fingerprint:
-            raise UserError(
+            raise ChangedFileError(
                 "the scene has changed since snakemake was started",
                 file=folder,
                 fix="run the same snakemake command again, and leave the scene's files unchanged "
@@ -160,8 +160,19 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     Raises:
         UserError: no such folder, too few photographs, malformed pose files, poses of other
             photographs, masks of another size than their photographs, a point cloud that cannot be
-            used.
+            used, folders that cannot be read.
     """
+    try:
+        return _scan(folder, scene, config, cache)
+    except OSError as error:
+        raise UserError(
+            f"cannot be read: {error.strerror}",
+            file=error.filename or folder,
+            fix="give yourself the permission to read it, or move it out of the scene folder",
+        ) from None
+
+
+def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     _check_folder(folder)
     facts_cache = FactCache(cache)
     warnings: list[str] = []
@@ -362,7 +373,7 @@ def _masks(
 
 
 def _read_mask(path: Path, cache: FactCache) -> FileFacts:
-    return FileFacts.model_validate(cache.get(path, "mask", lambda: read_facts(path).model_dump()))
+    return cache.get(path, "mask", FileFacts, partial(read_facts, path))
 
 
 def _photo(
@@ -406,7 +417,7 @@ def _digest_files(folder: Path, files: Sequence[Path], cache: FactCache) -> str:
 
 
 def _digest(path: Path, cache: FactCache) -> str:
-    return str(cache.get(path, "digest", partial(digest_of, path)))
+    return cache.get(path, "digest", str, partial(digest_of, path))
 
 
 def _fingerprint(

@@ -28,6 +28,10 @@ class UserError(Exception):
         return f"{text}\n  what to do: {self.fix}" if self.fix else text
 
 
+class ChangedFileError(UserError):
+    """A file of the scene or of a stage is not the one that was recorded."""
+
+
 def as_user_error(error: OSError) -> UserError | None:
     """The ``UserError`` for a full disk or missing permissions; None for other errors."""
     if error.errno in (errno.ENOSPC, errno.EDQUOT, errno.EFBIG):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -83,10 +84,14 @@ def first_error(error: ValidationError) -> str:
     where = ".".join(map(str, first["loc"]))
     found = first["msg"]
     if first["type"] not in ("json_invalid", "missing"):
-        found += f", found {_quoted(first['input'])}"
+        found += f", found {quoted(first['input'])}"
     return f"{where}: {found}" if where else found
 
 
-def _quoted(value: Any) -> str:
-    text = repr(value)
+def quoted(value: Any) -> str:
+    """``repr(value)``, shortened; of bounded length and time whatever the value refers to."""
+    try:
+        text = repr(value) if isinstance(value, str) else reprlib.repr(value)
+    except ValueError:  # Python does not print integers of thousands of digits.
+        return "a number of thousands of digits"
     return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."

@@ -14,6 +14,9 @@ IS_CHECKOUT = (PACKAGES / "Snakefile").is_file()
 WORKFLOW = PACKAGES if IS_CHECKOUT else PACKAGES / "pipeline" / "workflow"
 """The folder of the Snakefile and of ``profiles/``; setup.py copies them there."""
 
+SCAN_CACHE = ".scratch/scan.json"
+"""In a run's folder of results: facts about the files of its scene (``pipeline.io.fact_cache``)."""
+
 PREBUILT = PACKAGES / "pipeline" / "prebuilt"
 """Native libraries in wheels."""
 

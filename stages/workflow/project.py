@@ -11,8 +11,9 @@ from functools import cache, cached_property
 from pathlib import Path
 from typing import Any, NoReturn
 
+from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project, scene_config
-from pipeline.config.runs import Run, all_runs, parse_run
+from pipeline.config.runs import Run, all_runs, name_fault, parse_run
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import describe, make_plan, plan_record, upstream
 from pipeline.plan.scan import scan
@@ -21,7 +22,7 @@ from pipeline.plan.values import Plan
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.layout import PACKAGES
+from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.registry import STAGES
@@ -30,6 +31,14 @@ RESULTS = Path("results")
 # Written when runs of a batch failed. From then on it is an input of the tables, so that these are
 # made again after the next batch.
 FAILURES = RESULTS / ".failures.json"
+
+
+def check_config(path: str) -> None:
+    """End Snakemake with one message if it cannot read this configuration file."""
+    try:
+        check_config_file(Path(path))
+    except UserError as error:
+        _exit(error)
 
 
 class SnakemakeProject:
@@ -55,7 +64,7 @@ class SnakemakeProject:
             _exit(error)
         self._root = Path(self._project.data_root)
         for name in named:
-            if not (self._root / name).is_dir():
+            if name_fault(name) or not (self._root / name).is_dir():
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
         self._described: dict[str, str] = {}
@@ -134,10 +143,15 @@ class SnakemakeProject:
             _exit(error)
 
     def _scan_and_plan(self, name: str) -> Plan:
+        fault = name_fault(name)
+        if fault is not None:
+            what = f"the name of a scene or of a run cannot be used: {fault}"
+            shown = ascii(name) if len(name) <= 80 else ascii(f"{name[:80]}...")
+            raise UserError(what, file=self._root / shown[1:-1], fix="rename it")
         run = parse_run(name, self._project.configs, self._scenes)
         config = scene_config(self._raw, run.scene, run.config, run.seed)
         folder = self._root / run.scene
-        found = scan(folder, run.scene, config, cache=RESULTS / name / ".scratch" / "scan.json")
+        found = scan(folder, run.scene, config, cache=RESULTS / name / SCAN_CACHE)
         plan = make_plan(found, config, STAGES, str(folder))
         first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
@@ -148,7 +162,11 @@ class SnakemakeProject:
 
     @cached_property
     def _scenes(self) -> list[str]:
-        folders = (path for path in self._root.glob("*") if path.is_dir())
+        try:
+            folders = [path for path in self._root.glob("*") if os.path.isdir(path)]
+        except OSError as error:
+            fix = "give yourself the permission to read it, or set data_root to another folder"
+            _exit(UserError(f"cannot be read: {error.strerror}", file=self._root, fix=fix))
         return sorted(path.name for path in folders if path.name[0] not in "._")
 
     @cached_property

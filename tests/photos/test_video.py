@@ -14,7 +14,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from pipeline.config.schema import Video
-from pipeline.io.recorded import ChangedFileError
 from pipeline.io.videofile import read_video_facts
 from pipeline.photos.verify import verify_videos
 from pipeline.photos.video import (
@@ -28,7 +27,7 @@ from pipeline.photos.video import (
     extract_frames,
     measure,
 )
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.scene.manifest import Manifest, VideoFile
 from tests.tools import need_data
 from tests.videos import panned, write_video

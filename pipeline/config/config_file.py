@@ -1,0 +1,65 @@
+"""Checks of ``config/config.yaml`` before Snakemake reads it, whose errors are tracebacks."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import yaml
+
+from pipeline.runtime.errors import UserError
+
+_MAX_BYTES = 1 << 20
+# Aliases can make a short file stand for any number of values.
+_MAX_VALUES = 100_000
+
+
+def check_config_file(path: Path) -> None:
+    """Check that a configuration file can be read as a mapping.
+
+    Raises:
+        UserError: it is not a text in UTF-8, not YAML, not a mapping, or too large.
+    """
+    try:
+        if path.stat().st_size > _MAX_BYTES:
+            raise _wrong(path, f"expected at most {_MAX_BYTES >> 20} MiB, found a larger file")
+        content = yaml.safe_load(path.read_bytes().decode("utf-8-sig"))
+        count = _count(content, {})
+    except OSError as error:
+        raise _wrong(path, f"cannot be read: {error.strerror}") from None
+    except UnicodeDecodeError as error:
+        raise _wrong(path, f"expected text in UTF-8, found other bytes at {error.start}") from None
+    except (yaml.YAMLError, RecursionError, ValueError, TypeError) as error:
+        where = getattr(error, "problem_mark", None)
+        line = f"line {where.line + 1}: " if where is not None else ""
+        problem = getattr(error, "problem", None) or str(error) or type(error).__name__
+        raise _wrong(path, f"{line}expected YAML: {problem}"[:300]) from None
+    if count > _MAX_VALUES:
+        raise _wrong(path, f"expected options, found {count} values (by aliases)")
+    if content is not None and not isinstance(content, dict):
+        raise _wrong(path, "expected a mapping of options to values (preset: fast)")
+
+
+def _count(value: Any, known: dict[int, int]) -> int:
+    """The number of values with all aliases expanded.
+
+    Args:
+        known: id of a container -> its number; 0 while it is counted.
+
+    Raises:
+        ValueError: a container holds itself.
+    """
+    if not isinstance(value, dict | list | set | tuple):
+        return 1
+    if id(value) in known:
+        if not known[id(value)]:
+            raise ValueError("an alias refers to a value that holds it")
+        return known[id(value)]
+    known[id(value)] = 0
+    inner = value.values() if isinstance(value, dict) else value
+    known[id(value)] = 1 + sum(_count(item, known) for item in inner)
+    return known[id(value)]
+
+
+def _wrong(path: Path, what: str) -> UserError:
+    return UserError(what, file=path, fix="correct the file, or delete it to use the defaults")

@@ -8,6 +8,7 @@ import json
 import sys
 from pathlib import Path
 
+from pipeline.runtime.errors import EXIT_INTERRUPTED
 from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.machine import usable_cores
 
@@ -46,4 +47,8 @@ def _pairs(items: list[str]) -> dict[str, Path]:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        code = main()
+    except KeyboardInterrupt:  # While modules are imported.
+        code = EXIT_INTERRUPTED
+    sys.exit(code)

@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.presets import PRESETS
-from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.machine import usable_cores
 
 MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
@@ -41,6 +41,9 @@ def main(arguments: list[str] | None = None) -> int:
         code = command(**options)
     except UserError as error:
         return _fail(error)
+    except KeyboardInterrupt:
+        print("interrupted", file=sys.stderr)
+        return EXIT_INTERRUPTED
     except OSError as error:
         known = as_user_error(error)
         if known is None:
@@ -260,6 +263,15 @@ def _parser() -> argparse.ArgumentParser:
     )
     sub.add_argument(
         "--host", default="127.0.0.1", help="0.0.0.0: accessible to others (default: %(default)s)"
+    )
+    sub.add_argument(
+        "--allow-host",
+        dest="allowed_hosts",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="answer requests that name this host or come from its pages, as behind a proxy; can "
+        "be repeated (default: only localhost, this machine's name and addresses in numbers)",
     )
     sub.add_argument("--port", type=_positive, default=8080, help="(default: %(default)s)")
     sub.add_argument(

@@ -61,7 +61,8 @@ def snakemake_command(
         ours = WORKFLOW / "profiles" / profile
         profile = str(ours) if ours.is_dir() else profile
     return [
-        *(sys.executable, "-m", "snakemake", f"results/{folder.name}/metrics.json"),
+        *(sys.executable, "-m", "snakemake"),
+        *(f"results/{folder.name}/{file}" for file in ("metrics.json", "report.html")),
         *("--snakefile", str(WORKFLOW / "Snakefile"), "--cores", cores),
         *(() if profile is None else ("--workflow-profile", profile)),
         *options,

@@ -132,9 +132,8 @@ def _validated(model: type[Any], raw: Mapping[str, Any], prefix: str) -> Any:
         for problem in error.errors():
             path, sections = _path(model, problem["loc"])
             if problem["type"] != "extra_forbidden":
-                lines.append(
-                    f"{prefix}{path}: {problem['msg'].removeprefix('Value error, ')}, found {quoted(problem['input'])}"
-                )
+                what = problem["msg"].removeprefix("Value error, ")
+                lines.append(f"{prefix}{path}: {what}, found {quoted(problem['input'])}")
             elif moved := renamed(path):
                 lines += [f"{prefix}{line}" for line in moved]
             else:

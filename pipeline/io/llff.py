@@ -54,7 +54,9 @@ def read_poses_bounds(
         matrix = rows[i, :15].reshape(3, 5)
         down, right, backward, centre, (height, width, focal) = matrix.T
         rotation = np.stack([right, down, -backward])
-        if np.abs(rotation @ rotation.T - np.eye(3)).max() > 1e-2 or np.linalg.det(rotation) < 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            error = np.abs(rotation @ rotation.T - np.eye(3)).max()
+        if not error <= 1e-2 or np.linalg.det(rotation) < 0:
             raise UserError(
                 f"row {i} ({name}): expected a rotation, found another matrix", file=path, fix=_FIX
             )

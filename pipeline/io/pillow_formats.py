@@ -46,7 +46,7 @@ def read_pixels(file: IO[bytes], suffix: str) -> NDArray[np.uint8]:
         suffix: of the file, one of ``SUFFIXES``.
 
     Raises:
-        OSError, ValueError: no picture that can be decoded.
+        OSError, ValueError, EOFError: no picture that can be decoded.
     """
     register(suffix)
     with Image.open(file, formats=[format_of(suffix)]) as image:

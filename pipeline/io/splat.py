@@ -50,7 +50,7 @@ def read_splat(path: Path) -> Gaussians:
         what = f"expected a multiple of {_ROW.itemsize} bytes, found {len(data)}"
         raise UserError(what, file=path, fix=fix)
     table = np.frombuffer(data, _ROW)
-    if not np.isfinite(table["mean"]).all() or not (np.float64(table["scale"]) >= 0).all():
+    if not np.isfinite(table["mean"]).all() or not (table["scale"] >= 0).all():
         what = "expected a .splat file, found impossible positions or scales"
         raise UserError(what, file=path, fix=fix)
     with np.errstate(divide="ignore"):

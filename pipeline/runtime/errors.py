@@ -6,6 +6,9 @@ import errno
 from pathlib import Path
 
 EXIT_USER_ERROR = 2
+_MAX_LINE = 1000
+EXIT_INTERRUPTED = 130
+"""By convention 128 and the number of the signal, SIGINT."""
 
 
 class UserError(Exception):
@@ -20,12 +23,28 @@ class UserError(Exception):
     """
 
     def __init__(self, what: str, *, file: str | Path | None = None, fix: str | None = None):
-        self.what, self.file, self.fix = what, file, fix
+        self.what, self.file, self.fix = _printable(what), file, fix
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        text = f"{self.file}: {self.what}" if self.file is not None else self.what
+        name = _printable(str(self.file).replace("\n", "\\n"))
+        where = f"{name}: " if self.file is not None else ""
+        text = f"{where}{self.what}"
         return f"{text}\n  what to do: {self.fix}" if self.fix else text
+
+
+def _printable(text: str) -> str:
+    """``text`` in lines of bounded length without control characters: messages quote files and
+    their names, which may hold anything."""
+    lines = (
+        line if len(line) <= _MAX_LINE else f"{line[:_MAX_LINE]}..." for line in text.split("\n")
+    )
+    return "\n".join(
+        line
+        if line.isprintable()
+        else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
+        for line in lines
+    )
 
 
 class ChangedFileError(UserError):

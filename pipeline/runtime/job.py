@@ -30,8 +30,15 @@ from pydantic import BaseModel, ValidationError
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
 from pipeline.runtime.counters import NoCounters, StageCounters
-from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+from pipeline.runtime.errors import (
+    EXIT_INTERRUPTED,
+    EXIT_USER_ERROR,
+    ChangedFileError,
+    UserError,
+    as_user_error,
+)
 from pipeline.runtime.facts import run_record
+from pipeline.runtime.layout import SCAN_CACHE
 from pipeline.runtime.lock import locked, logging_to
 from pipeline.runtime.progress import write_progress_to
 from pipeline.runtime.record import (
@@ -149,16 +156,22 @@ def run_stage(
     Args:
         counters: model of the counters that ``work`` must record.
 
-    0: finished, or up to date. 2: a ``UserError``, with its message. 1: another exception, which is
-    a bug of the program, with a traceback.
+    0: finished, or up to date. 2: a ``UserError``, with its message. 130: interrupted by Ctrl-C.
+    1: another exception, which is a bug of the program, with a traceback.
     """
     with logging_to(request.log, request.out.parent.name):
         try:
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work, counters)
         except UserError as error:
+            if isinstance(error, ChangedFileError):
+                # The facts that the scan has cached about the scene's files may be wrong.
+                (request.out.parent / SCAN_CACHE).unlink(missing_ok=True)
             _say_error(request, error)
             return EXIT_USER_ERROR
+        except KeyboardInterrupt:
+            print(f"{request.stage}: interrupted", file=sys.stderr, flush=True)
+            return EXIT_INTERRUPTED
         except MemoryError:
             _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))
             return EXIT_USER_ERROR

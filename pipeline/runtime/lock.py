@@ -37,7 +37,7 @@ def logging_to(path: Path | None, name: str) -> Iterator[None]:
     terminal = sys.stderr
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        log = open(path, "w")  # noqa: SIM115  (closed below)
+        log = open(path, "w", encoding="utf-8", errors="backslashreplace")  # noqa: SIM115  (closed below)
     except OSError:
         # The stage will fail for the same reason, with a complete message.
         yield

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -15,6 +16,7 @@ from pipeline.render import RasterOptions
 from pipeline.render.views import render_rgb, render_view, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import View
+from pipeline.watching.access import checked
 from pipeline.watching.source import Source
 
 # Longer side in pixels while the camera moves; afterwards the image is rendered at full size.
@@ -106,18 +108,30 @@ class Page:
         host, port: address of the page; another port is taken if this one is in use.
         side: longer side of the renders, pixels.
         threads: number of threads of the rasterizer.
+        allowed_hosts: see ``access.refusal``.
 
     Raises:
         UserError: viser is not installed.
     """
 
-    def __init__(self, source: Source, *, host: str, port: int, side: int, threads: int):
+    def __init__(
+        self,
+        source: Source,
+        *,
+        host: str,
+        port: int,
+        side: int,
+        threads: int,
+        allowed_hosts: Collection[str] = (),
+    ):
         self.source, self.side = source, side
         self.options = RasterOptions(near=source.near, threads=threads)
         self.frame = ViewerFrame(source.views)
         self.lock = threading.Lock()
         self.clients: dict[int, _Client] = {}
-        self.server = _viser().ViserServer(host=host, port=port, label="splatmake", verbose=False)
+        viser = _viser()
+        with checked(allowed_hosts):
+            self.server = viser.ViserServer(host=host, port=port, label="splatmake", verbose=False)
         self.text = self.server.gui.add_markdown(source.shown.summary)
         self.names = {view.name: view for view in source.views}
         self.choice = self.server.gui.add_dropdown("camera", tuple(self.names))
@@ -190,9 +204,9 @@ class Page:
         self.server.stop()
 
 
-def serve(source: Source, *, host: str, port: int, side: int, threads: int) -> None:
+def serve(source: Source, *, host: str, port: int, **options: Any) -> None:
     """Show ``source`` until interrupted (see ``Page``)."""
-    page = Page(source, host=host, port=port, side=side, threads=threads)
+    page = Page(source, host=host, port=port, **options)
     print(f"open http://{host}:{page.port} (stop with Ctrl-C)", flush=True)
     try:
         while True:

@@ -188,9 +188,15 @@ class SnakemakeProject:
         return runs, left_out
 
     def every_run(self, wildcards: Any) -> list[str]:
-        """Input function: ``metrics.json`` of all runs."""
+        """Input function: the published files of all runs, so that a deleted one is made again."""
         runs, left_out = self._batch
-        targets = [RESULTS / run.name / "metrics.json" for run in runs if run not in left_out]
+        targets = [
+            RESULTS / run.name / file
+            for run in runs
+            if run not in left_out
+            for spec in STAGES.values()
+            for file in spec.publishes
+        ]
         return [str(path) for path in (*targets, FAILURES) if path in targets or path.exists()]
 
     def outcomes(self, wildcards: Any) -> str:

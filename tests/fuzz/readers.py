@@ -1,0 +1,322 @@
+"""The readers that are fuzzed, with small valid files made by the project's writers."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import json
+import struct
+import tempfile
+import zipfile
+import zlib
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipeline.geometry.cameras import CAMERA_MODELS, Camera
+from pipeline.io import pillow_formats
+from pipeline.io.arrays import read_array
+from pipeline.io.colmap import read_model, write_model
+from pipeline.io.gcp import read_ground_control
+from pipeline.io.llff import read_poses_bounds
+from pipeline.io.photofile import read_facts
+from pipeline.io.splat_files import read_gaussians, write_gaussians
+from pipeline.io.transforms import write_transforms
+from pipeline.io.videofile import read_video_facts
+from pipeline.photos.load import read_depth, read_picture
+from pipeline.plan.given_poses import fit_to_photos, load_given
+from pipeline.runtime.errors import UserError
+from pipeline.scene.manifest import Photo
+from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
+from pipeline.scene.views import View
+from tests.pictures import picture
+from tests.splats.samples import sample
+from tests.videos import write_video
+
+Files = dict[str, bytes]
+
+
+def _same(data: bytes) -> bytes:
+    return data
+
+
+@dataclass(frozen=True)
+class Reader:
+    """A reader under test.
+
+    Attributes:
+        seeds: the names and contents of one valid set of files each; the first file is mutated.
+        read: reads the folder of the files; raises what the oracle judges.
+        unpack, pack: half of the cases mutate ``unpack(content)``, and the file is ``pack`` of it:
+            for formats with checksums and compression, which refuse most other mutations.
+        weight: share of a campaign's cases, relative to the others.
+    """
+
+    seeds: Callable[[], Sequence[Files]]
+    read: Callable[[Path], object]
+    unpack: Callable[[bytes], bytes] = _same
+    pack: Callable[[bytes], bytes] = _same
+    weight: float = 1.0
+
+
+PHOTOS = tuple(
+    Photo(name=f"p{i}.jpg", path=f"p{i}.jpg", width=64, height=48, digest="") for i in range(4)
+)
+NAMES = [photo.name for photo in PHOTOS]
+
+
+def model(kinds: Sequence[str]) -> Reconstruction:
+    """Four images with cameras of these models, and six points."""
+    rng = np.random.default_rng(0)
+    intrinsics = {"f": 50.0, "fx": 50.0, "fy": 51.0, "cx": 32.0, "cy": 24.0}
+    cameras = {
+        number: Camera(
+            kind, 64, 48, np.array([intrinsics.get(n, 0.01) for n in CAMERA_MODELS[kind][1]])
+        )
+        for number, kind in enumerate(kinds, 1)
+    }
+    images = {
+        i + 1: PosedImage(name, i % len(kinds) + 1, np.eye(3), rng.normal(size=3))
+        for i, name in enumerate(NAMES)
+    }
+    points = Points(
+        rng.normal(size=(6, 3)),
+        rng.integers(0, 256, (6, 3), np.uint8),
+        rng.random(6),
+        np.arange(0, 13, 2),
+        np.tile([1, 2, 3], 4)[:12],
+        rng.random((12, 2)) * 40,
+    )
+    return Reconstruction(cameras, images, points)
+
+
+def colmap_seeds(first: str) -> Callable[[], Sequence[Files]]:
+    """Models whose file ``first`` is mutated."""
+
+    def make() -> Sequence[Files]:
+        found = []
+        for kinds in (["PINHOLE"], ["SIMPLE_RADIAL", "OPENCV_FISHEYE"], ["FULL_OPENCV"]):
+            with tempfile.TemporaryDirectory() as folder:
+                write_model(Path(folder), model(kinds), text=first.endswith("txt"))
+                files = {file.name: file.read_bytes() for file in Path(folder).iterdir()}
+            found.append({first: files.pop(first), **files})
+        return found
+
+    return make
+
+
+def read_colmap(folder: Path) -> object:
+    by_name = {photo.name: photo for photo in PHOTOS}
+    return fit_to_photos(read_model(folder), by_name, str(folder))
+
+
+def gaussian_seeds(suffix: str) -> Callable[[], Sequence[Files]]:
+    def make() -> Sequence[Files]:
+        found = []
+        for degree in (0, 1, 3):
+            with tempfile.TemporaryDirectory() as folder:
+                file = Path(folder) / f"g{suffix}"
+                write_gaussians(file, sample(6, degree))
+                found.append({file.name: file.read_bytes()})
+        return found
+
+    return make
+
+
+def ascii_ply() -> Sequence[Files]:
+    names = ["x", "y", "z", "f_dc_0", "f_dc_1", "f_dc_2", "opacity"]
+    names += [f"scale_{i}" for i in range(3)] + [f"rot_{i}" for i in range(4)]
+    rows = np.random.default_rng(0).normal(size=(3, len(names)))
+    lines = ["ply", "format ascii 1.0", "element vertex 3"]
+    lines += [f"property float {name}" for name in names] + ["end_header"]
+    lines += [" ".join(f"{value:.3f}" for value in row) for row in rows]
+    return [{"g.ply": "\n".join([*lines, ""]).encode()}]
+
+
+def read_any_gaussians(folder: Path) -> object:
+    (file,) = folder.iterdir()
+    gaussians = read_gaussians(file, [])
+    count = len(gaussians)
+    assert count > 0 and gaussians.sh.shape == (count, (gaussians.sh_degree + 1) ** 2, 3)
+    assert all(len(t) == count and bool(t.isfinite().all()) for t in gaussians.tensors().values())
+    return gaussians
+
+
+def transforms_seeds() -> Sequence[Files]:
+    pose = np.eye(4)
+    views = [
+        View(n, f"images/{n}", None, 64, 48, 50.0, 50.0, 32.0, 24.0, pose, i == 0)
+        for i, n in enumerate(NAMES)
+    ]
+    with tempfile.TemporaryDirectory() as folder:
+        file = Path(folder) / "transforms.json"
+        write_transforms(file, views, Path(folder))
+        content: dict[str, Any] = json.loads(file.read_text())
+    for i, frame in enumerate(content["frames"]):
+        frame["file_path"] = f"images/p{i}.jpg"
+    extra = {"applied_transform": np.eye(4)[:3].tolist(), "applied_scale": 2.0}
+    fisheye = content | extra | {"camera_model": "OPENCV_FISHEYE", "k1": 0.1, "k3": 0.01}
+    full = content | {"k1": 0.1, "k2": 0.01, "p1": 1e-3, "k4": 1e-3, "camera_angle_x": 0.7}
+    return [{"transforms.json": json.dumps(c).encode()} for c in (content, fisheye, full)]
+
+
+def llff_seeds() -> Sequence[Files]:
+    row = np.zeros((3, 5))
+    row[:, :3] = np.eye(3)[:, [1, 0, 2]] * (1, 1, -1)
+    row[:, 4] = 48, 64, 50
+    rows = np.tile(np.append(row.ravel(), [1.0, 9.0]), (len(NAMES), 1))
+    buffer = io.BytesIO()
+    np.save(buffer, rows)
+    return [{"poses_bounds.npy": buffer.getvalue()}]
+
+
+def read_llff(folder: Path) -> object:
+    (file,) = folder.iterdir()
+    read_poses_bounds(file, NAMES)
+    return load_given(file, "llff", PHOTOS, NAMES)
+
+
+def gcp_seeds() -> Sequence[Files]:
+    lines = [f"{i}.5 {i} 10 {i} 20 p{i}.jpg point{i}" for i in range(4)]
+    return [{"gcp_list.txt": "\n".join(["EPSG:32632", *lines]).encode()}]
+
+
+def photo_seeds(suffix: str) -> Callable[[], Sequence[Files]]:
+    def make() -> Sequence[Files]:
+        if suffix == ".heic":
+            if not pillow_formats.heif_installed():
+                return []
+            pillow_formats.register(suffix)
+        with tempfile.TemporaryDirectory() as folder:
+            tags = {0x010F: "NIKON", 0x0110: "D60", 0x0112: 6}
+            exif = {0x920A: 35.0, 0xA405: 52, 0x9003: "2020:01:02 03:04:05", 0xA432: "lens"}
+            gps = {1: "N", 2: (50.0, 30.0, 10.0), 3: "E", 4: (8.0, 1.0, 2.0), 6: 100.0}
+            alpha = suffix in (".png", ".webp", ".tif")
+            first = picture(Path(folder) / f"a{suffix}", (24, 16), tags=tags, exif=exif, gps=gps)
+            modes = ["L", "RGBA"] if alpha else ["L"]
+            more = [picture(Path(folder) / f"{m}{suffix}", (24, 16), mode=m) for m in modes]
+            return [{f"x{suffix}": path.read_bytes()} for path in (first, *more)]
+
+    return make
+
+
+def read_photo(folder: Path) -> object:
+    """The facts, then the pixels, as the stages read them."""
+    (file,) = folder.iterdir()
+    facts = read_facts(file)
+    assert facts.width > 0 and facts.height > 0 and facts.body.isprintable()
+    return read_picture(file)
+
+
+def video_seeds() -> Sequence[Files]:
+    frames = list(np.random.default_rng(0).integers(0, 255, (3, 32, 48, 3), np.uint8))
+    with tempfile.TemporaryDirectory() as folder:
+        paths = [write_video(Path(folder) / name, frames) for name in ("a.avi", "a.mp4")]
+        return [{f"x{path.suffix}": path.read_bytes()} for path in paths]
+
+
+def depth_seeds() -> Sequence[Files]:
+    found = []
+    for dtype in ("<f4", "<u2", "<f8"):
+        buffer = io.BytesIO()
+        np.save(buffer, np.ones((4, 6), dtype))
+        found.append({"d.npy": buffer.getvalue()})
+    return found
+
+
+def unpack_zip(data: bytes) -> bytes:
+    """The members' bytes, each after its name and its length."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
+    return b"".join(struct.pack("<HI", len(name), len(body)) + name + body for name, body in parts)
+
+
+def pack_zip(data: bytes) -> bytes:
+    buffer, at = io.BytesIO(), 0
+    with zipfile.ZipFile(buffer, "w") as archive:
+        while at + 6 <= len(data):
+            name, body = struct.unpack_from("<HI", data, at)
+            at += 6
+            shown = data[at : at + name % 64].decode("latin-1").replace("\0", "_") or "_"
+            archive.writestr(zipfile.ZipInfo(shown), data[at + name : at + name + body])
+            at += name + body
+    return buffer.getvalue()
+
+
+def pack_gzip(data: bytes) -> bytes:
+    return gzip.compress(data, 1, mtime=0)
+
+
+def pack_png(data: bytes) -> bytes:
+    """The same chunks with correct checksums."""
+    out, at = [data[:8]], 8
+    while at + 8 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        body = data[at + 4 : end]
+        out += [data[at : at + 4], body, zlib.crc32(body).to_bytes(4, "big")]
+        at = end + 4
+    return b"".join(out)
+
+
+def unpack_glb(data: bytes) -> bytes:
+    """The JSON chunk and the binary chunk, after the length of the first."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return data[12:16] + data[20 : 20 + length] + data[28 + length :]
+
+
+def pack_glb(data: bytes) -> bytes:
+    head = data[:4].ljust(4, b"\0")
+    length = struct.unpack("<I", head)[0] % (len(data) + 1)
+    text, body = data[4 : 4 + length], data[4 + length :]
+    chunks = struct.pack("<I", len(text)) + b"JSON" + text
+    chunks += struct.pack("<I", len(body)) + b"BIN\0" + body
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
+
+
+def _only(read: Callable[[Path], object]) -> Callable[[Path], object]:
+    def of_folder(folder: Path) -> object:
+        (file,) = folder.iterdir()
+        return read(file)
+
+    return of_folder
+
+
+def read_npy(file: Path) -> object:
+    try:
+        read_array(file.read_bytes())
+    except ValueError as error:
+        raise UserError(str(error)) from None
+    return read_depth(file)
+
+
+READERS: dict[str, Reader] = {
+    **{
+        f"colmap-{name}": Reader(colmap_seeds(name), read_colmap)
+        for stem in ("cameras", "images", "points3D")
+        for name in (f"{stem}.bin", f"{stem}.txt")
+    },
+    "transforms": Reader(
+        transforms_seeds,
+        lambda folder: load_given(folder, "transforms", PHOTOS, base_folder="images"),
+    ),
+    "llff": Reader(llff_seeds, read_llff),
+    "gcp": Reader(gcp_seeds, lambda folder: read_ground_control(folder / "gcp_list.txt", NAMES)),
+    "ply": Reader(gaussian_seeds(".ply"), read_any_gaussians),
+    "ply-ascii": Reader(ascii_ply, read_any_gaussians),
+    "spz": Reader(gaussian_seeds(".spz"), read_any_gaussians, gzip.decompress, pack_gzip),
+    "splat": Reader(gaussian_seeds(".splat"), read_any_gaussians),
+    "glb": Reader(gaussian_seeds(".glb"), read_any_gaussians, unpack_glb, pack_glb),
+    "npz": Reader(gaussian_seeds(".npz"), read_any_gaussians, unpack_zip, pack_zip),
+    "npy": Reader(depth_seeds, _only(read_npy)),
+    "jpeg": Reader(photo_seeds(".jpg"), read_photo),
+    "png": Reader(photo_seeds(".png"), read_photo, _same, pack_png),
+    "tiff": Reader(photo_seeds(".tif"), read_photo),
+    "webp": Reader(photo_seeds(".webp"), read_photo, weight=0.5),
+    "bmp": Reader(photo_seeds(".bmp"), read_photo, weight=0.5),
+    "avif": Reader(photo_seeds(".avif"), read_photo, weight=0.2),
+    "heic": Reader(photo_seeds(".heic"), read_photo, weight=0.2),
+    "video": Reader(video_seeds, _only(read_video_facts), weight=0.1),
+}

@@ -51,7 +51,7 @@ def read_array(data: bytes) -> NDArray:
         raise ValueError("expected an array of numpy (.npy), found no header of one") from None
     if dtype.kind not in "biuf":
         raise ValueError(f"expected an array of numbers, found {dtype}")
-    if not all(isinstance(side, int) and 0 <= side < 2**31 for side in shape) or len(shape) > 8:
+    if not all(type(side) is int and 0 <= side < 2**31 for side in shape) or len(shape) > 8:
         raise ValueError(f"expected an array of numbers, found the shape {str(shape)[:80]}")
     expected, found = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
     if expected != found:

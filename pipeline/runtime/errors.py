@@ -36,15 +36,13 @@ class UserError(Exception):
 def _printable(text: str) -> str:
     """``text`` in lines of bounded length without control characters: messages quote files and
     their names, which may hold anything."""
-    lines = (
-        line if len(line) <= _MAX_LINE else f"{line[:_MAX_LINE]}..." for line in text.split("\n")
-    )
-    return "\n".join(
-        line
-        if line.isprintable()
-        else "".join(c if c.isprintable() else ascii(c)[1:-1] for c in line)
-        for line in lines
-    )
+    shown = []
+    for line in text.split("\n"):
+        cut = line[:_MAX_LINE]
+        if not cut.isprintable():
+            cut = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in cut)[:_MAX_LINE]
+        shown.append(cut if len(line) <= _MAX_LINE else f"{cut}...")
+    return "\n".join(shown)
 
 
 class ChangedFileError(UserError):

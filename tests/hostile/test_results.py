@@ -214,3 +214,4 @@ def test_messages_hold_no_control_characters():
     error = UserError("found \x1b[2J\ud800 and " + "x" * 5000, file="a\nb", fix="rename it")
     assert str(error).startswith("a\\nb: found \\x1b[2J\\ud800 and xxx")
     assert len(str(error)) < 1100
+    assert len(str(UserError("\0" * 5000))) < 1100

@@ -1,0 +1,62 @@
+"""Findings of the fuzzer, by name."""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.io.arrays import read_array
+from pipeline.photos.load import read_picture
+from pipeline.runtime.errors import UserError
+from tests.fuzz.campaign import content
+from tests.fuzz.readers import READERS
+
+
+def npy(header: str) -> bytes:
+    body = f"{header}\n".encode("latin-1")
+    return b"\x93NUMPY\x01\x00" + len(body).to_bytes(2, "little") + body + bytes(8)
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (1,",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (1L), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (-1,), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (True,), }",
+        "{'descr': '<f8', 'fortran_order': False, 'shape': (" + "9" * 5000 + ",), }",
+        "{'descr': [('a', '<f8')], 'fortran_order': False, 'shape': (1,), }",
+        "{'descr': '|O', 'fortran_order': False, 'shape': (1,), }",
+        "{'descr': '|V0', 'fortran_order': False, 'shape': (1,), }",
+        "(" * 4000,
+    ],
+)
+def test_headers_of_numpy_are_python_source(header):
+    """numpy's parser raised tokenize.TokenError, which is no ValueError."""
+    with pytest.raises(ValueError, match="expected"):
+        read_array(npy(header))
+
+
+def test_an_empty_array_of_huge_sides():
+    buffer = io.BytesIO()
+    np.save(buffer, np.zeros((0, 3)))
+    assert read_array(buffer.getvalue()).shape == (0, 3)
+    huge = buffer.getvalue().replace(b"(0, 3)", b"(0, 9223372036854775808)")
+    with pytest.raises(ValueError, match="found the shape"):
+        read_array(huge)
+
+
+def test_a_truncated_heic_picture(tmp_path):
+    """pillow-heif raised EOFError."""
+    reader = READERS["heic"]
+    seeds = list(reader.seeds())
+    if not seeds:
+        pytest.skip("not run: pillow-heif is missing (pip install pillow-heif)")
+    data = content("heic", reader, seeds, 78)["x.heic"]
+    file = Path(tmp_path / "x.heic")
+    file.write_bytes(data)
+    with pytest.raises(UserError, match="not a readable image"):
+        read_picture(file)

@@ -143,11 +143,7 @@ class SnakemakeProject:
             _exit(error)
 
     def _scan_and_plan(self, name: str) -> Plan:
-        fault = name_fault(name)
-        if fault is not None:
-            what = f"the name of a scene or of a run cannot be used: {fault}"
-            shown = ascii(name) if len(name) <= 80 else ascii(f"{name[:80]}...")
-            raise UserError(what, file=self._root / shown[1:-1], fix="rename it")
+        self._check_results(name)
         run = parse_run(name, self._project.configs, self._scenes)
         config = scene_config(self._raw, run.scene, run.config, run.seed)
         folder = self._root / run.scene
@@ -157,6 +153,20 @@ class SnakemakeProject:
         plan = plan.model_copy(update={"scene": name})
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
         return plan
+
+    def _check_results(self, name: str) -> None:
+        """Check that the run can have a folder of results: otherwise Snakemake would end with an
+        error of its own, and other scenes of the batch with it."""
+        fault = name_fault(name)
+        if fault is not None:
+            what = f"the name of a scene or of a run cannot be used: {fault}"
+            shown = ascii(name) if len(name) <= 80 else ascii(f"{name[:80]}...")
+            raise UserError(what, file=self._root / shown[1:-1], fix="rename it")
+        folder = RESULTS / name
+        finished = (folder / "metrics.json").exists()  # Nothing may be left to write.
+        if folder.exists() and not finished and not os.access(folder, os.W_OK | os.X_OK):
+            fix = "make it writable, or run in another folder (snakemake --directory)"
+            raise UserError("this folder of results cannot be written", file=folder, fix=fix)
 
     # --- batches --------------------------------------------------------------------------
 

@@ -85,6 +85,19 @@ def test_a_folder_without_permission(data, monkeypatch):
     assert "what to do" in left_out["lost+found"]
 
 
+def test_results_that_cannot_be_written(data, monkeypatch):
+    photos(data / "other", 2)
+    results = data.parent / "results" / "other"
+    results.mkdir(parents=True)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "other")
+    planned, left_out = runs()
+    assert planned == ["good"]
+    assert "results/other: this folder of results cannot be written" in left_out["other"]
+    # Finished results may be read-only: there is nothing to write.
+    (results / "metrics.json").write_text("{}")
+    assert runs()[0] == ["good", "other"]
+
+
 def test_a_data_root_without_permission(data, monkeypatch, capfd):
     def glob(path: Path, pattern: str) -> list[Path]:
         raise PermissionError(errno.EACCES, "Permission denied", str(path))

@@ -46,9 +46,11 @@ localrules:
 report: project.packaged("pipeline/reporting/captions/workflow.rst")
 
 
+# The runs' files themselves, too: Snakemake makes a deleted file again only if it is asked for.
 rule all:
     input:
         "results/benchmark.csv",
+        project.every_run,
 
 
 # All scenes with all configurations and seeds. If some fail, after_failure() writes these files with

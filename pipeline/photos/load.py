@@ -205,6 +205,8 @@ def read_picture(path: str | Path, digest: str | None = None) -> Picture:
     if _is_truncated(data):
         raise UserError("the image is truncated or damaged", file=path, fix=FIX)
     picture: Picture | None = None
+    suffix = suffix_of(path.name)
+    if suffix in pillow_formats.SUFFIXES:
         # PIL raises exceptions of many types on damaged files.
         with contextlib.suppress(Exception):
             picture = pillow_formats.read_pixels(io.BytesIO(data), suffix)

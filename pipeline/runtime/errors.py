@@ -23,7 +23,8 @@ class UserError(Exception):
     """
 
     def __init__(self, what: str, *, file: str | Path | None = None, fix: str | None = None):
-        self.what, self.file, self.fix = _printable(what), file, fix
+        self.what, self.file = _printable(what), file
+        self.fix = None if fix is None else _printable(fix)
         super().__init__(str(self))
 
     def __str__(self) -> str:

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
-from pipeline.io import pillow_formats
+from pipeline.io import exr, pillow_formats
 from pipeline.io.arrays import read_array
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.gcp import read_ground_control
@@ -211,6 +211,30 @@ def read_photo(folder: Path) -> object:
     return read_picture(file)
 
 
+def exr_seeds() -> Sequence[Files]:
+    import OpenEXR
+
+    values = np.random.default_rng(0).random((16, 24)).astype(np.float32)
+    found = []
+    for names in ("RGB", "RGBA", "Y"):
+        header = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / "x.exr"
+            with OpenEXR.File(header, {name: values.copy() for name in names}) as file:
+                file.write(str(path))
+            found.append({path.name: path.read_bytes()})
+    return found
+
+
+def read_exr(file: Path) -> object:
+    """The facts, then the pixels, whose ValueError the check of photographs reports."""
+    read_facts(file)
+    try:
+        return exr.read_pixels(io.BytesIO(file.read_bytes()))
+    except ValueError as error:
+        raise UserError(str(error)) from None
+
+
 def video_seeds() -> Sequence[Files]:
     frames = list(np.random.default_rng(0).integers(0, 255, (3, 32, 48, 3), np.uint8))
     with tempfile.TemporaryDirectory() as folder:
@@ -318,5 +342,6 @@ READERS: dict[str, Reader] = {
     "bmp": Reader(photo_seeds(".bmp"), read_photo, weight=0.5),
     "avif": Reader(photo_seeds(".avif"), read_photo, weight=0.2),
     "heic": Reader(photo_seeds(".heic"), read_photo, weight=0.2),
+    "exr": Reader(exr_seeds, _only(read_exr), weight=0.3),
     "video": Reader(video_seeds, _only(read_video_facts), weight=0.1),
 }

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 from pipeline.io.arrays import read_array
+from pipeline.io.ply import read_splat_ply
 from pipeline.photos.load import read_picture
 from pipeline.runtime.errors import UserError
 from tests.fuzz.campaign import content
@@ -47,6 +48,15 @@ def test_an_empty_array_of_huge_sides():
     huge = buffer.getvalue().replace(b"(0, 3)", b"(0, 9223372036854775808)")
     with pytest.raises(ValueError, match="found the shape"):
         read_array(huge)
+
+
+def test_a_ply_header_with_a_count_of_5000_digits(tmp_path):
+    """Python refuses to convert it."""
+    (data,) = (files["g.ply"] for files in READERS["ply-ascii"].seeds())
+    file = tmp_path / "g.ply"
+    file.write_bytes(data.replace(b"vertex 3", b"vertex " + b"9" * 5000))
+    with pytest.raises(UserError, match="expected 'element vertex COUNT'"):
+        read_splat_ply(file)
 
 
 def test_a_truncated_heic_picture(tmp_path):

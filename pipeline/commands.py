@@ -9,20 +9,23 @@ from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Any
 
+import numpy as np
 from PIL import Image
 
 from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
+from pipeline.io.photofile import MAX_PIXELS
 from pipeline.io.splat_files import check_suffix, is_exported, read_gaussians, write_gaussians
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.plan.given_poses import MAX_COORDINATE
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render import BACKGROUNDS, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import track
-from pipeline.scene.views import camera_views, scene_extent
+from pipeline.scene.views import View, camera_views, scene_extent
 from pipeline.splats.reduce import reduce_gaussians
 
 
@@ -99,6 +102,7 @@ def render(
     views = camera_views(posed, how.max_side)
     if not views:
         raise UserError("expected cameras, found none", file=cameras, fix="use another model")
+    _check_views(views, cameras)
     if not all(posed.cameras[image.camera_id].is_pinhole for image in posed.images.values()):
         warnings.append(f"{cameras}: lens distortion is not rendered")
     # The near plane depends on all views, so that it is independent of ``names``.
@@ -119,6 +123,21 @@ def render(
         Image.fromarray(to_bytes(rgb)).save(buffer, "PNG")
         write_bytes(file, buffer.getvalue())
     return [f"{out}: {len(chosen)} views rendered"]
+
+
+def _check_views(views: Sequence[View], cameras: Path) -> None:
+    """Raises: UserError: a view is too large to be rendered, or out of the range of positions."""
+    for view in views:
+        with np.errstate(over="ignore", invalid="ignore"):
+            distance = float(np.abs(view.centre).max())
+        if view.width * view.height > MAX_PIXELS or not distance <= MAX_COORDINATE:
+            raise UserError(
+                f"{view.name}: cannot be rendered: {view.width}x{view.height} pixels, "
+                f"{distance:g} units from the origin",
+                file=cameras,
+                fix=f"use cameras of at most {MAX_PIXELS >> 20} megapixels (--max-side) and "
+                f"{MAX_COORDINATE:g} units from the origin",
+            )
 
 
 def _png(folder: Path, name: str, taken: set[Path]) -> Path:

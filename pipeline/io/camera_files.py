@@ -103,10 +103,16 @@ def _size(frame: Frame) -> tuple[int, int]:
     """Width and height in pixels from the frame's ``w`` and ``h``, else from its image file."""
     width, height = frame.fields.get("w"), frame.fields.get("h")
     if isinstance(width, int | float) and isinstance(height, int | float):
+        if not (0 < width < 2**31 and 0 < height < 2**31):  # False for NaN.
+            raise UserError(
+                f"{frame.source}: impossible size {str(width)[:40]}x{str(height)[:40]}",
+                file=frame.file,
+                fix="correct w and h, in pixels",
+            )
         return round(width), round(height)
     for suffix in ("", *sorted(PICTURE_SUFFIXES)):
         picture = frame.file.parent / (frame.path + suffix)
-        if picture.is_file():
+        if not frame.path.startswith(("/", "../")) and picture.is_file():
             facts = read_facts(picture)
             return facts.width, facts.height
     raise UserError(

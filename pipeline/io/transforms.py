@@ -152,7 +152,7 @@ def read_points_entry(path: Path) -> PointsEntry:
         return PointsEntry(None, np.eye(4))
     fields, file = frames[0].fields, frames[0].file
     name = fields.get("ply_file_path")
-    named = _relative(file, name) if isinstance(name, str) and name else None
+    named = _relative(file, _file_name(file, "ply_file_path", name)) if name else None
     to_world = np.linalg.inv(_applied_transform(file, fields))
     return PointsEntry(named, to_world.astype(np.float64))
 
@@ -267,10 +267,12 @@ def _frame(
     source = f"{source} ({path})"
     matrix = _matrix(file, f"{source}.transform_matrix", fields.get("transform_matrix"))
     scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
-    to_world = np.linalg.inv(applied) @ matrix
+    with np.errstate(over="ignore", invalid="ignore"):
+        to_world = np.linalg.inv(applied) @ matrix
     # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
     axes = to_world[:3, :3] * scale
-    u, _, vt = np.linalg.svd(axes)
+    # Zeros, which are no rotation, for values with which the decomposition may not converge.
+    u, _, vt = np.linalg.svd(axes if np.abs(axes).max() < 2 else np.zeros((3, 3)))
     nearest = u @ vt
     if np.abs(nearest - axes).max() > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
         raise UserError(

@@ -38,7 +38,7 @@ _FOCAL_RANGE = (0.02, 1000.0)
 _MAX_SHIFT = 10.0
 # Accepted distance of a camera from the origin. Beyond it, float64 resolves less than a
 # ten-thousandth of a unit.
-_MAX_COORDINATE = 1e12
+MAX_COORDINATE = 1e12
 
 
 @dataclass(frozen=True)
@@ -255,9 +255,9 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
 def _check_centre(image: PosedImage, source: str) -> None:
     with np.errstate(over="ignore", invalid="ignore"):
         distance = float(np.abs(image.centre).max())
-    if not distance <= _MAX_COORDINATE:  # NaN from an overflow is not.
+    if not distance <= MAX_COORDINATE:  # NaN from an overflow is not.
         raise UserError(
-            f"{image.name}: expected a camera at most {_MAX_COORDINATE:g} units from the origin, "
+            f"{image.name}: expected a camera at most {MAX_COORDINATE:g} units from the origin, "
             f"found {distance:g}",
             file=source,
             fix=f"correct its translation or remove {image.name} from the file, or set poses: "

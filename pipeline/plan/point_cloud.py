@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path, PurePosixPath
+from typing import cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -87,7 +88,13 @@ def find_point_cloud(
         return None
     files = _files(folder, path)
     counts = [
-        cache.get(folder / file, "points", cast("type[int | None]", int | None), partial(count_points, folder / file)) for file in files
+        cache.get(
+            folder / file,
+            "points",
+            cast("type[int | None]", int | None),
+            partial(count_points, folder / file),
+        )
+        for file in files
     ]
     size = sum((folder / file).stat().st_size for file in files)
     known = None if None in counts else sum(counts)
@@ -152,7 +159,12 @@ def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str
     source = folder / poses.path
     if source.is_dir():  # Splits of a synthetic scene, whose files name no cloud.
         return None
-    name = cache.get(source, "ply_file_path", cast("type[str | None]", str | None), lambda: read_points_entry(source).path)
+    name = cache.get(
+        source,
+        "ply_file_path",
+        cast("type[str | None]", str | None),
+        lambda: read_points_entry(source).path,
+    )
     if name is None:
         return None
     if not _is_inside(name) or not is_cloud(name) or not (folder / name).is_file():

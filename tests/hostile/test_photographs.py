@@ -85,6 +85,22 @@ def test_a_bad_photograph_is_left_out_and_the_others_are_used(tmp_path, kind, su
         assert warning.startswith(f"x{suffix}: left out: cannot be read")
 
 
+@pytest.mark.parametrize("side", [20_000, 60_000, 2**31 - 1])
+def test_an_avif_image_that_claims_a_huge_size_is_left_out(tmp_path, side):
+    good = photos(tmp_path / "images", 2)
+    file = tmp_path / "images" / "x.avif"
+    avif(file)
+    data = bytearray(file.read_bytes())
+    struct.pack_into(">II", data, data.index(b"ispe") + 8, side, side)
+    file.write_bytes(data)
+    found = look(tmp_path)
+    manifest, warnings = verify_manifest(
+        found.manifest, threads=1, min_photos=2, keep_duplicates=True
+    )
+    assert [photo.name for photo in manifest.photos] == [path.name for path in good]
+    assert any("x.avif: left out" in line for line in (*found.warnings, *warnings))
+
+
 def test_a_photograph_just_too_large_names_the_limit(tmp_path):
     file = tmp_path / "x.png"
     file.write_bytes(png_header(MAX_PIXELS // 1024, 1025))

@@ -47,6 +47,14 @@ def move(value: float) -> Change:
     return change
 
 
+def rotate(value: float) -> Change:
+    def change(content: dict[str, Any]) -> None:
+        for row in content["frames"][1]["transform_matrix"][:3]:
+            row[:3] = [value, -value, value]
+
+    return change
+
+
 def rename(name: object, key: str = "file_path") -> Change:
     return lambda content: content["frames"][1].update({key: name})
 
@@ -58,6 +66,9 @@ def put(**fields: object) -> Change:
 REFUSED: dict[str, tuple[Change, str]] = {
     "translation-1e308": (move(1e308), "p01.jpg: expected a camera at most .* found 1e.308"),
     "translation-1e20": (move(1e20), "p01.jpg: expected a camera at most"),
+    "rotation-1e308": (rotate(1e308), r"p01.jpg.*upper left 3x3 part is not a rotation"),
+    "rotation-1e155": (rotate(1e155), r"p01.jpg.*upper left 3x3 part is not a rotation"),
+    "rotation-0": (rotate(0.0), r"p01.jpg.*upper left 3x3 part is not a rotation"),
     "lone-surrogate": (rename("images/\ud800.jpg"), r"frames\[1\].file_path: expected a file name"),
     "nul": (rename("images/\0.jpg"), r"frames\[1\].file_path: expected a file name"),
     "mask-surrogate": (rename("\ud800.png", "mask_path"), "mask_path: expected a file name"),

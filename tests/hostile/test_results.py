@@ -15,13 +15,13 @@ import pytest
 from pipeline.command import main as command
 from pipeline.config.schema import Config
 from pipeline.io.npz import read_npz, write_npz
-from pipeline.io.splat_files import read_gaussians
+from pipeline.io.splat_files import read_gaussians, write_gaussians
 from pipeline.plan.scan import Scan, scan
 from pipeline.runtime import job as jobs
 from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError
 from pipeline.runtime.job import Job, Request, run_stage
 from pipeline.runtime.layout import SCAN_CACHE
-from tests.pictures import photos
+from tests.pictures import photos, picture
 from tests.splats.samples import sample
 
 
@@ -198,6 +198,35 @@ def test_a_bad_file_of_gaussians_is_one_message(tmp_path, capfd, case):
     assert command.main(["convert", str(file), str(tmp_path / "g.ply")]) == EXIT_USER_ERROR
     assert "error: " in capfd.readouterr().err
     assert not (tmp_path / "g.ply").exists()
+
+
+CAMERAS: dict[str, dict[str, object]] = {
+    "w-nan": {"w": float("nan"), "h": 48},
+    "w-infinite": {"w": float("inf"), "h": 48},
+    "w-1e9": {"w": 1e9, "h": 1e9, "fl_x": 1e9},
+    "w-negative": {"w": -1, "h": 48},
+    "translation-1e308": {"w": 64, "h": 48, "x": 1e308},
+    "outside": {"path": "../a.png"},
+}
+
+
+@pytest.mark.parametrize("case", CAMERAS)
+def test_cameras_that_cannot_be_rendered_are_one_message(tmp_path, capfd, case):
+    fields = dict(CAMERAS[case])
+    picture(tmp_path / "a.png")
+    folder = tmp_path / "scene"
+    folder.mkdir()
+    pose = np.eye(4)
+    pose[0, 3] = fields.pop("x", 0.0)
+    frame = {"file_path": fields.pop("path", "a.png"), "transform_matrix": pose.tolist()}
+    content = {"fl_x": 50, "frames": [frame], **fields}
+    (folder / "transforms.json").write_text(json.dumps(content))
+    write_gaussians(tmp_path / "g.ply", sample(5))
+    options = ["--cameras", str(folder), "-o", str(tmp_path / "out")]
+    assert command.main(["render", str(tmp_path / "g.ply"), *options]) == EXIT_USER_ERROR
+    said = capfd.readouterr().err
+    assert "error: " in said and "what to do" in said
+    assert not (tmp_path / "out").exists()
 
 
 def test_the_remedy_for_a_stages_gaussians_names_the_stage(tmp_path):

@@ -152,7 +152,9 @@ def read_points_entry(path: Path) -> PointsEntry:
         return PointsEntry(None, np.eye(4))
     fields, file = frames[0].fields, frames[0].file
     name = fields.get("ply_file_path")
-    named = _relative(file, _file_name(file, "ply_file_path", name)) if name else None
+    named = None
+    if isinstance(name, str) and name:
+        named = _relative(file, _file_name(file, "ply_file_path", name))
     to_world = np.linalg.inv(_applied_transform(file, fields))
     return PointsEntry(named, to_world.astype(np.float64))
 

@@ -36,9 +36,8 @@ _FOCAL_RANGE = (0.02, 1000.0)
 # Accepted distance of the principal point from the image's centre divided by the longer side: a
 # crop from the border of a much larger image has one outside of it.
 _MAX_SHIFT = 10.0
-# Accepted distance of a camera from the origin. Beyond it, float64 resolves less than a
-# ten-thousandth of a unit.
-MAX_COORDINATE = 1e12
+# Accepted distance of a camera from the origin, in any unit: its square is in the range of float32.
+MAX_COORDINATE = 1e18
 
 
 @dataclass(frozen=True)

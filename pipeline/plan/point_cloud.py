@@ -97,7 +97,7 @@ def find_point_cloud(
         for file in files
     ]
     size = sum((folder / file).stat().st_size for file in files)
-    known = None if None in counts else sum(counts)
+    known = None if None in counts else sum(count or 0 for count in counts)
     return PointCloudFiles(
         path=path, files=files, points=known, megabytes=float(f"{size / 1e6:.3g}")
     )

@@ -298,7 +298,7 @@ def test_positions_that_overflow_are_a_user_error(tmp_path):
     folder = tmp_path / "sparse" / "0"
     write_sparse(folder, [path.name for path in files], (64, 48))
     write_model(folder, Normalization(1e-200).model_to_given(read_model(folder)))
-    with pytest.raises(UserError, match="moderate size"):
+    with pytest.raises(UserError, match=r"at most 1e\+18 units from the origin"):
         given_model(look(tmp_path))
 
 

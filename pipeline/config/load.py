@@ -15,6 +15,7 @@ from pipeline.config.schema import Config
 from pipeline.config.section import Seed
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.json_file import MAX_QUOTED, quoted
+from pipeline.runtime.text import is_plain
 
 # Around a text that ``quoted`` quotes.
 _QUOTES = "'\""
@@ -42,7 +43,7 @@ def _named_configs(value: Any) -> Any:
 
 
 def _printable(path: str) -> str:
-    if not path.isprintable():
+    if not is_plain(path):
         raise ValueError("Input should be UTF-8 without control characters")
     return path
 

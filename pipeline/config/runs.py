@@ -11,6 +11,8 @@ from collections.abc import Collection
 from dataclasses import dataclass
 from itertools import product
 
+from pipeline.runtime.text import is_plain
+
 # File systems allow 255; temporary names are longer.
 MAX_NAME_BYTES = 200
 _SEED = re.compile(r"seed(\d+)")
@@ -67,7 +69,7 @@ def name_fault(name: str) -> str | None:
 
     Snakemake takes braces and angle brackets for its own syntax, and a repeated end for a cycle.
     """
-    if not name.isprintable():
+    if not is_plain(name):
         return "it is not UTF-8 or has control characters"
     if found := re.search(r"[{}<>]", name):
         return f"it has the character {found[0]}"

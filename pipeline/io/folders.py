@@ -14,6 +14,7 @@ from pipeline.io.names import (
     VIDEO_SUFFIXES,
     suffix_of,
 )
+from pipeline.runtime.text import is_plain
 
 # Folders of a scene with images that are not photographs, also with a suffix such as "_2".
 COMPANION_FOLDERS = frozenset({"masks", "depths", "sparse", "sparse_gt", "colmap", "stereo"})
@@ -58,7 +59,7 @@ def pictures_in(
     unread: list[str] = []
     for where, name in _files_in(scene / path, recursive, warnings):
         full = (Path(path) / where / name).as_posix()
-        if not full.isprintable():  # Bytes that are not UTF-8 are surrogates, which are not.
+        if not is_plain(full):
             shown = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in full)
             warnings.append(
                 f"{shown} is not used: its name is not UTF-8 or has control characters; rename it"
@@ -87,7 +88,7 @@ def videos_in(folder: Path, *, recursive: bool = True) -> list[str]:
     return sorted(
         (where / name).as_posix()
         for where, name in _files_in(folder, recursive, [])
-        if name[0] != "." and suffix_of(name) in VIDEO_SUFFIXES and str(where / name).isprintable()
+        if name[0] != "." and suffix_of(name) in VIDEO_SUFFIXES and is_plain(str(where / name))
     )
 
 

@@ -34,7 +34,7 @@ _ROWS = 256
 
 @dataclass(frozen=True)
 class Signature:
-    """What duplicates are told by.
+    """What duplicates are recognised by.
 
     Attributes:
         thumbnail: (SIDE, SIDE) int8, an image with locally normalised contrast.

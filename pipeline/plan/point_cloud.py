@@ -19,6 +19,7 @@ from pipeline.io.fact_cache import FactCache
 from pipeline.io.posefiles import GivenPoses
 from pipeline.io.transforms import read_points_entry
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import is_plain
 from pipeline.scene.normalization import Normalization
 
 _STEM = "points"
@@ -196,7 +197,7 @@ def _configured(folder: Path, wanted: str) -> str:
 def _is_usable(entry: Path) -> bool:
     """Whether this is a cloud with a name that JSON can hold."""
     name = entry.name
-    return entry.is_file() and name[0] != "." and name.isprintable() and is_cloud(name)
+    return entry.is_file() and name[0] != "." and is_plain(name) and is_cloud(name)
 
 
 def _is_inside(name: str) -> bool:

@@ -122,6 +122,9 @@ def test_a_single_subfolder_with_another_name_is_used(tmp_path):
 
 
 ODD_NAMES = [
+    "Screenshot 10.30.00\u202fPM.png",
+    "family \N{MAN}\u200d\N{GIRL}.jpg",
+    "no\u00a0break.jpg",
     "two words.jpg",
     "-rf.jpg",
     "{scene}.jpg",

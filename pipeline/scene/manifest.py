@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
@@ -55,6 +56,8 @@ class Photo(BaseModel):
     """Latitude and longitude in degrees, altitude in metres."""
     taken: str | None = None
     """Time of exposure from EXIF, ISO 8601."""
+    split: Literal["train", "test"] | None = None
+    """Its part of the scene's own split; null for scenes without one."""
 
     @model_validator(mode="after")
     def _files_have_digests(self) -> Photo:

@@ -46,7 +46,7 @@ def _radius(points: Array) -> Array:
     return np.asarray(np.linalg.norm(points, axis=-1, keepdims=True))
 
 
-def _to_angles(points: Array) -> Array:
+def to_angles(points: Array) -> Array:
     """The point at the distance theta from the centre, in the same direction."""
     radius = _radius(points)
     safe = np.maximum(radius, _TINY)
@@ -54,7 +54,7 @@ def _to_angles(points: Array) -> Array:
 
 
 def _from_angles(points: Array) -> Array:
-    """The inverse of ``_to_angles``; NaN at 90 degrees or more."""
+    """The inverse of ``to_angles``; NaN at 90 degrees or more."""
     theta = _radius(points)
     safe = np.maximum(theta, _TINY)
     result = np.where(theta > _TINY, points * np.tan(theta) / safe, points)
@@ -166,7 +166,7 @@ def _angular(polynomial: Callable[[Array, Array], Array]) -> LensModel:
         found = np.where(_radius(found) <= np.arctan(fold(rest)), found, np.nan)
         return _from_angles(found)
 
-    return LensModel(lambda points, rest: polynomial(_to_angles(points), rest), undistort, fold)
+    return LensModel(lambda points, rest: polynomial(to_angles(points), rest), undistort, fold)
 
 
 def solve(function: Callable[[Array], Array], target: Array) -> Array:
@@ -192,7 +192,7 @@ def solve(function: Callable[[Array], Array], target: Array) -> Array:
 
 _DIVISION = LensModel(_distort_division, _undistort_division, _fold_division)
 _EQUIDISTANT = LensModel(
-    lambda points, rest: _to_angles(points), lambda points, rest: _from_angles(points), _unlimited
+    lambda points, rest: to_angles(points), lambda points, rest: _from_angles(points), _unlimited
 )
 LENS_MODELS = {
     "FOV": LensModel(_distort_fov, _undistort_fov, _unlimited),

@@ -19,15 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.io.poses.files import checked_name, is_number, read_json
 from pipeline.io.poses.frames import (
     Lens,
     ListedSplit,
     PosedFrame,
     checked_camera,
-    checked_name,
     checked_pose,
-    is_number,
-    read_json,
     reconstruct,
 )
 from pipeline.runtime.atomic import write_json

@@ -13,6 +13,7 @@ import numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import has_model, read_model
 from pipeline.io.llff import read_poses_bounds, read_rows
+from pipeline.io.poses import metashape
 from pipeline.io.poses.frames import PosedFrame, reconstruct
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, posed_frames
@@ -172,6 +173,7 @@ FORMATS: tuple[PoseFormat, ...] = (
         # Row i belongs to photograph i, so unreadable photographs count.
         read=lambda path, sizes, listed: read_poses_bounds(path, listed)[0],
     ),
+    of_frames("metashape", metashape.find, metashape.frames),
 )
 """In the order of preference."""
 

@@ -5,8 +5,6 @@ Functions raise a ``UserError`` that names the file for values that no camera ca
 
 from __future__ import annotations
 
-import json
-import posixpath
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -17,22 +15,18 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.names import match_names
-from pipeline.runtime.errors import UserError
+from pipeline.io.poses.files import checked_name, malformed, shown
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 Array = NDArray[np.float64]
 ListedSplit = Literal["train", "test", "val", "none"]
 """The list of a scene's own split that a frame is in; "none": a frame that is in no list."""
 
-FIX = "export the file again, or set poses: ignore"
-# Larger files are no list of cameras.
-MAX_BYTES = 256 * 2**20
 # Larger coordinates have no use: float64 has less than a millimetre left at 1e12 metres.
 _MAX_COORDINATE = 1e12
 # Matrices printed with few digits deviate this much from a rotation.
 _ROTATION_TOLERANCE = 1e-2
 _MAX_SIDE = 1_000_000
-_MAX_NAME = 1000
 
 
 @dataclass(frozen=True)
@@ -102,10 +96,6 @@ def reconstruct(
     return Reconstruction(by_id, images)
 
 
-def malformed(file: Path, what: str, fix: str = FIX) -> UserError:
-    return UserError(what, file=file, fix=fix)
-
-
 def make_frame(
     file: Path, name: str, lens: Lens, rotation: Array, centre: Array, where: str = ""
 ) -> PosedFrame:
@@ -125,7 +115,7 @@ def checked_pose(file: Path, where: str, rotation: Array, centre: Array) -> tupl
     """Rotation and translation, world to camera, from ``make_frame``'s arguments."""
     nearest = checked_rotation(file, where, rotation)
     if not (np.abs(centre) < _MAX_COORDINATE).all():
-        raise malformed(file, f"{where}: expected a finite position, found {_shown(centre)}")
+        raise malformed(file, f"{where}: expected a finite position, found {shown(centre)}")
     return nearest, -nearest @ np.asarray(centre, np.float64)
 
 
@@ -151,77 +141,6 @@ def checked_camera(
         raise malformed(
             file,
             f"{where}: expected finite intrinsics and a positive focal length, found "
-            f"{_shown(camera.params)}",
+            f"{shown(camera.params)}",
         )
     return camera
-
-
-def checked_name(file: Path, name: str) -> str:
-    """``name`` with "/" between folders and without "." and inner ".."; relative to the folder of
-    ``file`` if it is absolute and inside of it."""
-    plain = posixpath.normpath(name.replace("\\", "/"))
-    shown = name[:80].encode(errors="replace").decode()
-    if not name or len(name) > _MAX_NAME or any(len(p) > 240 for p in plain.split("/")):
-        raise malformed(file, f"expected the name of a photograph, found {shown!r}")
-    if any(ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 for c in name):
-        raise malformed(file, f"expected the name of a photograph, found {shown!r}")
-    if not posixpath.isabs(plain):
-        return plain
-    folder = str(file.parent.resolve())
-    return posixpath.relpath(plain, folder) if plain.startswith(folder + "/") else plain
-
-
-def read_text(file: Path) -> str:
-    """The file's text (UTF-8, with or without byte order mark)."""
-    if file.stat().st_size > MAX_BYTES:
-        raise malformed(file, f"expected at most {MAX_BYTES >> 20} MiB")
-    try:
-        return file.read_bytes().decode("utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise malformed(file, f"expected UTF-8 text: {error}") from None
-
-
-def read_json(file: Path) -> Any:
-    """The content of a JSON file; integers beyond 64 bits become floats."""
-    try:
-        return json.loads(read_text(file), parse_int=_integer)
-    except json.JSONDecodeError as error:
-        where = f"line {error.lineno}, column {error.colno}"
-        raise malformed(file, f"{where}: not valid JSON ({error.msg})") from None
-    except RecursionError:
-        raise malformed(file, "not valid JSON (nested too deeply)") from None
-
-
-def _integer(digits: str) -> int | float:
-    return int(digits) if len(digits) < 19 else float(digits)
-
-
-def is_number(value: Any) -> bool:
-    """Whether ``value`` is a finite number."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < 1e300  # False for NaN.
-
-
-def number(file: Path, where: str, value: Any) -> float:
-    """``value``, or the number that it is the text of."""
-    try:
-        found = float(value) if isinstance(value, str) else value
-        if is_number(found):
-            return float(found)
-    except ValueError:
-        pass
-    raise malformed(file, f"{where}: expected a finite number, found {_shown(value)}")
-
-
-def numbers(file: Path, where: str, value: Any, count: int) -> Array:
-    """(count,) the numbers of a list or of a text with blanks between them."""
-    listed = value.split() if isinstance(value, str) else value
-    if not isinstance(listed, list | tuple) or len(listed) != count:
-        raise malformed(file, f"{where}: expected {count} numbers, found {_shown(value)}")
-    return np.array([number(file, where, entry) for entry in listed])
-
-
-def _shown(value: Any) -> str:
-    text = str(value.tolist() if isinstance(value, np.ndarray) else value)
-    return repr(text[:60].encode(errors="replace").decode())

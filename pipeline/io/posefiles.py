@@ -62,11 +62,13 @@ class GivenPoses(PoseSummary):
 
     Attributes:
         names: photographs' names in the pose files; empty for LLFF, which goes by order.
+        lost: photographs that the pose files list without a pose.
         splits: name -> the list of the scene's own split that it is in; empty without a split.
     """
 
     names: tuple[str, ...]
     splits: dict[str, ListedSplit] = {}
+    lost: tuple[str, ...] = ()
 
     @property
     def format(self) -> PoseFormat:

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import Camera
 from pipeline.io.poses.files import checked_name, is_number, read_json
 from pipeline.io.poses.frames import (
+    FLIP_YZ,
     Lens,
     ListedSplit,
     PosedFrame,
@@ -34,7 +35,6 @@ from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
 SPLITS: tuple[ListedSplit, ...] = ("train", "test", "val")
-_FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FIX = "correct the file, export it again, or set poses: ignore"
 _LISTS = tuple(f"{name}_filenames" for name in SPLITS)
@@ -180,7 +180,7 @@ def write_transforms(
     intrinsics: list[dict[str, Any]] = []
     for view in views:
         to_world = np.eye(4)
-        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ _FLIP_YZ
+        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ FLIP_YZ
         to_world[:3, 3] = view.centre
         frames.append(
             {"file_path": relative(view.image), "transform_matrix": to_world.tolist()}
@@ -274,7 +274,7 @@ def _frame(
     # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
     axes = to_world[:3, :3] * scale
     where = f"{source}.transform_matrix"
-    pose = checked_pose(file, where, _FLIP_YZ @ axes.T, to_world[:3, 3])
+    pose = checked_pose(file, where, FLIP_YZ @ axes.T, to_world[:3, 3])
     mask = entry.get("mask_path")
     return Frame(
         path=checked_name(file, path),

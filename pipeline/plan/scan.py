@@ -332,6 +332,11 @@ def _check_pose_names(
             f"{len(missing)} of {len(poses.names)} poses have no photograph and are left out "
             f"(first: {missing[0]})"
         )
+    if poses.lost:
+        warnings.append(
+            f"{len(poses.lost)} photographs are not used, because their pose is not finite "
+            f"(tracking was lost; first: {poses.lost[0]})"
+        )
     if len(photos) > len(matched):
         warnings.append(
             f"the poses name no folder: each is used for the {len(photos) // len(matched)} "

@@ -13,7 +13,7 @@ import numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import has_model, read_model
 from pipeline.io.llff import read_poses_bounds, read_rows
-from pipeline.io.poses import metashape
+from pipeline.io.poses import metashape, polycam, realitycapture, record3d, scannet
 from pipeline.io.poses.frames import PosedFrame, reconstruct
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, posed_frames
@@ -66,14 +66,19 @@ def of_frames(
     *,
     names: Names = "photos",
     files: Callable[[Path], list[Path]] = lambda path: [path],
+    lost: Callable[[Path], list[str]] = lambda path: [],
 ) -> PoseFormat:
-    """A format without points, by the function that reads its frames."""
+    """A format without points, by the function that reads its frames.
+
+    Args:
+        lost: the names of photographs that the files list without a pose.
+    """
     return PoseFormat(
         kind=kind,
         names=names,
         find=find,
         files=files,
-        summarise=lambda path: _of_frames(frames(path)),
+        summarise=lambda path: {**_of_frames(frames(path)), "lost": lost(path)},
         read=lambda path, sizes, listed: reconstruct(frames(path), sizes),
         frames=frames,
     )
@@ -174,6 +179,23 @@ FORMATS: tuple[PoseFormat, ...] = (
         read=lambda path, sizes, listed: read_poses_bounds(path, listed)[0],
     ),
     of_frames("metashape", metashape.find, metashape.frames),
+    of_frames("realitycapture_csv", realitycapture.find_csv, realitycapture.csv_frames),
+    of_frames("polycam", polycam.find, polycam.frames, names="scene", files=polycam.files),
+    of_frames("record3d", record3d.find, record3d.frames, names="scene"),
+    of_frames(
+        "scannet",
+        scannet.find,
+        scannet.frames,
+        names="scene",
+        files=scannet.files,
+        lost=scannet.lost,
+    ),
+    of_frames(
+        "realitycapture_xmp",
+        realitycapture.find_xmp,
+        realitycapture.xmp_frames,
+        files=realitycapture.xmp_files,
+    ),
 )
 """In the order of preference."""
 

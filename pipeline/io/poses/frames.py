@@ -22,6 +22,8 @@ Array = NDArray[np.float64]
 ListedSplit = Literal["train", "test", "val", "none"]
 """The list of a scene's own split that a frame is in; "none": a frame that is in no list."""
 
+#: Between OpenGL's axes of a camera (x right, y up, z backward) and COLMAP's.
+FLIP_YZ = np.diag([1.0, -1.0, -1.0])
 # Larger coordinates have no use: float64 has less than a millimetre left at 1e12 metres.
 _MAX_COORDINATE = 1e12
 # Matrices printed with few digits deviate this much from a rotation.

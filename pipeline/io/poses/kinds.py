@@ -4,11 +4,26 @@ from __future__ import annotations
 
 from typing import Literal
 
-PoseKind = Literal["colmap", "transforms", "llff", "metashape"]
+PoseKind = Literal[
+    "colmap",
+    "transforms",
+    "llff",
+    "metashape",
+    "realitycapture_csv",
+    "realitycapture_xmp",
+    "polycam",
+    "record3d",
+    "scannet",
+]
 
 POSE_LABELS: dict[PoseKind, str] = {
     "colmap": "COLMAP model",
     "transforms": "transforms",
     "llff": "LLFF poses",
     "metashape": "Metashape cameras",
+    "realitycapture_csv": "RealityCapture cameras",
+    "realitycapture_xmp": "RealityCapture XMP files in",
+    "polycam": "Polycam cameras",
+    "record3d": "Record3D poses",
+    "scannet": "ScanNet poses",
 }

@@ -75,31 +75,39 @@ def brown_camera(file: Path, where: str, width: float, height: float, lens: Brow
             ``MAX_RESIDUAL_PX``.
     """
     k1, k2, k3, k4 = (*lens.k, 0.0, 0.0, 0.0, 0.0)[:4]
-    intrinsics = (lens.fx, lens.fy, lens.cx, lens.cy)
-    curved = any(lens.p) and any(lens.p_radial)
-    full = "THIN_PRISM_FISHEYE" if lens.fisheye else "FULL_OPENCV"
-    rest: tuple[float, ...]
-    if lens.fisheye and not any(lens.p):
-        model, rest = "OPENCV_FISHEYE", (k1, k2, k3, k4)
-    elif lens.fisheye:
-        model, rest = full, (k1, k2, *lens.p, k3, k4, 0.0, 0.0)
-    elif k3 or k4:
-        model, rest = full, (k1, k2, *lens.p, k3, 0.0, 0.0, 0.0)
-    elif k1 or k2 or any(lens.p):
-        model, rest = "OPENCV", (k1, k2, *lens.p)
-    else:
-        model, rest = "PINHOLE", ()
-    camera = checked_camera(file, where, model, width, height, (*intrinsics, *rest))
-    others = np.array([lens.skew, k4, *lens.p_radial])
+    others = np.array([lens.skew, k1, k2, k3, k4, *lens.p, *lens.p_radial])
     if not np.isfinite(others).all():
         raise malformed(file, f"{where}: expected finite lens coefficients")
-    if lens.skew or curved or (k4 and not lens.fisheye):
-        start = {
-            "FULL_OPENCV": (k1, k2, *lens.p, k3, 0.0, 0.0, 0.0),
-            "THIN_PRISM_FISHEYE": (k1, k2, *lens.p, k3, k4, 0.0, 0.0),
-        }
-        return fitted(file, where, camera, full, start[full], lens.project)
-    return camera
+    rest = {
+        "PINHOLE": (),
+        "OPENCV": (k1, k2, *lens.p),
+        "FULL_OPENCV": (k1, k2, *lens.p, k3, 0.0, 0.0, 0.0),
+        "OPENCV_FISHEYE": (k1, k2, k3, k4),
+        "THIN_PRISM_FISHEYE": (k1, k2, *lens.p, k3, k4, 0.0, 0.0),
+    }[brown_model(lens)]
+    model = brown_model(lens)
+    params = (lens.fx, lens.fy, lens.cx, lens.cy, *rest)
+    camera = checked_camera(file, where, model, width, height, params)
+    if _is_exact(lens):
+        return camera
+    return fitted(file, where, camera, model, rest, lens.project)
+
+
+def brown_model(lens: Brown) -> str:
+    """The camera model of ``brown_camera``."""
+    k1, k2, k3 = (*lens.k, 0.0, 0.0, 0.0)[:3]
+    if lens.fisheye:
+        simple = _is_exact(lens) and not any(lens.p)
+        return "OPENCV_FISHEYE" if simple else "THIN_PRISM_FISHEYE"
+    if k3 or not _is_exact(lens):
+        return "FULL_OPENCV"
+    return "OPENCV" if k1 or k2 or any(lens.p) else "PINHOLE"
+
+
+def _is_exact(lens: Brown) -> bool:
+    """Whether a model of COLMAP has all coefficients that are not zero."""
+    fourth = any(lens.k[3:]) and not lens.fisheye
+    return not (lens.skew or fourth or (any(lens.p) and any(lens.p_radial)))
 
 
 def fitted(

@@ -13,7 +13,17 @@ import numpy as np
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import has_model, read_model
 from pipeline.io.llff import read_poses_bounds, read_rows
-from pipeline.io.poses import metashape, polycam, realitycapture, record3d, scannet
+from pipeline.io.poses import (
+    bundler,
+    metashape,
+    openmvg,
+    opensfm,
+    pix4d,
+    polycam,
+    realitycapture,
+    record3d,
+    scannet,
+)
 from pipeline.io.poses.frames import PosedFrame, reconstruct
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, posed_frames
@@ -180,6 +190,10 @@ FORMATS: tuple[PoseFormat, ...] = (
     ),
     of_frames("metashape", metashape.find, metashape.frames),
     of_frames("realitycapture_csv", realitycapture.find_csv, realitycapture.csv_frames),
+    of_frames("pix4d", pix4d.find, pix4d.frames, files=pix4d.files),
+    of_frames("bundler", bundler.find, bundler.frames, files=bundler.files),
+    of_frames("opensfm", opensfm.find, opensfm.frames),
+    of_frames("openmvg", openmvg.find, openmvg.frames),
     of_frames("polycam", polycam.find, polycam.frames, names="scene", files=polycam.files),
     of_frames("record3d", record3d.find, record3d.frames, names="scene"),
     of_frames(

@@ -14,6 +14,10 @@ PoseKind = Literal[
     "polycam",
     "record3d",
     "scannet",
+    "bundler",
+    "opensfm",
+    "openmvg",
+    "pix4d",
 ]
 
 POSE_LABELS: dict[PoseKind, str] = {
@@ -26,4 +30,8 @@ POSE_LABELS: dict[PoseKind, str] = {
     "polycam": "Polycam cameras",
     "record3d": "Record3D poses",
     "scannet": "ScanNet poses",
+    "bundler": "Bundler cameras",
+    "opensfm": "OpenSfM cameras",
+    "openmvg": "OpenMVG cameras",
+    "pix4d": "Pix4D cameras",
 }

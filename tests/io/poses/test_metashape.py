@@ -194,7 +194,7 @@ def test_messages(tmp_path, content, message):
 
 
 @settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 @given(st.data())
 def test_damaged_files_give_a_message_or_valid_cameras(tmp_path, data):

@@ -6,7 +6,6 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.optimize import least_squares
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import fold_radius, project
@@ -34,6 +33,8 @@ def fit_camera(
         The camera, and the largest error over the image in pixels: infinity if ``lens`` has no
         inverse somewhere in the image.
     """
+    from scipy.optimize import least_squares  # Heavy, and few scenes need it.
+
     first = Camera(model, width, height, np.array(start, np.float64))
     fx, fy, cx, cy = first.pinhole
     scale = np.array([fx, fy])

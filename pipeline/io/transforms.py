@@ -221,7 +221,7 @@ def frame_camera_model(frame: Frame) -> str:
         return "OPENCV_FISHEYE"
     if model and model not in _PERSPECTIVE:
         raise UserError(
-            f"{frame.source}: camera_model {model} is not supported; expected "
+            f"{frame.source}: camera_model {model[:40]} is not supported; expected "
             f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE",
             file=frame.file,
             fix="convert the photographs to perspective ones, or set poses: ignore",
@@ -267,6 +267,7 @@ def _frame(
     path = entry.get("file_path") if isinstance(entry, dict) else None
     if not isinstance(path, str) or not path:
         raise UserError(f"{source}.file_path: expected a file name", file=file, fix=_FIX)
+    path = checked_name(file, path)
     source = f"{source} ({path})"
     matrix = _matrix(file, f"{source}.transform_matrix", entry.get("transform_matrix"))
     scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
@@ -277,7 +278,7 @@ def _frame(
     pose = checked_pose(file, where, FLIP_YZ @ axes.T, to_world[:3, 3])
     mask = entry.get("mask_path")
     return Frame(
-        path=checked_name(file, path),
+        path=path,
         mask=checked_name(file, mask) if isinstance(mask, str) and mask else None,
         rotation=pose[0],
         translation=pose[1],

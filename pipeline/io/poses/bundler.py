@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import malformed, numbers, read_text
+from pipeline.io.poses.files import malformed, numbers, read_text, shown
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
 
@@ -58,7 +58,7 @@ def frames(path: Path) -> list[PosedFrame]:
     found = []
     for i, name in enumerate(islice(names, int(count))):
         focal, *rest = lines[1 + 5 * i : 6 + 5 * i]
-        where = f"camera {i} ({name[:80]})"
+        where = f"camera {i} ({shown(name)})"
         f, k1, k2 = numbers(path, where, focal, 3).tolist()
         if f == 0:
             continue

@@ -18,7 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers
+from pipeline.io.poses.files import checked_name, find_by_head, malformed, number, numbers, shown
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_rotation, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 from pipeline.io.poses.xml import read_xml
@@ -72,7 +72,7 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
     world = _similarity(file, "the chunk's transform", chunk.find("transform")) or _IDENTITY
     components = {
         component.get("id", ""): _similarity(
-            file, f"component {component.get('id')}", component.find("transform")
+            file, f"component {component.get('id', '')[:40]}", component.find("transform")
         )
         for component in chunk.iterfind("components/component")
     }
@@ -84,13 +84,13 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
     lenses: dict[str, Lens] = {}
     found = []
     for camera in cameras:
-        label = camera.get("label", "")
+        label = checked_name(file, camera.get("label", ""))
         similarity = components.get(camera.get("component_id", "")) or world
         sensor = camera.get("sensor_id", "")
         if sensor not in sensors:
-            raise malformed(file, f"camera {label}: expected its sensor {sensor!r}, found none")
+            raise malformed(file, f"camera {label}: expected the sensor {shown(sensor)}")
         if sensor not in lenses:
-            lenses[sensor] = _lens(file, f"sensor {sensor}", sensors[sensor])
+            lenses[sensor] = _lens(file, f"sensor {sensor[:40]}", sensors[sensor])
         text = camera.findtext("transform", "")
         pose = numbers(file, f"camera {label}: transform", text, 16).reshape(4, 4)
         # The rotation is made exact first, so that its error does not move the centre.
@@ -120,11 +120,11 @@ def _lens(file: Path, where: str, sensor: Element) -> Lens:
     if not calibrations:
         raise malformed(file, f"{where}: expected a calibration, found none")
     calibration = (adjusted or calibrations)[-1]
-    kind = calibration.get("type") or sensor.get("type", "frame")
+    kind = calibration.get("type") or sensor.get("type") or "frame"
     if kind not in ("frame", "fisheye"):
         raise malformed(
             file,
-            f"{where}: {kind} cameras are not supported; expected frame or fisheye cameras",
+            f"{where}: {kind[:40]} cameras are not supported; expected frame or fisheye cameras",
             fix="export undistorted photographs with their cameras, or set poses: ignore",
         )
     size = calibration.find("resolution")

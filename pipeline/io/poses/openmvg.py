@@ -47,7 +47,7 @@ def frames(file: Path) -> list[PosedFrame]:
             raise malformed(file, f"view {shown(name)}: expected id_pose and id_intrinsic")
         if pose not in extrinsics or camera not in intrinsics:
             continue
-        where = f"view {name[:80]}"
+        where = f"view {shown(name)}"
         if camera not in lenses:
             lenses[camera] = _lens(file, f"intrinsic {camera}", intrinsics[camera])
         matrix = extrinsics[pose].get("rotation")

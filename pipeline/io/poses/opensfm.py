@@ -10,10 +10,10 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 
-from pipeline.io.poses.files import malformed, number, numbers, read_json
+from pipeline.geometry.rotations import rotation_from_vector
+from pipeline.io.poses.files import malformed, number, numbers, read_json, shown
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 
@@ -45,16 +45,16 @@ def frames(file: Path) -> list[PosedFrame]:
     lenses: dict[str, Lens] = {}
     found = []
     for name, shot in largest["shots"].items():
-        where = f"shot {name[:80]}"
+        where = f"shot {shown(name)}"
         camera = shot.get("camera") if isinstance(shot, dict) else None
         if not isinstance(camera, str) or camera not in largest["cameras"]:
             raise malformed(file, f"{where}: expected one of the file's cameras")
         if camera not in lenses:
-            lenses[camera] = _lens(file, f"camera {camera[:80]}", largest["cameras"][camera])
+            lenses[camera] = _lens(file, f"camera {shown(camera)}", largest["cameras"][camera])
         vector = numbers(file, f"{where}: rotation", shot.get("rotation"), 3)
         if np.abs(vector).max() > 1e6:
             raise malformed(file, f"{where}: expected a rotation vector in radians")
-        rotation = np.asarray(cv2.Rodrigues(vector)[0], np.float64)
+        rotation = rotation_from_vector(vector)
         translation = numbers(file, f"{where}: translation", shot.get("translation"), 3)
         with np.errstate(all="ignore"):
             centre = -rotation.T @ translation

@@ -13,7 +13,7 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
+from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text, shown
 from pipeline.io.poses.frames import Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 
@@ -49,7 +49,7 @@ def frames(path: Path) -> list[PosedFrame]:
         head, *block = rows[start : start + _LINES]
         *words, width, height = ("", "", *head.split())
         name = " ".join(words).strip()
-        where = f"image {name[:80]}"
+        where = f"image {shown(name)}"
         key = (width, height, *block[:5])
         if key not in lenses:
             lenses[key] = _lens(path, where, width, height, block)

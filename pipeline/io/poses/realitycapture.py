@@ -54,11 +54,11 @@ def csv_frames(file: Path) -> list[PosedFrame]:
     lenses: dict[tuple[float, ...], Lens] = {}
     found = []
     for line, text in enumerate(content.splitlines(), 1):
-        row = next(csv.reader([text]), []) if not text.startswith("#") and text.strip() else []
+        row = _cells(text)
         if not row:
             continue
-        if len(row) < len(columns):
-            raise malformed(file, f"line {line}: expected {len(columns)} columns, found {len(row)}")
+        if len(row) < len(header):
+            raise malformed(file, f"line {line}: expected {len(header)} columns, found {len(row)}")
         where = f"line {line}"
 
         def value(name: str, row: list[str] = row, where: str = where) -> float:
@@ -178,6 +178,16 @@ def _pixels(
     """Focal length and principal point in pixels."""
     side = max(width, height)
     return focal / _FILM_MM * side, width / 2 + point[0] * side, height / 2 + point[1] * side
+
+
+def _cells(line: str) -> list[str]:
+    """The cells of a line; empty for comments and blank lines."""
+    if line.startswith("#") or not line.strip():
+        return []
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error:
+        return [line]  # A cell that is longer than any name.
 
 
 def _text(head: bytes) -> str:

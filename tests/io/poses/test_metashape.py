@@ -179,7 +179,7 @@ OUTSIDE = """<?xml version="1.0"?><!DOCTYPE document [<!ENTITY a SYSTEM "file://
             export(known_scene(opencv()), calibration(opencv())).replace(
                 'sensor_id="0"', 'sensor_id="5"'
             ),
-            "its sensor '5'",
+            "the sensor '5'",
         ),
         (export(known_scene(opencv()), calibration(opencv(), f=float("nan"))), "finite number"),
         (export(known_scene(opencv()), calibration(opencv(), k1=1e300)), "finite"),

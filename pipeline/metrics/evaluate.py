@@ -49,6 +49,8 @@ EXPOSURE_PROTOCOL = (
 POSES_PROTOCOL = (
     "the pose of each test camera is optimised on its photograph, with the scene held fixed"
 )
+POSES_OF_ALL = "from all photographs, test views included (as usual in the field)"
+POSES_OF_SPLIT = "poses are given; points are given or from the training photographs alone"
 Mask = NDArray[np.bool_]
 
 
@@ -232,7 +234,7 @@ def evaluate_views(
         protocol=ProtocolDescription(
             resolution=_sizes(protocol.views),
             split=_describe_split(protocol),
-            poses_and_points="from all photographs, test views included (as usual in the field)",
+            poses_and_points=POSES_OF_SPLIT if protocol.listed else POSES_OF_ALL,
             num_views=len(per_view),
             psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
             ssim=SSIM_VARIANT,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
 from typing import Literal
 
@@ -121,6 +121,11 @@ class Manifest(BaseModel):
             )
 
         write_text(path, self._with_files(inside).model_dump_json(indent=1) + "\n")
+
+    def only(self, names: Collection[str]) -> Manifest:
+        """The manifest with these photographs alone."""
+        photos = tuple(photo for photo in self.photos if photo.name in names)
+        return self.model_copy(update={"photos": photos})
 
     @staticmethod
     def read(path: Path) -> Manifest:

@@ -18,6 +18,7 @@ PoseKind = Literal[
     "opensfm",
     "openmvg",
     "pix4d",
+    "pix4d_angles",
 ]
 
 POSE_LABELS: dict[PoseKind, str] = {
@@ -34,4 +35,5 @@ POSE_LABELS: dict[PoseKind, str] = {
     "opensfm": "OpenSfM cameras",
     "openmvg": "OpenMVG cameras",
     "pix4d": "Pix4D cameras",
+    "pix4d_angles": "Pix4D cameras",
 }

@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses import bundler, openmvg, opensfm, pix4d
+from pipeline.io.poses import bundler, openmvg, opensfm, pix4d, pix4d_angles
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Reconstruction
 from tests.io.poses.known import (
@@ -242,6 +242,55 @@ def test_pix4d_messages(tmp_path, text):
         pix4d.frames(file)
 
 
+def angles_text(known: Reconstruction) -> str:
+    lines = ["imageName X Y Z Omega Phi Kappa"]
+    for image in known.images.values():
+        r = image.rotation.T @ FLIP_YZ  # = Rx Ry Rz
+        angles = np.arctan2(-r[1, 2], r[2, 2]), np.arcsin(r[0, 2]), np.arctan2(-r[0, 1], r[0, 0])
+        values = [*image.centre.tolist(), *np.degrees(angles).tolist()]
+        lines.append(" ".join([image.name, *map(repr, values)]))
+    return "\n".join(lines) + "\n"
+
+
+def cam_text(lens: Camera) -> str:
+    mm = 12.8 / WIDTH
+    f, _, cx, cy, k1, k2, t1, t2, k3, *_ = lens.params.tolist()
+    return f"""Pix4D camera calibration file 0
+#Focal Length mm assuming a sensor width of 12.8x9.6mm
+F {f * mm!r}
+#Principal Point mm
+Px {cx * mm!r}
+Py {cy * mm!r}
+#Symmetrical Lens Distortion Coeffs
+K1 {k1}
+K2 {k2}
+K3 {k3}
+#Tangential Lens Distortion Coeffs
+T1 {t1}
+T2 {t2}
+"""
+
+
+def write_angles(folder: Path, poses: str | bytes, camera: str) -> Path:
+    (folder / "a_pix4d_calibrated_internal_camera_parameters.cam").write_text(camera)
+    file = folder / "a_calibrated_external_camera_parameters.txt"
+    file.write_bytes(poses.encode() if isinstance(poses, str) else poses)
+    return file
+
+
+def test_pix4d_angles(tmp_path):
+    lens = square("FULL_OPENCV", -0.1, 0.03, 1e-3, -2e-3, 0.01, 0, 0, 0)
+    known = known_scene(lens, origin=UTM, names="my photo {}.jpg")
+    write_angles(tmp_path, angles_text(known), cam_text(lens))
+    check_same(read("pix4d_angles", tmp_path), known)
+
+
+def test_several_cameras_of_pix4d_are_an_error(tmp_path):
+    file = write_angles(tmp_path, angles_text(known_scene(K3)), 2 * cam_text(K3))
+    with pytest.raises(UserError, match=r"expected one camera.*found 2"):
+        pix4d_angles.frames(file)
+
+
 # --- hostile files ------------------------------------------------------------------------
 
 
@@ -276,3 +325,11 @@ def test_damaged_openmvg(tmp_path, data):
 def test_damaged_pix4d(tmp_path, data):
     sample = pix4d_text(known_scene(K3, 2), np.zeros(3))
     error_or_valid(pix4d.frames, write_pix4d(tmp_path, data.draw(mutated(sample))))
+
+
+@DAMAGED
+@given(st.data(), st.booleans())
+def test_damaged_pix4d_angles(tmp_path, data, poses):
+    texts = [angles_text(known_scene(K3, 2)), cam_text(K3)]
+    texts[not poses] = data.draw(mutated(texts[not poses])).decode("utf-8", "replace")
+    error_or_valid(pix4d_angles.frames, write_angles(tmp_path, *texts))

@@ -261,9 +261,9 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/scene/test_views.py",),
     ),
     "opengl_axes": Mutant(
-        "pipeline/io/transforms.py",
-        "_FLIP_YZ = np.diag([1.0, -1.0, -1.0])",
-        "_FLIP_YZ = np.diag([-1.0, -1.0, 1.0])",
+        "pipeline/io/poses/frames.py",
+        "FLIP_YZ = np.diag([1.0, -1.0, -1.0])",
+        "FLIP_YZ = np.diag([-1.0, -1.0, 1.0])",
         "transforms.json's axes taken for others",
         ("tests/io/test_transforms.py",),
     ),

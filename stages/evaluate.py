@@ -24,7 +24,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     every = settled.config.split.test_every
     truth = ["pose errors with respect to sparse_gt/"] if scan.truth is not None else []
     reason = f"one view in {every}, sorted by name, is a test view"
-    if every == 0:
+    if scan.num_test:
+        reason = f"{scan.num_test} test views: the split that the given poses list"
+    elif every == 0:
         reason = "no test views: measured on the training views"
     return StagePlan(run=True, reason=reason, decisions=truth)
 
@@ -55,7 +57,7 @@ def work(job: Job) -> None:
     evaluation.write(job.out)
     job.counters = EvaluateCounters.model_validate(evaluation, from_attributes=True)
     job.decide(f"PSNR {evaluation.psnr:.2f} dB, SSIM {evaluation.ssim:.4f}")
-    if not protocol.every:
+    if not protocol.has_test_views:
         job.warn("there are no test views: quality was measured on training views")
 
 

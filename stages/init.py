@@ -70,8 +70,12 @@ def work(job: Job) -> None:
     elif config.method != "random" and len(points) == 0:
         job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
+        manifest = inputs.read_manifest(job, "views")
+        if any(view.has_listed_split for view in training):
+            manifest = manifest.only({view.name for view in training})
+            job.decide("test views of the scene's own split are not used for points")
         report = triangulate(
-            inputs.read_manifest(job, "views"),
+            manifest,
             job.inputs["model"] / "sparse" / "0",
             triangulated,
             job.section(Features),

@@ -86,6 +86,9 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=InspectCounters,
-    options=("poses", "inspect", "views.masks", "init.points_file", "sfm.georeference"),
+    options=(
+        *("poses", "inspect", "views.masks", "split.source"),
+        *("init.points_file", "sfm.georeference"),
+    ),
     facts=facts,
 )

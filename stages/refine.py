@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Sfm
-from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
+from pipeline.io.poses.formats import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job

@@ -68,6 +68,12 @@ def _not_all(every: int) -> int:
 class Split(Section):
     """Test views: excluded from training, used for evaluation."""
 
+    source: Literal["auto", "every"] = Field(
+        "auto",
+        description="auto: the split that the given poses list (transforms_train.json and "
+        "transforms_test.json, or nerfstudio's train_filenames and test_filenames), else every "
+        "n-th view. every: every n-th view of all photographs.",
+    )
     test_every: Annotated[int, Field(ge=0), AfterValidator(_not_all), Unit("views")] = Field(
         8,
         description="Every n-th view, sorted by name, is a test view (3DGS: 8). 0: no test views; "

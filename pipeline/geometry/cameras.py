@@ -20,8 +20,32 @@ CAMERA_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
         6,
         ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
     ),
+    "FOV": (7, ("fx", "fy", "cx", "cy", "omega")),
     "SIMPLE_RADIAL_FISHEYE": (8, ("f", "cx", "cy", "k")),
     "RADIAL_FISHEYE": (9, ("f", "cx", "cy", "k1", "k2")),
+    "THIN_PRISM_FISHEYE": (
+        10,
+        ("fx", "fy", "cx", "cy", "k1", "k2", "p1", "p2", "k3", "k4", "sx1", "sy1"),
+    ),
+    "RAD_TAN_THIN_PRISM_FISHEYE": (
+        11,
+        (
+            *("fx", "fy", "cx", "cy", "k0", "k1", "k2", "k3", "k4", "k5"),
+            *("p0", "p1", "s0", "s1", "s2", "s3"),
+        ),
+    ),
+    "SIMPLE_DIVISION": (12, ("f", "cx", "cy", "k")),
+    "DIVISION": (13, ("fx", "fy", "cx", "cy", "k")),
+    "SIMPLE_FISHEYE": (14, ("f", "cx", "cy")),
+    "FISHEYE": (15, ("fx", "fy", "cx", "cy")),
+    "EUCM": (16, ("fx", "fy", "cx", "cy", "alpha", "beta")),
+}
+_WITH_TWO_FOCAL_LENGTHS = {
+    "SIMPLE_PINHOLE": "PINHOLE",
+    "SIMPLE_RADIAL": "OPENCV",
+    "RADIAL": "OPENCV",
+    "SIMPLE_DIVISION": "DIVISION",
+    "SIMPLE_FISHEYE": "FISHEYE",
 }
 
 
@@ -74,9 +98,7 @@ class Camera:
         if self.intrinsics_names[0] == "f" and abs(sx - sy) < 1e-9 * sx:
             params = np.array([fx * sx, cx * sx, cy * sy, *rest])
             return Camera(self.model, width, height, params)
-        model = {"SIMPLE_PINHOLE": "PINHOLE", "SIMPLE_RADIAL": "OPENCV", "RADIAL": "OPENCV"}.get(
-            self.model, self.model
-        )
+        model = _WITH_TWO_FOCAL_LENGTHS.get(self.model, self.model)
         if model == "OPENCV" and len(rest) < 4:
             rest = np.concatenate([rest, np.zeros(4 - len(rest))])
         if self.model.endswith("RADIAL_FISHEYE"):

@@ -1,8 +1,8 @@
 """Lens distortion of COLMAP's camera models and its inverse, vectorised.
 
 Formulas: COLMAP's documentation, "Camera Models"; OpenCV's "Camera Calibration" and "Fisheye
-camera model" for FULL_OPENCV and OPENCV_FISHEYE. Normalised coordinates are (x / z, y / z) of a
-point in the camera's frame, without unit.
+camera model" for FULL_OPENCV and OPENCV_FISHEYE; the models of ``pipeline.geometry.lens_models``
+are there. Normalised coordinates are (x / z, y / z) of a point in the camera's frame, without unit.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.lens_models import LENS_MODELS
 
 Array = NDArray[np.float64]
 
@@ -24,6 +25,8 @@ MAX_ERROR = 1e-9
 
 def distort(camera: Camera, points: Array) -> Array:
     """Apply the lens distortion: (..., 2) to (..., 2), both in normalised coordinates."""
+    if camera.model in LENS_MODELS:
+        return LENS_MODELS[camera.model].distort(points, np.array(_radial(camera)))
     if "FISHEYE" in camera.model:
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
         theta = np.arctan(radius)
@@ -48,6 +51,8 @@ def undistort(camera: Camera, points: Array) -> Array:
     The result is NaN for points without an inverse: beyond ``fold_radius``, and for fisheye rays
     at 90 degrees or more from the optical axis, which have no normalised coordinates.
     """
+    if camera.model in LENS_MODELS:
+        return LENS_MODELS[camera.model].undistort(points, np.array(_radial(camera)))
     if "FISHEYE" in camera.model:
         return _undistort_fisheye(camera, points)
     found = np.array(points, dtype=np.float64)
@@ -77,6 +82,8 @@ def undistort(camera: Camera, points: Array) -> Array:
 def fold_radius(camera: Camera) -> float:
     """The largest undistorted radius, in normalised coordinates, up to which the distorted radius
     increases; infinity if it always does."""
+    if camera.model in LENS_MODELS:
+        return LENS_MODELS[camera.model].fold_radius(np.array(_radial(camera)))
     if "FISHEYE" in camera.model:
         theta = _first_descent(lambda t: t * _polynomial(t**2, _radial(camera)), np.pi / 2)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf

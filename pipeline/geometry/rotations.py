@@ -40,3 +40,10 @@ def rotation_to_quat(rotation: NDArray[np.float64]) -> NDArray[np.float64]:
     q = q / np.linalg.norm(q, axis=-1, keepdims=True)
     result: NDArray[np.float64] = np.where(q[..., :1] < 0, -q, q)
     return result
+
+
+def rotation_from_vector(vector: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(3,) rotation vector, the axis times the angle in radians, to a (3, 3) rotation."""
+    half = 0.5 * float(np.linalg.norm(vector))
+    # np.sinc(x) is sin(pi x) / (pi x).
+    return quat_to_rotation(np.array([np.cos(half), *(0.5 * np.sinc(half / np.pi) * vector)]))

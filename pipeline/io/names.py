@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import PurePosixPath
 
 from pipeline.io import pillow_formats
@@ -53,3 +53,48 @@ class NameIndex:
     def find(self, name: str) -> str | None:
         plain = PurePosixPath(name).as_posix()
         return plain if plain in self._exact else self._by_stem.get(stem_key(name))
+
+
+def match_names(listed: Sequence[str], photos: Iterable[str]) -> dict[str, str]:
+    """Photograph -> its name in a pose file.
+
+    Names match as in ``NameIndex``. If none does, the folders are another program's, and the last
+    parts of the paths are compared, as many as tell the listed names apart. A name without a
+    folder then matches the photographs of that name in several folders if all of these folders
+    hold the same names: pictures taken from the same positions.
+
+    Args:
+        listed: the names in the pose file.
+        photos: the photographs' names.
+    """
+    names = sorted(photos)
+    index = NameIndex(names)
+    found: dict[str, str] = {}
+    for name in listed:
+        match = index.find(name)
+        if match is not None:
+            found.setdefault(match, name)
+    depth = 4
+    while not found and depth:
+        found = _match_tails(listed, names, depth)
+        depth -= 1
+    return found
+
+
+def _match_tails(listed: Sequence[str], photos: Sequence[str], depth: int) -> dict[str, str]:
+    """``match_names`` by the last ``depth`` parts of the paths; empty where that is ambiguous."""
+
+    def tail(name: str) -> str:
+        return "/".join(stem_key(name.replace("\\", "/")).split("/")[-depth:])
+
+    by_tail: dict[str, str] = {}
+    for name in listed:
+        if by_tail.setdefault(tail(name), name) != name:
+            return {}
+    found = {photo: by_tail[tail(photo)] for photo in photos if tail(photo) in by_tail}
+    folders: dict[str, set[str]] = {}
+    for photo in found:
+        path = PurePosixPath(photo)
+        folders.setdefault(path.parent.as_posix(), set()).add(tail(photo))
+    several = len(found) > len(set(found.values()))
+    return {} if several and len({frozenset(held) for held in folders.values()}) > 1 else found

@@ -3,34 +3,29 @@
 from __future__ import annotations
 
 import os
-from collections import Counter
 from functools import partial
 from pathlib import Path, PurePosixPath
-from typing import Any, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.geometry.cameras import Camera
-from pipeline.io.colmap import has_model, read_model
+from pipeline.io.colmap import has_model
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
-from pipeline.io.llff import read_rows
 from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, suffix_of
+from pipeline.io.poses.formats import (
+    COLMAP_FOLDERS,
+    FORMATS,
+    MIN_IMAGES_PER_CAMERA,
+    PoseFormat,
+    format_of,
+)
+from pipeline.io.poses.frames import ListedSplit, PosedFrame
+from pipeline.io.poses.kinds import POSE_LABELS, PoseKind
 from pipeline.io.recorded import digest_of
-from pipeline.io.transforms import find_transforms, frame_camera_model, read_frames
+from pipeline.io.transforms import read_frames
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import Reconstruction
 
-_COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 _MODEL_FILES = [(stem, end) for stem in ("cameras", "images") for end in ("bin", "txt")]
-_LLFF_FILE = "poses_bounds.npy"
-# A camera with fewer images determines no more than a focal length and one radial coefficient.
-MIN_IMAGES_PER_CAMERA = 5
-
-
-PoseKind = Literal["colmap", "transforms", "llff"]
-_KINDS = {"colmap": "COLMAP model", "transforms": "transforms", "llff": "LLFF poses"}
 
 
 class PoseSummary(BaseModel):
@@ -40,8 +35,8 @@ class PoseSummary(BaseModel):
 
     kind: PoseKind = Field(description="Kind of the pose files.")
     path: str = Field(
-        description="The model's folder, the json or the npy file, relative to the scene folder; "
-        "`.` for several transforms files."
+        description="The pose file, or the folder that holds the pose files, relative to the scene "
+        "folder; `.` for the scene folder itself."
     )
     num_images: int = Field(description="Number of images with a pose.")
     models: tuple[str, ...] = Field(description="Camera models in use.")
@@ -58,8 +53,9 @@ class PoseSummary(BaseModel):
     @property
     def label(self) -> str:
         """Kind, place and number of the poses, in words."""
-        where = "transforms*.json" if self.path == "." else self.path
-        return f"{_KINDS[self.kind]} {where}, {self.num_images} cameras"
+        several = self.kind == "transforms" and self.path == "."
+        where = "transforms*.json" if several else self.path
+        return f"{POSE_LABELS[self.kind]} {where}, {self.num_images} cameras"
 
 
 class GivenPoses(PoseSummary):
@@ -67,26 +63,29 @@ class GivenPoses(PoseSummary):
 
     Attributes:
         names: photographs' names in the pose files; empty for LLFF, which goes by order.
+        lost: photographs that the pose files list without a pose.
+        splits: name -> the list of the scene's own split that it is in; empty without a split.
     """
 
     names: tuple[str, ...]
+    splits: dict[str, ListedSplit] = {}
+    lost: tuple[str, ...] = ()
+
+    @property
+    def format(self) -> PoseFormat:
+        return format_of(self.kind)
 
 
 def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
-    """The poses in a scene folder: a COLMAP model, else transforms, else LLFF; None without any.
+    """The poses in a scene folder, of the first of ``FORMATS`` that it has; None without any.
 
     Raises:
         UserError: the pose files are malformed.
     """
-    for path in _COLMAP_FOLDERS:
-        if has_model(folder / path):
-            return _summary(folder, "colmap", path, cache)
-    files = find_transforms(folder)
-    if files:
-        path = files[0].name if len(files) == 1 else "."
-        return _summary(folder, "transforms", path, cache)
-    if (folder / _LLFF_FILE).is_file():
-        return _summary(folder, "llff", _LLFF_FILE, cache)
+    for entry in FORMATS:
+        path = entry.find(folder)
+        if path is not None:
+            return _summary(folder, entry, path, cache)
     return None
 
 
@@ -94,21 +93,15 @@ def incomplete_models(folder: Path) -> list[str]:
     """A warning for each COLMAP folder that has cameras or images but not both."""
     return [
         f"{path}: not used: expected a COLMAP model with cameras and images, found only one of them"
-        for path in _COLMAP_FOLDERS
+        for path in COLMAP_FOLDERS
         if not has_model(folder / path)
         and any((folder / path / f"{stem}.{end}").is_file() for stem, end in _MODEL_FILES)
     ]
 
 
-def pose_files(path: Path) -> list[Path]:
+def pose_files(path: Path, kind: PoseKind) -> list[Path]:
     """The files that the poses at ``path`` (folder or file) consist of."""
-    if path.is_file():
-        return [path]
-    for suffix in (".bin", ".txt"):
-        files = [path / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-        if files[0].is_file() and files[1].is_file():
-            return [file for file in files if file.is_file()]
-    return find_transforms(path)
+    return format_of(kind).files(path)
 
 
 def truth_folder(folder: Path) -> Path | None:
@@ -117,21 +110,52 @@ def truth_folder(folder: Path) -> Path | None:
     return truth if has_model(truth) else None
 
 
-def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder | None:
-    """The existing photographs that transforms*.json lists, or None if there are none.
+def listed_photos(
+    folder: Path, poses: GivenPoses | None, warnings: list[str]
+) -> PhotoFolder | None:
+    """The existing photographs that the pose files list, or None if there are none.
 
     Args:
-        warnings: None if the poses are not used; then a malformed file is no error.
+        poses: None if poses are not used; then a malformed file is no error, and adds no warning.
+        warnings: warnings are added to this list.
     """
-    if not find_transforms(folder) or (warnings is None and has_any_model(folder)):
+    found = _listing(folder, poses)
+    if found is None:
         return None
+    entry, path = found
     repeated: list[str] = []
     try:
-        frames = {frame.path: frame for frame in read_frames(folder, repeated)}
+        if entry.kind == "transforms":
+            read_frames(folder / path, repeated)
+        frames = entry.frames(folder / path) if entry.frames is not None else []
     except UserError:
-        if warnings is not None:
+        if poses is not None:
             raise
         return None
+    name = "transforms*.json" if entry.kind == "transforms" else path
+    warnings = warnings if poses is not None else []
+    return _existing(folder, frames, name, repeated, warnings)
+
+
+def _listing(folder: Path, poses: GivenPoses | None) -> tuple[PoseFormat, str] | None:
+    """The format that lists the photographs, and the path of its files."""
+    if poses is not None:
+        return (poses.format, poses.path) if poses.format.names == "scene" else None
+    for entry in FORMATS:
+        path = entry.find(folder)
+        if path is not None:
+            return (entry, path) if entry.names == "scene" else None
+    return None
+
+
+def _existing(
+    folder: Path,
+    listed: list[PosedFrame],
+    source: str,
+    repeated: list[str],
+    warnings: list[str],
+) -> PhotoFolder | None:
+    frames = {frame.name: frame for frame in listed}
     parents = sorted({str(PurePosixPath(name).parent) for name in frames})
     existing = [
         str(PurePosixPath(parent) / name)
@@ -146,13 +170,11 @@ def transforms_photos(folder: Path, warnings: list[str] | None) -> PhotoFolder |
         return None
     base = os.path.commonpath([os.path.dirname(name) or "." for name in found]) or "."
     masks = {os.path.relpath(name, base): frame.mask for name, frame in found.items()}
-    listed = {name: mask for name, mask in masks.items() if mask is not None}
-    usable = {name: mask for name, mask in listed.items() if _is_inside(folder, mask)}
-    if warnings is not None:
-        warnings += _frame_warnings(repeated, sorted(set(listed.values()) - set(usable.values())))
-    return PhotoFolder(
-        base, base, "the photographs that transforms*.json lists", sorted(masks), usable
-    )
+    named = {name: mask for name, mask in masks.items() if mask is not None}
+    usable = {name: mask for name, mask in named.items() if _is_inside(folder, mask)}
+    lost = sorted(set(named.values()) - set(usable.values()))
+    warnings += _frame_warnings(source, repeated, lost)
+    return PhotoFolder(base, base, f"the photographs that {source} lists", sorted(masks), usable)
 
 
 def _is_inside(folder: Path, name: str) -> bool:
@@ -160,92 +182,32 @@ def _is_inside(folder: Path, name: str) -> bool:
     return not name.startswith(("/", "../")) and (folder / name).is_file()
 
 
-def _frame_warnings(repeated: list[str], lost_masks: list[str]) -> list[str]:
+def _frame_warnings(source: str, repeated: list[str], lost_masks: list[str]) -> list[str]:
     warnings = []
     if repeated:
         warnings.append(
-            f"{len(repeated)} frames of transforms*.json name the file of an earlier frame and are "
+            f"{len(repeated)} frames of {source} name the file of an earlier frame and are "
             f"left out (first: {repeated[0]})"
         )
     if lost_masks:
         warnings.append(
-            f"{len(lost_masks)} masks that transforms*.json lists are not used: they are missing, "
+            f"{len(lost_masks)} masks that {source} lists are not used: they are missing, "
             f"or outside of the scene folder (first: {lost_masks[0]})"
         )
     return warnings
 
 
-def has_any_model(folder: Path) -> bool:
-    return any(has_model(folder / path) for path in _COLMAP_FOLDERS)
-
-
-def _summary(folder: Path, kind: str, path: str, cache: FactCache) -> GivenPoses:
+def _summary(folder: Path, entry: PoseFormat, path: str, cache: FactCache) -> GivenPoses:
     """Summarise the poses; cached by the files' digests, because large models take seconds."""
     digests = [
         [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
-        for file in pose_files(folder / path)
+        for file in entry.files(folder / path)
     ]
-    read = {"colmap": _colmap, "transforms": _transforms, "llff": _llff}[kind]
-    key = f"poses:{folder / path}"
     return cache.get_for_state(
-        key,
+        f"poses:{entry.kind}:{folder / path}",
         digests,
         GivenPoses,
-        lambda: GivenPoses.model_validate({"kind": kind, "path": path, **read(folder, path)}),
+        lambda: GivenPoses.model_validate(
+            {"kind": entry.kind, "path": path, **entry.summarise(folder / path)}
+        ),
     )
-
-
-def _colmap(folder: Path, path: str) -> dict[str, Any]:
-    model = read_model(folder / path)
-    used = [model.cameras[i] for i in sorted({im.camera_id for im in model.images.values()})]
-    return {
-        "names": sorted(image.name for image in model.images.values()),
-        "num_images": len(model.images),
-        "models": sorted({camera.model for camera in used}),
-        "pinhole": all(camera.is_pinhole for camera in used),
-        "num_points": len(model.points),
-        "tracked": _tracked(model),
-        "centred": any(_is_centred(model.cameras[i]) for i in _shared(model)),
-    }
-
-
-def _tracked(model: Reconstruction) -> int:
-    known = ~np.isnan(model.points.track_xy[:, 0])
-    seen = Counter(model.points.track_image_id[known].tolist())
-    return min((seen[number] for number in model.images), default=0)
-
-
-def _shared(model: Reconstruction) -> list[int]:
-    """Ids of the cameras with ``MIN_IMAGES_PER_CAMERA`` images or more."""
-    used = Counter(image.camera_id for image in model.images.values())
-    return [number for number, count in used.items() if count >= MIN_IMAGES_PER_CAMERA]
-
-
-def _is_centred(camera: Camera) -> bool:
-    return camera.pinhole[2:] == (camera.width / 2, camera.height / 2)
-
-
-def _transforms(folder: Path, path: str) -> dict[str, Any]:
-    frames = read_frames(folder / path)
-    models = sorted({frame_camera_model(frame) for frame in frames})
-    return {
-        "names": sorted(frame.path for frame in frames),
-        "num_images": len(frames),
-        "models": models,
-        "pinhole": models == ["PINHOLE"],
-        "num_points": 0,
-        "tracked": 0,
-        "centred": False,
-    }
-
-
-def _llff(folder: Path, path: str) -> dict[str, Any]:
-    return {
-        "names": [],
-        "num_images": len(read_rows(folder / path)),
-        "models": ["SIMPLE_PINHOLE"],
-        "pinhole": True,
-        "num_points": 0,
-        "tracked": 0,
-        "centred": False,
-    }

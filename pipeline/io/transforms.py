@@ -7,12 +7,11 @@ and z gives COLMAP's. nerfstudio may have transformed COLMAP's world by ``applie
 
 from __future__ import annotations
 
-import json
 import math
 import os
-import posixpath
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -20,22 +19,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.bounded import MIB, read_bounded
-from pipeline.io.names import NameIndex
+from pipeline.io.poses.files import checked_name, is_number, read_json, shown
+from pipeline.io.poses.frames import (
+    FLIP_YZ,
+    Lens,
+    ListedSplit,
+    PosedFrame,
+    checked_camera,
+    checked_pose,
+    reconstruct,
+)
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
-from pipeline.scene.reconstruction import PosedImage, Reconstruction
+from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-SPLITS = ("train", "test", "val")
-_FLIP_YZ = np.diag([1.0, -1.0, -1.0])
+SPLITS: tuple[ListedSplit, ...] = ("train", "test", "val")
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
 _FIX = "correct the file, export it again, or set poses: ignore"
-# Matrices printed with few digits deviate this much from a rotation.
-_ROTATION_TOLERANCE = 1e-2
 # Scales of nerfstudio's world relative to COLMAP's. Their cubes are far from a float's range.
 _SCALES = (1e-12, 1e12)
-_MAX_BYTES = 512 * MIB
+_LISTS = tuple(f"{name}_filenames" for name in SPLITS)
+# Units farther apart are a mistake, and overflow where they are multiplied.
+_SMALLEST_SCALE = 1e-15
 
 
 @dataclass(frozen=True)
@@ -47,6 +53,8 @@ class Frame:
         mask: likewise, or None.
         rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
         fields: the file's fields, overridden by the frame's.
+        split: the list of the scene's own split that it is in, or None: transforms_train.json and
+            so on, or ``train_filenames`` and so on of nerfstudio.
         file: the json.
         source: "frames[i] (PATH)", for messages.
     """
@@ -56,6 +64,7 @@ class Frame:
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     fields: Mapping[str, Any]
+    split: ListedSplit | None
     file: Path
     source: str
 
@@ -95,6 +104,25 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
     return list(frames.values())
 
 
+def posed_frames(path: Path) -> list[PosedFrame]:
+    """The frames of a file or of the files in a scene folder, with cameras and split.
+
+    Raises:
+        UserError: as ``read_frames``, and for camera models that are not supported.
+    """
+    return [
+        PosedFrame(
+            frame.path,
+            Lens(frame_camera_model(frame), partial(_camera, frame)),
+            frame.rotation,
+            frame.translation,
+            frame.mask,
+            frame.split,
+        )
+        for frame in read_frames(path)
+    ]
+
+
 def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconstruction:
     """Poses of the frames whose photographs exist.
 
@@ -108,23 +136,9 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
         Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
 
     Raises:
-        UserError: as ``read_frames``, and for intrinsics that are missing or impossible.
+        UserError: as ``posed_frames``, and for intrinsics that are missing or impossible.
     """
-    index = NameIndex(sizes)
-    cameras: dict[tuple, int] = {}
-    by_id: dict[int, Camera] = {}
-    images: dict[int, PosedImage] = {}
-    found: dict[str, Frame] = {}
-    for frame in read_frames(path):
-        if name := index.find(frame.path):
-            found.setdefault(name, frame)
-    for number, (name, frame) in enumerate(sorted(found.items()), 1):
-        camera = _camera(frame, *sizes[name])
-        key = (camera.model, camera.width, camera.height, *camera.params.tolist())
-        camera_id = cameras.setdefault(key, len(cameras) + 1)
-        by_id[camera_id] = camera
-        images[number] = PosedImage(name, camera_id, frame.rotation, frame.translation)
-    return Reconstruction(by_id, images)
+    return reconstruct(posed_frames(path), sizes)
 
 
 @dataclass(frozen=True)
@@ -152,9 +166,7 @@ def read_points_entry(path: Path) -> PointsEntry:
         return PointsEntry(None, np.eye(4))
     fields, file = frames[0].fields, frames[0].file
     name = fields.get("ply_file_path")
-    named = None
-    if isinstance(name, str) and name:
-        named = _relative(file, _file_name(file, "ply_file_path", name))
+    named = checked_name(file, name) if isinstance(name, str) and name else None
     to_world = np.linalg.inv(_applied_transform(file, fields))
     return PointsEntry(named, to_world.astype(np.float64))
 
@@ -180,7 +192,7 @@ def write_transforms(
     intrinsics: list[dict[str, Any]] = []
     for view in views:
         to_world = np.eye(4)
-        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ _FLIP_YZ
+        to_world[:3, :3] = view.world_to_camera[:3, :3].T @ FLIP_YZ
         to_world[:3, 3] = view.centre
         frames.append(
             {"file_path": relative(view.image), "transform_matrix": to_world.tolist()}
@@ -221,10 +233,10 @@ def frame_camera_model(frame: Frame) -> str:
         return "OPENCV_FISHEYE"
     if model and model not in _PERSPECTIVE:
         raise UserError(
-            f"{frame.source}: camera_model {model} is not supported; expected "
+            f"{frame.source}: camera_model {model[:40]} is not supported; expected "
             f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE",
             file=frame.file,
-            fix="convert the photographs to perspective or fisheye ones, or set poses: ignore",
+            fix="convert the photographs to perspective ones, or set poses: ignore",
         )
     if any(_number(frame, name, 0.0) for name in ("k3", "k4", "k5", "k6")):
         return "FULL_OPENCV"
@@ -234,30 +246,30 @@ def frame_camera_model(frame: Frame) -> str:
 
 
 def _frames_of(file: Path) -> list[Frame]:
-    data = read_bounded(file, _MAX_BYTES, fix=_FIX)
-    try:
-        content = json.loads(data)
-    except UnicodeDecodeError as error:
-        raise UserError(f"expected UTF-8 text: {error}", file=file, fix=_FIX) from None
-    except json.JSONDecodeError as error:
-        raise UserError(
-            f"line {error.lineno}, column {error.colno}: not valid JSON ({error.msg})",
-            file=file,
-            fix=_FIX,
-        ) from None
-    except RecursionError:
-        raise UserError("not valid JSON (nested too deeply)", file=file, fix=_FIX) from None
-    except ValueError:
-        # Python refuses to convert longer ones, which takes quadratic time.
-        raise UserError(
-            "expected numbers, found an integer of thousands of digits", file=file, fix=_FIX
-        ) from None
+    content = read_json(file)
     listed = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(listed, list):
         raise UserError("expected an object with a list 'frames'", file=file, fix=_FIX)
     applied = _applied_transform(file, content)
-    shared = {key: value for key, value in content.items() if key != "frames"}
-    return [_frame(file, i, entry, shared, applied) for i, entry in enumerate(listed)]
+    shared = {key: value for key, value in content.items() if key not in ("frames", *_LISTS)}
+    frames = [_frame(file, i, entry, shared, applied) for i, entry in enumerate(listed)]
+    split_of = _splits(file, content)
+    return [replace(frame, split=split_of(frame.path)) for frame in frames]
+
+
+def _splits(file: Path, content: Mapping[str, Any]) -> Callable[[str], ListedSplit | None]:
+    """The function from a frame's photograph to the list that it is in."""
+    whole: dict[str, ListedSplit] = {f"transforms_{name}.json": name for name in SPLITS}
+    if file.name in whole:
+        return lambda path: whole[file.name]
+    lists = {name: content.get(f"{name}_filenames") for name in SPLITS}
+    found: dict[str, ListedSplit] = {}
+    for name in SPLITS:
+        listed = lists[name]
+        for entry in listed if isinstance(listed, list) else []:
+            if isinstance(entry, str):
+                found.setdefault(checked_name(file, entry), name)
+    return lambda path: found.get(path, "none") if found else None
 
 
 def _frame(
@@ -273,51 +285,28 @@ def _frame(
         to_world = np.linalg.inv(applied) @ matrix
     # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
     axes = to_world[:3, :3] * scale
-    # Zeros, which are no rotation, for values with which the decomposition may not converge.
-    u, _, vt = np.linalg.svd(axes if np.abs(axes).max() < 2 else np.zeros((3, 3)))
-    nearest = u @ vt
-    if np.abs(nearest - axes).max() > _ROTATION_TOLERANCE or np.linalg.det(nearest) < 0:
-        raise UserError(
-            f"{source}.transform_matrix: its upper left 3x3 part is not a rotation",
-            file=file,
-            fix=_FIX,
-        )
-    rotation = _FLIP_YZ @ nearest.T
+    where = f"{source}.transform_matrix"
+    pose = checked_pose(file, where, FLIP_YZ @ axes.T, to_world[:3, 3])
     mask = fields.get("mask_path") or None
     if mask is not None:
-        mask = _relative(file, _file_name(file, f"{source}.mask_path", mask))
+        mask = _file_name(file, f"{source}.mask_path", mask)
     return Frame(
-        path=_relative(file, path),
+        path=path,
         mask=mask,
-        rotation=rotation,
-        translation=-rotation @ to_world[:3, 3],
+        rotation=pose[0],
+        translation=pose[1],
         fields={**shared, **fields},
+        split=None,
         file=file,
         source=source,
     )
 
 
 def _file_name(file: Path, where: str, value: Any) -> str:
-    if isinstance(value, str) and value and "\0" not in value:
-        try:
-            value.encode()
-        except UnicodeEncodeError:  # A lone surrogate: JSON allows it, file systems do not.
-            pass
-        else:
-            return value
-    raise UserError(
-        f"{where}: expected a file name, found {ascii(value)[:80]}", file=file, fix=_FIX
-    )
-
-
-def _relative(file: Path, path: str) -> str:
-    """``path`` normalised and relative to the folder of ``file``; absolute or with leading ".."
-    only if it is outside of that folder."""
-    plain = posixpath.normpath(path.replace("\\", "/"))
-    if not posixpath.isabs(plain):
-        return plain
-    folder = str(file.parent.resolve())
-    return posixpath.relpath(plain, folder) if plain.startswith(folder + "/") else plain
+    """``checked_name`` of a field."""
+    if not isinstance(value, str) or not value:
+        raise UserError(f"{where}: expected a file name, found {shown(value)}", file=file, fix=_FIX)
+    return checked_name(file, value, f"{where}: ")
 
 
 def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
@@ -328,8 +317,13 @@ def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
         matrix = np.zeros(0)
     if matrix.shape not in ((4, 4), (3, 4)):
         raise UserError(f"{where}: expected 4x4 numbers", file=file, fix=_FIX)
-    if not np.isfinite(matrix).all():
-        raise UserError(f"{where}: holds values that are not finite", file=file, fix=_FIX)
+    if not (np.abs(matrix) < 1 / _SMALLEST_SCALE).all():
+        largest = shown(np.abs(matrix).max())
+        raise UserError(
+            f"{where}: expected values below {1 / _SMALLEST_SCALE:g}, found {largest}",
+            file=file,
+            fix=_FIX,
+        )
     full = np.eye(4)
     full[:3] = matrix[:3]
     return full
@@ -341,8 +335,10 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     if "applied_transform" in content:
         applied = _matrix(file, "applied_transform", content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
-    if not _is_number(scale) or scale <= 0:
-        raise UserError("applied_scale: expected a positive number", file=file, fix=_FIX)
+    if not is_number(scale) or not _SMALLEST_SCALE < scale < 1 / _SMALLEST_SCALE:
+        raise UserError(
+            f"applied_scale: expected a positive number, found {shown(scale)}", file=file, fix=_FIX
+        )
     # The largest element of the axes: between their length and its third.
     size = float(np.abs(applied[:3, :3]).max())
     if not (_SCALES[0] <= scale * size <= _SCALES[1] and _SCALES[0] <= size <= _SCALES[1]):
@@ -359,16 +355,9 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
     return applied
 
 
-def _is_number(value: Any) -> bool:
-    """Whether ``value`` is a finite number; integers in JSON may exceed the range of floats."""
-    if isinstance(value, bool) or not isinstance(value, int | float):
-        return False
-    return abs(value) < 1e300  # False for NaN.
-
-
 def _number(frame: Frame, name: str, default: float) -> float:
     value = frame.fields.get(name, default)
-    if not _is_number(value):
+    if not is_number(value):
         raise UserError(
             f"{frame.source}: {name} is {str(value)[:40]!r}, expected a finite number",
             file=frame.file,
@@ -381,10 +370,6 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
     """The frame's camera, with the photograph's size if the frame has none."""
     width = round(_number(frame, "w", photo_width))
     height = round(_number(frame, "h", photo_height))
-    if width <= 0 or height <= 0:
-        raise UserError(
-            f"{frame.source}: impossible size {width}x{height}", file=frame.file, fix=_FIX
-        )
     fx = _focal(frame, "fl_x", "camera_angle_x", width)
     fy = _focal(frame, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:
@@ -393,7 +378,8 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
             file=frame.file,
             fix=_FIX,
         )
-    params = [fx or fy, fy or fx, _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)]
+    fx, fy = fx or fy or 0.0, fy or fx or 0.0
+    params = [fx, fy, _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)]
     model = frame_camera_model(frame)
     rest = {
         "PINHOLE": (),
@@ -402,7 +388,7 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
         "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
     }[model]
     params += [_number(frame, name, 0.0) for name in rest]
-    return Camera(model, width, height, np.array(params, np.float64))
+    return checked_camera(frame.file, frame.source, model, width, height, params)
 
 
 def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:

@@ -49,6 +49,8 @@ EXPOSURE_PROTOCOL = (
 POSES_PROTOCOL = (
     "the pose of each test camera is optimised on its photograph, with the scene held fixed"
 )
+POSES_OF_ALL = "from all photographs, test views included (as usual in the field)"
+POSES_OF_SPLIT = "poses are given; points are given or from the training photographs alone"
 Mask = NDArray[np.bool_]
 
 
@@ -59,7 +61,10 @@ class Protocol:
     Attributes:
         views: the evaluated views: the test views, or all views if there are none.
         training_views: an even sample of the training views; empty without test views.
-        every: every n-th view, sorted by name, is a test view; 0: there are none.
+        every: every n-th view, sorted by name, is a test view; 0: there are none, or the scene's
+            own split lists them.
+        num_training: number of training views.
+        listed: whether the views are test views of the scene's own split.
         background: RGB in [0, 1] behind renders and transparent photographs.
         near: near plane of the renders, as in training; world units.
         extent: radius of the scene, world units (``scene_extent``).
@@ -71,6 +76,12 @@ class Protocol:
     background: Color
     near: float
     extent: float
+    num_training: int
+    listed: bool
+
+    @property
+    def has_test_views(self) -> bool:
+        return self.every > 0 or self.listed
 
     def options(self, train: Train, threads: int) -> RasterOptions:
         """Options of the rasterizer: as in training, over ``background``."""
@@ -97,13 +108,16 @@ def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protoc
         .astype(int)
     )
     extent = scene_extent(list(views))
+    listed = any(view.has_listed_split for view in test)
     return Protocol(
         test or list(views),
         [training[i] for i in picks] if test else [],
-        split.test_every if test else 0,
+        split.test_every if test and not listed else 0,
         BACKGROUNDS["white" if train.background in ("white", "random") else "black"],
         near_plane(extent),
         extent,
+        len(training),
+        listed,
     )
 
 
@@ -220,7 +234,7 @@ def evaluate_views(
         protocol=ProtocolDescription(
             resolution=_sizes(protocol.views),
             split=_describe_split(protocol),
-            poses_and_points="from all photographs, test views included (as usual in the field)",
+            poses_and_points=POSES_OF_SPLIT if protocol.listed else POSES_OF_ALL,
             num_views=len(per_view),
             psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
             ssim=SSIM_VARIANT,
@@ -271,6 +285,11 @@ def _sizes(views: Sequence[View]) -> tuple[str, ...]:
 
 
 def _describe_split(protocol: Protocol) -> str:
+    if protocol.listed:
+        return (
+            f"test views: the scene's own split, listed with its poses: {protocol.num_training} "
+            f"training views, {len(protocol.views)} test views"
+        )
     if not protocol.every:
         return "no test views: measured on the TRAINING views"
     return f"test views: one view in {protocol.every}, sorted by name, from the first"

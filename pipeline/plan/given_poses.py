@@ -10,11 +10,10 @@ import numpy as np
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
-from pipeline.io.colmap import read_model, write_model
-from pipeline.io.llff import read_poses_bounds
-from pipeline.io.names import NameIndex
-from pipeline.io.posefiles import PoseKind
-from pipeline.io.transforms import read_transforms
+from pipeline.io.colmap import write_model
+from pipeline.io.names import NameIndex, match_names
+from pipeline.io.poses.formats import format_of
+from pipeline.io.poses.kinds import PoseKind
 from pipeline.runtime.errors import UserError
 from pipeline.scene.georeference import GIVEN_UNIT, CartesianOrigin, Georeference
 from pipeline.scene.manifest import Manifest, Photo
@@ -114,29 +113,24 @@ def load_given(
         kind: its format.
         photos: the photographs that are used.
         listed: for LLFF, the names of all photographs, also of those that are not used.
-        base_folder: for transforms, the folder of the photographs relative to that of the json.
+        base_folder: the folder of the photographs relative to the scene folder, for formats whose
+            names are relative to the latter.
 
     Raises:
         UserError: malformed pose files; a camera with another aspect ratio than its photograph,
             or with an impossible focal length.
     """
     by_name = {photo.name: photo for photo in photos}
-    sizes = {photo.name: (photo.width, photo.height) for photo in photos}
-    if kind == "transforms":
-        prefix = "" if base_folder == "." else f"{base_folder}/"
-        model = read_transforms(path, {prefix + name: size for name, size in sizes.items()})
-        model = Reconstruction(
-            model.cameras,
-            {
-                i: PosedImage(im.name[len(prefix) :], im.camera_id, im.rotation, im.translation)
-                for i, im in model.images.items()
-            },
-        )
-    elif kind == "llff":
-        # Row i belongs to photograph i, so unreadable photographs count; they are dropped below.
-        model, _ = read_poses_bounds(path, listed)
-    else:
-        model = read_model(path)
+    entry = format_of(kind)
+    prefix = entry.prefix(base_folder)
+    sizes = {prefix + photo.name: (photo.width, photo.height) for photo in photos}
+    model = entry.read(path, sizes, listed)
+    if prefix:
+        images = {
+            i: replace(image, name=image.name.removeprefix(prefix))
+            for i, image in model.images.items()
+        }
+        model = replace(model, images=images)
     fitted = fit_to_photos(model, by_name, str(path))
     normalization = _normalization(fitted, path)
     return GivenModel(normalization.model_to_scene(fitted), normalization)
@@ -178,7 +172,8 @@ def fit_to_photos(
     """``model`` reduced to the images that are photographs, with their names, and with cameras
     resized to them.
 
-    Names match exactly or without suffix. Image ids do not change.
+    Names match as in ``match_names``. Image ids do not change; the second photograph of an image
+    and further ones get new ids, without observations.
 
     Args:
         photos: name -> photograph.
@@ -188,18 +183,23 @@ def fit_to_photos(
         UserError: a camera with another aspect ratio than its photograph, or with an impossible
             focal length.
     """
-    index = NameIndex(photos)
+    matched: dict[str, list[str]] = {}
+    for name, listed in match_names(_names(model), photos).items():
+        matched.setdefault(listed, []).append(name)
     images: dict[int, PosedImage] = {}
     cameras: dict[int, Camera] = {}
     ids: dict[tuple[int, int, int], int] = {}
     scale: dict[int, tuple[float, float]] = {}
-    last_id = max(model.cameras, default=0)
-    taken: set[str] = set()
-    for number, image in sorted(model.images.items()):
-        name = index.find(image.name)
-        if name is None or name in taken:
-            continue
-        taken.add(name)
+    last_id, last_image = max(model.cameras, default=0), max(model.images, default=0)
+    pairs = [
+        (number, image, name)
+        for number, image in sorted(model.images.items())
+        for name in matched.pop(image.name, [])
+    ]
+    for number, image, name in pairs:
+        if number in images:
+            last_image += 1
+            number = last_image
         photo, camera = photos[name], model.cameras[image.camera_id]
         _check_camera(photo, camera, source)
         _check_centre(image, source)
@@ -217,6 +217,11 @@ def fit_to_photos(
         scale[number] = photo.width / camera.width, photo.height / camera.height
         images[number] = PosedImage(name, ids[key], image.rotation, image.translation)
     return Reconstruction(cameras, images, _points_in(model.points, scale))
+
+
+def _names(model: Reconstruction) -> list[str]:
+    """The names of the images in the order of their ids."""
+    return [image.name for _, image in sorted(model.images.items())]
 
 
 def _check_camera(photo: Photo, camera: Camera, source: str) -> None:

@@ -10,9 +10,9 @@ from pathlib import Path, PurePosixPath
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
-from pipeline.io.names import NameIndex
+from pipeline.io.names import NameIndex, match_names
 from pipeline.io.photofile import FileFacts, read_facts
-from pipeline.io.posefiles import GivenPoses, transforms_photos
+from pipeline.io.posefiles import GivenPoses, listed_photos
 from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
 from pipeline.runtime.errors import UserError
 
@@ -28,7 +28,7 @@ def choose_photo_folder(
     warnings: list[str],
 ) -> PhotoFolder:
     """The folder of ``inspect.image_folder``; with "auto" that of the photographs that
-    transforms.json lists, else ``images`` or a smaller copy of it, else the scene folder.
+    the pose files list, else ``images`` or a smaller copy of it, else the scene folder.
 
     Args:
         folder: the scene folder.
@@ -47,10 +47,9 @@ def choose_photo_folder(
                 file=folder / configured,
                 fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
             )
-    if poses is None or poses.kind == "transforms":
-        listed = transforms_photos(folder, warnings if poses is not None else None)
-        if listed is not None and configured in ("auto", listed.path):
-            return listed
+    listed = listed_photos(folder, poses, warnings)
+    if listed is not None and configured in ("auto", listed.path):
+        return listed
     if configured not in ("auto", "."):
         names = pictures_in(folder, configured, warnings)
         base = "images" if re.fullmatch(r"images_[248]", configured) else configured
@@ -135,13 +134,13 @@ def _is_complete(
         used = kind == "depths" or config.views.masks == "auto"
         if used and (folder / kind).is_dir() and not (folder / f"{kind}{suffix}").is_dir():
             return False
-    if poses is not None and poses.kind == "transforms":
+    if poses is not None and poses.format.names == "scene":
         return False  # Without w and h, the focal length may refer to the full size.
-    if poses is not None and poses.kind == "llff":
+    if poses is not None and poses.format.names == "order":
         return len(copy.names) == poses.num_images
-    needed = poses.names if poses is not None else full.names
-    in_copy, in_full = NameIndex(copy.names), NameIndex(full.names)
-    return all(in_copy.find(name) for name in needed if in_full.find(name))
+    needed = match_names(poses.names, full.names) if poses is not None else full.names
+    in_copy = NameIndex(copy.names)
+    return all(in_copy.find(name) for name in needed)
 
 
 def read_all(

@@ -124,7 +124,8 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         image_folder=scan.image_folder,
         view_size=view_size(*scan.sizes[0], config.views.max_long_side_px),
         training_memory_mb=training_memory_mb(scan, config),
-        given_poses=poses and PoseSummary.model_validate(poses.model_dump(exclude={"names"})),
+        given_poses=poses
+        and PoseSummary.model_validate(poses.model_dump(exclude={"names", "splits", "lost"})),
         truth="sparse_gt" if scan.truth is not None else None,
         truth_digest=scan.truth_digest,
         fingerprint=scan.fingerprint,

@@ -66,7 +66,7 @@ def posed_scene(
         max_long_side: of views, in pixels; None: as in the finished scene, else that of the
             photographs.
         every: every this-many-th view is a test view, 0: none; None: as in the finished scene,
-            else the default.
+            else the scene's own split or the default.
         exported: whether the model is an exported file: in the unit of the given poses. Otherwise
             the views are in the world that the scene was trained in.
 
@@ -77,8 +77,8 @@ def posed_scene(
     if any((folder / name).exists() for name in _RESULTS):
         return _finished(folder, max_long_side, every, exported)
     side = Views(max_long_side_px=max_long_side or 2**31)
-    split = Split() if every is None else Split(test_every=every)
-    found = scan(folder, folder.name, Config(views=side), cache=None)
+    split = Split() if every is None else Split(source="every", test_every=every)
+    found = scan(folder, folder.name, Config(views=side, split=split), cache=None)
     if found.poses is None:
         raise UserError(
             "expected photographs with poses (a COLMAP model in sparse/0, transforms.json or "
@@ -117,7 +117,7 @@ def _finished(
     if max_long_side is not None:
         views = views.model_copy(update={"max_long_side_px": max_long_side})
     if every is not None:
-        split = split.model_copy(update={"test_every": every})
+        split = split.model_copy(update={"source": "every", "test_every": every})
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
     model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"))
     if exported:

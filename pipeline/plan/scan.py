@@ -19,7 +19,7 @@ from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, companions
 from pipeline.io.gcp import GCP_FILE
-from pipeline.io.names import LINEAR_SUFFIXES, NameIndex, stem_key, suffix_of
+from pipeline.io.names import LINEAR_SUFFIXES, match_names, stem_key, suffix_of
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
     GivenPoses,
@@ -29,6 +29,7 @@ from pipeline.io.posefiles import (
     truth_folder,
 )
 from pipeline.io.recorded import digest_of
+from pipeline.plan.listed_split import Part, listed_split
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
@@ -136,6 +137,11 @@ class Scan(BaseModel):
         return sum(photo.gps is not None for photo in self.photos)
 
     @property
+    def num_test(self) -> int:
+        """Number of test views of the scene's own split; 0 without one."""
+        return sum(photo.split == "test" for photo in self.photos)
+
+    @property
     def num_focal(self) -> int:
         return sum(photo.focal_px is not None for photo in self.photos)
 
@@ -153,7 +159,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         folder: the scene folder: photographs or videos, and optionally poses, masks, depth maps.
         scene: the scene's name.
         config: of which ``inspect``, ``views``, ``features``, ``poses``,
-            ``init.points_file`` and ``sfm.georeference`` are used.
+            ``split``, ``init.points_file`` and ``sfm.georeference`` are used.
         cache: JSON file that caches facts about files; None for no cache. A file that cannot be
             written is no error.
 
@@ -205,6 +211,8 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         )
     if poses is not None:
         _check_pose_names(folder, poses, chosen, sorted(facts), warnings)
+    split = _listed_split(poses, chosen, sorted(facts), config, warnings)
+    facts = {name: found for name, found in facts.items() if not split or split[name]}
 
     suffix = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
     masks = _masks(folder, suffix, config, chosen, facts, facts_cache)
@@ -214,7 +222,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
-        )
+        ).model_copy(update={"split": split.get(name)})
         for name in sorted(facts)
     ]
     truth = truth_folder(folder)
@@ -233,7 +241,9 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ground_control=control,
         cloud=cloud,
         truth=truth,
-        truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
+        truth_digest=_digest_files(folder, pose_files(truth, "colmap"), facts_cache)
+        if truth
+        else None,
         fingerprint=_fingerprint(
             folder,
             manifest,
@@ -306,7 +316,7 @@ def _check_pose_names(
     warnings: list[str],
 ) -> None:
     """Check that poses and photographs belong together; warn of those without a counterpart."""
-    if poses.kind == "llff":
+    if poses.format.names == "order":
         if len(chosen.names) != poses.num_images:
             raise UserError(
                 f"expected as many poses as photographs, found {poses.num_images} poses and "
@@ -315,10 +325,10 @@ def _check_pose_names(
                 fix="restore the missing photographs, or set poses: ignore",
             )
         return
-    prefix = "" if poses.kind == "colmap" or chosen.base == "." else f"{chosen.base}/"
-    index = NameIndex(prefix + name for name in names)
-    matched = [index.find(name) for name in poses.names]
-    missing = [name for name, match in zip(poses.names, matched, strict=True) if match is None]
+    prefix = poses.format.prefix(chosen.base)
+    photos = match_names(poses.names, [prefix + name for name in names])
+    matched = set(photos.values())
+    missing = [name for name in poses.names if name not in matched]
     if len(missing) == len(poses.names):
         raise UserError(
             f"none of its {len(poses.names)} images is a photograph in "
@@ -333,12 +343,37 @@ def _check_pose_names(
             f"{len(missing)} of {len(poses.names)} poses have no photograph and are left out "
             f"(first: {missing[0]})"
         )
-    without = sorted({prefix + name for name in names} - {match for match in matched if match})
+    if poses.lost:
+        warnings.append(
+            f"{len(poses.lost)} photographs are not used, because their pose is not finite "
+            f"(tracking was lost; first: {poses.lost[0]})"
+        )
+    if len(photos) > len(matched):
+        warnings.append(
+            f"the poses name no folder: each is used for the {len(photos) // len(matched)} "
+            f"photographs of its name in different folders (first: {min(photos)})"
+        )
+    without = sorted({prefix + name for name in names} - photos.keys())
     if without:
         warnings.append(
             f"{len(without)} of {len(names)} photographs have no given pose and are not used "
             f"(first: {without[0]})"
         )
+
+
+def _listed_split(
+    poses: GivenPoses | None,
+    chosen: PhotoFolder,
+    names: Sequence[str],
+    config: Config,
+    warnings: list[str],
+) -> dict[str, Part | None]:
+    """Photograph -> its part of the scene's own split; empty where that is not used."""
+    if poses is None or not poses.splits or config.split.source != "auto":
+        return {}
+    prefix = poses.format.prefix(chosen.base)
+    found = listed_split(poses.splits, [prefix + name for name in names], warnings)
+    return {name.removeprefix(prefix): part for name, part in found.items()}
 
 
 # --- masks and photographs ----------------------------------------------------------------
@@ -433,7 +468,7 @@ def _fingerprint(
     files: list[Photo | VideoFile] = [*photos, *manifest.videos]
     others = [Path(p) for photo in photos for p in (photo.mask, photo.depth) if p is not None]
     if poses is not None:
-        others += pose_files(folder / poses.path)
+        others += pose_files(folder / poses.path, poses.kind)
     if control is not None:
         others.append(control)
     others += clouds

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from pathlib import Path
+from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, model_validator
 
@@ -55,6 +56,8 @@ class Photo(BaseModel):
     """Latitude and longitude in degrees, altitude in metres."""
     taken: str | None = None
     """Time of exposure from EXIF, ISO 8601."""
+    split: Literal["train", "test"] | None = None
+    """Its part of the scene's own split; null for scenes without one."""
 
     @model_validator(mode="after")
     def _files_have_digests(self) -> Photo:
@@ -118,6 +121,11 @@ class Manifest(BaseModel):
             )
 
         write_text(path, self._with_files(inside).model_dump_json(indent=1) + "\n")
+
+    def only(self, names: Collection[str]) -> Manifest:
+        """The manifest with these photographs alone."""
+        photos = tuple(photo for photo in self.photos if photo.name in names)
+        return self.model_copy(update={"photos": photos})
 
     @staticmethod
     def read(path: Path) -> Manifest:

@@ -28,6 +28,7 @@ class View:
         world_to_camera: (4, 4) float64.
         is_test: whether this is a test view, which is not trained on.
         camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
+        has_listed_split: whether the scene's own split says if this is a test view.
         image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
     """
 
@@ -45,6 +46,7 @@ class View:
     camera_id: int = 0
     image_digest: str | None = None
     mask_digest: str | None = None
+    has_listed_split: bool = False
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -87,6 +89,8 @@ def load_views(
     """
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
+    parts = {photo.split for photo in photos}
+    listed = split.source == "auto" and parts == {"train", "test"}
     # A single view is a training view.
     every = split.test_every if len(photos) > 1 else 0
     result = []
@@ -109,10 +113,11 @@ def load_views(
                 cx=cx,
                 cy=cy,
                 world_to_camera=image.world_to_camera,
-                is_test=is_test_view(index, every),
+                is_test=photo.split == "test" if listed else is_test_view(index, every),
                 camera_id=image.camera_id,
                 image_digest=photo.digest,
                 mask_digest=photo.mask_digest if views.masks == "auto" else None,
+                has_listed_split=listed,
             )
         )
     return result

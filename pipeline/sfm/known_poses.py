@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import schema
 from pipeline.geometry.similarity import robust_similarity
-from pipeline.io.posefiles import pose_files
+from pipeline.io.poses.formats import colmap_files
 from pipeline.sfm.alignment import transform_model
 from pipeline.sfm.counters import RefineCounters
 from pipeline.sfm.models import write_model
@@ -72,7 +72,7 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
     adjusted = _adjust_more_tracks(model, tracks, refined) if refined.freed else refined.model
     if not refined.freed or not _is_finite(adjusted):
         out.mkdir(parents=True, exist_ok=True)
-        for file in pose_files(sparse):
+        for file in colmap_files(sparse):
             shutil.copy(file, out)
         unchanged = [*refined.decisions, "known poses are unchanged"]
         counters = RefineCounters(freed=False, error_before_px=before, error_px=before)

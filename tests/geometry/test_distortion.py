@@ -22,6 +22,17 @@ PARAMS = {
     "FULL_OPENCV": [400, 410, 318, 243, 0.3, 0.02, 0.001, -0.002, 0.01, 0.5, 0.05, 0.002],
     "SIMPLE_RADIAL_FISHEYE": [300, 320, 240, 0.03],
     "RADIAL_FISHEYE": [300, 320, 240, 0.03, -0.01],
+    "FOV": [400, 410, 318, 243, 0.9],
+    "THIN_PRISM_FISHEYE": [300, 305, 318, 243, 0.02, -0.01, 1e-3, -2e-3, 3e-3, -5e-4, 4e-3, -3e-3],
+    "RAD_TAN_THIN_PRISM_FISHEYE": [
+        *(300, 305, 318, 243, 0.02, -0.01, 3e-3, -5e-4, 1e-4, 2e-5),
+        *(1e-3, -2e-3, 4e-3, 1e-3, -3e-3, 2e-3),
+    ],
+    "SIMPLE_DIVISION": [400, 320, 240, -0.2],
+    "DIVISION": [400, 410, 318, 243, 0.15],
+    "SIMPLE_FISHEYE": [300, 320, 240],
+    "FISHEYE": [300, 305, 318, 243],
+    "EUCM": [300, 305, 318, 243, 0.6, 1.1],
 }
 
 
@@ -62,6 +73,24 @@ json.dump(out, sys.stdout)
         ours = unproject(camera(model), np.array(xy))
         np.testing.assert_allclose(ours, np.array(back)[:, :2], atol=1e-6, err_msg=model)
         np.testing.assert_allclose(ours, points, atol=1e-8, err_msg=model)
+
+
+@pytest.mark.parametrize("model", sorted(PARAMS))
+def test_a_camera_resized_with_its_image_sees_the_same(model: str) -> None:
+    whole, rays = camera(model), grid() / 2
+    for width, height in ((320, 240), (321, 240)):
+        factor = np.array([width / 640, height / 480])
+        resized = whole.resized(width, height)
+        np.testing.assert_allclose(project(resized, rays), project(whole, rays) * factor)
+
+
+def test_a_division_model_ends_at_its_fold() -> None:
+    lens = camera("DIVISION")
+    radius = fold_radius(lens)
+    inside, outside = np.array([[radius * 0.99, 0.0]]), np.array([[radius * 1.01, 0.0]])
+    np.testing.assert_allclose(undistort(lens, distort(lens, inside)), inside, atol=1e-8)
+    assert np.isnan(distort(lens, outside)).all()
+    assert np.isnan(undistort(lens, np.array([[2.7, 0.0]]))).all()
 
 
 @pytest.mark.parametrize("model", ["SIMPLE_RADIAL", "OPENCV_FISHEYE"])

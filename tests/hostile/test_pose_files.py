@@ -64,32 +64,32 @@ def put(**fields: object) -> Change:
 
 
 REFUSED: dict[str, tuple[Change, str]] = {
-    "translation-1e308": (move(1e308), "p01.jpg: expected a camera at most .* found 1e.308"),
-    "translation-1e20": (move(1e20), "p01.jpg: expected a camera at most"),
-    "rotation-1e308": (rotate(1e308), r"p01.jpg.*upper left 3x3 part is not a rotation"),
-    "rotation-1e155": (rotate(1e155), r"p01.jpg.*upper left 3x3 part is not a rotation"),
-    "rotation-0": (rotate(0.0), r"p01.jpg.*upper left 3x3 part is not a rotation"),
+    "translation-1e308": (move(1e308), "p01.jpg.*expected values below .* found '1e.308"),
+    "translation-1e20": (move(1e20), "p01.jpg.*expected values below"),
+    "rotation-1e308": (rotate(1e308), "p01.jpg.*expected values below"),
+    "rotation-1e155": (rotate(1e155), "p01.jpg.*expected values below"),
+    "rotation-0": (rotate(0.0), "p01.jpg.*the matrix is not a rotation"),
     "lone-surrogate": (rename("images/\ud800.jpg"), r"frames\[1\].file_path: expected a file name"),
     "nul": (rename("images/\0.jpg"), r"frames\[1\].file_path: expected a file name"),
     "mask-surrogate": (rename("\ud800.png", "mask_path"), "mask_path: expected a file name"),
-    "mask-number": (rename(3, "mask_path"), "mask_path: expected a file name, found 3"),
-    "applied_scale-1e200": (put(applied_scale=1e200), "applied_scale.* found 1e.200"),
-    "applied_scale-1e-200": (put(applied_scale=1e-200), "applied_scale.* found 1e-200"),
+    "mask-number": (rename(3, "mask_path"), "mask_path: expected a file name, found '3'"),
+    "applied_scale-1e200": (put(applied_scale=1e200), "applied_scale.* found '1e.200"),
+    "applied_scale-1e-200": (put(applied_scale=1e-200), "applied_scale.* found '1e-200"),
     "applied_transform-1e200": (
         put(applied_transform=(np.eye(4)[:3] * 1e200).tolist()),
-        "applied_scale.* found 1e.200",
+        "applied_transform.* found '1e.200",
     ),
-    "principal-point": (put(cx=1e299), "impossible principal point"),
-    "focal-length": (put(fl_x=1e299), "impossible focal length"),
+    "principal-point": (put(cx=1e299), "expected finite intrinsics"),
+    "focal-length": (put(fl_x=1e299), "expected finite intrinsics"),
     "size": (put(w=1e18, h=1e18), "p00.jpg"),
-    "size-digits": (put(w=10**4000), r"frames\[0\].*: w is '1000.*expected a finite number"),
+    "size-digits": (put(w=10**4000), r"frames\[0\].*: w is .*expected a finite number"),
     **{
-        f"distortion-{name}": (put(**{name: 1e299}), r"impossible lens distortion .*1e\+299")
+        f"distortion-{name}": (put(**{name: 1e299}), r"expected finite intrinsics .*1e\+299")
         for name in ("k1", "k2", "p1", "k3")
     },
     "fisheye": (
         put(camera_model="OPENCV_FISHEYE", k1=-1e299),
-        "impossible lens distortion .OPENCV_FISHEYE",
+        "expected finite intrinsics",
     ),
 }
 
@@ -111,7 +111,7 @@ def test_an_integer_of_5000_digits(tmp_path):
     folder = make_scene(tmp_path / "scene")
     file = folder / "transforms.json"
     file.write_text(file.read_text().replace('"fl_x": 50', f'"fl_x": {"9" * 5000}'))
-    with pytest.raises(UserError, match="an integer of thousands of digits"):
+    with pytest.raises(UserError, match="fl_x is .inf., expected a finite number"):
         look(folder)
 
 

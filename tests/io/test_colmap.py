@@ -315,3 +315,37 @@ def test_half_turns_and_handedness():
         np.testing.assert_allclose(np.abs(rotation_to_quat(rotation)), quat, atol=1e-15)
     quarter = quat_to_rotation(np.array([1.0, 0.0, 0.0, 1.0]))
     np.testing.assert_allclose(quarter @ [1.0, 0, 0], [0, 1.0, 0], atol=1e-15)
+
+
+def test_a_model_of_colmap_with_rigs_and_every_camera_model_is_read(tmp_path):
+    """Written by pycolmap, in a process of its own."""
+    script = """
+import sys, numpy as np, pycolmap
+model = pycolmap.Reconstruction()
+rng = np.random.default_rng(3)
+kinds = [k for n, k in pycolmap.CameraModelId.__members__.items()
+         if n not in ("INVALID", "EQUIRECTANGULAR")]
+for i, kind in enumerate(kinds, 1):
+    camera = pycolmap.Camera.create_from_model_id(i, kind, 500.0, 640, 480)
+    model.add_camera_with_trivial_rig(camera)
+    image = pycolmap.Image(name=f"{kind.name}.jpg", camera_id=i, image_id=i)
+    q = rng.normal(size=4)
+    pose = pycolmap.Rigid3d(pycolmap.Rotation3d(q / np.linalg.norm(q)), rng.normal(size=3))
+    model.add_image_with_trivial_frame(image, pose)
+model.write(sys.argv[1])
+for image in model.images.values():
+    print(image.name, *image.cam_from_world().matrix().ravel().tolist())
+"""
+    process = subprocess.run(
+        [sys.executable, "-c", script, str(tmp_path)], capture_output=True, text=True, check=True
+    )
+    assert (tmp_path / "rigs.bin").is_file() and (tmp_path / "frames.bin").is_file()
+    model = read_model(tmp_path)
+    lines = process.stdout.split("\n")[:-1]
+    assert len(lines) == len(model.images) == len(CAMERA_MODELS)
+    for line in lines:
+        name, *values = line.split()
+        image = model.by_name()[name]
+        expected = np.array([float(value) for value in values]).reshape(3, 4)
+        np.testing.assert_allclose(image.world_to_camera[:3], expected, atol=1e-12)
+        assert model.cameras[image.camera_id].model == name.removesuffix(".jpg")

@@ -6,13 +6,22 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
 
 from pipeline.geometry.distortion import project
 from pipeline.geometry.rotations import quat_to_rotation
-from pipeline.io.transforms import find_transforms, read_frames, read_transforms, write_transforms
+from pipeline.io.transforms import (
+    find_transforms,
+    posed_frames,
+    read_frames,
+    read_transforms,
+    write_transforms,
+)
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
+from tests.io.poses.known import error_or_valid, mutated
 
 SIZES = {"images/a.png": (200, 100)}
 
@@ -155,7 +164,7 @@ NAN[0, 3] = np.nan
         ({"frames": [frame(np.eye(3))]}, "4x4"),
         ({"frames": [frame(2 * np.eye(4))]}, "not a rotation"),
         ({"frames": [frame(np.diag([1.0, 1, -1, 1]))]}, "not a rotation"),
-        ({"frames": [frame(NAN)]}, r"frames\[0\] \(images/a.png\).transform_matrix.*not finite"),
+        ({"frames": [frame(NAN)]}, r"frames\[0\] \(images/a.png\).transform_matrix.*found .nan"),
         ({"frames": [frame()]}, "no focal length"),
         ({"fl_x": -1, "frames": [frame()]}, "fl_x is -1"),
         ({"fl_x": "wide", "frames": [frame()]}, "fl_x is 'wide'"),
@@ -241,3 +250,16 @@ def test_relative_names_are_valid_if_a_folder_is_a_symbolic_link(tmp_path):
     file = tmp_path / "results" / "export" / "transforms.json"
     write_transforms(file, views(tmp_path, 1, True), file.parent)
     assert (file.parent / read_frames(file)[0].path).is_file()
+
+
+@settings(
+    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@given(st.data())
+def test_damaged_files_give_a_message_or_valid_cameras(tmp_path, data):
+    frames = [frame(path=f"images/{i}.png", k1=0.1 * i) for i in range(2)]
+    content = {"fl_x": 400, "w": 640, "h": 480, "applied_scale": 0.5, "frames": frames}
+    content |= {"train_filenames": ["images/0.png"], "test_filenames": ["images/1.png"]}
+    file = tmp_path / "transforms.json"
+    file.write_bytes(data.draw(mutated(json.dumps(content))))
+    error_or_valid(posed_frames, file)

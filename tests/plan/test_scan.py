@@ -720,3 +720,30 @@ def test_circular_symbolic_links_are_followed_once(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "images" / "again").symlink_to(tmp_path / "images")
     assert names(look(tmp_path)) == ["p00.jpg", "p01.jpg"]
+
+
+def test_poses_without_folders_are_those_of_the_photographs_in_several(tmp_path):
+    """The same positions photographed in different light."""
+    for folder in ("midday", "night"):
+        photos(tmp_path / folder, 3)
+    write_sparse(tmp_path / "sparse" / "0", [f"p0{i}.jpg" for i in range(3)], (64, 48))
+    result = look(tmp_path)
+    assert any("each is used for the 2 photographs of its name" in line for line in result.warnings)
+    images = given_model(result).model.by_name()
+    assert sorted(images) == names(result) and len(images) == 6
+    assert (images["midday/p02.jpg"].centre == images["night/p02.jpg"].centre).all()
+    picture(tmp_path / "night" / "p09.jpg")
+    (tmp_path / "midday" / "p02.jpg").unlink()
+    with pytest.raises(UserError, match="none of its 3 images is a photograph"):
+        look(tmp_path)
+
+
+def test_poses_of_photographs_that_were_in_other_folders(tmp_path):
+    photos(tmp_path / "images" / "left", 2)
+    photos(tmp_path / "images" / "right", 2)
+    listed = [f"D:\\site\\{side}\\p0{i}.JPG" for side in ("right", "left") for i in range(2)]
+    write_sparse(tmp_path / "sparse" / "0", listed, (64, 48))
+    images = given_model(look(tmp_path)).model.by_name()
+    depth = {name: image.translation[2] for name, image in images.items()}
+    expected = {"right/p00.jpg": 0, "right/p01.jpg": 1, "left/p00.jpg": 2, "left/p01.jpg": 3}
+    assert depth == expected

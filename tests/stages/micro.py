@@ -38,6 +38,7 @@ SCENES = {
     # As many photographs of this size as structure from motion needs.
     "photos": DemoSpec(views=20, width=200, height=150, poses="colmap", masks=True),
     "raw": DemoSpec(views=3, width=48, height=36, format="dng"),
+    "split": DemoSpec(views=6, width=48, height=36, format="png", poses="transforms"),
     "alpha": DemoSpec(views=6, width=64, height=48, format="png", alpha=True, poses="colmap"),
 }
 
@@ -45,6 +46,7 @@ SCENES = {
 def write_scenes(folder: Path) -> None:
     for name, spec in SCENES.items():
         write_demo(folder / name, spec)
+    _split_in_two(folder / "split")
     photos = folder / "photos"
     shutil.copytree(photos / "images", photos / "others")
     shutil.copytree(photos / "images", folder / "copies")
@@ -55,6 +57,15 @@ def write_scenes(folder: Path) -> None:
     (photos / "scan.csv").write_text("".join(f"{x},{y},{z}\n" for x, y, z in xyz[::2].tolist()))
     views = [cv2.imread(str(path)) for path in sorted((photos / "images").iterdir())]
     write_video(folder / "video" / "clip.avi", views)
+
+
+def _split_in_two(scene: Path) -> None:
+    """List every second frame for the test, as NeRF-synthetic does."""
+    content = json.loads((scene / "transforms.json").read_text())
+    (scene / "transforms.json").unlink()
+    for name, first in (("train", 0), ("test", 1)):
+        part = content | {"frames": content["frames"][first::2]}
+        (scene / f"transforms_{name}.json").write_text(json.dumps(part))
 
 
 def with_option(options: Options, path: str, value: Any) -> dict[str, Any]:

@@ -68,6 +68,7 @@ FLIPS = {
     "inspect.keep_duplicates": Flip(True, ESTIMATED, "copies"),
     "views.max_long_side_px": Flip(48, POSED),
     "views.masks": Flip("ignore", POSED),
+    "split.source": Flip("every", POSED, "split"),
     "split.test_every": Flip(5, POSED),
     **{
         f"decode.{name}": Flip(value, POSED, "raw")

@@ -1,0 +1,1 @@
+"""Poses of other programs: one module a program, and the registry of their formats."""

@@ -1,0 +1,114 @@
+"""Reading of other programs' text files, which are hostile until checked.
+
+Functions raise a ``UserError`` that names the file.
+"""
+
+from __future__ import annotations
+
+import json
+import posixpath
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.io.bounded import read_bounded
+from pipeline.runtime.errors import UserError
+
+FIX = "export the file again, or set poses: ignore"
+# Larger files are no list of cameras.
+MAX_BYTES = 512 * 2**20
+_MAX_NAME = 1000
+_HEAD_BYTES = 4096
+
+
+def malformed(file: Path, what: str, fix: str = FIX) -> UserError:
+    return UserError(what, file=file, fix=fix)
+
+
+def checked_name(file: Path, name: str, where: str = "") -> str:
+    """``name`` with "/" between folders and without "." and inner ".."; relative to the folder of
+    ``file`` if it is absolute and inside of it.
+
+    Args:
+        where: precedes the message.
+    """
+    plain = posixpath.normpath(name.replace("\\", "/"))
+    if not name or len(name) > _MAX_NAME or any(len(p) > 240 for p in plain.split("/")):
+        raise malformed(file, f"{where}expected a file name, found {shown(name)}")
+    if any(ord(c) < 32 or 0xD800 <= ord(c) < 0xE000 for c in name):
+        raise malformed(file, f"{where}expected a file name, found {shown(name)}")
+    if not posixpath.isabs(plain):
+        return plain
+    folder = str(file.parent.resolve())
+    return posixpath.relpath(plain, folder) if plain.startswith(folder + "/") else plain
+
+
+def read_text(file: Path) -> str:
+    """The file's text (UTF-8, with or without byte order mark)."""
+    try:
+        return read_bounded(file, MAX_BYTES, fix=FIX).decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise malformed(file, f"expected UTF-8 text: {error}") from None
+
+
+def read_json(file: Path) -> Any:
+    """The content of a JSON file; integers beyond 64 bits become floats."""
+    try:
+        return json.loads(read_text(file), parse_int=_integer)
+    except json.JSONDecodeError as error:
+        where = f"line {error.lineno}, column {error.colno}"
+        raise malformed(file, f"{where}: not valid JSON ({error.msg})") from None
+    except RecursionError:
+        raise malformed(file, "not valid JSON (nested too deeply)") from None
+
+
+def _integer(digits: str) -> int | float:
+    return int(digits) if len(digits) < 19 else float(digits)
+
+
+def is_number(value: Any) -> bool:
+    """Whether ``value`` is a finite number."""
+    if isinstance(value, bool) or not isinstance(value, int | float):
+        return False
+    return abs(value) < 1e300  # False for NaN.
+
+
+def number(file: Path, where: str, value: Any) -> float:
+    """``value``, or the number that it is the text of."""
+    try:
+        found = float(value) if isinstance(value, str) else value
+        if is_number(found):
+            return float(found)
+    except ValueError:
+        pass
+    raise malformed(file, f"{where}: expected a finite number, found {shown(value)}")
+
+
+def numbers(file: Path, where: str, value: Any, count: int) -> NDArray[np.float64]:
+    """(count,) the numbers of a list or of a text with blanks between them."""
+    listed = value.split() if isinstance(value, str) else value
+    if not isinstance(listed, list | tuple) or len(listed) != count:
+        raise malformed(file, f"{where}: expected {count} numbers, found {shown(value)}")
+    return np.array([number(file, where, entry) for entry in listed])
+
+
+def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> str | None:
+    """The first file in ``folder``, sorted by name, with this suffix in any case, whose first
+    bytes ``is_one`` accepts."""
+    if not folder.is_dir():
+        return None
+    for file in sorted(folder.iterdir()):
+        if file.suffix.lower() == suffix and file.is_file() and file.name[0] != ".":
+            with file.open("rb") as stream:
+                if is_one(stream.read(_HEAD_BYTES)):
+                    return file.name
+    return None
+
+
+def shown(value: Any) -> str:
+    """``value`` in a message."""
+    text = str(value.tolist() if isinstance(value, np.ndarray) else value)
+    return repr(text[:60].encode(errors="replace").decode())

@@ -1,0 +1,215 @@
+"""RealityCapture and RealityScan: "Internal/External camera parameters" (CSV), XMP sidecars.
+
+Both give the focal length for a film 36 mm wide, f / 36 of the photograph's longer side in pixels;
+the principal point is a fraction of that side from the image centre. Distortion is Brown-Conrady
+with the coefficients k1 to k4, t1 and t2 (OpenCV's p1 and p2), or the division model, whose
+undistorted radius is r / (1 + k1 r^2).
+
+In the CSV, heading, pitch and roll are camera to world with OpenGL axes: Rz(-heading) Rx(pitch)
+Ry(roll), degrees. In XMP, Rotation is world to camera with COLMAP's axes, Position the centre.
+Sources: nerfstudio's ``realitycapture_utils.py``; AliceVision's ``importKnownPoses`` and
+``exportDistortion``; RealityCapture's help, "XMP Metadata".
+"""
+
+from __future__ import annotations
+
+import csv
+from functools import partial
+from pathlib import Path
+from xml.etree.ElementTree import Element
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.cameras import Camera
+from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
+from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, checked_camera, make_frame
+from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.io.poses.xml import read_xml
+
+_REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
+_OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
+_XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
+_FILM_MM = 36.0
+# Folders of photographs that XMP files may be beside.
+_PHOTO_FOLDERS = ("images", ".")
+_HEAD_BYTES = 4096
+
+
+def find_csv(folder: Path) -> str | None:
+    return find_by_head(folder, ".csv", lambda head: _header(_text(head)) is not None)
+
+
+def csv_frames(file: Path) -> list[PosedFrame]:
+    """The rows of the CSV file.
+
+    Raises:
+        UserError: malformed rows.
+    """
+    content = read_text(file)
+    header = _header(content)
+    if header is None:
+        raise malformed(file, f"expected the columns {', '.join(_REQUIRED)}, found others")
+    columns = {name: i for i, name in enumerate(header)}
+    lenses: dict[tuple[float, ...], Lens] = {}
+    found = []
+    for line, text in enumerate(content.splitlines(), 1):
+        row = _cells(text)
+        if not row:
+            continue
+        if len(row) < len(header):
+            raise malformed(file, f"line {line}: expected {len(header)} columns, found {len(row)}")
+        where = f"line {line}"
+
+        def value(name: str, row: list[str] = row, where: str = where) -> float:
+            text = row[columns[name]].strip() if name in columns else "0"
+            return number(file, f"{where}: {name}", text)
+
+        heading, pitch, roll = np.radians([value(n) for n in ("heading", "pitch", "roll")])
+        rotation = FLIP_YZ @ (_rz(-heading) @ _rx(pitch) @ _ry(roll)).T
+        centre = np.array([value("x"), value("y"), value("alt")])
+        key = tuple(value(name) for name in ("f", *_OPTIONAL))
+        if key not in lenses:
+            lenses[key] = _lens(file, where, key[0], key[1:3], key[3:7], key[7:9])
+        name = row[columns["name"]].strip()
+        found.append(make_frame(file, name, lenses[key], rotation, centre, where))
+    if not found:
+        raise malformed(file, "expected a camera in each line, found none")
+    return found
+
+
+def find_xmp(folder: Path) -> str | None:
+    return next((name for name in _PHOTO_FOLDERS if xmp_files(folder / name)), None)
+
+
+def xmp_files(path: Path) -> list[Path]:
+    """The XMP files in a folder that have a pose."""
+    if not path.is_dir():
+        return []
+    found = [
+        file for file in sorted(path.iterdir()) if file.suffix.lower() == ".xmp" and file.is_file()
+    ]
+    return [file for file in found if _has_pose(file)]
+
+
+def xmp_frames(path: Path) -> list[PosedFrame]:
+    """The cameras of the XMP files in a folder.
+
+    Raises:
+        UserError: a malformed file, or a lens that is not supported.
+    """
+    return [_of_xmp(file) for file in xmp_files(path)]
+
+
+def _has_pose(file: Path) -> bool:
+    with file.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    return b"xcr:Rotation" in head and b"xcr:Position" in head
+
+
+def _of_xmp(file: Path) -> PosedFrame:
+    root = read_xml(file)
+    found = [e for e in root.iter() if _field(e, "Rotation") and _field(e, "Position")]
+    if not found:
+        raise malformed(file, "expected xcr:Rotation and xcr:Position, found none")
+    entry = found[0]
+    rotation = numbers(file, "xcr:Rotation", _field(entry, "Rotation"), 9).reshape(3, 3)
+    centre = numbers(file, "xcr:Position", _field(entry, "Position"), 3)
+    names = ("FocalLength35mm", "PrincipalPointU", "PrincipalPointV", "Skew", "AspectRatio")
+    standard = {"FocalLength35mm": "", "AspectRatio": "1"}
+    focal, u, v, skew, aspect = (
+        number(file, f"xcr:{name}", _field(entry, name) or standard.get(name, "0"))
+        for name in names
+    )
+    if skew or aspect != 1:
+        raise malformed(file, "expected square pixels without skew (xcr:Skew, xcr:AspectRatio)")
+    words = (_field(entry, "DistortionCoeficients") or "0 0 0 0 0 0").split()
+    coefficients = numbers(file, "xcr:DistortionCoeficients", words, len(words)).tolist()
+    k, t = (*coefficients[:4], 0.0, 0.0, 0.0, 0.0)[:4], (*coefficients[4:6], 0.0, 0.0)[:2]
+    model = (_field(entry, "DistortionModel") or "perspective").lower()
+    if model == "division":
+        if any(k[1:]) or any(t):
+            raise malformed(file, "division: expected one coefficient, found several")
+        lens = Lens("SIMPLE_DIVISION", partial(_division, file, focal, (u, v), k[0]))
+    elif model == "perspective" or model.startswith("brown"):
+        lens = _lens(file, file.name, focal, (u, v), k, t)
+    else:
+        raise malformed(
+            file,
+            f"xcr:DistortionModel {model[:40]} is not supported; expected perspective, brown3, "
+            "brown4, with or without tangential coefficients, or division",
+        )
+    return make_frame(file, file.stem, lens, rotation, centre)
+
+
+def _field(element: Element, name: str) -> str | None:
+    """The text of a property, which RealityCapture writes as an attribute or as an element."""
+    return element.get(_XCR + name) or element.findtext(_XCR + name)
+
+
+def _lens(
+    file: Path,
+    where: str,
+    focal: float,
+    point: tuple[float, ...],
+    k: tuple[float, ...],
+    t: tuple[float, ...],
+) -> Lens:
+    """The lens, whose camera depends on the photograph's size."""
+    unit = Brown(focal, focal, point[0], point[1], k=k, p=(t[0], t[1]))
+    return Lens(brown_model(unit), partial(_brown, file, where, unit))
+
+
+def _brown(file: Path, where: str, unit: Brown, width: int, height: int) -> Camera:
+    f, cx, cy = _pixels(unit.fx, (unit.cx, unit.cy), width, height)
+    return brown_camera(file, where, width, height, Brown(f, f, cx, cy, k=unit.k, p=unit.p))
+
+
+def _division(
+    file: Path, focal: float, point: tuple[float, float], k: float, width: int, height: int
+) -> Camera:
+    params = (*_pixels(focal, point, width, height), k)
+    return checked_camera(file, file.name, "SIMPLE_DIVISION", width, height, params)
+
+
+def _pixels(
+    focal: float, point: tuple[float, float], width: int, height: int
+) -> tuple[float, float, float]:
+    """Focal length and principal point in pixels."""
+    side = max(width, height)
+    return focal / _FILM_MM * side, width / 2 + point[0] * side, height / 2 + point[1] * side
+
+
+def _cells(line: str) -> list[str]:
+    """The cells of a line; empty for comments and blank lines."""
+    if line.startswith("#") or not line.strip():
+        return []
+    try:
+        return next(csv.reader([line]), [])
+    except csv.Error:
+        return [line]  # A cell that is longer than any name.
+
+
+def _text(head: bytes) -> str:
+    return head.decode("utf-8-sig", errors="replace")
+
+
+def _header(content: str) -> list[str] | None:
+    """The names of the columns, in the first or, after "#cameras N", the second line."""
+    for line in content.splitlines()[:2]:
+        names = [name.strip().lstrip("#").lower() for name in line.split(",")]
+        if all(name in names for name in _REQUIRED):
+            return names
+    return None
+
+
+def _rotation(axis: int, angle: float) -> NDArray[np.float64]:
+    c, s = np.cos(angle), np.sin(angle)
+    i, j = [(1, 2), (2, 0), (0, 1)][axis]
+    matrix = np.eye(3)
+    matrix[i, i] = matrix[j, j] = c
+    matrix[i, j], matrix[j, i] = -s, s
+    return matrix
+
+
+_rx, _ry, _rz = (partial(_rotation, axis) for axis in range(3))

@@ -142,11 +142,20 @@ class Sfm(Section):
         "auto", description="auto: incremental; global if the incremental model is not good."
     )
     camera_model: Literal[
-        "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+        "auto",
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "EQUIRECTANGULAR",
     ] = Field(
         "auto",
         description="COLMAP's camera model. auto: SIMPLE_RADIAL; OPENCV_FISHEYE if EXIF names a "
-        "fisheye lens.",
+        "fisheye lens; EQUIRECTANGULAR for panoramas (GPano metadata, or a 360 degree camera in "
+        "EXIF). EQUIRECTANGULAR: all photographs are panoramas. Others: of the photographs that "
+        "are not panoramas.",
     )
     share_cameras: Literal["auto", "single", "group", "folder", "image"] = Field(
         "auto",

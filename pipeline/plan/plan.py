@@ -12,6 +12,7 @@ from collections.abc import Collection, Mapping, Sequence
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.budget import training_memory_mb
+from pipeline.plan.panoramas import panorama_hints
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
@@ -42,7 +43,7 @@ def make_plan(
     return Plan(
         scene=scan.manifest.scene,
         stages=decided,
-        warnings=_shortened(scan.warnings),
+        warnings=_shortened([*panorama_hints(scan, config), *scan.warnings]),
         config=settled.config,
         facts=_facts(scan, settled.config),
         folder=folder,

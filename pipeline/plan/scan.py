@@ -29,6 +29,7 @@ from pipeline.io.posefiles import (
     truth_folder,
 )
 from pipeline.io.recorded import digest_of
+from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
@@ -79,6 +80,8 @@ class Scan(BaseModel):
     fingerprint: str
     frames: tuple[Photo, ...] = ()
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
+    maybe_panoramas: tuple[str, ...] = ()
+    """Photographs of which only the aspect ratio is that of a panorama."""
 
     def with_frames(self, max_frames: int) -> Scan:
         """The scan with placeholders for up to ``max_frames`` frames of the videos."""
@@ -134,6 +137,10 @@ class Scan(BaseModel):
     @property
     def num_gps(self) -> int:
         return sum(photo.gps is not None for photo in self.photos)
+
+    @property
+    def num_panoramas(self) -> int:
+        return sum(photo.panorama for photo in self.photos)
 
     @property
     def num_focal(self) -> int:
@@ -206,6 +213,8 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         )
         for name in sorted(facts)
     ]
+    if poses is None:
+        warnings += partial_panoramas(facts)
     truth = truth_folder(folder)
     control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
     cloud = find_point_cloud(folder, config, poses, control is not None, facts_cache, warnings)
@@ -221,6 +230,7 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
         ordered=why_ordered(photos, len(videos)),
         ground_control=control,
         cloud=cloud,
+        maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth), facts_cache) if truth else None,
         fingerprint=_fingerprint(
@@ -390,6 +400,7 @@ def _photo(
         depth_digest=_digest(depth, cache) if depth else None,
         focal_px=facts.focal_px,
         camera_group=facts.camera_group,
+        panorama=facts.panorama == "full",
         gps=facts.gps,
         taken=facts.taken,
     )

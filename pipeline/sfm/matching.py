@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -103,7 +104,7 @@ def match_features(
             f"verified pairs connect the photographs into {len(components)} separate groups: the "
             f"largest has {components[0]} of {len(names)}; outside it: {list_names(isolated)}"
         )
-    priors = sum(camera.has_prior_focal_length for camera in cameras)
+    priors = sum(camera.has_prior_focal_length and not camera.is_spherical() for camera in cameras)
     median = int(np.median(list(verified.values())))
     counters = MatchesCounters(
         num_pairs=len(pairs),
@@ -119,11 +120,15 @@ def match_features(
         decisions=[
             decision,
             f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
-            f"{len(cameras)} camera(s) ({cameras[0].model_name}) for {len(names)} photographs, "
+            f"{len(cameras)} camera(s) ({_models(cameras)}) for {len(names)} photographs, "
             f"{priors} with a focal length from EXIF",
         ],
         warnings=warnings,
     )
+
+
+def _models(cameras: list[pycolmap.Camera]) -> str:
+    return ", ".join(sorted({camera.model_name for camera in cameras}))
 
 
 def resolve_pairs(

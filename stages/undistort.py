@@ -42,7 +42,11 @@ def work(job: Job) -> None:
         job.out,
         threads=job.threads,
     )
-    job.record(UndistortCounters(undistorted=len(report.manifest.photos)), [], report.warnings)
+    counters = UndistortCounters(undistorted=report.photographs)
+    if report.split:
+        wide = {"split": report.split, "views": len(report.manifest.photos)}
+        counters = counters.model_copy(update={**wide, "used_share": report.used_share})
+    job.record(counters, report.decisions, report.warnings)
 
 
 SPEC = StageSpec(

@@ -200,6 +200,11 @@ class Undistort(Section):
     jpeg_quality: Annotated[int, Field(ge=0, le=100), Unit("percent")] = Field(
         0, description="JPEG quality of the undistorted images. 0: lossless PNG."
     )
+    mask_nadir_degrees: Annotated[float, Field(ge=0, le=90), Unit("degrees")] = Field(
+        0.0,
+        description="Panoramas: pixels closer than this to straight down (tripod, photographer) "
+        "are ignored in training.",
+    )
 
 
 class Init(Section):

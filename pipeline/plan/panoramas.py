@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import TYPE_CHECKING
+from collections.abc import Mapping, Sequence
 
 from pipeline.config.schema import Config
 from pipeline.io.photofile import FileFacts
 from pipeline.runtime.errors import UserError
-
-if TYPE_CHECKING:
-    from pipeline.plan.scan import Scan
+from pipeline.scene.manifest import Photo
 
 
 def partial_panoramas(facts: Mapping[str, FileFacts]) -> list[str]:
@@ -25,10 +22,9 @@ def partial_panoramas(facts: Mapping[str, FileFacts]) -> list[str]:
     ]
 
 
-def panorama_hints(scan: Scan, config: Config) -> list[str]:
-    """A warning about photographs of which only the aspect ratio is that of a panorama."""
-    maybe = scan.maybe_panoramas
-    if not maybe or scan.poses is not None or config.sfm.camera_model != "auto":
+def panorama_hints(maybe: Sequence[str], config: Config) -> list[str]:
+    """A warning about the photographs of which only the aspect ratio is that of a panorama."""
+    if not maybe or config.sfm.camera_model != "auto":
         return []
     return [
         f"{len(maybe)} photographs have the aspect ratio 2:1 of a 360 degree panorama (first: "
@@ -36,9 +32,9 @@ def panorama_hints(scan: Scan, config: Config) -> list[str]:
     ]
 
 
-def check_panorama_sizes(scan: Scan) -> None:
+def check_panorama_sizes(photos: Sequence[Photo]) -> None:
     """Raises: UserError: ``sfm.camera_model`` is EQUIRECTANGULAR, and a photograph is not 2:1."""
-    for photo in scan.planned:
+    for photo in photos:
         if photo.width != 2 * photo.height:
             raise UserError(
                 f"sfm.camera_model is EQUIRECTANGULAR, but the photograph is {photo.width}x"

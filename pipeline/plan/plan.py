@@ -40,10 +40,11 @@ def make_plan(
     for name in running:
         sources = sorted(set(_upstream(stages[name], running).values()))
         decided[name] = decided[name].model_copy(update={"inputs": sources})
+    hints = panorama_hints(scan.maybe_panoramas, config) if scan.poses is None else []
     return Plan(
         scene=scan.manifest.scene,
         stages=decided,
-        warnings=_shortened([*panorama_hints(scan, config), *scan.warnings]),
+        warnings=_shortened([*hints, *scan.warnings]),
         config=settled.config,
         facts=_facts(scan, settled.config),
         folder=folder,

@@ -142,7 +142,7 @@ def _camera_model(scan: Scan, config: Config) -> Choice:
     wanted = config.sfm.camera_model
     count, whole = scan.num_panoramas, len(scan.planned)
     if wanted == "EQUIRECTANGULAR":
-        check_panorama_sizes(scan)
+        check_panorama_sizes(scan.planned)
         return (
             wanted,
             f"EQUIRECTANGULAR cameras: panoramas of 360 degrees{_configured(count, whole)}",

@@ -29,6 +29,7 @@ class View:
         is_test: whether this is a test view, which is not trained on.
         camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
         image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
+        source: name of the photograph of which this is a part; None for a whole photograph.
     """
 
     name: str
@@ -45,6 +46,7 @@ class View:
     camera_id: int = 0
     image_digest: str | None = None
     mask_digest: str | None = None
+    source: str | None = None
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -53,8 +55,8 @@ class View:
 
 
 def is_test_view(index: int, every: int) -> bool:
-    """Whether view ``index`` of the views sorted by name is a test view: every ``every``-th is,
-    from the first, as in Mip-NeRF 360 and 3DGS. 0: none is."""
+    """Whether photograph ``index`` of the photographs sorted by name is for testing: every
+    ``every``-th is, from the first, as in Mip-NeRF 360 and 3DGS. 0: none is."""
     return every > 0 and index % every == 0
 
 
@@ -87,10 +89,13 @@ def load_views(
     """
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
-    # A single view is a training view.
-    every = split.test_every if len(photos) > 1 else 0
+    # Views of one photograph are all test views or all training views: they overlap.
+    sources = {name: i for i, name in enumerate(sorted({p.source or p.name for p in photos}))}
+    # A single photograph is for training.
+    every = split.test_every if len(sources) > 1 else 0
     result = []
-    for index, photo in enumerate(photos):
+    for photo in photos:
+        index = sources[photo.source or photo.name]
         image = posed[photo.name]
         camera = model.cameras[image.camera_id]
         if not camera.is_pinhole:
@@ -113,6 +118,7 @@ def load_views(
                 camera_id=image.camera_id,
                 image_digest=photo.digest,
                 mask_digest=photo.mask_digest if views.masks == "auto" else None,
+                source=photo.source,
             )
         )
     return result

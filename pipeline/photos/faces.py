@@ -2,8 +2,8 @@
 
 A pinhole image of more than about 110 degrees is stretched at its border, and none holds 180.
 Panoramas and wide fisheye photographs are therefore split into up to six views, each looking along
-an axis of the camera and cropped to what the lens sees. Neighbours overlap by ``OVERLAP_DEGREES``,
-so every ray of the photograph is in some view.
+an axis of the camera and cropped to what the lens sees. Neighbours overlap by
+``cube.OVERLAP_DEGREES``, so every ray of the photograph is in some view.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cube import REACH, ROTATIONS
 from pipeline.geometry.rays import pixels, rays
 from pipeline.photos.lens import Lens, mapped_lens
 
@@ -22,9 +23,6 @@ Bools = NDArray[np.bool_]
 
 # Largest field of view along a side of a photograph that becomes one pinhole view.
 MAX_FIELD_DEGREES = 110.0
-OVERLAP_DEGREES = 5.0
-# Tangent of half the field of view of a face.
-REACH = float(np.tan(np.radians(45 + OVERLAP_DEGREES / 2)))
 # Smallest side of a cropped face, as a share of the whole face: narrower views are hardly of use.
 MIN_SIDE = 0.25
 # A face is left out if a smaller share of the photograph's pixels is in no other face.
@@ -33,16 +31,6 @@ MIN_SHARE = 0.001
 SAMPLES = 512
 # Pixels by which a panorama is extended beyond its borders, for interpolation across them.
 PADDING = 4
-
-# Camera to face: rows are the face's axes (right, down, forward) in the camera's frame.
-_ROTATIONS: dict[str, tuple[tuple[int, int, int], ...]] = {
-    "front": ((1, 0, 0), (0, 1, 0), (0, 0, 1)),
-    "right": ((0, 0, -1), (0, 1, 0), (1, 0, 0)),
-    "left": ((0, 0, 1), (0, 1, 0), (-1, 0, 0)),
-    "down": ((1, 0, 0), (0, 0, -1), (0, 1, 0)),
-    "up": ((1, 0, 0), (0, 0, 1), (0, -1, 0)),
-    "back": ((-1, 0, 0), (0, 1, 0), (0, 0, -1)),
-}
 
 
 @dataclass(frozen=True)
@@ -122,9 +110,9 @@ class Face:
 def split(wide: WideCamera) -> list[Face]:
     """The views of a wide camera."""
     directions = wide.samples()
-    inside = {name: _in_face(name, directions) for name in _ROTATIONS}
+    inside = {name: _in_face(name, directions) for name in ROTATIONS}
     chosen = dict(inside)
-    for name in reversed(_ROTATIONS):
+    for name in reversed(ROTATIONS):
         others = [seen for other, seen in chosen.items() if other != name]
         alone = chosen[name] & ~np.any(others, axis=0) if others else chosen[name]
         if alone.sum() < MIN_SHARE * len(directions):
@@ -191,13 +179,13 @@ def _unit(points: Floats) -> Floats:
 
 
 def _in_face(name: str, directions: Floats) -> Bools:
-    local = directions @ np.array(_ROTATIONS[name], np.float64).T
+    local = directions @ np.array(ROTATIONS[name], np.float64).T
     return np.asarray(np.abs(local[:, :2]).max(axis=1) <= REACH * local[:, 2])
 
 
 def _face(wide: WideCamera, name: str, directions: Floats) -> Face:
     """The face cropped to ``directions``, (N, 3) rays inside it."""
-    rotation = np.array(_ROTATIONS[name], np.float64)
+    rotation = np.array(ROTATIONS[name], np.float64)
     fx, fy, _, _ = wide.camera.pinhole
     focal = float(np.sqrt(fx * fy))
     local = directions @ rotation.T

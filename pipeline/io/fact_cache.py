@@ -14,7 +14,7 @@ from pipeline.runtime.atomic import write_text
 from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
-_VERSION = 5
+_VERSION = 6
 
 M = TypeVar("M", bound=BaseModel)
 

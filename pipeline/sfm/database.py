@@ -26,6 +26,7 @@ from pipeline.config import schema
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.record import file_digest
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pairs import Pair
@@ -223,14 +224,18 @@ class _MatchingInputs:
         features: Path,
     ):
         self._cameras, self._images = cameras, images
-        self._camera = {camera.camera_id: camera for camera in cameras}
+        self._verified = {
+            camera.camera_id: with_prior(camera) if is_uncalibrated(camera) else camera
+            for camera in cameras
+        }
         self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
         self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
         self._digest = {image_id: file_digest(file) for image_id, file in self._file.items()}
         self.keypoints = lru_cache(maxsize=CACHED_KEYPOINT_FILES)(self._read)
 
     def camera(self, image_id: int) -> pycolmap.Camera:
-        return self._camera[self._camera_of[image_id]]
+        """The camera as pairs are verified with it."""
+        return self._verified[self._camera_of[image_id]]
 
     def _read(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """(F, 2) positions and (F, 128) descriptors."""

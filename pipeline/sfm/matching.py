@@ -27,6 +27,7 @@ from pipeline.sfm.database import (
     plan_cameras,
     verified_inliers,
 )
+from pipeline.sfm.fisheye import set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.quiet import quiet_colmap
 
@@ -82,6 +83,7 @@ def match_features(
     cameras, camera_of = plan_cameras(manifest, sharing)
     images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
     pairs, decision = resolve_pairs(manifest, features, config)
+    initial = set_initial_focals(cameras, images, features, pairs, experiments.max_ratio, seed)
     settings = MatchingSettings(experiments.max_ratio, config.min_inliers, seed)
     database = out / "database.db"
     num_cached = build_database(
@@ -119,6 +121,7 @@ def match_features(
         num_cached=num_cached,
         decisions=[
             decision,
+            *initial,
             f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
             f"{len(cameras)} camera(s) ({_models(cameras)}) for {len(names)} photographs, "
             f"{priors} with a focal length from EXIF",

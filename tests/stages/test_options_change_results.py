@@ -92,6 +92,7 @@ FLIPS = {
     "sfm.refine_principal_point": Flip("yes", FIXED),
     "undistort.blank_pixels": Flip(1.0, POSED),
     "undistort.jpeg_quality": Flip(50, POSED),
+    "undistort.mask_nadir_degrees": Flip(30.0, POSED, "panoramas"),
     "init.method": Flip("random", POSED),
     "init.max_points": Flip(100, POSED),
     "init.points_file": Flip("scan.csv", POSED),

@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from pipeline.sfm.isolate import run_isolated
+from pipeline.runtime.isolate import run_isolated
 
 
 def mapped(folder: Path) -> dict[str, Any]:

@@ -22,7 +22,7 @@ from pipeline.photos.faces import (
     used_share,
 )
 from pipeline.photos.image_circle import image_circle
-from pipeline.photos.lens import pinhole_lens
+from pipeline.photos.lens import Lens, pinhole_lens
 from pipeline.photos.naming import rename
 from pipeline.photos.undistorted_files import Target, load_source, write_view
 from pipeline.photos.undistorted_model import Part, undistorted_model
@@ -97,26 +97,20 @@ def undistort(
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         # One camera at a time: its maps are as large as an image.
         for key, group in sorted(groups.items()):
-            source = _camera_of_size(model.cameras[key[0]], group[0])
-            camera, views_of = wide[key], faces.get(key, [])
-            targets = []
+            camera = wide[key]
             if camera is None:
+                source = _camera_of_size(model.cameras[key[0]], group[0])
                 lens = pinhole_lens(source, config.blank_pixels, views.max_long_side_px)
                 targets = [Target(lens, len(cameras) + 1)]
-                if lens.valid is not None:
-                    share = 100 * (1 - float(lens.valid.mean()))
-                    warnings.append(
-                        f"camera {key[0]} ({source.model}): {share:.1f}% of the undistorted images "
-                        f"is blank and masked"
-                    )
+                warnings += _blank(key[0], source, lens)
             else:
-                shares[key] = used_share(camera, views_of)
-                decisions.append(_describe(key[0], camera, views_of, shares[key]))
-                for number, face in enumerate(views_of, start=len(cameras) + 1):
-                    lens = face_lens(camera, face, views.max_long_side_px)
-                    targets.append(Target(lens, number, face, camera))
-            for target in targets:
-                cameras[target.camera_id] = target.lens.target
+                shares[key] = used_share(camera, faces[key])
+                decisions.append(_describe(key[0], camera, faces[key], shares[key]))
+                targets = [
+                    Target(face_lens(camera, face, views.max_long_side_px), number, face, camera)
+                    for number, face in enumerate(faces[key], start=len(cameras) + 1)
+                ]
+            cameras |= {target.camera_id: target.lens.target for target in targets}
 
             def work(photo: Photo, targets: list[Target] = targets) -> list[Photo]:
                 loaded = load_source(photo, targets[0])
@@ -190,6 +184,17 @@ def _key(photo: Photo, face: Face | None) -> str:
         return photo.name
     path = PurePosixPath(photo.name)
     return str(path.with_name(f"{path.stem}_{face.name}{path.suffix}"))
+
+
+def _blank(camera_id: int, camera: Camera, lens: Lens) -> list[str]:
+    """A warning if a part of the undistorted images is blank."""
+    if lens.valid is None:
+        return []
+    share = 100 * (1 - float(lens.valid.mean()))
+    return [
+        f"camera {camera_id} ({camera.model}): {share:.1f}% of the undistorted images is blank and "
+        "masked"
+    ]
 
 
 def _describe(camera_id: int, wide: WideCamera, faces: list[Face], share: float) -> str:

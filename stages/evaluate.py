@@ -50,7 +50,8 @@ def work(job: Job) -> None:
     )
     job.add_messages([], evaluation.warnings)
     if (truth := job.inputs["inspect"] / "truth").is_dir():
-        refined = train.refine_poses
+        # The truth has the poses of photographs, not of the views of split ones.
+        refined = train.refine_poses and all(view.source is None for view in views)
         model = inputs.trained_model(job) if refined else inputs.input_model(job, "poses")
         error = pose_error(model, read_model(truth))
         evaluation = evaluation.model_copy(update={"pose_error": error})

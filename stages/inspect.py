@@ -47,7 +47,7 @@ def work(job: Job) -> None:
         found.manifest,
         threads=job.threads,
         min_photos=config.inspect.min_images,
-        keep_duplicates=config.inspect.keep_duplicates or found.poses is not None,
+        keep_duplicates=config.experiments.inspect.keep_duplicates or found.poses is not None,
     )
     job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
@@ -87,7 +87,7 @@ SPEC = StageSpec(
     decide=decide,
     counters=InspectCounters,
     options=(
-        *("poses", "inspect", "views.masks", "split.source"),
+        *("poses", "inspect", "experiments.inspect", "views.masks", "split.source"),
         *("init.points_file", "sfm.georeference"),
     ),
     facts=facts,

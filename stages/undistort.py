@@ -19,16 +19,39 @@ if TYPE_CHECKING:
     from pipeline.plan.settle import Settled
 
 
+WIDE_MODELS = {"EQUIRECTANGULAR", "OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE"}
+
+
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     if scan.poses is not None:
         models = ", ".join(scan.poses.models)
+        decisions = [_splitting()] if set(scan.poses.models) & WIDE_MODELS else []
         if scan.poses.pinhole:
             return StagePlan(run=False, reason=f"the given cameras are pinhole cameras ({models})")
-        return StagePlan(run=True, reason=f"the given cameras have lens distortion ({models})")
+        if models == "EQUIRECTANGULAR":
+            return StagePlan(
+                run=True, reason="the given cameras are panoramas", decisions=decisions
+            )
+        reason = f"the given cameras have lens distortion ({models})"
+        return StagePlan(run=True, reason=reason, decisions=decisions)
     model = settled.config.sfm.camera_model
+    if scan.num_panoramas or model == "EQUIRECTANGULAR":
+        count = len(scan.planned) if model == "EQUIRECTANGULAR" else scan.num_panoramas
+        reason = f"{count} photographs are panoramas"
+        return StagePlan(run=True, reason=reason, decisions=[_splitting()])
+    if model == "OPENCV_FISHEYE":
+        reason = f"{model} cameras have lens distortion"
+        return StagePlan(run=True, reason=reason, decisions=[_splitting()])
     if model in ("PINHOLE", "SIMPLE_PINHOLE"):
         return StagePlan(run=False, reason=f"{model} cameras have no lens distortion")
     return StagePlan(run=True, reason=f"{model} cameras have lens distortion")
+
+
+def _splitting() -> str:
+    return (
+        "panoramas, and photographs of fisheye lenses of more than 110 degrees along a side, are "
+        "split into overlapping pinhole views"
+    )
 
 
 def work(job: Job) -> None:
@@ -42,7 +65,11 @@ def work(job: Job) -> None:
         job.out,
         threads=job.threads,
     )
-    job.record(UndistortCounters(undistorted=len(report.manifest.photos)), [], report.warnings)
+    counters = UndistortCounters(undistorted=report.photographs)
+    if report.split:
+        wide = {"split": report.split, "views": len(report.manifest.photos)}
+        counters = counters.model_copy(update={**wide, "used_share": report.used_share})
+    job.record(counters, report.decisions, report.warnings)
 
 
 SPEC = StageSpec(

@@ -25,6 +25,16 @@ PartOfRun = Annotated[float, Field(ge=0, lt=1), Unit("share of the steps")]
 Factor = Annotated[float, Field(gt=0), Unit("factor")]
 
 
+class InspectExperiments(Section):
+    """The photographs that are used."""
+
+    keep_duplicates: bool = Field(
+        False,
+        description="Keep photographs that show the same as another: copies, reduced copies and "
+        "bursts. They are always kept if poses are given.",
+    )
+
+
 class MatchesExperiments(Section):
     """Feature matching."""
 
@@ -224,6 +234,7 @@ class ReportExperiments(Section):
 class Experiments(Section):
     """Options of experiments, by the section that they belong to."""
 
+    inspect: InspectExperiments = Field(default_factory=InspectExperiments)
     matches: MatchesExperiments = Field(default_factory=MatchesExperiments)
     init: InitExperiments = Field(default_factory=InitExperiments)
     train: TrainExperiments = Field(default_factory=TrainExperiments)

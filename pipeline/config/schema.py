@@ -40,11 +40,6 @@ class Inspect(Section):
         "poses are estimated, below features.max_long_side_px).",
     )
     min_images: Count = Field(2, description="Fewer readable photographs are an error.")
-    keep_duplicates: bool = Field(
-        False,
-        description="Keep photographs that show the same as another: copies, reduced copies and "
-        "bursts. They are always kept if poses are given.",
-    )
 
 
 class Views(Section):
@@ -148,11 +143,20 @@ class Sfm(Section):
         "auto", description="auto: incremental; global if the incremental model is not good."
     )
     camera_model: Literal[
-        "auto", "SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE"
+        "auto",
+        "SIMPLE_PINHOLE",
+        "PINHOLE",
+        "SIMPLE_RADIAL",
+        "RADIAL",
+        "OPENCV",
+        "OPENCV_FISHEYE",
+        "EQUIRECTANGULAR",
     ] = Field(
         "auto",
         description="COLMAP's camera model. auto: SIMPLE_RADIAL; OPENCV_FISHEYE if EXIF names a "
-        "fisheye lens.",
+        "fisheye lens; EQUIRECTANGULAR for panoramas (GPano metadata, or a 360 degree camera in "
+        "EXIF). EQUIRECTANGULAR: all photographs are panoramas. Others: of the photographs that "
+        "are not panoramas.",
     )
     share_cameras: Literal["auto", "single", "group", "folder", "image"] = Field(
         "auto",
@@ -196,6 +200,11 @@ class Undistort(Section):
     )
     jpeg_quality: Annotated[int, Field(ge=0, le=100), Unit("percent")] = Field(
         0, description="JPEG quality of the undistorted images. 0: lossless PNG."
+    )
+    mask_nadir_degrees: Annotated[float, Field(ge=0, le=90), Unit("degrees")] = Field(
+        0.0,
+        description="Panoramas: pixels closer than this to straight down (tripod, photographer) "
+        "are ignored in training.",
     )
 
 

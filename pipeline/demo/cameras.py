@@ -20,13 +20,26 @@ LENSES: dict[str, tuple[str, tuple[float, ...]]] = {
     "simple_radial": ("SIMPLE_RADIAL", (-0.06,)),
     "opencv": ("OPENCV", (-0.09, 0.015, 0.0012, -0.0008)),
     "opencv_fisheye": ("OPENCV_FISHEYE", (0.03, -0.008, 0.0, 0.0)),
+    "fisheye_190": ("OPENCV_FISHEYE", (-0.02, 0.001, 0.0, 0.0)),
+    "equirectangular": ("EQUIRECTANGULAR", ()),
 }
+# Lenses with rays at 90 degrees and more from the optical axis, and the radius of the image circle
+# as a share of the shorter side (None: the whole image).
+WIDE: dict[str, float | None] = {"fisheye_190": 0.48, "equirectangular": None}
+FISHEYE_HALF_ANGLE = np.radians(95)
 
 
 def lens(distortion: str, width: int, height: int) -> Camera:
     """The demo's camera: ``distortion`` is a key of ``LENSES``; sizes in pixels."""
     model, coefficients = LENSES[distortion]
+    if model == "EQUIRECTANGULAR":
+        return Camera(model, width, height, np.array([width, height], np.float64))
     focal = FOCAL_MM / SENSOR_WIDTH_MM * width
+    circle = WIDE.get(distortion)
+    if circle is not None:
+        k1, k2 = coefficients[:2]
+        angle = FISHEYE_HALF_ANGLE
+        focal = circle * min(width, height) / (angle + k1 * angle**3 + k2 * angle**5)
     focals = [focal] if model.startswith("SIMPLE") else [focal, focal]
     return Camera(model, width, height, np.array([*focals, width / 2, height / 2, *coefficients]))
 

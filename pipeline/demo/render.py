@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.demo.scene import BACKGROUND, SceneObject, shade, trace
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
+from pipeline.geometry.rays import rays as unit_rays
 from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]
@@ -26,7 +27,8 @@ RAYS_PER_BATCH = 32_768
 
 @dataclass(frozen=True)
 class Rays:
-    """Rays of a camera as (2, rows, columns) normalised points, the same for all its photographs.
+    """Rays of a camera as (3, rows, columns) vectors in its frame, the same for all photographs: of
+    depth 1, or unit vectors for a wide lens, with NaN outside its image circle.
 
     Attributes:
         fine: SAMPLES per pixel and axis, with a margin of MARGIN pixels.
@@ -45,8 +47,8 @@ class Rendered:
         light: (H, W, 3) float64 linear RGB; multiplied by alpha if ``transparent``.
         coverage: (H, W) float64, share of the pixel covered by the visitor, the last object of
             the scene (``visitor``), or by any object (``transparent``); else 1.
-        depth: (H, W) float32, z of the scene's surface at the pixel centre, ignoring the
-            visitor; 0 if there is no surface.
+        depth: (H, W) float32, z of the scene's surface at the pixel centre, for a wide lens its
+            distance, ignoring the visitor; 0 if there is no surface.
     """
 
     light: Array
@@ -54,9 +56,17 @@ class Rendered:
     depth: NDArray[np.float32]
 
 
-def rays(camera: Camera) -> Rays:
-    fine = _grid(camera, SAMPLES, MARGIN)
-    return Rays(fine, _grid(camera, 1, 0))
+def rays(camera: Camera, wide: bool = False, max_angle: float = np.pi) -> Rays:
+    """The rays of a camera.
+
+    Args:
+        wide: the lens sees at 90 degrees and more from its axis, up to ``max_angle``, radians.
+    """
+    fine, centres = _grid(camera, SAMPLES, MARGIN, wide), _grid(camera, 1, 0, wide)
+    if wide:
+        limit = np.cos(max_angle)
+        fine, centres = (np.where(grid[2] >= limit, grid, np.nan) for grid in (fine, centres))
+    return Rays(fine, centres)
 
 
 def render(
@@ -76,12 +86,13 @@ def render(
         visitor: the last thing does not belong to the scene; coverage is its share.
     """
     rows, columns = through.fine.shape[1:]
-    flat = through.fine.reshape(2, -1)
+    flat = through.fine.reshape(3, -1)
     layers = np.empty((4, flat.shape[1]))
     pixel = TEXTURE_SIGMA / camera.pinhole[0]
     for start in range(0, flat.shape[1], RAYS_PER_BATCH):
         part = slice(start, start + RAYS_PER_BATCH)
-        origin, direction = _world(posed, flat[:, part])
+        seen = np.isfinite(flat[0, part])
+        origin, direction = _world(posed, _or_forward(flat[:, part]))
         t, index = trace(origin, direction, objects)
         light = shade(origin, direction, t, index, pixel * t, objects)
         if transparent:
@@ -89,6 +100,7 @@ def render(
             light *= inside
         else:
             inside = index == len(objects) - 1 if visitor else np.ones(index.shape, bool)
+        light = np.where(seen, light, 0.0)
         layers[:3, part], layers[3, part] = light, inside
     picture = np.ascontiguousarray(layers.reshape(4, rows, columns).transpose(1, 2, 0))
     picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), LENS_SIGMA * SAMPLES), np.float64)
@@ -96,23 +108,36 @@ def render(
     picture = picture.reshape(height, SAMPLES, width, SAMPLES, 4).mean(axis=(1, 3))
     picture = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
 
-    origin, direction = _world(posed, through.centres.reshape(2, -1))
+    centres = through.centres.reshape(3, -1)
+    origin, direction = _world(posed, _or_forward(centres))
     t, index = trace(origin, direction, objects[:-1] if visitor else objects)
-    depth = np.where((index == BACKGROUND) & transparent, 0.0, t).astype(np.float32)
+    nothing = ((index == BACKGROUND) & transparent) | ~np.isfinite(centres[0])
+    depth = np.where(nothing, 0.0, t).astype(np.float32)
     return Rendered(picture[..., :3], picture[..., 3], depth.reshape(camera.height, camera.width))
 
 
-def _grid(camera: Camera, samples: int, margin: int) -> Array:
+def _grid(camera: Camera, samples: int, margin: int, wide: bool) -> Array:
     x = (np.arange((camera.width + 2 * margin) * samples) + 0.5) / samples - margin
     y = (np.arange((camera.height + 2 * margin) * samples) + 0.5) / samples - margin
+    if camera.is_spherical:
+        x, y = x % camera.width, np.clip(y, 0.0, camera.height)
     xy = np.stack(np.meshgrid(x, y), axis=-1)
-    return np.ascontiguousarray(np.moveaxis(unproject(camera, xy), -1, 0))
+    if wide:
+        return np.ascontiguousarray(np.moveaxis(unit_rays(camera, xy), -1, 0))
+    plane = np.moveaxis(unproject(camera, xy), -1, 0)
+    return np.concatenate([plane, np.ones_like(plane[:1])])
+
+
+def _or_forward(vectors: Array) -> Array:
+    """(3, N) rays, the optical axis where there is none."""
+    return np.where(np.isfinite(vectors[0]), vectors, np.array([[0.0], [0.0], [1.0]]))
 
 
 def _world(posed: PosedImage, points: Array) -> tuple[Array, Array]:
-    """Origin (3, 1) and directions (3, N) of depth 1, so that a hit's t is its z depth.
+    """Origin (3, 1) and directions (3, N) of rays: of depth 1, so that a hit's t is its z depth, or
+    unit vectors.
 
     Written out rather than a matrix product: BLAS may round differently with other threads.
     """
     right, down, forward = (row[:, None] for row in posed.rotation)
-    return posed.centre[:, None], right * points[0] + down * points[1] + forward
+    return posed.centre[:, None], right * points[0] + down * points[1] + forward * points[2]

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.demo.cameras import FOCAL_MM, SENSOR_WIDTH_MM, focal_35mm
+from pipeline.demo.cameras import FOCAL_MM, SENSOR_WIDTH_MM, WIDE, focal_35mm
 
 Array = NDArray[np.float64]
 
@@ -26,6 +27,13 @@ SRGB_TO_XYZ = np.array(
 )
 BLACK_LEVEL, WHITE_LEVEL = 1024, 15360  # of 14 bits
 RGGB = ((0, 1), (1, 2))
+# A whole sphere: Google's "Photo Sphere XMP Metadata".
+GPANO = (
+    b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF '
+    b'xmlns:rdf="http://www.w3.org/1999/02/22-rdf-syntax-ns#"><rdf:Description rdf:about="" '
+    b'xmlns:GPano="http://ns.google.com/photos/1.0/panorama/" '
+    b'GPano:ProjectionType="equirectangular"/></rdf:RDF></x:xmpmeta>'
+)
 
 
 def srgb(light: Array) -> Array:
@@ -38,23 +46,34 @@ def to_bytes(values: Array) -> NDArray[np.uint8]:
     return np.rint(np.clip(values, 0.0, 1.0) * 255).astype(np.uint8)
 
 
-def write_picture(path: Path, pixels: NDArray[np.uint8], taken: str) -> None:
+def write_picture(
+    path: Path, pixels: NDArray[np.uint8], taken: str, distortion: str = "none"
+) -> None:
     """Write (H, W, 3 or 4) sRGB pixels as JPEG or PNG, by the name, with EXIF of the lens.
+
+    Wide lenses have no focal length in EXIF: a fisheye lens has a name, a panorama GPano metadata.
 
     Args:
         taken: EXIF time, "YYYY:MM:DD hh:mm:ss".
+        distortion: a key of ``LENSES``.
     """
     exif = Image.Exif()
     exif[271], exif[272], exif[274], exif[306] = MAKE, MODEL, 1, taken
     photo = exif.get_ifd(0x8769)
     photo[36867] = taken
-    photo[37386] = float(FOCAL_MM)
-    photo[41486] = photo[41487] = pixels.shape[1] / SENSOR_WIDTH_MM * 10
-    photo[41488] = 3  # pixels per centimetre
-    photo[41989] = focal_35mm(pixels.shape[1], pixels.shape[0])
+    options: dict[str, Any] = {}
+    if distortion == "equirectangular":
+        options["xmp"] = GPANO
+    elif distortion in WIDE:
+        photo[42036] = "Fisheye"
+    else:
+        photo[37386] = float(FOCAL_MM)
+        photo[41486] = photo[41487] = pixels.shape[1] / SENSOR_WIDTH_MM * 10
+        photo[41488] = 3  # pixels per centimetre
+        photo[41989] = focal_35mm(pixels.shape[1], pixels.shape[0])
     exif[0x8769] = photo
-    # Other formats ignore the two options of JPEG.
-    Image.fromarray(pixels).save(path, exif=exif, quality=JPEG_QUALITY, subsampling=0)
+    # Other formats ignore the options of JPEG.
+    Image.fromarray(pixels).save(path, exif=exif, quality=JPEG_QUALITY, subsampling=0, **options)
 
 
 def white_balance() -> Array:

@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.demo.cameras import LENSES, lens, orbit
+from pipeline.demo.cameras import FISHEYE_HALF_ANGLE, LENSES, WIDE, lens, orbit
 from pipeline.demo.render import Rays, rays, render
 from pipeline.demo.scene import OBJECTS, VISITOR, SceneObject
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
@@ -77,6 +77,12 @@ class DemoSpec:
             raise UserError(f"unknown format {self.format!r} or poses {self.poses!r}")
         if self.distortion not in LENSES:
             raise UserError(f"unknown distortion {self.distortion!r}", fix=f"One of {[*LENSES]}.")
+        if self.distortion == "equirectangular" and self.width != 2 * self.height:
+            raise UserError("a panorama is twice as wide as high", fix="Choose another --size.")
+        if self.distortion in WIDE and (self.poses == "colmap" and self.points):
+            raise UserError(
+                "points of wide lenses are not written", fix="Use --no-points with --poses colmap."
+            )
         if self.alpha and self.format != "png":
             raise UserError(f"{self.format} has no alpha", fix="Use --format png with --alpha.")
         if self.alpha and self.masks:
@@ -160,7 +166,8 @@ def _views(spec: DemoSpec) -> list[PosedImage]:
 @lru_cache(maxsize=1)
 def _rays(spec: DemoSpec) -> Rays:
     """The rays through the camera's pixels, computed once per process."""
-    return rays(_camera(spec))
+    angle = np.pi if WIDE.get(spec.distortion) is None else FISHEYE_HALF_ANGLE
+    return rays(_camera(spec), spec.distortion in WIDE, float(angle))
 
 
 def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
@@ -182,7 +189,7 @@ def _write_view(folder: Path, spec: DemoSpec, number: int) -> Written:
         colour = to_bytes(srgb(straight)) * (alpha > 0)[..., None]
         write_picture(path, np.dstack([colour, alpha]), taken)
     else:
-        write_picture(path, colour, taken)
+        write_picture(path, colour, taken, spec.distortion)
     np.save(folder / "depth_gt" / f"{stem}.npy", seen.depth)
     depth = seen.depth
     if spec.masks:
@@ -251,12 +258,11 @@ def _transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
     fx, fy, cx, cy = camera.pinhole
     rest = [float(v) for v in camera.params[len(camera.intrinsics_names) :]]
     fisheye = "FISHEYE" in camera.model
+    if camera.is_spherical:
+        listed = {"camera_model": camera.model, "w": camera.width, "h": camera.height}
+        return {**listed, "frames": _frames(views)}
     names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
     rest += [0.0] * (4 - len(rest))
-    frames = []
-    for posed in views:
-        pose = np.linalg.inv(posed.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/{posed.name}", "transform_matrix": pose.tolist()})
     return {
         "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
         "w": camera.width,
@@ -266,5 +272,13 @@ def _transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
         "cx": cx,
         "cy": cy,
         **dict(zip(names, rest, strict=True)),
-        "frames": frames,
+        "frames": _frames(views),
     }
+
+
+def _frames(views: list[PosedImage]) -> list[dict[str, Any]]:
+    frames = []
+    for posed in views:
+        pose = np.linalg.inv(posed.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
+        frames.append({"file_path": f"images/{posed.name}", "transform_matrix": pose.tolist()})
+    return frames

@@ -39,6 +39,7 @@ CAMERA_MODELS: dict[str, tuple[int, tuple[str, ...]]] = {
     "SIMPLE_FISHEYE": (14, ("f", "cx", "cy")),
     "FISHEYE": (15, ("fx", "fy", "cx", "cy")),
     "EUCM": (16, ("fx", "fy", "cx", "cy", "alpha", "beta")),
+    "EQUIRECTANGULAR": (17, ("w", "h")),
 }
 _WITH_TWO_FOCAL_LENGTHS = {
     "SIMPLE_PINHOLE": "PINHOLE",
@@ -66,23 +67,34 @@ class Camera:
     params: NDArray[np.float64]
 
     @property
+    def is_spherical(self) -> bool:
+        """Whether the image is an equirectangular panorama, 360 by 180 degrees."""
+        return self.model == "EQUIRECTANGULAR"
+
+    @property
     def is_pinhole(self) -> bool:
         """Whether this is a perspective camera whose distortion coefficients are all zero."""
         if self.model in ("SIMPLE_PINHOLE", "PINHOLE"):
             return True
+        if self.is_spherical:
+            return False
         distortion = self.params[len(self.intrinsics_names) :]
         return "FISHEYE" not in self.model and not np.any(distortion)
 
     @property
     def intrinsics_names(self) -> tuple[str, ...]:
-        """The leading parameters' names: focal lengths and principal point, no distortion."""
+        """The leading parameters' names: focal lengths and principal point, no distortion; width
+        and height for a panorama."""
         names = CAMERA_MODELS[self.model][1]
         return names[:3] if names[0] == "f" else names[:4]
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
-        """(fx, fy, cx, cy) in pixels, without the distortion."""
+        """(fx, fy, cx, cy) in pixels, without the distortion; for a panorama, those of a camera
+        with the angular resolution of its centre."""
         p = [float(v) for v in self.params]
+        if self.is_spherical:
+            return p[0] / (2 * np.pi), p[1] / np.pi, p[0] / 2, p[1] / 2
         if self.intrinsics_names[0] == "f":
             return p[0], p[0], p[1], p[2]
         return p[0], p[1], p[2], p[3]
@@ -92,6 +104,8 @@ class Camera:
 
         A model with one focal length becomes one with two if the aspect ratio changes.
         """
+        if self.is_spherical:
+            return Camera(self.model, width, height, np.array([width, height], np.float64))
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy = self.pinhole
         rest = self.params[len(self.intrinsics_names) :]

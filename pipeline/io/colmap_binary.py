@@ -86,7 +86,7 @@ def read_cameras(file: Path) -> dict[int, Camera]:
     """Camera id -> camera, from ``cameras`` of a model."""
     reader = _Reader(file)
     cameras: dict[int, Camera] = {}
-    for _ in range(reader.count(48)):
+    for _ in range(reader.count(40)):
         number, kind, width, height = (int(v) for v in reader.unpack("IiQQ"))
         if kind not in _MODEL_NAMES:
             raise unknown_model(file, number, str(kind))

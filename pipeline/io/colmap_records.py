@@ -77,6 +77,13 @@ def make_camera(
             file=file,
             fix=REMEDY,
         )
+    if camera.is_spherical and p != [width, height]:
+        raise UserError(
+            f"camera {number}: expected the image's size {width}x{height} as parameters of "
+            f"{name}, found {p}",
+            file=file,
+            fix=REMEDY,
+        )
     return camera
 
 

@@ -17,6 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import exr, pillow_formats
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
+from pipeline.io.panorama import Panorama, panorama_of
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 
@@ -61,6 +62,7 @@ class FileFacts(BaseModel):
     focal_px: float | None = None
     gps: tuple[float, float, float] | None = None
     taken: str | None = None
+    panorama: Panorama = "no"
 
     @property
     def camera_group(self) -> str:
@@ -90,14 +92,15 @@ def read_facts(path: Path) -> FileFacts:
             width, height = image.size
             if _bits(image) > 16:
                 raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
-            exif = _exif_of(lambda: _header_exif(image))
+            exif = _exif_facts(_exif_of(lambda: _header_exif(image)), width, height)
             return FileFacts(
                 digest=digest,
                 width=width,
                 height=height,
                 alpha=_has_transparency(image),
                 bits=_bits(image),
-                **_exif_facts(exif, width, height),
+                panorama=panorama_of(_xmp(image), exif["body"], width, height),
+                **exif,
             )
     except UnidentifiedImageError:
         reason = f"no header of its format found ({', '.join(_formats(path.name))})"
@@ -221,6 +224,12 @@ def _quiet() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         yield
+
+
+def _xmp(image: Image.Image) -> bytes:
+    """The XMP packet stored before the pixels; empty without one."""
+    found = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
+    return found.encode("utf-8", "replace") if isinstance(found, str) else bytes(found)
 
 
 def _header_exif(image: Image.Image) -> Image.Exif:

@@ -231,10 +231,12 @@ def frame_camera_model(frame: Frame) -> str:
     model = str(names.get("camera_model", "")).upper()
     if model == "OPENCV_FISHEYE" or names.get("is_fisheye"):
         return "OPENCV_FISHEYE"
+    if model == "EQUIRECTANGULAR":
+        return model
     if model and model not in _PERSPECTIVE:
         raise UserError(
             f"{frame.source}: camera_model {model[:40]} is not supported; expected "
-            f"{', '.join(_PERSPECTIVE)} or OPENCV_FISHEYE",
+            f"{', '.join(_PERSPECTIVE)}, OPENCV_FISHEYE or EQUIRECTANGULAR",
             file=frame.file,
             fix="convert the photographs to perspective ones, or set poses: ignore",
         )
@@ -370,6 +372,15 @@ def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
     """The frame's camera, with the photograph's size if the frame has none."""
     width = round(_number(frame, "w", photo_width))
     height = round(_number(frame, "h", photo_height))
+    if frame_camera_model(frame) == "EQUIRECTANGULAR":
+        if not 0 < width == 2 * height:
+            raise UserError(
+                f"{frame.source}: the panorama is {width}x{height} pixels; expected 360 by 180 "
+                "degrees, twice as wide as high",
+                file=frame.file,
+                fix=_FIX,
+            )
+        return Camera("EQUIRECTANGULAR", width, height, np.array([width, height], np.float64))
     fx = _focal(frame, "fl_x", "camera_angle_x", width)
     fy = _focal(frame, "fl_y", "camera_angle_y", height)
     if fx is None and fy is None:

@@ -236,6 +236,7 @@ def evaluate_views(
             split=_describe_split(protocol),
             poses_and_points=POSES_OF_SPLIT if protocol.listed else POSES_OF_ALL,
             num_views=len(per_view),
+            num_photographs=_split_photographs(protocol.views),
             psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
             ssim=SSIM_VARIANT,
             lpips=LPIPS_VARIANTS[config.lpips_net] if lpips is not None else reason,
@@ -279,6 +280,13 @@ def photo_over_background(
     return to_bytes(pixels.rgb / 255.0 * alpha + np.array(background) * (1 - alpha))
 
 
+def _split_photographs(views: Sequence[View]) -> int | None:
+    """Number of photographs that the views are parts of; None if each view is a photograph."""
+    if all(view.source is None for view in views):
+        return None
+    return len({view.source or view.name for view in views})
+
+
 def _sizes(views: Sequence[View]) -> tuple[str, ...]:
     sizes = sorted({(view.width, view.height) for view in views})
     return tuple(f"{w}x{h}" for w, h in sizes)
@@ -292,4 +300,6 @@ def _describe_split(protocol: Protocol) -> str:
         )
     if not protocol.every:
         return "no test views: measured on the TRAINING views"
+    if _split_photographs(protocol.views) is not None:
+        return f"test views: all of one photograph in {protocol.every}, sorted by name"
     return f"test views: one view in {protocol.every}, sorted by name, from the first"

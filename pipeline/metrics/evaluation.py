@@ -31,6 +31,11 @@ class ProtocolDescription(JsonObject):
     split: str = Field(description="Which views were measured.")
     poses_and_points: str = Field(description="Which photographs they were computed from.")
     num_views: int = Field(ge=1, description="Number of measured views.")
+    num_photographs: int | None = Field(
+        None,
+        description="Number of photographs that the measured views are parts of; null where each "
+        "view is a photograph.",
+    )
     psnr: str = Field(description="Definition of `psnr`.")
     ssim: str = Field(description="Definition of `ssim`.")
     lpips: str = Field(description="Definition of `lpips`, or why it was not measured.")

@@ -53,3 +53,19 @@ class UndistortCounters(StageCounters):
     """Counters of the undistort stage."""
 
     undistorted: int = Field(ge=0, description="Number of undistorted photographs.")
+    split: int | None = Field(
+        None,
+        ge=0,
+        description="Number of photographs that were split into several views (panoramas, wide "
+        "fisheye lenses); absent without any.",
+    )
+    views: int | None = Field(
+        None, ge=0, description="Number of views of all photographs; absent if none was split."
+    )
+    used_share: float | None = Field(
+        None,
+        ge=0,
+        le=1,
+        description="Share of the pixels of split photographs, inside the image circle of the "
+        "lens, that are in some view; absent if none was split.",
+    )

@@ -40,7 +40,7 @@ class Exposures:
         gains: (V, 3) float64 RGB factors of a view's display values relative to the average view.
         spread: standard deviation of the gains over the views, in stops; the largest of the
             channels.
-        measured: number of views with at least ``MIN_OBSERVATIONS`` usable observations.
+        measured: number of photographs with at least ``MIN_OBSERVATIONS`` usable observations.
     """
 
     gains: Array
@@ -51,6 +51,8 @@ class Exposures:
 def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures:
     """Estimate the gains of ``views`` from their colours at the observations of ``model``.
 
+    Views of one photograph have the same gains.
+
     Args:
         views: views of images of ``model``, matched by name. They may have another resolution than
             the model's cameras.
@@ -58,6 +60,8 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
     numbers = {image.name: number for number, image in model.images.items()}
+    groups: dict[str, int] = {}
+    group = [groups.setdefault(view.source or view.name, len(groups)) for view in views]
     point_of, view_of, colours = [], [], []
     for index, view in enumerate(views):
         number = numbers[view.name]
@@ -68,12 +72,13 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
         scale = np.array([view.width / camera.width, view.height / camera.height])
         usable, log_colours = _log_colours(view, points.track_xy[observations] * scale)
         point_of.append(owner[observations[usable]])
-        view_of.append(np.full(len(log_colours), index))
+        view_of.append(np.full(len(log_colours), group[index]))
         colours.append(log_colours)
     if not point_of:
         return Exposures(np.ones((len(views), 3)), 0.0, 0)
     point, view_index = np.concatenate(point_of), np.concatenate(view_of)
-    return _solve(point, view_index, np.concatenate(colours), len(views))
+    found = _solve(point, view_index, np.concatenate(colours), len(groups))
+    return Exposures(found.gains[group], found.spread, found.measured)
 
 
 def sample_views(views: Sequence[View]) -> list[View]:

@@ -140,7 +140,7 @@ def _duplicates(replaced: Mapping[str, str]) -> list[str]:
     some = ", ".join(pairs[:3]) + (", ..." if len(pairs) > 3 else "")
     return [
         f"{len(pairs)} photographs are left out, because they show the same as others ({some}): "
-        "copies, or a camera that stood still (inspect.keep_duplicates)"
+        "copies, or a camera that stood still (experiments.inspect.keep_duplicates)"
     ]
 
 

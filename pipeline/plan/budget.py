@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import math
+from collections import Counter
 
 from pipeline.config.schema import Config
+from pipeline.geometry.cube import ROTATIONS, panorama_face_side
 from pipeline.plan.scan import Scan
 from pipeline.plan.training_memory import gaussians_in, memory_mb
 from pipeline.runtime.errors import UserError
@@ -31,12 +33,13 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
         UserError: ``train.memory_mb`` is too small.
     """
     density = config.train.density
-    width, height = view_size(*scan.sizes[0], config.views.max_long_side_px)
+    sizes = planned_views(scan, config)
+    width, height = typical_view(scan, config)
     minutes, pixels = config.train.budget_minutes, density.pixels_per_gaussian
     if pixels == "auto":
         pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET
     by_view = width * height / pixels
-    by_scene = width * height * len(scan.planned) / TRAINING_PIXELS_PER_GAUSSIAN
+    by_scene = width * height * len(sizes) / TRAINING_PIXELS_PER_GAUSSIAN
     by_time = math.inf if minutes is None else GAUSSIANS_PER_MINUTE * minutes
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_time)))
     if density.strategy == "original" and density.pixels_per_gaussian == "auto":
@@ -80,12 +83,46 @@ def training_memory_mb(scan: Scan, config: Config) -> int:
 
 
 def _pixels(scan: Scan, config: Config) -> int:
-    sizes = [view_size(p.width, p.height, config.views.max_long_side_px) for p in scan.planned]
-    return sum(width * height for width, height in sizes)
+    return sum(width * height for width, height in planned_views(scan, config))
+
+
+def planned_views(scan: Scan, config: Config) -> list[tuple[int, int]]:
+    """(width, height) of the views of each photograph, as far as they are known before the cameras
+    are: six of a panorama, one of each other photograph."""
+    cap, given = config.views.max_long_side_px, scan.poses
+    everywhere = (
+        config.sfm.camera_model == "EQUIRECTANGULAR"
+        if given is None
+        else (given.models == ("EQUIRECTANGULAR",))
+    )
+    sizes = []
+    for photo in scan.planned:
+        if everywhere or (photo.panorama and given is None):
+            side = min(panorama_face_side(photo.width), cap)
+            sizes += [(side, side)] * len(ROTATIONS)
+        else:
+            sizes.append(view_size(photo.width, photo.height, cap))
+    return sizes
+
+
+def typical_view(scan: Scan, config: Config) -> tuple[int, int]:
+    """Width and height of the views of the most frequent photographs; of panoramas if there are
+    any."""
+    views = planned_views(scan, config)
+    if len(views) == len(scan.planned):
+        return view_size(*scan.sizes[0], config.views.max_long_side_px)
+    return Counter(views).most_common(1)[0][0]
 
 
 def resolution_line(scan: Scan, config: Config) -> str:
     """The plan's sentence about the size of the views."""
+    views = planned_views(scan, config)
+    if len(views) > len(scan.planned):
+        side = typical_view(scan, config)[0]
+        return (
+            f"{len(views)} views, of {side}x{side} pixels: panoramas are split into "
+            f"{len(ROTATIONS)} views each"
+        )
     (width, height), *others = scan.sizes
     cap = config.views.max_long_side_px
     small_width, small_height = view_size(width, height, cap)

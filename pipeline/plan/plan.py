@@ -11,14 +11,14 @@ from collections.abc import Collection, Mapping, Sequence
 
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
-from pipeline.plan.budget import training_memory_mb
+from pipeline.plan.budget import training_memory_mb, typical_view
+from pipeline.plan.panoramas import panorama_hints
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.summary import found
 from pipeline.plan.values import Plan, SceneFacts
-from pipeline.scene.views import view_size
 
 # Limits the length of lists in the plan, which is passed on command lines.
 MAX_LISTED = 20
@@ -39,10 +39,11 @@ def make_plan(
     for name in running:
         sources = sorted(set(_upstream(stages[name], running).values()))
         decided[name] = decided[name].model_copy(update={"inputs": sources})
+    hints = panorama_hints(scan.maybe_panoramas, config) if scan.poses is None else []
     return Plan(
         scene=scan.manifest.scene,
         stages=decided,
-        warnings=_shortened(scan.warnings),
+        warnings=_shortened([*hints, *scan.warnings]),
         config=settled.config,
         facts=_facts(scan, settled.config),
         folder=folder,
@@ -122,7 +123,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         camera_groups=_most_frequent(groups),
         ordered=scan.ordered,
         image_folder=scan.image_folder,
-        view_size=view_size(*scan.sizes[0], config.views.max_long_side_px),
+        view_size=typical_view(scan, config),
         training_memory_mb=training_memory_mb(scan, config),
         given_poses=poses
         and PoseSummary.model_validate(poses.model_dump(exclude={"names", "splits", "lost"})),

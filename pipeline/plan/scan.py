@@ -30,6 +30,7 @@ from pipeline.io.posefiles import (
 )
 from pipeline.io.recorded import digest_of
 from pipeline.plan.listed_split import Part, listed_split
+from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
@@ -80,6 +81,8 @@ class Scan(BaseModel):
     fingerprint: str
     frames: tuple[Photo, ...] = ()
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
+    maybe_panoramas: tuple[str, ...] = ()
+    """Photographs of which only the aspect ratio is that of a panorama."""
 
     def with_frames(self, max_frames: int) -> Scan:
         """The scan with placeholders for up to ``max_frames`` frames of the videos."""
@@ -140,6 +143,10 @@ class Scan(BaseModel):
     def num_test(self) -> int:
         """Number of test views of the scene's own split; 0 without one."""
         return sum(photo.split == "test" for photo in self.photos)
+
+    @property
+    def num_panoramas(self) -> int:
+        return sum(photo.panorama for photo in self.photos)
 
     @property
     def num_focal(self) -> int:
@@ -225,6 +232,8 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ).model_copy(update={"split": split.get(name)})
         for name in sorted(facts)
     ]
+    if poses is None:
+        warnings += partial_panoramas(facts)
     truth = truth_folder(folder)
     control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
     cloud = find_point_cloud(folder, config, poses, control is not None, facts_cache, warnings)
@@ -240,6 +249,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ordered=why_ordered(photos, len(videos)),
         ground_control=control,
         cloud=cloud,
+        maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=_digest_files(folder, pose_files(truth, "colmap"), facts_cache)
         if truth
@@ -436,6 +446,7 @@ def _photo(
         depth_digest=_digest(depth, cache) if depth else None,
         focal_px=facts.focal_px,
         camera_group=facts.camera_group,
+        panorama=facts.panorama == "full",
         gps=facts.gps,
         taken=facts.taken,
     )

@@ -16,6 +16,7 @@ from typing import Any
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget
+from pipeline.plan.panoramas import check_panorama_sizes
 from pipeline.plan.scan import Scan
 
 # Up to this many photographs (780 pairs), all pairs are matched. For more, retrieval takes a
@@ -138,6 +139,29 @@ def _mapper(config: Config) -> Choice:
 
 
 def _camera_model(scan: Scan, config: Config) -> Choice:
+    wanted = config.sfm.camera_model
+    count, whole = scan.num_panoramas, len(scan.planned)
+    if wanted == "EQUIRECTANGULAR":
+        check_panorama_sizes(scan.planned)
+        return (
+            wanted,
+            f"EQUIRECTANGULAR cameras: panoramas of 360 degrees{_configured(count, whole)}",
+        )
+    if count == whole:
+        return "EQUIRECTANGULAR", "EQUIRECTANGULAR cameras: all photographs are panoramas"
+    choice, text = _perspective_model(scan, config)
+    if count:
+        text += f"; EQUIRECTANGULAR cameras for {count} panoramas"
+    return choice, text
+
+
+def _configured(found: int, count: int) -> str:
+    """The end of the sentence about panoramas: whether the photographs themselves say so."""
+    return "" if found == count else ", as configured"
+
+
+def _perspective_model(scan: Scan, config: Config) -> Choice:
+    """The model of the cameras of the photographs that are not panoramas."""
     wanted = config.sfm.camera_model
     priors = f"focal length from EXIF in {scan.num_focal} of {len(scan.planned)} photographs"
     if wanted != "auto":

@@ -52,6 +52,10 @@ class Photo(BaseModel):
     """Focal length from EXIF, in pixels at ``width`` x ``height``."""
     camera_group: str = ""
     """Equal for photographs with the same camera body, lens, focal length and size."""
+    panorama: bool = False
+    """Whether it is an equirectangular panorama of 360 by 180 degrees."""
+    source: str | None = None
+    """Name of the photograph of which this is a part; null for a whole photograph."""
     gps: tuple[float, float, float] | None = None
     """Latitude and longitude in degrees, altitude in metres."""
     taken: str | None = None

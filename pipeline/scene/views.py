@@ -30,6 +30,7 @@ class View:
         camera_id: key into ``Reconstruction.cameras``; views of one camera share intrinsics.
         has_listed_split: whether the scene's own split says if this is a test view.
         image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
+        source: name of the photograph of which this is a part; None for a whole photograph.
     """
 
     name: str
@@ -47,6 +48,7 @@ class View:
     image_digest: str | None = None
     mask_digest: str | None = None
     has_listed_split: bool = False
+    source: str | None = None
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -55,8 +57,8 @@ class View:
 
 
 def is_test_view(index: int, every: int) -> bool:
-    """Whether view ``index`` of the views sorted by name is a test view: every ``every``-th is,
-    from the first, as in Mip-NeRF 360 and 3DGS. 0: none is."""
+    """Whether photograph ``index`` of the photographs sorted by name is for testing: every
+    ``every``-th is, from the first, as in Mip-NeRF 360 and 3DGS. 0: none is."""
     return every > 0 and index % every == 0
 
 
@@ -91,10 +93,13 @@ def load_views(
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
     parts = {photo.split for photo in photos}
     listed = split.source == "auto" and parts == {"train", "test"}
-    # A single view is a training view.
-    every = split.test_every if len(photos) > 1 else 0
+    # Views of one photograph are all test views or all training views: they overlap.
+    sources = {name: i for i, name in enumerate(sorted({p.source or p.name for p in photos}))}
+    # A single photograph is for training.
+    every = split.test_every if len(sources) > 1 else 0
     result = []
-    for index, photo in enumerate(photos):
+    for photo in photos:
+        index = sources[photo.source or photo.name]
         image = posed[photo.name]
         camera = model.cameras[image.camera_id]
         if not camera.is_pinhole:
@@ -118,6 +123,7 @@ def load_views(
                 image_digest=photo.digest,
                 mask_digest=photo.mask_digest if views.masks == "auto" else None,
                 has_listed_split=listed,
+                source=photo.source,
             )
         )
     return result

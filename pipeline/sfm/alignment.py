@@ -15,6 +15,7 @@ from pipeline.geometry.up_direction import up_direction
 from pipeline.io.gcp import GCP_FILE, read_ground_control
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
+from pipeline.sfm.bearings import camera_rays
 from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
 
 Georeference = Literal["auto", "gps", "gcp", "none"]
@@ -88,10 +89,10 @@ def _triangulate(
         if name not in by_name:
             continue
         image = by_name[name]
-        normalized = model.camera(image.camera_id).cam_from_img(np.array(pixel, np.float64))
-        if normalized is None:
+        local = camera_rays(model.camera(image.camera_id), np.array([pixel], np.float64))[0]
+        if not np.isfinite(local).all():
             continue
-        ray = image.cam_from_world().rotation.matrix().T @ np.append(normalized, 1.0)
+        ray = image.cam_from_world().rotation.matrix().T @ local
         centres.append(image.projection_center())
         rays.append(ray / np.linalg.norm(ray))
     if len(rays) < 2:

@@ -106,6 +106,8 @@ def _alternatives(
     """
     other: Mapper = "global" if first == "incremental" else "incremental"
     yield other, "", None
+    if not _adjustable_cameras(database):
+        return
 
     def one_camera(path: Path) -> bool:
         return share_cameras_by_size(database, path)
@@ -153,10 +155,15 @@ def _rank(attempt: Attempt) -> tuple[int, float]:
 
 def _initial_focal_range(database: Path) -> list[float]:
     """Smallest and largest initial focal length of the cameras, over the longer side."""
-    with pycolmap.Database.open(database) as opened:
-        cameras = opened.read_all_cameras()
+    cameras = _adjustable_cameras(database)
     found = [c.mean_focal_length() / max(c.width, c.height) for c in cameras]
     return [float(min(found)), float(max(found))]
+
+
+def _adjustable_cameras(database: Path) -> list[pycolmap.Camera]:
+    """The cameras that have intrinsics: all but those of panoramas."""
+    with pycolmap.Database.open(database) as opened:
+        return [camera for camera in opened.read_all_cameras() if not camera.is_spherical()]
 
 
 def _view_graph_focal(database: Path) -> float:
@@ -173,18 +180,19 @@ def _view_graph_focal(database: Path) -> float:
 
 
 def _median_focal(database: Path) -> float:
-    with pycolmap.Database.open(database) as opened:
-        cameras = opened.read_all_cameras()
+    cameras = _adjustable_cameras(database)
     found = sorted(c.mean_focal_length() / max(c.width, c.height) for c in cameras)
     return float(found[len(found) // 2])
 
 
 def _set_cameras(source: Path, target: Path, model: str | None, focal: float) -> bool:
-    """Copy a database; its cameras get this model (None: unchanged) and focal length (over the
-    longer side), without a prior."""
+    """Copy a database; its cameras, except of panoramas, get this model (None: unchanged) and focal
+    length (over the longer side), without a prior."""
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
         for camera in database.read_all_cameras():
+            if camera.is_spherical():
+                continue
             side = max(camera.width, camera.height)
             database.update_camera(
                 pycolmap.Camera.create_from_model_name(

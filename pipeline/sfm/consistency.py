@@ -18,6 +18,13 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
+from pipeline.sfm.bearings import (
+    camera_pixels,
+    camera_rays,
+    image_side,
+    is_wide,
+    pixels_per_radian,
+)
 from pipeline.sfm.pairs import proximity_pairs
 
 Floats = NDArray[np.float64]
@@ -71,16 +78,18 @@ class _View:
     Attributes:
         rotation, translation: world to camera, (3, 3) and (3,).
         normalized: (F, 2) keypoints in normalized image coordinates (on the plane z = 1).
+        rays: (F, 3) unit rays of the keypoints of a wide camera, else None.
         points: sorted ids of the observed 3D points.
-        side: longer side, pixels.
-        focal: focal length, pixels.
+        side: longer side, pixels; of a panorama see ``image_side``.
+        focal: focal length, or pixels per radian at the centre of a panorama.
     """
 
     rotation: Floats
     translation: Floats
     normalized: Floats
+    rays: Floats | None
     points: NDArray[np.int64]
-    side: int
+    side: float
     focal: float
 
 
@@ -104,9 +113,10 @@ def measure_consistency(
             rotation=pose.rotation.matrix(),
             translation=np.asarray(pose.translation),
             normalized=np.asarray(camera.cam_from_img(xy), np.float64).reshape(-1, 2),
+            rays=camera_rays(camera, xy) if is_wide(camera) else None,
             points=np.unique(np.array(seen, np.int64)),
-            side=max(camera.width, camera.height),
-            focal=float(camera.mean_focal_length()),
+            side=image_side(camera),
+            focal=pixels_per_radian(camera),
         )
     agreeing, matches = 0, 0
     strongest: dict[int, int] = {}
@@ -133,13 +143,18 @@ def _matches_agree(a: _View, b: _View, matches: NDArray[np.uint32]) -> NDArray[n
     rotation = b.rotation @ a.rotation.T
     translation = b.translation - rotation @ a.translation
     translation = translation / max(float(np.linalg.norm(translation)), 1e-12)
-    x = np.column_stack([a.normalized[matches[:, 0]], np.ones(len(matches))])
-    y = np.column_stack([b.normalized[matches[:, 1]], np.ones(len(matches))])
+    wide = a.rays is not None or b.rays is not None
+    x, y = (_directions(v, m, wide) for v, m in ((a, matches[:, 0]), (b, matches[:, 1])))
     rotated = x @ rotation.T
     line_b = np.cross(translation, rotated)  # E x
     line_a = np.cross(y, translation) @ rotation  # E^T y
     error = (y * line_b).sum(1)
-    norm = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
+    if wide:
+        # Rays vary on the sphere: the derivative is the part of the line perpendicular to the ray.
+        along_a, along_b = (line_a * x).sum(1), (line_b * y).sum(1)
+        norm = (line_a**2).sum(1) - along_a**2 + (line_b**2).sum(1) - along_b**2
+    else:
+        norm = (line_a[:, :2] ** 2).sum(1) + (line_b[:, :2] ** 2).sum(1)
     sampson = np.abs(error) / np.sqrt(np.maximum(norm, 1e-24))
     on_line = sampson * (a.focal + b.focal) / 2 <= MAX_SAMPSON_DISTANCE * max(a.side, b.side)
     # Depths of the triangulated point, up to a positive factor: y d2 = R x d1 + t.
@@ -151,13 +166,21 @@ def _matches_agree(a: _View, b: _View, matches: NDArray[np.uint32]) -> NDArray[n
     return np.asarray(on_line & (parallel | ((depth_a > 0) & (depth_b > 0))))
 
 
+def _directions(view: _View, chosen: NDArray[np.uint32], wide: bool) -> Floats:
+    """(M, 3) rays through keypoints: of depth 1, or unit vectors if one of the cameras is wide."""
+    if view.rays is not None:
+        return view.rays[chosen]
+    flat = np.column_stack([view.normalized[chosen], np.ones(len(chosen))])
+    return flat / np.linalg.norm(flat, axis=1, keepdims=True) if wide else flat
+
+
 def _missing_covisibility(model: pycolmap.Reconstruction, views: dict[int, _View]) -> float:
     """Share of neighbouring images whose expected common points are mostly not observed."""
     ids = list(views)
     if len(ids) < 2:
         return 0.0
     centres = np.stack([-views[i].rotation.T @ views[i].translation for i in ids])
-    axes = np.stack([views[i].rotation[2] for i in ids])
+    axes = _axes(model, ids, views)
     point_ids = np.array(sorted(model.points3D), np.int64)
     xyz = np.stack([model.point3D(int(i)).xyz for i in point_ids])
     shares = []
@@ -181,6 +204,17 @@ def _missing_covisibility(model: pycolmap.Reconstruction, views: dict[int, _View
     return float(np.mean(np.array(shares) < COVISIBLE_SHARE * upper_quartile))
 
 
+def _axes(model: pycolmap.Reconstruction, ids: list[int], views: dict[int, _View]) -> Floats:
+    """(N, 3) viewing directions. Panoramas look everywhere: all have the same direction, the mean
+    of the others."""
+    axes = np.stack([views[i].rotation[2] for i in ids])
+    spheres = np.array([model.camera(model.image(i).camera_id).is_spherical() for i in ids])
+    if spheres.any():
+        mean = axes[~spheres].sum(axis=0) if not spheres.all() else np.array([0.0, 0.0, 1.0])
+        axes[spheres] = mean / max(float(np.linalg.norm(mean)), 1e-12)
+    return axes
+
+
 def _expected_visible(
     model: pycolmap.Reconstruction,
     image_id: int,
@@ -202,9 +236,11 @@ def _expected_visible(
     local = xyz @ view.rotation.T + view.translation
     in_front = local[:, 2] > 1e-9
     xy = np.full((len(xyz), 2), np.nan)
-    if in_front.any():
+    if is_wide(camera):
+        xy = camera_pixels(camera, local)
+    elif in_front.any():
         xy[in_front] = np.asarray(camera.img_from_cam(local[in_front]), np.float64).reshape(-1, 2)
-    border = BORDER * view.side
+    border = BORDER * max(camera.width, camera.height)
     inside = ((xy > border) & (xy < (camera.width - border, camera.height - border))).all(1)
     ray_one, ray_other = xyz - from_centre, xyz - to_centre
     length_one, length_other = (np.linalg.norm(r, axis=1) for r in (ray_one, ray_other))

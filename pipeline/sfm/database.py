@@ -26,6 +26,7 @@ from pipeline.config import schema
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.record import file_digest
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pairs import Pair
@@ -68,25 +69,29 @@ def plan_cameras(
     """Group the photographs into cameras.
 
     ``sfm.share_cameras`` decides which photographs share a camera; photographs of different sizes
-    never do. The focal length prior of a camera is the median of its photographs' EXIF priors.
+    never do, and panoramas only with panoramas. The focal length prior of a camera is the median
+    of its photographs' EXIF priors; a panorama's camera has no parameters to estimate.
 
     Returns:
         The cameras (ids from 1, in order of their first photograph) and photograph name -> camera
         id.
     """
-    members: dict[tuple[tuple[str, ...], int, int], list[Photo]] = defaultdict(list)
+    members: dict[tuple[tuple[str, ...], int, int, str], list[Photo]] = defaultdict(list)
+    chosen: str = "SIMPLE_RADIAL" if sfm.camera_model == "auto" else sfm.camera_model
     for photo in manifest.photos:
-        members[_sharing(photo, sfm.share_cameras), photo.width, photo.height].append(photo)
-    model = "SIMPLE_RADIAL" if sfm.camera_model == "auto" else sfm.camera_model
+        group = _sharing(photo, sfm.share_cameras)
+        model = "EQUIRECTANGULAR" if photo.panorama else chosen
+        members[group, photo.width, photo.height, model].append(photo)
     cameras, camera_of = [], {}
-    for index, ((_, width, height), photos) in enumerate(members.items(), start=1):
+    for index, ((_, width, height, model), photos) in enumerate(members.items(), start=1):
         priors = [p.focal_px for p in photos if p.focal_px]
         guess = DEFAULT_FOCAL_FACTOR * max(width, height)
         if "FISHEYE" in model:
             guess = 0.5 * max(width, height)
         focal = float(np.median(priors)) if priors else guess
         camera = pycolmap.Camera.create_from_model_name(index, model, focal, width, height)
-        camera.has_prior_focal_length = bool(priors)
+        # View graph calibration leaves cameras with a prior as they are.
+        camera.has_prior_focal_length = bool(priors) or camera.is_spherical()
         cameras.append(camera)
         camera_of.update({p.name: index for p in photos})
     return cameras, camera_of
@@ -169,17 +174,20 @@ def share_cameras_by_size(source: Path, target: Path) -> bool:
     with pycolmap.Database.open(source) as database:
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()}
         used = {image.camera_id for image in database.read_all_images()}
-    shared_ids: dict[tuple[int, int], int] = {}
+    shared_ids: dict[tuple[int, int, bool], int] = {}
     merged = {}
     for camera_id in sorted(used):
         camera = cameras[camera_id]
-        merged[camera_id] = shared_ids.setdefault((camera.width, camera.height), camera_id)
+        key = (camera.width, camera.height, camera.is_spherical())
+        merged[camera_id] = shared_ids.setdefault(key, camera_id)
     if len(shared_ids) == len(used):
         return False
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
         for camera_id in shared_ids.values():
             camera = cameras[camera_id]
+            if camera.is_spherical():
+                continue
             side = max(camera.width, camera.height)
             shared = pycolmap.Camera.create_from_model_name(
                 camera_id,
@@ -216,14 +224,18 @@ class _MatchingInputs:
         features: Path,
     ):
         self._cameras, self._images = cameras, images
-        self._camera = {camera.camera_id: camera for camera in cameras}
+        self._verified = {
+            camera.camera_id: with_prior(camera) if is_uncalibrated(camera) else camera
+            for camera in cameras
+        }
         self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
         self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
         self._digest = {image_id: file_digest(file) for image_id, file in self._file.items()}
         self.keypoints = lru_cache(maxsize=CACHED_KEYPOINT_FILES)(self._read)
 
     def camera(self, image_id: int) -> pycolmap.Camera:
-        return self._camera[self._camera_of[image_id]]
+        """The camera as pairs are verified with it."""
+        return self._verified[self._camera_of[image_id]]
 
     def _read(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
         """(F, 2) positions and (F, 128) descriptors."""

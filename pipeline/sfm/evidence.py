@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
+from pipeline.sfm.bearings import camera_rays, is_wide
 from pipeline.sfm.consistency import Pairs, measure_consistency
 from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
 
@@ -49,6 +50,9 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         consistency = measure_consistency(model, opened, pairs)
     focal = {i: float(model.camera(i).mean_focal_length()) for i in used}
     side = {i: max(model.camera(i).width, model.camera(i).height) for i in used}
+    relative = [
+        focal[i] / side[i] for i in camera_of.values() if not model.camera(i).is_spherical()
+    ]
     off = {
         i: max(focal[i] / prior, prior / max(focal[i], 1e-9))
         for i, prior in priors.items()
@@ -72,8 +76,10 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         parallax=parallax,
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=None if _agrees_with_exif(focal_off) else _focal_certainty(model),
-        focal_relative=float(np.median([focal[c] / side[c] for c in camera_of.values()])),
+        focal_certainty=(
+            None if _agrees_with_exif(focal_off) or not relative else _focal_certainty(model)
+        ),
+        focal_relative=float(np.median(relative)) if relative else None,
     )
 
 
@@ -83,22 +89,31 @@ def focal_priors(database: Path) -> dict[int, float]:
         return {
             camera.camera_id: float(camera.mean_focal_length())
             for camera in opened.read_all_cameras()
-            if camera.has_prior_focal_length
+            if camera.has_prior_focal_length and not camera.is_spherical()
         }
 
 
 def _geometry(model: pycolmap.Reconstruction) -> tuple[float, int, NDArray[np.float64]]:
     """Share of the observations behind their camera, number of observations, and (P,) angles in
     degrees of each point: the largest between the first ray of its track and any other."""
-    poses = {}
+    poses, wide = {}, {}
     for image_id in model.reg_image_ids():
         image = model.image(image_id)
-        poses[image_id] = (image.cam_from_world().matrix()[2], image.projection_center())
+        matrix = image.cam_from_world().matrix()
+        poses[image_id] = (matrix[2], image.projection_center())
+        camera = model.camera(image.camera_id)
+        if is_wide(camera):
+            xy = np.array([p.xy for p in image.points2D], np.float64).reshape(-1, 2)
+            wide[image_id] = camera_rays(camera, xy) @ matrix
     behind, observations = 0, 0
     angles = np.zeros(model.num_points3D())
     for index, point in enumerate(model.points3D.values()):
         seen = [poses[element.image_id] for element in point.track.elements]
         axes, centres = (np.array(column) for column in zip(*seen, strict=True))
+        for row, element in enumerate(point.track.elements):
+            if element.image_id in wide:
+                # A wide lens sees behind its plane: the point must be along the keypoint's ray.
+                axes[row] = wide[element.image_id][element.point2D_idx]
         behind += int((axes[:, :3] @ point.xyz + axes[:, 3] <= 0).sum())
         observations += len(seen)
         rays = centres - point.xyz
@@ -154,8 +169,14 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
 
     For each pair the rotation that best aligns the keypoints' rays (Kabsch) gives a median
     distance between predicted and matched keypoints; the value is the upper quartile over the
-    pairs, minimised over focal lengths and radial distortions on a grid.
+    pairs, minimised over focal lengths and radial distortions on a grid. Panoramas have neither;
+    if most pairs have one, the value is computed from the rays of all.
     """
+    spheres = {i for pair in pairs for i in pair if _is_spherical(model, i)}
+    flat = {pair: matches for pair, matches in pairs.items() if not spheres & set(pair)}
+    if len(flat) < len(pairs) / 2:
+        return _sphere_parallax(model, database, pairs)
+    pairs = flat
     if not pairs:
         return 0.0
     chosen = list(pairs)[:: max(1, len(pairs) // PARALLAX_PAIRS)]
@@ -191,6 +212,32 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
     return best
 
 
+def _is_spherical(model: pycolmap.Reconstruction, image_id: int) -> bool:
+    return bool(model.camera(model.image(image_id).camera_id).is_spherical())
+
+
+def _sphere_parallax(
+    model: pycolmap.Reconstruction, database: pycolmap.Database, pairs: Pairs
+) -> float:
+    """``_parallax`` from rays: angles, as a share of the angle of ``image_side``."""
+    medians = []
+    for first, second in list(pairs)[:: max(1, len(pairs) // PARALLAX_PAIRS)]:
+        matches = pairs[first, second]
+        a, b = (
+            camera_rays(
+                model.camera(model.image(i).camera_id),
+                database.read_keypoints(i)[column, :2].astype(np.float64),
+            )
+            for i, column in ((first, matches[:, 0]), (second, matches[:, 1]))
+        )
+        good = np.isfinite(a).all(1) & np.isfinite(b).all(1)
+        rotated = _rotated_onto(a[good], b[good])
+        chord = np.linalg.norm(rotated - b[good], axis=1)
+        angles = 2 * np.arcsin(np.clip(chord / 2, 0, 1))
+        medians.append(float(np.median(angles)) if len(angles) else 0.0)
+    return float(np.percentile(medians, 75)) / (np.pi / 2)
+
+
 def _undistorted(points: NDArray[np.float64], radial: float) -> NDArray[np.float64]:
     """(..., 2) normalized coordinates with one radial term removed, to first order."""
     return points * (1 - radial * (points**2).sum(-1, keepdims=True))
@@ -202,11 +249,17 @@ def _best_rotated(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
     rays_a, rays_b = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (a, b))
     rays_a /= np.linalg.norm(rays_a, axis=-1, keepdims=True)
     rays_b /= np.linalg.norm(rays_b, axis=-1, keepdims=True)
-    u, _, vt = np.linalg.svd(np.swapaxes(rays_b, -1, -2) @ rays_a)
-    vt[:, 2] *= (np.linalg.det(u) * np.linalg.det(vt))[:, None]
-    rotated = rays_a @ np.swapaxes(u @ vt, -1, -2)
+    rotated = _rotated_onto(rays_a, rays_b)
     depth = np.where(rotated[..., 2:] > 1e-6, rotated[..., 2:], np.nan)
     return np.asarray(rotated[..., :2] / depth)
+
+
+def _rotated_onto(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(..., M, 3) unit rays ``a``, rotated by the rotation that best aligns them with ``b``
+    (Kabsch 1976)."""
+    u, _, vt = np.linalg.svd(np.swapaxes(b, -1, -2) @ a)
+    vt[..., 2, :] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]
+    return np.asarray(a @ np.swapaxes(u @ vt, -1, -2))
 
 
 def _agrees_with_exif(focal_off: float | None) -> bool:

@@ -104,8 +104,9 @@ class Evidence(BaseModel):
         description="Smallest relative increase of the bundle adjustment cost for a focal length "
         "that is off by 20 %; null (not computed) if the focal length agrees with EXIF."
     )
-    focal_relative: float = Field(
-        description="Median over the images of the focal length over the longer side."
+    focal_relative: float | None = Field(
+        description="Median over the images of the focal length over the longer side; null if all "
+        "are panoramas."
     )
 
 
@@ -219,8 +220,9 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
         return [
             *findings,
             _Finding(
-                not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
-                f"the focal length is {e.focal_relative:.2f} times the image's longer side",
+                e.focal_relative is not None
+                and not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
+                f"the focal length is {e.focal_relative or 0:.2f} times the image's longer side",
                 _FOCAL,
             ),
             _Finding(

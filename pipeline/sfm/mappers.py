@@ -10,6 +10,7 @@ import pycolmap
 
 from pipeline.runtime.progress import Progress
 from pipeline.sfm.counters import Mapper
+from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 
 # Smallest number of registered images of a model (2 for a scene of two photographs).
 MIN_MODEL_SIZE = 3
@@ -31,12 +32,27 @@ def run_mapper(
     """
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         run = _map_incremental if mapper == "incremental" else _map_global
-        models = run(database, Path(folder), total, seed)
+        models = run(_with_fisheye_priors(database, Path(folder)), Path(folder), total, seed)
     smallest = min(MIN_MODEL_SIZE, total)
     models = [m for m in models if m.num_reg_images() >= smallest and m.num_points3D() > 0]
     # Of models with equally many images, the one with more points comes first.
     models.sort(key=lambda m: (-m.num_reg_images(), -m.num_points3D()))
     return models
+
+
+def _with_fisheye_priors(database: Path, folder: Path) -> Path:
+    """The database, or a copy in ``folder`` in which fisheye lenses have a prior: without one
+    COLMAP ignores their pairs. Mapping refines the focal length in both cases."""
+    with pycolmap.Database.open(database) as opened:
+        uncalibrated = [c for c in opened.read_all_cameras() if is_uncalibrated(c)]
+    if not uncalibrated:
+        return database
+    copy = folder / "priors.db"
+    shutil.copyfile(database, copy)
+    with pycolmap.Database.open(copy) as opened:
+        for camera in uncalibrated:
+            opened.update_camera(with_prior(camera))
+    return copy
 
 
 def _map_incremental(

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
@@ -26,6 +27,7 @@ from pipeline.sfm.database import (
     plan_cameras,
     verified_inliers,
 )
+from pipeline.sfm.fisheye import set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.quiet import quiet_colmap
 
@@ -81,6 +83,7 @@ def match_features(
     cameras, camera_of = plan_cameras(manifest, sharing)
     images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
     pairs, decision = resolve_pairs(manifest, features, config)
+    initial = set_initial_focals(cameras, images, features, pairs, experiments.max_ratio, seed)
     settings = MatchingSettings(experiments.max_ratio, config.min_inliers, seed)
     database = out / "database.db"
     num_cached = build_database(
@@ -103,7 +106,7 @@ def match_features(
             f"verified pairs connect the photographs into {len(components)} separate groups: the "
             f"largest has {components[0]} of {len(names)}; outside it: {list_names(isolated)}"
         )
-    priors = sum(camera.has_prior_focal_length for camera in cameras)
+    priors = sum(camera.has_prior_focal_length and not camera.is_spherical() for camera in cameras)
     median = int(np.median(list(verified.values())))
     counters = MatchesCounters(
         num_pairs=len(pairs),
@@ -118,12 +121,17 @@ def match_features(
         num_cached=num_cached,
         decisions=[
             decision,
+            *initial,
             f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
-            f"{len(cameras)} camera(s) ({cameras[0].model_name}) for {len(names)} photographs, "
+            f"{len(cameras)} camera(s) ({_models(cameras)}) for {len(names)} photographs, "
             f"{priors} with a focal length from EXIF",
         ],
         warnings=warnings,
     )
+
+
+def _models(cameras: list[pycolmap.Camera]) -> str:
+    return ", ".join(sorted({camera.model_name for camera in cameras}))
 
 
 def resolve_pairs(

@@ -66,9 +66,13 @@ def refine(
         return Refined(best, False, set(), ["the tracks fit exactly: nothing is refined"])
     decisions: list[str] = []
     freed, free_principal_points = False, set[int]()
+    adjustable = {i for i, camera in model.cameras.items() if not camera.is_spherical()}
+    if not adjustable:
+        text = "panoramas have no intrinsics to refine"
+        return Refined(best, False, set(), [text])
     if not shared:
         if principal_point == "yes":
-            shared = set(model.cameras)
+            shared = adjustable
         else:
             text = (
                 f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and "
@@ -211,8 +215,9 @@ def _block_order_is_unique(model: pycolmap.Reconstruction) -> bool:
 
 
 def _shared_cameras(model: pycolmap.Reconstruction) -> set[int]:
-    """Ids of the cameras with enough registered images."""
-    used = [model.image(i).camera_id for i in model.reg_image_ids()]
+    """Ids of the cameras with enough registered images, without those of panoramas."""
+    ids = [model.image(i).camera_id for i in model.reg_image_ids()]
+    used = [camera_id for camera_id in ids if not model.camera(camera_id).is_spherical()]
     return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES_PER_CAMERA}
 
 

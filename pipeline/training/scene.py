@@ -213,9 +213,10 @@ def _choose_gains(
         if spread < EXPOSURES_DIFFER:
             return NO_GAINS
     found = measure_exposures(views, model)
+    photographs = len({view.source or view.name for view in views})
     notes.decisions.append(
         f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
-        f"measured in {found.measured} of {len(views)} photographs"
+        f"measured in {found.measured} of {photographs} photographs"
     )
     names = [view.name for view in views]
     return ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))

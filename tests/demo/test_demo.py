@@ -157,8 +157,9 @@ def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> N
 
 @pytest.mark.parametrize("distortion", LENSES)
 def test_transforms_equal_the_ground_truth(tmp_path: Path, distortion: str) -> None:
+    height = 16 if distortion == "equirectangular" else 24
     spec = DemoSpec(
-        views=2, width=32, height=24, distortion=distortion, poses="transforms", format="png"
+        views=2, width=32, height=height, distortion=distortion, poses="transforms", format="png"
     )
     write_demo(tmp_path / "s", spec)
     told = json.loads((tmp_path / "s" / "transforms.json").read_text())
@@ -169,6 +170,9 @@ def test_transforms_equal_the_ground_truth(tmp_path: Path, distortion: str) -> N
         np.testing.assert_allclose(pose[:3, 3], view.centre, atol=1e-9)
         np.testing.assert_allclose(-pose[:3, 2], view.rotation[2], atol=1e-9)  # looks along -z
         np.testing.assert_allclose(pose[:3, 1], -view.rotation[1], atol=1e-9)  # y up
+    if distortion == "equirectangular":
+        assert (told["camera_model"], told["w"], told["h"]) == ("EQUIRECTANGULAR", 32, 16)
+        return
     names = ("fl_x", "fl_y", "cx", "cy", "k1", "k2") + (
         ("k3", "k4") if "fisheye" in distortion else ("p1", "p2")
     )

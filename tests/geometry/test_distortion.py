@@ -67,7 +67,7 @@ json.dump(out, sys.stdout)
         check=True,
     )
     expected = json.loads(process.stdout)
-    assert set(expected) == set(CAMERA_MODELS)
+    assert set(expected) == set(CAMERA_MODELS) - {"EQUIRECTANGULAR"}  # see test_rays.py
     for model, (xy, back) in expected.items():
         np.testing.assert_allclose(project(camera(model), points), xy, atol=1e-8, err_msg=model)
         ours = unproject(camera(model), np.array(xy))

@@ -111,7 +111,7 @@ def test_an_integer_of_5000_digits(tmp_path):
     folder = make_scene(tmp_path / "scene")
     file = folder / "transforms.json"
     file.write_text(file.read_text().replace('"fl_x": 50', f'"fl_x": {"9" * 5000}'))
-    with pytest.raises(UserError, match="fl_x is .inf., expected a finite number"):
+    with pytest.raises(UserError, match=r"fl_x is .inf., expected a finite number"):
         look(folder)
 
 

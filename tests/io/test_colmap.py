@@ -113,10 +113,19 @@ def test_round_trip(tmp_path, text, seed, names, num_points):
 def test_every_camera_model_in_both_formats(tmp_path, name, seed):
     count = len(CAMERA_MODELS[name][1])
     params = np.random.default_rng(seed).random(count) + 0.1
+    if name == "EQUIRECTANGULAR":
+        params = np.array([64.0, 48.0])
     model = Reconstruction({1: Camera(name, 64, 48, params)}, {})
     for text in (False, True):
         write_model(tmp_path, model, text=text)
         assert_same(read_model(tmp_path), model)
+
+
+def test_a_panorama_whose_parameters_are_not_its_size_is_an_error(tmp_path):
+    camera = Camera("EQUIRECTANGULAR", 64, 32, np.array([128.0, 64.0]))
+    write_model(tmp_path, Reconstruction({1: camera}, {}))
+    with pytest.raises(UserError, match="64x32"):
+        read_model(tmp_path)
 
 
 def test_empty_model(tmp_path):
@@ -324,7 +333,7 @@ import sys, numpy as np, pycolmap
 model = pycolmap.Reconstruction()
 rng = np.random.default_rng(3)
 kinds = [k for n, k in pycolmap.CameraModelId.__members__.items()
-         if n not in ("INVALID", "EQUIRECTANGULAR")]
+         if n != "INVALID"]
 for i, kind in enumerate(kinds, 1):
     camera = pycolmap.Camera.create_from_model_id(i, kind, 500.0, 640, 480)
     model.add_camera_with_trivial_rig(camera)

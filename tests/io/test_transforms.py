@@ -132,6 +132,7 @@ def test_equal_intrinsics_are_one_camera(tmp_path):
         ({"camera_model": "OPENCV", "k1": 0.1, "p2": 0.01}, ("OPENCV", 8)),
         ({"camera_model": "OPENCV", "k1": 0.0}, ("PINHOLE", 4)),
         ({"k1": 0.1, "k3": 0.2}, ("FULL_OPENCV", 12)),
+        ({"camera_model": "EQUIRECTANGULAR", "w": 80, "h": 40}, ("EQUIRECTANGULAR", 2)),
     ],
 )
 def test_camera_models(tmp_path, fields, expected):
@@ -170,7 +171,8 @@ NAN[0, 3] = np.nan
         ({"fl_x": "wide", "frames": [frame()]}, "fl_x is 'wide'"),
         ({"camera_angle_x": 4, "frames": [frame()]}, "radians"),
         ({"fl_x": 1, "w": 0, "frames": [frame()]}, "0x100"),
-        ({"fl_x": 1, "camera_model": "EQUIRECTANGULAR", "frames": [frame()]}, "EQUIRECTANGULAR"),
+        ({"fl_x": 1, "camera_model": "CYLINDRICAL", "frames": [frame()]}, "EQUIRECTANGULAR"),
+        ({"w": 90, "camera_model": "EQUIRECTANGULAR", "frames": [frame()]}, "twice as wide"),
         ({"applied_transform": [[1]], "frames": [frame()]}, "applied_transform"),
         ({"fl_x": 10**400, "frames": [frame()]}, "fl_x"),
         ({"applied_scale": 10**400, "frames": [frame()]}, "applied_scale"),

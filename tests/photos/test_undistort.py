@@ -17,8 +17,9 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import project
 from pipeline.io.colmap import read_model
 from pipeline.io.recorded import digest_of
+from pipeline.photos.lens import pinhole_camera
 from pipeline.photos.load import load_mask, load_rgb, load_rgba, resize_area
-from pipeline.photos.undistort import pinhole_camera, undistort
+from pipeline.photos.undistort import undistort
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction

@@ -282,6 +282,32 @@ def test_cameras(tmp_path, group, share, model):
     assert (sfm.share_cameras, sfm.camera_model) == (share, model)
 
 
+def test_panoramas_have_spherical_cameras_and_six_views_each(tmp_path):
+    seen = many(tmp_path, 4, panorama=lambda i: True)
+    plan = make_plan(seen, Config())
+    assert plan.config.sfm.camera_model == "EQUIRECTANGULAR"
+    assert plan.stages["undistort"].run and "panoramas" in plan.stages["undistort"].reason
+    assert any("24 views" in line for line in plan.stages["train"].decisions)
+    one = seen.photos[0].model_copy(update={"panorama": False})
+    mixed = seen.manifest.model_copy(update={"photos": (one, *seen.photos[1:])})
+    plan = make_plan(seen.model_copy(update={"manifest": mixed}), Config())
+    assert plan.config.sfm.camera_model == "SIMPLE_RADIAL"
+    assert any("3 panoramas" in line for line in plan.stages["sfm"].decisions)
+
+
+def test_photographs_of_2_to_1_are_panoramas_only_if_the_options_say_so(tmp_path):
+    photos(tmp_path / "images", 2, (1200, 600))
+    plan = plan_of(tmp_path)
+    assert any("sfm.camera_model: EQUIRECTANGULAR" in line for line in plan.warnings)
+    assert plan.config.sfm.camera_model == "SIMPLE_RADIAL"
+    plan = plan_of(tmp_path, sfm={"camera_model": "EQUIRECTANGULAR"})
+    assert not plan.warnings and plan.stages["undistort"].run
+    picture(tmp_path / "images" / "narrow.jpg", (64, 48))
+    with pytest.raises(UserError, match="64x48") as error:
+        plan_of(tmp_path, sfm={"camera_model": "EQUIRECTANGULAR"})
+    assert str(error.value.file).endswith("narrow.jpg")
+
+
 def test_decisions_contain_the_resolution_and_the_split(tmp_path):
     photos(tmp_path / "images", 2, (72, 128))
     plan = plan_of(tmp_path, views={"max_long_side_px": 96}, split={"test_every": 5})

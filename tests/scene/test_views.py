@@ -51,6 +51,19 @@ def test_every_eighth_photograph_with_a_pose_is_a_test_view():
     )
 
 
+def test_views_of_one_photograph_are_all_for_testing_or_all_for_training():
+    manifest, model = make(20)
+    photos = [
+        p.model_copy(update={"source": f"s{i // 3}.jpg"}) for i, p in enumerate(manifest.photos)
+    ]
+    views = load_views(
+        Manifest(scene="s", photos=tuple(photos)), model, Views(), Split(test_every=4)
+    )
+    assert [v.source for v in views if v.is_test] == ["s0.jpg"] * 3 + ["s4.jpg"] * 3
+    one = Manifest(scene="s", photos=tuple(photos[:3]))
+    assert not any(v.is_test for v in load_views(one, model, Views(), Split()))
+
+
 def test_masks_can_be_ignored():
     manifest, model = make(1)
     assert load_views(manifest, model, Views(), Split())[0].mask == "/m/p00.jpg"

@@ -39,6 +39,9 @@ SCENES = {
     "photos": DemoSpec(views=20, width=200, height=150, poses="colmap", masks=True),
     "raw": DemoSpec(views=3, width=48, height=36, format="dng"),
     "split": DemoSpec(views=6, width=48, height=36, format="png", poses="transforms"),
+    "panoramas": DemoSpec(
+        views=3, width=64, height=32, distortion="equirectangular", poses="transforms"
+    ),
     "alpha": DemoSpec(views=6, width=64, height=48, format="png", alpha=True, poses="colmap"),
 }
 

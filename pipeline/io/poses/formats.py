@@ -144,7 +144,7 @@ def _shared(model: Reconstruction) -> list[int]:
 
 
 def _is_centred(camera: Camera) -> bool:
-    return camera.pinhole[2:] == (camera.width / 2, camera.height / 2)
+    return not camera.is_spherical and camera.pinhole[2:] == (camera.width / 2, camera.height / 2)
 
 
 def _without_points(names: Sequence[str], count: int, models: Sequence[str]) -> dict[str, Any]:

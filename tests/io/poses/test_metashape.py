@@ -183,7 +183,10 @@ OUTSIDE = """<?xml version="1.0"?><!DOCTYPE document [<!ENTITY a SYSTEM "file://
         ),
         (export(known_scene(opencv()), calibration(opencv(), f=float("nan"))), "finite number"),
         (export(known_scene(opencv()), calibration(opencv(), k1=1e300)), "finite"),
-        (export(known_scene(opencv()), calibration(opencv())).replace("p1.jpg", ""), "expected a file name"),
+        (
+            export(known_scene(opencv()), calibration(opencv())).replace("p1.jpg", ""),
+            "expected a file name",
+        ),
     ],
 )
 def test_messages(tmp_path, content, message):

@@ -1,0 +1,102 @@
+"""Structure from motion with panoramas: mapping, refinement and the quality check."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from pipeline.runtime.isolate import run_isolated
+
+
+def mapped(folder: Path) -> dict[str, Any]:
+    """Map a synthetic dataset of panoramas, refine and judge it."""
+    import numpy as np
+    import pycolmap
+
+    from pipeline.sfm.attempts import map_until_good
+    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.refine import refine
+
+    quiet_colmap()
+    pycolmap.set_random_seed(1)
+    options = pycolmap.SyntheticDatasetOptions(
+        num_rigs=1,
+        num_cameras_per_rig=1,
+        num_frames_per_rig=8,
+        num_points3D=300,
+        camera_model_id=pycolmap.CameraModelId.EQUIRECTANGULAR,
+        camera_params=[1600.0, 800.0],
+        camera_width=1600,
+        camera_height=800,
+    )
+    path = folder / "database.db"
+    with pycolmap.Database.open(path) as database:
+        truth = pycolmap.synthesize_dataset(options, database)
+        pycolmap.synthesize_noise(
+            pycolmap.SyntheticNoiseOptions(point2D_stddev=0.3), truth, database
+        )
+    best, attempts = map_until_good(path, "incremental", 8, 0.5, 0, 3)
+    refined = refine(best.models[0], radial=True, principal_point="auto")
+    errors = []
+    ids = sorted(truth.reg_image_ids())
+    for i in ids[1:]:
+        angles = []
+        for model in (truth, refined.model):
+            a, b = (model.image(k).cam_from_world().rotation.matrix() for k in (ids[0], i))
+            angles.append(b @ a.T)
+        cosine = (np.trace(angles[0] @ angles[1].T) - 1) / 2
+        errors.append(float(np.degrees(np.arccos(np.clip(cosine, -1, 1)))))
+    assert best.evidence is not None
+    return {
+        "verdict": best.verdict.grade,
+        "attempts": len(attempts),
+        "evidence": best.evidence.model_dump(),
+        "error": max(errors),
+        "freed": refined.freed,
+    }
+
+
+def test_panoramas_are_mapped_and_judged_by_their_rays(tmp_path: Path) -> None:
+    found = run_isolated(mapped, tmp_path)
+    evidence = found["evidence"]
+    assert found["verdict"] == "good" and found["attempts"] == 1, found
+    assert evidence["registered"] == 8 and evidence["behind_camera"] == 0
+    assert evidence["agreeing_matches"] > 0.97 and evidence["agreeing_pairs"] == 1
+    assert evidence["focal_relative"] is None and evidence["parallax"] > 0.01
+    assert found["error"] < 0.3 and not found["freed"]
+
+
+def turned(folder: Path) -> float:
+    """``_parallax`` of panoramas that were only turned."""
+    import numpy as np
+    import pycolmap
+
+    from pipeline.sfm.evidence import _sphere_parallax
+
+    rng = np.random.default_rng(0)
+    rays = rng.normal(size=(200, 3))
+    model = pycolmap.Reconstruction()
+    camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=1600, height=800, params=[1600, 800])
+    camera.camera_id = 1
+    model.add_camera_with_trivial_rig(camera)
+    with pycolmap.Database.open(folder / "database.db") as database:
+        database.write_camera(camera, use_camera_id=True)
+        for number in (1, 2):
+            turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+            turn *= np.sign(np.linalg.det(turn))
+            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
+            image = pycolmap.Image(name=str(number), camera_id=1, image_id=number)
+            model.add_image_with_trivial_frame(image, pose)
+            database.write_image(
+                pycolmap.Image(name=str(number), camera_id=1, image_id=number), use_image_id=True
+            )
+            xy = np.asarray(camera.img_from_cam(rays @ turn.T))
+            database.write_keypoints(number, xy.astype(np.float32))
+        matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
+        return _sphere_parallax(model, database, {(1, 2): matches})
+
+
+def test_panoramas_that_only_turn_have_no_parallax(tmp_path: Path) -> None:
+    assert run_isolated(turned, tmp_path) == pytest.approx(0, abs=1e-5)

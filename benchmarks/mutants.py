@@ -240,7 +240,7 @@ MUTANTS: dict[str, Mutant] = {
         ("tests/e2e/test_regression.py",),
     ),
     "undistort_half_pixel": Mutant(
-        "pipeline/photos/undistort.py",
+        "pipeline/photos/lens.py",
         "map_x[part], map_y[part] = xy[..., 0] - 0.5, xy[..., 1] - 0.5",
         "map_x[part], map_y[part] = xy[..., 0], xy[..., 1]",
         "undistorted pictures half a pixel off",

@@ -144,7 +144,7 @@ def test_raw_and_jpeg_show_what_the_png_shows(folder: Path, tmp_path: Path) -> N
     write_demo(tmp_path / "dng", replace(SPEC, format="dng"))
     paths = sorted((tmp_path / "dng" / "images").iterdir())
     photos = [
-        Photo(name=p.name, path=str(p), width=160, height=120, digest=digest_of(p), raw=True)
+        Photo(name=p.name, path=str(p), width=160, height=120, digest=digest_of(p), linear=True)
         for p in paths
     ]
     manifest = Manifest(scene="demo", photos=tuple(photos))

@@ -15,7 +15,6 @@ if os.path.exists("config/config.yaml"):
 
 
 project = SnakemakeProject(config, workflow.basedir)
-THREADS = workflow.cores or 8
 RUN = (
     "python -m stages {rule} --out results/{wildcards.scene:q}/{rule} --key {params.key:q}"
     " --input {params.inputs:q} --publish {params.publish:q} --threads {threads}"
@@ -24,6 +23,7 @@ RUN = (
 
 
 onstart:
+    project.before_jobs(workflow)
     # No limit on the rate of jobs: Snakemake's limiter uses a considerable share of a core after
     # some dozens of jobs.
     workflow.scheduler.job_rate_limiter = None
@@ -111,9 +111,10 @@ for spec in project.stages:
             stage=f"results/{{scene}}/{spec.name}/stage.json",
         log:
             f"results/{{scene}}/logs/{spec.name}.log",
-        threads: THREADS
+        threads: project.threads(workflow)
         resources:
-            mem_mb=project.memory_mb(spec),
+            mem_mb=project.memory_mb(spec, workflow),
+            runtime=project.minutes(spec),
         params:
             key=project.key(spec),
             inputs=project.folders(spec),

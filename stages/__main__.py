@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeline.runtime.errors import EXIT_INTERRUPTED
 from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.machine import usable_cores
+from stages.workflow.cluster import OVERHEAD_MB, granted_cpus
 
 
 def main() -> int:
@@ -28,15 +29,19 @@ def main() -> int:
     parser.add_argument("--memory-mb", type=int, help="memory that the stage may use, in MB")
     parser.add_argument("--log", type=Path, help="file that messages are also written to")
     args = parser.parse_args()
+    threads, memory_mb = max(1, args.threads), args.memory_mb
+    if (granted := granted_cpus()) is not None:
+        threads = min(threads, granted)
+        memory_mb = memory_mb and max(1, memory_mb - OVERHEAD_MB)
     request = Request(
         stage=args.stage,
         key=json.loads(args.key),
         inputs=_pairs(args.input),
         out=args.out,
-        threads=max(1, args.threads),
+        threads=threads,
         log=args.log,
         publish=_pairs(args.publish),
-        memory_mb=args.memory_mb,
+        memory_mb=memory_mb,
     )
     spec = importlib.import_module(f"stages.{args.stage}").SPEC
     return run_stage(request, spec.work, spec.counters)

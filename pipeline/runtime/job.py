@@ -54,6 +54,7 @@ from pipeline.runtime.record import (
     read_record,
 )
 from pipeline.runtime.section import read_section
+from pipeline.runtime.termination import EXIT_TERMINATED, Terminated, raising_on_sigterm
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -159,7 +160,7 @@ def run_stage(
     0: finished, or up to date. 2: a ``UserError``, with its message. 130: interrupted by Ctrl-C.
     1: another exception, which is a bug of the program, with a traceback.
     """
-    with logging_to(request.log, request.out.parent.name):
+    with logging_to(request.log, request.out.parent.name), raising_on_sigterm():
         try:
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work, counters)
@@ -172,6 +173,10 @@ def run_stage(
         except KeyboardInterrupt:
             print(f"{request.stage}: interrupted", file=sys.stderr, flush=True)
             return EXIT_INTERRUPTED
+        except Terminated:
+            name = f"{request.stage} of {request.out.parent.name}"
+            print(f"{name} was terminated (SIGTERM)", file=sys.stderr, flush=True)
+            return EXIT_TERMINATED
         except MemoryError:
             _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))
             return EXIT_USER_ERROR

@@ -14,6 +14,7 @@ from typing import Any, NoReturn
 from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, name_fault, parse_run
+from pipeline.plan import duration
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import describe, make_plan, plan_record, upstream
 from pipeline.plan.scan import scan
@@ -25,6 +26,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
+from stages.workflow.cluster import DEFAULT_CPUS, OVERHEAD_MB, granted_cpus, largest_node
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
@@ -39,6 +41,8 @@ def check_config(path: str) -> None:
         check_config_file(Path(path))
     except UserError as error:
         _exit(error)
+# Factor of the memory of a job that is tried again.
+MORE_MEMORY = 1.5
 
 
 class SnakemakeProject:
@@ -120,12 +124,41 @@ class SnakemakeProject:
         """Params function: the stage's key."""
         return lambda wildcards: stage_key(spec, self._plan(wildcards.scene))
 
-    def memory_mb(self, spec: StageSpec) -> Callable[[Any], int]:
-        """Resources function: memory in MB that the stage may use and a cluster reserves."""
-        declared = spec.memory_mb
-        if isinstance(declared, int):
-            return lambda wildcards: declared
-        return lambda wildcards: declared(self._plan(wildcards.scene))
+    def threads(self, workflow: Any) -> Callable[[Any], int]:
+        """Threads function: the cores of this machine that Snakemake may use; on a cluster those of
+        a node; in a job those of the job."""
+
+        def count(wildcards: Any) -> int:
+            limit = workflow.resource_settings.cores
+            if workflow.remote_exec:
+                return granted_cpus() or limit
+            if not workflow.non_local_exec:
+                return int(workflow.cores)
+            node = largest_node()
+            cpus = DEFAULT_CPUS if node is None else min(DEFAULT_CPUS, node.cpus)
+            return min(cpus, limit or cpus)
+
+        return count
+
+    def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int], int]:
+        """Resources function: memory in MB that the stage may use, and what a cluster's job needs
+        besides. A job that is tried again gets more: the last may have been killed for memory."""
+
+        def megabytes(wildcards: Any, attempt: int) -> int:
+            declared = spec.memory_mb
+            if not isinstance(declared, int):
+                declared = declared(self._plan(wildcards.scene))
+            needed = round(declared * MORE_MEMORY ** (attempt - 1))
+            remote = workflow.remote_exec or workflow.non_local_exec
+            return needed + (OVERHEAD_MB if remote else 0)
+
+        return megabytes
+
+    def minutes(self, spec: StageSpec) -> Callable[[Any, int], int]:
+        """Resources function: time limit of the stage's job on a cluster."""
+        return lambda wildcards, attempt: (
+            attempt * duration.minutes(spec.name, self._plan(wildcards.scene))
+        )
 
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""
@@ -219,6 +252,16 @@ class SnakemakeProject:
                 "outcomes": [_outcome(run, left_out.get(run)) for run in runs],
             }
         )
+
+    # --- clusters -------------------------------------------------------------------------
+
+    def before_jobs(self, workflow: Any) -> None:
+        """Compile the native libraries before jobs are submitted: a compiler takes more memory than
+        a job may use, and nodes may have none."""
+        if workflow.non_local_exec:
+            for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
+                command = [sys.executable, "-m", module, "--target", "all"]
+                subprocess.run(command, check=False, stdout=sys.stderr)
 
     # --- failures -------------------------------------------------------------------------
 

@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
+from pipeline.runtime import termination
 from pipeline.runtime.progress import Progress
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
@@ -72,6 +73,10 @@ class Session:
             self.saved = now
         self.progress.advance(state.clock - before, note=self._note())
         self.metrics_log.write(state, steps, factor, self.progress.seconds_left())
+        if termination.requested():
+            self._save()
+            self.log(f"terminated (SIGTERM) after {state.step} steps, which a checkpoint keeps")
+            raise termination.Terminated
 
     def _resume(self) -> None:
         # Messages on checkpoints are logged only: they are not part of the result.

@@ -15,6 +15,7 @@ import torch
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.render import Backend, make_backend
+from pipeline.runtime import termination
 from pipeline.runtime.errors import UserError
 from pipeline.training.checkpoints.identity import identity_of
 from pipeline.training.data.inputs import Inputs
@@ -95,10 +96,11 @@ def train(
             unit="steps" if config.budget_minutes is None else "parts",
         )
         trainer = Trainer(scene, state, config, experiments, backend, threads)
-        while state.clock < steps:
-            before = state.clock
-            trainer.step()
-            session.after_step(before, trainer.factor())
+        with termination.deferred():
+            while state.clock < steps:
+                before = state.clock
+                trainer.step()
+                session.after_step(before, trainer.factor())
         # With a limit of gradients per pixel, Gaussians that are seen may have none.
         if not experiments.gradients_per_pixel:
             state.drop_unseen(len(scene.views))

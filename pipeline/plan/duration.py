@@ -1,0 +1,79 @@
+"""Estimates of the stages' durations, from which a cluster's time limits are made.
+
+They are for two cores of a slow machine; time limits are a multiple of them. Rates were measured
+with the scenes of ``benchmarks/records``.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from pipeline.plan.values import Plan
+
+# Time limits are this many times the estimate, and at least so many minutes: nodes differ, and a
+# job that is killed for its time starts again from its checkpoint.
+MARGIN, MIN_MINUTES = 4, 10
+# Pairs per photograph where not all are matched.
+NEIGHBOURS = 40
+
+
+def minutes(stage: str, plan: Plan) -> int:
+    """Time limit of a stage in minutes."""
+    return max(MIN_MINUTES, math.ceil(MARGIN * seconds(stage, plan) / 60))
+
+
+def seconds(stage: str, plan: Plan) -> float:
+    """Estimated duration of a stage in seconds."""
+    estimate = _ESTIMATES.get(stage)
+    return estimate(plan) if estimate is not None else _PROGRAM
+
+
+_PROGRAM = 10.0
+"""Starting Python, importing torch, reading and writing files."""
+
+
+def _photos(plan: Plan) -> int:
+    return plan.facts.photographs + plan.facts.max_frames
+
+
+def _per_photo(rate: float) -> Callable[[Plan], float]:
+    return lambda plan: _PROGRAM + rate * _photos(plan)
+
+
+def _decode(plan: Plan) -> float:
+    return _PROGRAM + 4 * plan.facts.linear + 0.1 * plan.facts.video_frames + _photos(plan)
+
+
+def _matches(plan: Plan) -> float:
+    count = _photos(plan)
+    pairs = count * (count - 1) // 2
+    if plan.config.matches.pairs != "exhaustive":
+        pairs = min(pairs, NEIGHBOURS * count)
+    return _PROGRAM + 0.05 * pairs
+
+
+def _train(plan: Plan) -> float:
+    train = plan.config.train
+    width, height = plan.facts.view_size
+    step = 0.005 + 1e-7 * train.density.max_gaussians + 6e-8 * width * height
+    length = train.steps * step
+    if train.budget_minutes is not None:
+        length = 60 * train.budget_minutes
+    return _PROGRAM + 0.2 * _photos(plan) + length
+
+
+_ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
+    "inspect": _per_photo(0.2),
+    "decode": _decode,
+    "features": _per_photo(1.5),
+    "matches": _matches,
+    "sfm": _per_photo(3.0),
+    "refine": _per_photo(2.0),
+    "undistort": _per_photo(0.5),
+    "init": _per_photo(1.0),
+    "train": _train,
+    "evaluate": _per_photo(0.5),
+    "coverage": _per_photo(1.0),
+    "export": _per_photo(0.5),
+}

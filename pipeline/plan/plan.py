@@ -109,6 +109,7 @@ def _facts(scan: Scan, config: Config) -> SceneFacts:
         max_frames=len(scan.frames),
         video_frames=sum(video.frames for video in scan.videos),
         linear=scan.num_linear,
+        panoramas=scan.num_panoramas,
         alpha=scan.num_alpha,
         masks=scan.num_masks,
         depths=scan.num_depths,

@@ -20,8 +20,9 @@ def found(facts: SceneFacts, frames_chosen: int | None = None) -> str:
         else:
             parts.append(f"{videos}, {frames_chosen} of {total} frames chosen")
     if facts.photographs or not facts.videos:
-        linear = f" ({facts.linear} RAW or EXR)" if facts.linear else ""
-        parts.append(f"{facts.photographs} photographs{linear}")
+        kinds = {"RAW or EXR": facts.linear, "panoramas": facts.panoramas}
+        among = ", ".join(f"{count} {kind}" for kind, count in kinds.items() if count)
+        parts.append(f"{facts.photographs} photographs" + (f" ({among})" if among else ""))
     counts = {"masks": facts.masks, "depth maps": facts.depths, "GPS positions": facts.gps}
     parts += [f"{name}: {count}" for name, count in counts.items() if count]
     if facts.ground_control:

@@ -36,6 +36,7 @@ class SceneFacts(BaseModel):
         0, description="Number of frames of the videos according to their headers; 0 if unknown."
     )
     linear: int = Field(description="Number of RAW and EXR files among the photographs.")
+    panoramas: int = Field(0, description="Number of equirectangular panoramas among them.")
     alpha: int = Field(description="Number of photographs with transparent pixels.")
     masks: int = Field(description="Number of photographs with a mask.")
     depths: int = Field(description="Number of photographs with a depth map.")

@@ -41,6 +41,8 @@ def check_config(path: str) -> None:
         check_config_file(Path(path))
     except UserError as error:
         _exit(error)
+
+
 # Factor of the memory of a job that is tried again.
 MORE_MEMORY = 1.5
 

@@ -35,9 +35,9 @@ CLOUD = PointCloudFiles(path="points.laz", files=("points.laz",), points=1234567
             "2 videos, at most 150 of 412 frames; poses: none",
         ),
         (
-            {"linear": 3, "masks": 20, "gps": 7, "given_poses": POSES},
+            {"linear": 3, "panoramas": 9, "masks": 20, "gps": 7, "given_poses": POSES},
             None,
-            "20 photographs (3 RAW or EXR); masks: 20; GPS positions: 7; "
+            "20 photographs (3 RAW or EXR, 9 panoramas); masks: 20; GPS positions: 7; "
             "poses: COLMAP model sparse/0, 12 cameras",
         ),
         (

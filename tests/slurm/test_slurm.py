@@ -14,6 +14,7 @@ import pytest
 from pipeline.runtime.record import file_digest
 from tests.e2e.harness import TINY, command, copy_project, copy_run, environment, make_scene
 from tests.slurm.cluster import Cluster, missing_programs, running
+from tests.tools import unsupported
 
 TARGET = "results/tiny/metrics.json"
 CONFIG = TINY | {"train": {"steps": 2500, "density": {"max_gaussians": 6_000}}}
@@ -22,12 +23,14 @@ CONFIG = TINY | {"train": {"steps": 2500, "density": {"max_gaussians": 6_000}}}
 @pytest.fixture(scope="module")
 def cluster() -> Iterator[Cluster]:
     if missing := missing_programs():
-        pytest.skip(f"not run: missing {', '.join(missing)} (slurm-wlm, munge)")
+        unsupported(f"a cluster on one machine needs {', '.join(missing)} (slurm-wlm, munge)")
     # Sockets are in this folder, and their paths must be short.
     folder = Path(tempfile.mkdtemp(prefix="slurm-"))
-    with running(folder) as found:
-        yield found
-    shutil.rmtree(folder, ignore_errors=True)
+    try:
+        with running(folder) as found:
+            yield found
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
 
 
 @pytest.fixture(scope="module")

@@ -1,14 +1,18 @@
-"""A Slurm cluster on the loopback address: a controller and nodes of one CPU each.
+"""``python -m benchmarks.slurm_cluster -- COMMAND``: runs a command beside a Slurm cluster on
+this machine, with a controller and nodes of one CPU each on the loopback address, to try ``profiles/slurm``.
 
-Needs root, and Debian's packages ``slurm-wlm`` and ``munge``. It has no accounting.
+Needs root, and Debian's packages ``slurm-wlm`` and ``munge``. The cluster has no accounting.
 """
 
 from __future__ import annotations
 
+import argparse
 import os
 import shutil
 import socket
 import subprocess
+import sys
+import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -20,7 +24,7 @@ PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scontrol")
 # Where Slurm's programs look for their configuration, also in jobs, to which the executor plugin
 # passes no variables of Slurm.
 CONF = Path("/etc/slurm/slurm.conf")
-MARK = "# of splatmake's tests\n"
+MARK = "# of benchmarks.slurm_cluster\n"
 _CONF = """
 ClusterName=test
 SlurmctldHost={host}(127.0.0.1)
@@ -203,3 +207,26 @@ def _free_port() -> int:
 
 def _path() -> str:
     return os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
+
+
+def main() -> int:
+    parser = argparse.ArgumentParser("benchmarks.slurm_cluster", description=__doc__)
+    parser.add_argument("--nodes", type=int, default=2)
+    parser.add_argument("--memory-mb", type=int, default=6000, help="of each node")
+    parser.add_argument("command", nargs="+")
+    options = parser.parse_args()
+    if missing := missing_programs():
+        parser.error(f"missing: {', '.join(missing)}")
+    # Sockets are in this folder, and their paths must be short.
+    folder = Path(tempfile.mkdtemp(prefix="slurm-"))
+    try:
+        with running(folder, options.nodes, options.memory_mb) as cluster:
+            done = subprocess.run(options.command, env=cluster.environment, check=False)
+            print(cluster.run("squeue", "-t", "all", "-o", "%i %T %M %C %m %l %N"))
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)
+    return done.returncode
+
+
+if __name__ == "__main__":
+    sys.exit(main())

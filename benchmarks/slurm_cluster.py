@@ -1,5 +1,5 @@
-"""``python -m benchmarks.slurm_cluster -- COMMAND``: runs a command beside a Slurm cluster on
-this machine, with a controller and nodes of one CPU each on the loopback address, to try ``profiles/slurm``.
+"""``python -m benchmarks.slurm_cluster -- COMMAND``: runs a command beside a Slurm cluster on this
+machine, to try ``profiles/slurm``: a controller and nodes of one CPU each on the loopback address.
 
 Needs root, and Debian's packages ``slurm-wlm`` and ``munge``. The cluster has no accounting.
 """

@@ -1,4 +1,4 @@
-"""A lens that no model holds exactly is fitted, and the largest error over the image is returned."""
+"""A lens that no model holds exactly is fitted; the largest error over the image is returned."""
 
 import numpy as np
 

@@ -79,6 +79,8 @@ def read_archive(file: BinaryIO) -> dict[str, NDArray]:
                     f"expected at most {_MAX_MEMBERS} arrays of at most {_MAX_EXPANSION} times the "
                     f"file's size, found {len(members)} arrays of {total} bytes"
                 )
+            if any(member.compress_size > size for member in members):
+                raise ValueError("expected arrays in the archive, found one larger than the file")
             # zipfile stops at the size that the member's entry gives.
             return {
                 member.filename.removesuffix(".npy"): read_array(archive.read(member))

@@ -2,18 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import io
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from pipeline.io.arrays import read_array
+from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.ply import read_splat_ply
 from pipeline.photos.load import read_picture
 from pipeline.runtime.errors import UserError
 from tests.fuzz.campaign import content
-from tests.fuzz.readers import READERS
+from tests.fuzz.readers import READERS, las_seeds, read_points
 
 
 def npy(header: str) -> bytes:
@@ -70,3 +71,23 @@ def test_a_truncated_heic_picture(tmp_path):
     file.write_bytes(data)
     with pytest.raises(UserError, match="not a readable image"):
         read_picture(file)
+
+
+def test_an_archive_whose_member_claims_to_be_larger_than_the_file() -> None:
+    """zipfile asks for the bytes that the entry of the directory claims."""
+    buffer = io.BytesIO()
+    np.savez(buffer, means=np.zeros((6, 3), np.float32))
+    data = bytearray(buffer.getvalue())
+    entry = data.index(b"PK\x01\x02")
+    data[entry + 20 : entry + 24] = (2_530_607_533).to_bytes(4, "little")
+    with pytest.raises(ValueError, match="larger than the file"):
+        read_archive(io.BytesIO(bytes(data)))
+
+
+def test_a_las_file_that_ends_in_a_record(tmp_path) -> None:
+    (name, content), *_ = las_seeds()[0].items()
+    for end in range(227, len(content), 7):
+        file = tmp_path / name
+        file.write_bytes(content[:end])
+        with contextlib.suppress(UserError):
+            read_points(file)

@@ -87,5 +87,8 @@ def read_las(path: Path) -> Chunks:
                 colour = stacked([points.red, points.green, points.blue], np.float32)
                 # 16 bits by the standard; files with 8 bits are common.
                 yield Chunk(xyz, colour)
-    except (laspy.LaspyException, ValueError, OverflowError, EOFError, RuntimeError) as error:
+    except (
+        *(laspy.LaspyException, ValueError, OverflowError, EOFError, RuntimeError),
+        *(struct.error, KeyError, IndexError),
+    ) as error:
         raise damaged(path, f"the points cannot be read: {str(error)[:200]}") from None

@@ -77,7 +77,7 @@ class Split(Section):
 
 
 class Decode(Section):
-    """Development of RAW photographs; all photographs of a scene with the same settings."""
+    """Development of RAW and EXR photographs; all photographs of a scene with the same settings."""
 
     demosaic: Literal["linear", "ahd", "aahd"] = Field(
         "ahd", description="Demosaicing algorithm of LibRaw."

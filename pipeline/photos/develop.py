@@ -6,13 +6,13 @@ from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 
-import cv2
 import numpy as np
 
 from pipeline.config.schema import Decode
 from pipeline.io.exr import EXR_SUFFIXES
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import digest_of
+from pipeline.photos.encode import write_picture
 from pipeline.photos.linear_image import Developed, develop_exr
 from pipeline.photos.naming import rename
 from pipeline.photos.raw import RawDeveloper
@@ -92,11 +92,7 @@ def _is_exr(photo: Photo) -> bool:
 def _write(photo: Photo, name: str, developed: Developed, out: Path) -> Photo:
     rgb, alpha = developed.rgb, developed.alpha
     path = out / "images" / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    picture = rgb[..., ::-1] if alpha is None else np.dstack([rgb[..., ::-1], alpha])
-    # Encoded and written separately: cv2.imwrite does not report a full disk.
-    _, data = cv2.imencode(".png", picture)
-    path.write_bytes(data.tobytes())
+    write_picture(path, rgb[..., ::-1] if alpha is None else np.dstack([rgb[..., ::-1], alpha]))
     height, width = rgb.shape[:2]
     focal = None if photo.focal_px is None else photo.focal_px * width / photo.width
     return photo.model_copy(

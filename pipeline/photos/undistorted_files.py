@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import schema
 from pipeline.io.recorded import digest_of
+from pipeline.photos.encode import write_picture
 from pipeline.photos.faces import Face, WideCamera, depth_factor, padded
 from pipeline.photos.lens import Lens
 from pipeline.photos.load import (
@@ -102,16 +103,16 @@ def write_view(
     picture, alpha = _picture(source, lens)
     path = out / "images" / name
     if path.suffix == ".jpg":
-        _encode(path, _bgr(to_8bit(picture)), [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
+        write_picture(path, _bgr(to_8bit(picture)), [cv2.IMWRITE_JPEG_QUALITY, config.jpeg_quality])
     elif alpha is None:
-        _encode(path, _bgr(picture))
+        write_picture(path, _bgr(picture))
     else:
-        _encode(path, np.dstack([_bgr(picture), alpha]))
+        write_picture(path, np.dstack([_bgr(picture), alpha]))
 
     mask = _mask(source, lens)
     mask_path = out / "masks" / f"{name}.png" if mask is not None else None
     if mask is not None and mask_path is not None:
-        _encode(mask_path, mask.astype(np.uint8) * 255)
+        write_picture(mask_path, mask.astype(np.uint8) * 255)
     depth_path = None
     if source.depth is not None:
         suffix = Path(str(photo.depth)).suffix.replace(".npz", ".npy")
@@ -187,7 +188,7 @@ def _write_depth(depth: Picture, target: Target, path: Path) -> None:
         depth = (np.rint(scaled) if depth.dtype.kind == "u" else scaled).astype(depth.dtype)
     depth = _nearest(depth, lens.target.width, lens.target.height)
     if path.suffix != ".npy":
-        return _encode(path, depth)
+        return write_picture(path, depth)
     path.parent.mkdir(parents=True, exist_ok=True)
     np.save(path, depth)
 
@@ -201,13 +202,6 @@ def _nearest(picture: Picture, width: int, height: int) -> Picture:
 def _bgr(rgb: Picture) -> Picture:
     """Convert by cv2: its encoders are several times slower for a reversed view of an array."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
-
-
-def _encode(path: Path, picture: Picture, options: list[int] | None = None) -> None:
-    """Encode and write separately: cv2.imwrite does not report a full disk."""
-    path.parent.mkdir(parents=True, exist_ok=True)
-    _, data = cv2.imencode(path.suffix, picture, options or [])
-    path.write_bytes(data.tobytes())
 
 
 def _check_size(picture: Picture, photo: Photo, path: str) -> None:

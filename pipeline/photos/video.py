@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Video
 from pipeline.io.recorded import digest_of
 from pipeline.io.videofile import opened_video
+from pipeline.photos.encode import write_picture
 from pipeline.photos.video_frames import FrameFormat, is_combed
 from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.progress import Progress
@@ -373,10 +374,7 @@ def _write_frames(
 def _write_frame(video: VideoFile, index: int, frame: NDArray[np.uint8], folder: Path) -> Photo:
     name = video.frame_name(index)
     path = folder / name
-    path.parent.mkdir(parents=True, exist_ok=True)
-    # Encoded and written separately: cv2.imwrite does not report a full disk.
-    _, data = cv2.imencode(".png", frame)
-    path.write_bytes(data.tobytes())
+    write_picture(path, frame)
     height, width = frame.shape[:2]
     return Photo(
         name=name,

@@ -28,13 +28,10 @@ def granted_cpus() -> int | None:
 
 
 @cache
-def largest_node(partition: str | None = None) -> Node | None:
-    """The largest number of cores and memory of a node; None if Slurm does not answer.
-
-    Args:
-        partition: of Slurm; None: the default partition, or all if none is the default.
-    """
-    command = ["sinfo", "-h", "-o", "%P %c %m", *(["-p", partition] if partition else [])]
+def largest_node() -> Node | None:
+    """The largest number of cores and memory of a node of the default partition, of all partitions
+    if none is the default; None if Slurm does not answer."""
+    command = ["sinfo", "-h", "-o", "%P %c %m"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=20, check=True)
     except (OSError, subprocess.SubprocessError):

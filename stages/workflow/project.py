@@ -136,9 +136,8 @@ class SnakemakeProject:
                 return granted_cpus() or limit
             if not workflow.non_local_exec:
                 return int(workflow.cores)
-            node = largest_node()
-            cpus = DEFAULT_CPUS if node is None else min(DEFAULT_CPUS, node.cpus)
-            return min(cpus, limit or cpus)
+            wanted, node = limit or DEFAULT_CPUS, largest_node()
+            return wanted if node is None else min(wanted, node.cpus)
 
         return count
 

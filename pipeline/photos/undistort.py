@@ -27,10 +27,14 @@ from pipeline.photos.naming import rename
 from pipeline.photos.undistorted_files import Target, load_source, write_view
 from pipeline.photos.undistorted_model import Part, undistorted_model
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Reconstruction
 
+# Peak memory per pixel of a photograph: as decoded, as extended beyond its borders, and its views.
+# Maps are kept for all photographs of a camera.
+_PHOTO_BYTES, _MAP_BYTES = 12.0, 14.0
 # Largest relative difference of the aspect ratio between a photograph and its camera, which
 # differ by rounding.
 SHAPE_TOLERANCE = 0.02
@@ -94,7 +98,9 @@ def undistort(
     done: list[Photo] = []
     decisions: list[str] = []
     warnings: list[str] = []
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    largest = max((photo.width * photo.height for photo in photos), default=0)
+    threads = threads_within(threads, _PHOTO_BYTES * largest, _MAP_BYTES * largest)
+    with ThreadPoolExecutor(threads) as pool:
         # One camera at a time: its maps are as large as an image.
         for key, group in sorted(groups.items()):
             camera = wide[key]

@@ -17,8 +17,12 @@ from pipeline.io.videofile import FIX as FIX_VIDEO
 from pipeline.io.videofile import opened_video
 from pipeline.photos.duplicates import Signature, find_duplicates, signature
 from pipeline.runtime.errors import ChangedFileError, UserError
+from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
+
+# Peak memory per pixel of a photograph while it is decoded.
+_PHOTO_BYTES = 7.0
 
 
 def verify_manifest(
@@ -57,7 +61,8 @@ def verify_photos(
         UserError: fewer than ``min_photos`` remain (the message says why), or a photograph has
             changed since it was scanned.
     """
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
+    largest = max((photo.width * photo.height for photo in manifest.photos), default=0)
+    with ThreadPoolExecutor(threads_within(threads, _PHOTO_BYTES * largest)) as pool:
         results = pool.map(_check, manifest.photos)
         found = list(track(results, "checking photographs", len(manifest.photos), "photos"))
     checked = dict(zip((photo.name for photo in manifest.photos), found, strict=True))

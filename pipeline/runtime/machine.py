@@ -11,6 +11,9 @@ from typing import Any
 
 from pipeline.runtime.processor import processor_name, sysctl_value
 
+# The share of the memory that threads with large pictures use; the rest is left to other programs.
+_THREADS_SHARE = 0.5
+
 
 def machine_facts() -> dict[str, Any]:
     """Host, processor, logical cores, memory in MiB, and the load average of the last minute (None
@@ -42,6 +45,17 @@ def physical_memory() -> int:
     if sys.platform == "darwin":
         return int(sysctl_value("hw.memsize"))
     return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+
+
+def threads_within(threads: int, bytes_each: float, kept: float = 0.0) -> int:
+    """The number of threads, at most ``threads``, that a part of the memory is enough for.
+
+    Args:
+        bytes_each: memory that each thread needs.
+        kept: memory that all need together.
+    """
+    available = _THREADS_SHARE * usable_memory() - kept
+    return max(1, min(threads, int(available / max(bytes_each, 1.0))))
 
 
 def usable_memory(root: Path = Path("/")) -> int:

@@ -14,13 +14,19 @@ import numpy as np
 
 from pipeline.config import schema
 from pipeline.runtime.isolate import run_isolated
+from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
+from pipeline.scene.views import view_size
 from pipeline.sfm.counters import FeaturesCounters
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
 # Part of the cache key: increase it when a change of the code changes keypoints.
 ALGORITHM_VERSION = 2
+
+# Peak memory per pixel of a photograph while it is decoded, and of the image that SIFT is detected
+# in: its scale space begins with twice the size.
+_PHOTO_BYTES, _SIFT_BYTES = 7.0, 250.0
 
 # With fewer keypoints than this, a photograph rarely has a verified pair, and a warning is given.
 FEW_FEATURES = 100
@@ -126,6 +132,12 @@ def _extract_opencv(
 
     from pipeline.sfm import sift
 
+    sizes = [(photo.width, photo.height) for photo in photos]
+    largest = max(width * height for width, height in sizes)
+    small = [view_size(width, height, config.max_long_side_px) for width, height in sizes]
+    detection = max(width * height for width, height in small)
+    threads = threads_within(threads, max(_PHOTO_BYTES * largest, _SIFT_BYTES * detection))
+
     def extract(photo: Photo) -> None:
         picture = sift.DetectionImage(photo, config.max_long_side_px)
         sift.detect(picture, config.max_features).write(targets[photo.name])
@@ -135,7 +147,7 @@ def _extract_opencv(
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:
-        with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
+        with ThreadPoolExecutor(max_workers=threads) as pool:
             try:
                 for _ in pool.map(extract, photos):
                     progress.advance()

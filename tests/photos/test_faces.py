@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 from PIL import Image
@@ -22,6 +23,9 @@ from pipeline.photos.faces import WideCamera, padded, split, used_share
 from pipeline.photos.image_circle import image_circle
 from pipeline.photos.load import load_mask, load_rgb
 from pipeline.photos.undistort import UndistortReport, undistort
+from pipeline.runtime import machine
+from pipeline.runtime.isolate import run_isolated
+from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Points, Reconstruction
 
@@ -50,7 +54,11 @@ def photo(path: Path, picture: np.ndarray, **more: object) -> Photo:
 
 
 def undistorted(
-    folder: Path, camera: Camera, photos: list[Photo], config: Undistort | None = None
+    folder: Path,
+    camera: Camera,
+    photos: list[Photo],
+    config: Undistort | None = None,
+    threads: int = 2,
 ) -> tuple[UndistortReport, Reconstruction]:
     images = {
         i + 1: image for i, image in enumerate(orbit([p.name for p in photos] + ["x"] * 8, 0))
@@ -59,7 +67,7 @@ def undistorted(
     manifest = Manifest(scene="s", photos=tuple(photos))
     model = Reconstruction({1: camera}, images)
     out = folder / "out"
-    report = undistort(manifest, model, config or Undistort(), Views(), out, threads=2)
+    report = undistort(manifest, model, config or Undistort(), Views(), out, threads=threads)
     return report, read_model(out / "sparse" / "0")
 
 
@@ -215,3 +223,22 @@ def test_views_never_take_the_name_of_another_photograph(tmp_path: Path) -> None
     photos = [photo(tmp_path / name, picture) for name in ("a.png", "a.jpg")]
     report, _ = undistorted(tmp_path, PANORAMA, photos)
     assert len({view.path for view in report.manifest.photos}) == 12
+
+
+def peak_growth(folder: Path, threads: int, usable: float) -> float:
+    """Bytes per pixel of a panorama that splitting four of them takes at most, with ``threads`` and
+    this usable memory."""
+    size = (3000, 1500)
+    camera = Camera("EQUIRECTANGULAR", *size, np.array(size, np.float64))
+    grey = np.tile(np.linspace(0, 255, size[0]).astype(np.uint8)[None, :, None], (size[1], 1, 3))
+    photos = [photo(folder / f"p{i}.jpg", grey) for i in range(4)]
+    machine.usable_memory = lambda root=Path("/"): int(usable)
+    cv2.remap(grey, *np.zeros((2, 8, 8), np.float32), cv2.INTER_LINEAR)  # loads what it needs
+    before = peak_memory_mb()
+    undistorted(folder, camera, photos, threads=threads)
+    return (peak_memory_mb() - before) * 2**20 / (size[0] * size[1])
+
+
+def test_memory_limits_how_many_panoramas_are_split_at_a_time(tmp_path: Path) -> None:
+    """Without the limit, four at a time take twice as much."""
+    assert run_isolated(peak_growth, tmp_path, 4, 0.0) < 40

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from pipeline.runtime.machine import physical_memory, usable_memory
+from pipeline.runtime import machine
+from pipeline.runtime.machine import physical_memory, threads_within, usable_memory
 
 
 @pytest.mark.parametrize(
@@ -47,3 +48,19 @@ def test_the_least_limit_counts(
         path.parent.mkdir(parents=True, exist_ok=True)
         path.write_text(value + "\n")
     assert usable_memory(tmp_path) == (physical_memory() if wanted is None else wanted)
+
+
+@pytest.mark.parametrize(
+    ("threads", "each", "kept", "expected"),
+    [
+        (8, 1e9, 0, 4),
+        (2, 1e9, 0, 2),
+        (8, 1e9, 2e9, 2),
+        (8, 9e9, 0, 1),
+        (8, 1, 9e9, 1),
+        (0, 0, 0, 1),
+    ],
+)
+def test_half_of_the_memory_limits_the_threads(monkeypatch, threads, each, kept, expected):
+    monkeypatch.setattr(machine, "usable_memory", lambda: 8_000_000_000)
+    assert threads_within(threads, each, kept) == expected

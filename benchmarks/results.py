@@ -254,8 +254,8 @@ class WideResult:
         photographs, registered: numbers, of all photographs and of those with an estimated pose.
         views: number of pinhole views made of the photographs.
         rotation_median_deg, rotation_mean_deg: errors of rotations against the true poses.
-        centre_relative_median: errors of camera centres, divided by the cameras' median distance
-            from their mean.
+        centre_relative_median: errors of camera centres, divided by their root mean square
+            distance from their mean.
         psnr, ssim: of test views.
         used_share: share of the photographs' pixels that some view shows; None where photographs
             are views.

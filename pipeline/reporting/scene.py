@@ -144,7 +144,12 @@ def _decisions(plan: PlanRecord, results: Path) -> dict[str, list[str]]:
     """The decisions of each stage that ran: those of the plan, then those of the stage."""
     return {
         name: step.decisions
-        + (list(read_stage(results / name).decisions) if name != "report" else [])
+        + [
+            text
+            for job in step.folders(name)
+            if name != "report"
+            for text in read_stage(results / job).decisions
+        ]
         for name, step in plan.stages.items()
         if step.run
     }

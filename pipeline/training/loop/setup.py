@@ -82,7 +82,7 @@ def load_scene(
     """
     store = choose_image_store(inputs.views, config, memory_mb)
     noise = experiments.salt_and_pepper_share
-    targets = Targets(inputs.views, threads, noise, seed, store)
+    targets = Targets(inputs.views, threads, noise, seed, store, inputs.layers)
     near = near_plane(inputs.extent)
     inputs = _without_hidden_views(inputs, targets, warn)
     background = config.background
@@ -107,13 +107,15 @@ def initial_state(
     backend: Backend,
     *,
     steps: int,
+    start: int,
     seed: int,
     warn: Warn,
 ) -> TrainState:
-    """The state before the first step of a schedule of ``steps`` steps."""
+    """The state after ``start`` steps of a schedule of ``steps`` steps. In the middle of it, the
+    degree of spherical harmonics is that of the initial Gaussians."""
     inputs = scene.inputs
     rng = np.random.Generator(np.random.PCG64(seed))
-    gaussians = inputs.initial.with_sh_degree(0).clone()
+    gaussians = (inputs.initial if start else inputs.initial.with_sh_degree(0)).clone()
     gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
     density = make_strategy(
         config.density, experiments, steps=steps, scale=inputs.size, extent=inputs.extent
@@ -123,7 +125,7 @@ def initial_state(
     order = rng.permutation(len(scene.views))
     own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
     adam = Adam(gaussians, experiments.adam_beta1, own_frames, backend)
-    return TrainState(gaussians, adam, density, cameras, rng, order)
+    return TrainState(gaussians, adam, density, cameras, rng, order, clock=start)
 
 
 def learning_rate_unit(inputs: Inputs, experiments: TrainExperiments) -> float:

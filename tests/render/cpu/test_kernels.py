@@ -275,3 +275,23 @@ def test_invalid_arguments_are_errors_that_name_them() -> None:
     fwd = render.forward(*scene, cam, RasterOptions())
     with pytest.raises(ValueError, match="d_color"):
         render.backward(fwd, torch.zeros(8, 9, 3))
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_part_of_an_image_is_rendered_as_the_whole_is(antialias: bool) -> None:
+    """Also Gaussians whose Jacobian is clamped to the part's frustum, if it were an image."""
+    scene, whole = random_scene(8, 400, size=0.4), camera(96, 80)
+    left, top, width, height = 37, 21, 23, 30
+    part = replace(
+        whole, width=width, height=height, cx=whole.cx - left, cy=whole.cy - top, part_of=whole
+    )
+    options = RasterOptions(antialias=antialias)
+    expected = render.forward(*scene, whole, options).color
+    expected = expected[top : top + height, left : left + width]
+    torch.testing.assert_close(
+        render.forward(*scene, part, options).color, expected, atol=2e-5, rtol=0
+    )
+    alone = render.forward(*scene, replace(part, part_of=None), options).color
+    assert (alone - expected).abs().max() > 1e-3
+    _, _, image = reference_image(scene, part, options)
+    assert relative(render.forward(*scene, part, options).color, image.color) < 1e-5

@@ -7,7 +7,7 @@ scene are at infinity, so that distant surroundings belong to the outer blocks.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -108,6 +108,7 @@ class Partition(JsonFile, JsonObject):
 
     file_name: ClassVar[str] = "partition.json"
 
+    schema_version: Literal[1] = Field(1, description="Version of this file's format.")
     axes: Matrix3 = Field(description="Directions of the blocks' faces as rows, orthonormal.")
     blocks: tuple[Block, ...] = Field(description="The blocks.")
 

@@ -92,5 +92,3 @@ def test_the_union_of_regions_is_the_scene(divided: DividedScene) -> None:
     assert len(joined) == len(gaussians)
     order = lambda means: means[np.lexsort(means.T)]  # noqa: E731
     np.testing.assert_array_equal(order(joined.means.numpy()), order(gaussians.means.numpy()))
-
-

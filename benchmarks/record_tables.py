@@ -24,6 +24,7 @@ from benchmarks.results import (
     StabilityResult,
     StressResult,
     VideoFrames,
+    WideResult,
 )
 from benchmarks.sfm import summary
 from pipeline.runtime.errors import UserError
@@ -212,6 +213,30 @@ def video(records: Sequence[Stored]) -> str:
     return markdown.table(rows)
 
 
+def wide(records: Sequence[Stored]) -> str:
+    return lenses(results(records, Record[WideResult]))
+
+
+def lenses(found: Sequence[WideResult]) -> str:
+    rows = [
+        [
+            *("lens", "pixels", "photographs", "with a pose", "views", "pixels used"),
+            *("rotation: median, mean, deg", "centre", "PSNR (dB)", "SSIM"),
+        ]
+    ]
+    for r in found:
+        rows.append(
+            [
+                *(r.lens, r.pixels, str(r.photographs), str(r.registered), str(r.views)),
+                cell(r.used_share, ".1%"),
+                f"{r.rotation_median_deg:.4f}, {r.rotation_mean_deg:.4f}",
+                f"{r.centre_relative_median:.3%}",
+                *(f"{r.psnr:.2f}", f"{r.ssim:.4f}"),
+            ]
+        )
+    return markdown.table(rows)
+
+
 TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "mesh": mesh,
     "coverage": coverage,
@@ -223,5 +248,6 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "page": page,
     "raster_stress": raster_stress,
     "video": video,
+    "wide": wide,
 }
 """The table of each benchmark, by the ``benchmark`` of its record."""

@@ -239,3 +239,36 @@ class VideoFrames:
     chosen: int
     chosen_sharpness: float
     even_sharpness: float
+
+
+# ---- benchmarks.wide ----
+
+
+@dataclass(frozen=True)
+class WideResult:
+    """The demo scene, reconstructed from photographs of one lens without poses.
+
+    Attributes:
+        lens: of the photographs.
+        pixels: width and height of a photograph.
+        photographs, registered: numbers, of all photographs and of those with an estimated pose.
+        views: number of pinhole views made of the photographs.
+        rotation_median_deg, rotation_mean_deg: errors of rotations against the true poses.
+        centre_relative_median: errors of camera centres, divided by the cameras' median distance
+            from their mean.
+        psnr, ssim: of test views.
+        used_share: share of the photographs' pixels that some view shows; None where photographs
+            are views.
+    """
+
+    lens: str
+    pixels: str
+    photographs: int
+    registered: int
+    views: int
+    rotation_median_deg: float
+    rotation_mean_deg: float
+    centre_relative_median: float
+    psnr: float
+    ssim: float
+    used_share: float | None

@@ -32,6 +32,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
+    from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
     manifest, model, split = (
@@ -46,6 +47,7 @@ def work(job: Job) -> None:
         views=load_views(manifest, model, FULL_SIZE, split),
         training_size_views=inputs.trained_views(job),
         georeference=inputs.georeference(job),
+        given=Unrounded.read(job.inputs["inspect"]),
         folder=job.inputs["train"].parent / job.stage,
     )
     report = export_scene(
@@ -65,7 +67,7 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=ExportCounters,
-    inputs=inputs.TRAINED,
+    inputs=inputs.TRAINED | {"inspect": ("inspect",)},
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -1,8 +1,9 @@
 """Check that all photographs and videos can be decoded, and read the given poses.
 
-Outputs: ``images.json`` (the manifest); where the scene has them ``sparse/0`` (given poses),
-``truth`` and ``gcp_list.txt``; ``georeference.json`` if the given poses were translated or scaled;
-``cloud.npz``, a subsample of the scene's point cloud.
+Outputs: ``images.json`` (the manifest); where the scene has them ``sparse/0`` (given poses) and
+``unrounded.npz`` (the same, not rounded), ``truth`` and ``gcp_list.txt``;
+``georeference.json`` if the given poses were translated or scaled; ``cloud.npz``, a subsample of
+the scene's point cloud.
 """
 
 from __future__ import annotations
@@ -51,17 +52,17 @@ def work(job: Job) -> None:
     )
     job.add_messages([], [*found.warnings, *warnings])
     manifest.write(job.out / "images.json")
-    count, given_counts, normalization = len(manifest.photos), {}, None
+    count, given_counts, given = len(manifest.photos), {}, None
     videos = len(manifest.videos) if found.videos else None
     if (poses := found.poses) is not None:
         given = load_given(
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
         job.add_messages(given.write(job.out), [])
-        model, normalization = given.model, given.normalization
+        model = given.model
         given_counts = {"given_poses": len(model.images), "given_points": len(model.points)}
     if found.cloud is not None:
-        cloud = read_point_cloud(folder, found.cloud, found.poses, normalization)
+        cloud = read_point_cloud(folder, found.cloud, found.poses, given)
         write_cloud(job.out, cloud)
         given_counts |= {"cloud_points": cloud.num_read}
         job.add_messages([f"{found.cloud.path}: {cloud.text}"], [])

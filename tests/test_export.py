@@ -77,7 +77,7 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
         stage="export",
         scene="NAME",
         key={"seed": 0, "config": config},
-        inputs={role: scene / "undistort" for role in ("views", "model", "poses")}
+        inputs={role: scene / "undistort" for role in ("views", "model", "poses", "inspect")}
         | {"train": scene / "train"},
         out=out,
         scratch=out.parent,

@@ -10,6 +10,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
+from pipeline.config.config_file import check_config_file
 from pipeline.config.runs import name_fault
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.layout import WORKFLOW
@@ -34,7 +35,7 @@ def snakemake_command(
         options: further options of Snakemake.
 
     Raises:
-        UserError: no such folder, or no Snakemake.
+        UserError: no such folder, no Snakemake, or a configuration file that cannot be read.
     """
     if not scene.is_dir():
         raise UserError(
@@ -52,6 +53,8 @@ def snakemake_command(
         raise UserError(
             "snakemake is not installed", fix="install splatmake with its dependencies (pip)"
         )
+    for file in _config_files(options):
+        check_config_file(file)
     # Snakemake reads values as YAML: a quoted path stays one string. The spaces keep the quotes,
     # which it would strip.
     entries = [f"data_root= {json.dumps(str(folder.parent), ensure_ascii=False)} "]
@@ -68,6 +71,20 @@ def snakemake_command(
         *options,
         *("--config", *entries, *config),
     ]
+
+
+def _config_files(options: Sequence[str]) -> list[Path]:
+    """The configuration files that Snakemake is given: it ends with a traceback if it cannot read
+    one."""
+    files, takes = [], False
+    for word in options:
+        name, _, value = word.partition("=")
+        if word.startswith("-"):
+            takes = name in ("--configfile", "--configfiles")
+            files += [Path(value)] if takes and value else []
+        elif takes:
+            files.append(Path(word))
+    return files
 
 
 def replace_process(command: list[str]) -> NoReturn:

@@ -1,4 +1,4 @@
-"""Checks of ``config/config.yaml`` before Snakemake reads it, whose errors are tracebacks."""
+"""Checks of configuration files before Snakemake reads them, whose errors are tracebacks."""
 
 from __future__ import annotations
 
@@ -21,6 +21,10 @@ def check_config_file(path: Path) -> None:
         UserError: it is not a text in UTF-8, not YAML, not a mapping, or too large.
     """
     try:
+        if path.is_fifo():  # A shell's <(command), which can be read once.
+            return
+        if path.exists() and not path.is_file():
+            raise _wrong(path, "expected a file")
         if path.stat().st_size > _MAX_BYTES:
             raise _wrong(path, f"expected at most {_MAX_BYTES >> 20} MiB, found a larger file")
         content = yaml.safe_load(path.read_bytes().decode("utf-8-sig"))
@@ -62,4 +66,4 @@ def _count(value: Any, known: dict[int, int]) -> int:
 
 
 def _wrong(path: Path, what: str) -> UserError:
-    return UserError(what, file=path, fix="correct the file, or delete it to use the defaults")
+    return UserError(what, file=path, fix="correct the file, or leave it out to use the defaults")

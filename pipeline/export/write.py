@@ -21,6 +21,7 @@ from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.unrounded import Unrounded
 from pipeline.scene.views import View, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
@@ -42,6 +43,7 @@ class ExportScene:
         views: all views, at the size of the photographs.
         training_size_views: the same views at the size used in training.
         georeference: frame of the poses; None for given poses in their own world.
+        given: the given poses before rounding; empty for estimated ones.
         folder: final folder of the exported files.
     """
 
@@ -51,6 +53,7 @@ class ExportScene:
     views: list[View]
     training_size_views: list[View]
     georeference: Georeference | None
+    given: Unrounded
     folder: Path
 
     @property
@@ -125,9 +128,9 @@ def export_scene(
     threads: int,
 ) -> ExportReport:
     """Write the configured formats and ``frame.json`` into ``out``."""
-    given = scene.normalization
-    model = given.model_to_given(scene.model)
-    views = [given.view_to_given(view) for view in scene.views]
+    model = scene.given.model_to_given(scene.model, scene.normalization)
+    poses = {name: image.world_to_camera for name, image in model.by_name().items()}
+    views = [replace(view, world_to_camera=poses[view.name]) for view in scene.views]
     scene = _in_given_unit(scene)
     gaussians = reduce_gaussians(
         scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order

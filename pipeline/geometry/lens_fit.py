@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 MAX_RESIDUAL_PX = 0.05
 # Sides of the grids of pixels for the fit, and for its largest error.
 _FIT_GRID, _CHECK_GRID = 25, 41
+# Steps of the fit, each of which evaluates the errors once and once for each parameter.
+_MAX_STEPS = 60
 
 
 def fit_camera(
@@ -56,14 +58,16 @@ def fit_camera(
             return first, float("inf")
         expected = lens(points)
         unit = np.where(np.arange(len(first.params)) < len(first.intrinsics_names), fx, 1.0)
+        # MINPACK: without BLAS, whose results depend on the number of threads.
         found = least_squares(
             lambda x: errors(x * unit, points, expected).ravel(),
             first.params / unit,
+            method="lm",
             x_scale="jac",
-            xtol=1e-14,
-            ftol=1e-14,
-            gtol=1e-14,
-            max_nfev=60,
+            xtol=1e-10,
+            ftol=1e-10,
+            gtol=1e-10,
+            max_nfev=_MAX_STEPS * (len(first.params) + 1),
         )
         camera = Camera(model, width, height, found.x * unit)
         residual = float(np.linalg.norm(errors(camera.params, check, lens(check)), axis=1).max())

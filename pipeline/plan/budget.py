@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
+from typing import NamedTuple
 
 from pipeline.config.schema import Config
 from pipeline.geometry.cube import ROTATIONS, panorama_face_side
@@ -33,13 +34,14 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
         UserError: ``train.memory_mb`` is too small.
     """
     density = config.train.density
-    sizes = planned_views(scan, config)
-    width, height = typical_view(scan, config)
+    typical = _typical(scan, config)
+    area = typical.width * typical.height
     minutes, pixels = config.train.budget_minutes, density.pixels_per_gaussian
     if pixels == "auto":
         pixels = PIXELS_PER_GAUSSIAN if minutes is None else PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET
-    by_view = width * height / pixels
-    by_scene = width * height * len(sizes) / TRAINING_PIXELS_PER_GAUSSIAN
+    # The views of a panorama show different parts of the scene.
+    by_view = area * typical.views / pixels
+    by_scene = area * _num_views(scan, config) / TRAINING_PIXELS_PER_GAUSSIAN
     by_time = math.inf if minutes is None else GAUSSIANS_PER_MINUTE * minutes
     wanted = max(MIN_GAUSSIANS, round(min(by_view, by_scene, by_time)))
     if density.strategy == "original" and density.pixels_per_gaussian == "auto":
@@ -49,7 +51,7 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
         return limited
     if wanted >= density.max_gaussians:
         return density.max_gaussians, f"at most {density.max_gaussians} Gaussians, as configured"
-    why = f"one per {pixels:g} pixels of a view"
+    why = f"one per {pixels:g} pixels of {'a panorama' if typical.views > 1 else 'a view'}"
     if by_scene < by_view:
         why = f"one per {TRAINING_PIXELS_PER_GAUSSIAN} pixels of all photographs"
     if by_time < min(by_view, by_scene):
@@ -83,44 +85,64 @@ def training_memory_mb(scan: Scan, config: Config) -> int:
 
 
 def _pixels(scan: Scan, config: Config) -> int:
-    return sum(width * height for width, height in planned_views(scan, config))
+    return sum(p.width * p.height * p.views for p in _planned(scan, config))
 
 
-def planned_views(scan: Scan, config: Config) -> list[tuple[int, int]]:
-    """(width, height) of the views of each photograph, as far as they are known before the cameras
-    are: six of a panorama, one of each other photograph."""
+def _num_views(scan: Scan, config: Config) -> int:
+    return sum(photo.views for photo in _planned(scan, config))
+
+
+class _Planned(NamedTuple):
+    """The views of a photograph: their size in pixels and their number."""
+
+    width: int
+    height: int
+    views: int
+
+
+def _planned(scan: Scan, config: Config) -> list[_Planned]:
+    """The views of each photograph, as far as they are known before the cameras are: six of a
+    panorama, one of each other photograph."""
     cap, given = config.views.max_long_side_px, scan.poses
     everywhere = (
         config.sfm.camera_model == "EQUIRECTANGULAR"
         if given is None
         else (given.models == ("EQUIRECTANGULAR",))
     )
-    sizes = []
+    found = []
     for photo in scan.planned:
         if everywhere or (photo.panorama and given is None):
             side = min(panorama_face_side(photo.width), cap)
-            sizes += [(side, side)] * len(ROTATIONS)
+            found.append(_Planned(side, side, len(ROTATIONS)))
         else:
-            sizes.append(view_size(photo.width, photo.height, cap))
-    return sizes
+            found.append(_Planned(*view_size(photo.width, photo.height, cap), 1))
+    return found
+
+
+def _typical(scan: Scan, config: Config) -> _Planned:
+    """The views of the photographs that have most views together."""
+    planned = _planned(scan, config)
+    if all(photo.views == 1 for photo in planned):
+        return _Planned(*view_size(*scan.sizes[0], config.views.max_long_side_px), 1)
+    views: Counter[_Planned] = Counter()
+    for photo in planned:
+        views[photo] += photo.views
+    return views.most_common(1)[0][0]
 
 
 def typical_view(scan: Scan, config: Config) -> tuple[int, int]:
-    """Width and height of the views of the most frequent photographs; of panoramas if there are
-    any."""
-    views = planned_views(scan, config)
-    if len(views) == len(scan.planned):
-        return view_size(*scan.sizes[0], config.views.max_long_side_px)
-    return Counter(views).most_common(1)[0][0]
+    """Width and height of most views."""
+    typical = _typical(scan, config)
+    return typical.width, typical.height
 
 
 def resolution_line(scan: Scan, config: Config) -> str:
     """The plan's sentence about the size of the views."""
-    views = planned_views(scan, config)
-    if len(views) > len(scan.planned):
-        side = typical_view(scan, config)[0]
+    views = _num_views(scan, config)
+    if views > len(scan.planned):
+        width, height = typical_view(scan, config)
         return (
-            f"{len(views)} views, of {side}x{side} pixels: panoramas are split into "
+            f"{views} views, most of {width}x{height} pixels: panoramas are split into "
             f"{len(ROTATIONS)} views each"
         )
     (width, height), *others = scan.sizes

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
@@ -19,6 +20,7 @@ from pipeline.scene.georeference import GIVEN_UNIT, CartesianOrigin, Georeferenc
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
+from pipeline.scene.unrounded import Rounding, Unrounded
 
 # Relative difference of the aspect ratios of a photograph and its camera; rounding in reduced
 # copies causes less.
@@ -41,16 +43,33 @@ MAX_COORDINATE = 1e18
 
 @dataclass(frozen=True)
 class GivenModel:
-    """A scene's given poses and points, near the origin and of moderate size.
+    """A scene's given poses and points, near the origin, of moderate size and rounded.
 
     Attributes:
-        model: in the scene's world.
+        model: in the scene's world, rounded.
         normalization: from the given world to the scene's; the identity if the given poses are
             near their origin and of moderate size.
+        unrounded: in the given world.
     """
 
     model: Reconstruction
     normalization: Normalization
+    unrounded: Unrounded = field(default_factory=Unrounded)
+
+    @classmethod
+    def of(cls, given: Reconstruction, path: Path) -> GivenModel:
+        """The model of the given world, read from ``path``.
+
+        Raises:
+            UserError: positions that overflow.
+        """
+        normalization, rounding = _frame(given, path)
+        model = rounding.model(normalization.model_to_scene(given))
+        return cls(model, normalization, Unrounded.of(given, rounding))
+
+    def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
+        """(..., 3) points of the given world, in the scene's world and rounded."""
+        return self.unrounded.rounding.points(self.normalization.to_scene(points))
 
     def georeference(self) -> Georeference | None:
         """The content of ``georeference.json``; None if the scene's world is the given one."""
@@ -71,13 +90,14 @@ class GivenModel:
         )
 
     def write(self, folder: Path) -> list[str]:
-        """Write ``sparse/0`` and, if the scene's world is not the given one,
-        ``georeference.json`` into ``folder``.
+        """Write ``sparse/0``, ``unrounded.npz`` and, if the scene's world is not the given
+        one, ``georeference.json`` into ``folder``.
 
         Returns:
             Messages about the translation and the scale.
         """
         write_model(folder / "sparse" / "0", self.model)
+        self.unrounded.write(folder)
         georeference = self.georeference()
         if georeference is None:
             return []
@@ -132,18 +152,18 @@ def load_given(
         }
         model = replace(model, images=images)
     fitted = fit_to_photos(model, by_name, str(path))
-    normalization = _normalization(fitted, path)
-    return GivenModel(normalization.model_to_scene(fitted), normalization)
+    return GivenModel.of(fitted, path)
 
 
-def _normalization(model: Reconstruction, path: Path) -> Normalization:
-    """The normalization of a model that is far from its origin or in an extreme unit.
+def _frame(model: Reconstruction, path: Path) -> tuple[Normalization, Rounding]:
+    """The normalization of a model that is far from its origin or in an extreme unit, and the
+    rounding in the scene's world.
 
     Raises:
         UserError: positions that overflow.
     """
     if not model.images:
-        return Normalization()
+        return Normalization(), Rounding()
     centres = np.stack([image.centre for image in model.images.values()])
     extent = model.points.xyz if len(model.points) else centres
     with np.errstate(over="ignore", invalid="ignore"):
@@ -157,13 +177,14 @@ def _normalization(model: Reconstruction, path: Path) -> Normalization:
         )
     # Cameras in one place without points: rounding errors are no size.
     if size <= 1e-12 * np.abs(mean).max():
-        return Normalization()
+        return Normalization(), Rounding()
     # Rounded, so that it is readable and rarely changes when photographs are added.
     step = 10.0 ** np.ceil(np.log10(size))
     far = np.abs(mean).max() > _MAX_DISTANCE * size
     origin = np.round(mean / step) * step if far else np.zeros(3)
     thousands = int(np.floor(np.log10(size / _MIN_SIZE) / 3))
-    return Normalization(float(1000.0**-thousands), origin)
+    scale = float(1000.0**-thousands)
+    return Normalization(scale, origin), Rounding.of_size(scale * size)
 
 
 def fit_to_photos(

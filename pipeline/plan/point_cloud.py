@@ -18,9 +18,9 @@ from pipeline.io.clouds.values import PointCloud
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.posefiles import GivenPoses
 from pipeline.io.transforms import read_points_entry
+from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import is_plain
-from pipeline.scene.normalization import Normalization
 
 _STEM = "points"
 _NONE = "set init.points_file: none"
@@ -108,23 +108,23 @@ def read_point_cloud(
     folder: Path,
     cloud: PointCloudFiles,
     poses: GivenPoses | None,
-    normalization: Normalization | None,
+    given: GivenModel | None,
 ) -> PointCloud:
     """A subsample of the cloud in the scene's world, if poses are given; else as stored.
 
     Args:
-        normalization: of the given poses; None without given poses.
+        given: the given poses; None without given poses.
 
     Raises:
         UserError: see ``read_clouds``.
     """
     read = read_clouds([folder / file for file in cloud.files])
-    if poses is None or normalization is None:
+    if poses is None or given is None:
         return read
     xyz = read.xyz
     if poses.kind == "transforms":
         xyz = _transformed(xyz, read_points_entry(folder / poses.path).to_world)
-    return replace(read, xyz=normalization.to_scene(xyz))
+    return replace(read, xyz=given.to_scene(xyz))
 
 
 def _transformed(xyz: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
@@ -51,14 +51,16 @@ class Normalization:
         """A model of the given world, in the scene's world."""
         if self.is_identity:
             return model
-        images = {
-            number: replace(
-                image, translation=image.rotation @ (self.scale * (self.origin - image.centre))
-            )
-            for number, image in model.images.items()
-        }
+        images = {number: self.image_to_scene(image) for number, image in model.images.items()}
         points = replace(model.points, xyz=self.to_scene(model.points.xyz))
         return Reconstruction(model.cameras, images, points)
+
+    def image_to_scene(self, image: PosedImage) -> PosedImage:
+        """An image of the given world, in the scene's world."""
+        if self.is_identity:
+            return image
+        moved = image.rotation @ (self.scale * (self.origin - image.centre))
+        return replace(image, translation=moved)
 
     def model_to_given(self, model: Reconstruction) -> Reconstruction:
         """A model of the scene's world, in the given world."""

@@ -49,7 +49,8 @@ NEAR_RATIO = 1.4
 MIN_EXPECTED_POINTS = 40
 # Margin inside the image border, as a share of the longer side: keypoints are missing there.
 BORDER = 0.03
-# Two neighbours lack covisibility if they share less than this fraction of the upper quartile.
+# Two neighbours lack covisibility if they share less than this fraction of the upper quartile of
+# neighbours of their kinds.
 COVISIBLE_SHARE = 0.3
 
 
@@ -175,7 +176,11 @@ def _directions(view: _View, chosen: NDArray[np.uint32], wide: bool) -> Floats:
 
 
 def _missing_covisibility(model: pycolmap.Reconstruction, views: dict[int, _View]) -> float:
-    """Share of neighbouring images whose expected common points are mostly not observed."""
+    """Share of neighbouring images whose expected common points are mostly not observed.
+
+    Shares of observed points are compared among pairs of the same kinds of images: a panorama
+    observes few of the points of a photograph, which has several times its angular resolution.
+    """
     ids = list(views)
     if len(ids) < 2:
         return 0.0
@@ -183,7 +188,8 @@ def _missing_covisibility(model: pycolmap.Reconstruction, views: dict[int, _View
     axes = _axes(model, ids, views)
     point_ids = np.array(sorted(model.points3D), np.int64)
     xyz = np.stack([model.point3D(int(i)).xyz for i in point_ids])
-    shares = []
+    spheres = _spheres(model, ids)
+    shares: dict[tuple[bool, bool], list[float]] = {}
     for pair in proximity_pairs(centres, axes, NEIGHBOURS):
         for one, other in (pair, pair[::-1]):
             own = views[ids[one]].points
@@ -197,18 +203,26 @@ def _missing_covisibility(model: pycolmap.Reconstruction, views: dict[int, _View
             )
             if expected.sum() >= MIN_EXPECTED_POINTS:
                 common = np.isin(own[expected], views[ids[other]].points, assume_unique=True)
-                shares.append(float(common.mean()))
-    if not shares:
-        return 0.0
-    upper_quartile = float(np.percentile(shares, 75))
-    return float(np.mean(np.array(shares) < COVISIBLE_SHARE * upper_quartile))
+                kinds = (bool(spheres[one]), bool(spheres[other]))
+                shares.setdefault(kinds, []).append(float(common.mean()))
+    missing = [
+        share < COVISIBLE_SHARE * np.percentile(of_kinds, 75)
+        for of_kinds in shares.values()
+        for share in of_kinds
+    ]
+    return float(np.mean(missing)) if missing else 0.0
+
+
+def _spheres(model: pycolmap.Reconstruction, ids: list[int]) -> NDArray[np.bool_]:
+    """(N,) whether the images are panoramas."""
+    return np.array([model.camera(model.image(i).camera_id).is_spherical() for i in ids])
 
 
 def _axes(model: pycolmap.Reconstruction, ids: list[int], views: dict[int, _View]) -> Floats:
     """(N, 3) viewing directions. Panoramas look everywhere: all have the same direction, the mean
     of the others."""
     axes = np.stack([views[i].rotation[2] for i in ids])
-    spheres = np.array([model.camera(model.image(i).camera_id).is_spherical() for i in ids])
+    spheres = _spheres(model, ids)
     if spheres.any():
         mean = axes[~spheres].sum(axis=0) if not spheres.all() else np.array([0.0, 0.0, 1.0])
         axes[spheres] = mean / max(float(np.linalg.norm(mean)), 1e-12)

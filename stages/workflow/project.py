@@ -203,10 +203,8 @@ class SnakemakeProject:
             shown = ascii(name) if len(name) <= 80 else ascii(f"{name[:80]}...")
             raise UserError(what, file=self._root / shown[1:-1], fix="rename it")
         folder = RESULTS / name
-        finished = (folder / "metrics.json").exists()  # Nothing may be left to write.
-        if folder.exists() and not finished and not os.access(folder, os.W_OK | os.X_OK):
-            fix = "make it writable, or run in another folder (snakemake --directory)"
-            raise UserError("this folder of results cannot be written", file=folder, fix=fix)
+        if not (folder / "metrics.json").exists():  # Else nothing may be left to write.
+            _check_writable(folder)
 
     # --- batches --------------------------------------------------------------------------
 
@@ -263,8 +261,14 @@ class SnakemakeProject:
     # --- clusters -------------------------------------------------------------------------
 
     def before_jobs(self, workflow: Any) -> None:
-        """Compile the native libraries before jobs are submitted: a compiler takes more memory than
-        a job may use, and nodes may have none."""
+        """Check that the jobs can write, and compile the native libraries before jobs are
+        submitted: a compiler takes more memory than a job may use, and nodes may have none."""
+        names = {getattr(job.wildcards, "scene", None) for job in workflow.dag.needrun_jobs()}
+        for name in sorted(filter(None, names)):
+            try:
+                _check_writable(RESULTS / name)
+            except UserError as error:
+                _exit(error)
         if workflow.non_local_exec:
             for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
                 command = [sys.executable, "-m", module, "--target", "all"]
@@ -329,6 +333,13 @@ def _outcome(
     if message is None:
         return named | {"status": "ok"}
     return named | {"status": status, "stage": stage, "message": message.strip()}
+
+
+def _check_writable(folder: Path) -> None:
+    """Check that a run's folder of results, which may not exist yet, can be written."""
+    if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
+        fix = "make it writable, or run in another folder (snakemake --directory)"
+        raise UserError("this folder of results cannot be written", file=folder, fix=fix)
 
 
 def _exit(error: UserError) -> NoReturn:

@@ -23,6 +23,7 @@ from benchmarks.results import (
     StabilityResult,
     StressResult,
     VideoFrames,
+    WideResult,
 )
 from benchmarks.sfm.summary import Cost, Run
 from benchmarks.tables import KINDS, MARKER, RECORDS, pages, rewritten
@@ -35,6 +36,11 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
         Record[VideoFrames],
         VideoFrames("walk.mp4", 900, 60, 120.4, 100.0),
         "| walk.mp4 | 900 | 60 | 120 | 100 | 1.20 |",
+    ),
+    "wide": (
+        Record[WideResult],
+        WideResult("fisheye", "720x720", 24, 23, 115, 0.01, 0.02, 1e-4, 33.5, 0.95, 0.987),
+        "| fisheye | 720x720 | 24 | 23 | 115 | 98.7% | 0.0100, 0.0200 | 0.010% | 33.50 | 0.9500 |",
     ),
     "mesh": (
         Record[MeshResult],

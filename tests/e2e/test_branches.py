@@ -102,6 +102,25 @@ def test_frames_of_a_video_become_a_scene(project, masked):
     assert plan["stages"]["decode"]["reason"] == f"1 video: at most {len(views)} frames"
 
 
+def test_panoramas_and_photographs_become_one_scene(project):
+    folder = project / "data" / "mixed" / "images"
+    folder.mkdir(parents=True)
+    panoramas = ("--views", "12", "--size", "512x256", "--distortion", "equirectangular")
+    for part, options in (("whole", panoramas), ("part", ("--size", "240x180"))):
+        make_scene(project, part, *options)
+        for photo in (project / "data" / part / "images").iterdir():
+            photo.rename(folder / f"{part}_{photo.name}")
+    done = snakemake(project, "results/mixed/metrics.json", config=TINY)
+    assert rules_run(done) == ALWAYS | SFM | {"undistort"}
+    found = json.loads((project / "results/mixed/metrics.json").read_text())
+    assert found["input"].startswith("32 photographs (12 panoramas)")
+    assert found["registered_images"] == 32 and found["psnr"] > 18
+    views = {view["name"].split("_")[0] for view in found["per_view"]}
+    assert views == {"whole", "part"}
+    sfm = json.loads((project / "results/mixed/sfm/stage.json").read_text())
+    assert sfm["counters"]["verdict"] == "good"
+
+
 def test_given_poses_can_be_ignored(project, masked):
     shutil.copytree(masked, project / "data/ignored")
     done = snakemake(project, "-n", "results/ignored/metrics.json", config={"poses": "ignore"})

@@ -27,7 +27,8 @@ from typing import NoReturn
 
 from pipeline.runtime.errors import UserError
 from tests.fuzz.mutations import mutated
-from tests.fuzz.readers import READERS, Files, Reader
+from tests.fuzz.reader import Files, Reader
+from tests.fuzz.readers import READERS
 
 MEMORY = 1 << 30
 """Bytes of memory that a case may take beyond those of the idle process."""

@@ -10,7 +10,6 @@ import tempfile
 import zipfile
 import zlib
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +18,10 @@ import numpy as np
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io import exr, pillow_formats
 from pipeline.io.arrays import read_array
-from pipeline.io.clouds.las_points import count_las, read_las
-from pipeline.io.clouds.text_points import read_text
 from pipeline.io.colmap import read_model, write_model
 from pipeline.io.gcp import read_ground_control
 from pipeline.io.llff import read_poses_bounds
 from pipeline.io.photofile import read_facts
-from pipeline.io.poses.formats import format_of
-from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.splat_files import read_gaussians, write_gaussians
 from pipeline.io.transforms import write_transforms
 from pipeline.io.videofile import read_video_facts
@@ -36,37 +31,12 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
-from tests.io.poses import test_metashape, test_photogrammetry
-from tests.io.poses.known import HEIGHT, WIDTH, known_scene, opencv
+from tests.fuzz.clouds import CLOUDS
+from tests.fuzz.poses import POSES
+from tests.fuzz.reader import Files, Reader, of_file, same
 from tests.pictures import picture
 from tests.splats.samples import sample
 from tests.videos import write_video
-
-Files = dict[str, bytes]
-
-
-def _same(data: bytes) -> bytes:
-    return data
-
-
-@dataclass(frozen=True)
-class Reader:
-    """A reader under test.
-
-    Attributes:
-        seeds: the names and contents of one valid set of files each; the first file is mutated.
-        read: reads the folder of the files; raises what the oracle judges.
-        unpack, pack: half of the cases mutate ``unpack(content)``, and the file is ``pack`` of it:
-            for formats with checksums and compression, which refuse most other mutations.
-        weight: share of a campaign's cases, relative to the others.
-    """
-
-    seeds: Callable[[], Sequence[Files]]
-    read: Callable[[Path], object]
-    unpack: Callable[[bytes], bytes] = _same
-    pack: Callable[[bytes], bytes] = _same
-    weight: float = 1.0
-
 
 PHOTOS = tuple(
     Photo(name=f"p{i}.jpg", path=f"p{i}.jpg", width=64, height=48, digest="") for i in range(4)
@@ -306,80 +276,12 @@ def pack_glb(data: bytes) -> bytes:
     return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
 
 
-def _only(read: Callable[[Path], object]) -> Callable[[Path], object]:
-    def of_folder(folder: Path) -> object:
-        (file,) = folder.iterdir()
-        return read(file)
-
-    return of_folder
-
-
 def read_npy(file: Path) -> object:
     try:
         read_array(file.read_bytes())
     except ValueError as error:
         raise UserError(str(error)) from None
     return read_depth(file)
-
-
-def metashape_text() -> str:
-    lens = opencv(-0.1, 0.03, 1e-3, -2e-3)
-    return test_metashape.export(known_scene(lens), test_metashape.calibration(lens))
-
-
-def opensfm_text() -> str:
-    lens = Camera("RADIAL", WIDTH, HEIGHT, np.array([500.0, WIDTH / 2, HEIGHT / 2, -0.1, 0.03]))
-    camera = {"projection_type": "perspective", "width": WIDTH, "height": HEIGHT}
-    camera |= {"focal": 500 / WIDTH, "k1": -0.1, "k2": 0.03}
-    return test_photogrammetry.opensfm_json(known_scene(lens), camera)
-
-
-# Kind of pose file -> its name, and the content of a valid one.
-POSE_SEEDS: dict[PoseKind, tuple[str, Callable[[], str]]] = {
-    "metashape": ("cameras.xml", metashape_text),
-    "opensfm": ("reconstruction.json", opensfm_text),
-    "openmvg": (
-        "sfm_data.json",
-        lambda: test_photogrammetry.openmvg_json(known_scene(opencv())),
-    ),
-}
-XYZ = b"# x y z r g b\n" + b"".join(b"%d.5 %d 1e2 255 0 %d\n" % (i, -i, i) for i in range(20))
-
-
-def las_seeds() -> Sequence[Files]:
-    import laspy
-
-    cloud = laspy.create(point_format=3, file_version="1.2")
-    cloud.x, cloud.y, cloud.z = np.arange(20.0), np.arange(20.0) / 2, np.ones(20)
-    stream = io.BytesIO()
-    cloud.write(stream)
-    return [{"points.las": stream.getvalue()}]
-
-
-def read_points(file: Path) -> object:
-    count_las(file)
-    return list(read_las(file))
-
-
-def pose_seeds(kind: PoseKind) -> Callable[[], Sequence[Files]]:
-    name, text = POSE_SEEDS[kind]
-    return lambda: [{name: text().encode()}]
-
-
-def read_poses(kind: PoseKind) -> Callable[[Path], object]:
-    """Finds the file and reads the poses of all photographs that it lists."""
-
-    def read(folder: Path) -> object:
-        entry = format_of(kind)
-        path = entry.find(folder)
-        if path is None or entry.frames is None:  # no longer recognised
-            return None
-        sizes = {frame.name: (WIDTH, HEIGHT) for frame in entry.frames(folder / path)}
-        found = entry.read(folder / path, sizes, ())
-        assert all(np.isfinite(image.world_to_camera).all() for image in found.images.values())
-        return found
-
-    return read
 
 
 READERS: dict[str, Reader] = {
@@ -393,9 +295,8 @@ READERS: dict[str, Reader] = {
         lambda folder: load_given(folder, "transforms", PHOTOS, base_folder="images"),
     ),
     "llff": Reader(llff_seeds, read_llff),
-    **{kind: Reader(pose_seeds(kind), read_poses(kind), weight=0.5) for kind in POSE_SEEDS},
-    "xyz": Reader(lambda: [{"points.xyz": XYZ}], _only(lambda file: list(read_text(file)))),
-    "las": Reader(las_seeds, _only(read_points), weight=0.3),
+    **POSES,
+    **CLOUDS,
     "gcp": Reader(gcp_seeds, lambda folder: read_ground_control(folder / "gcp_list.txt", NAMES)),
     "ply": Reader(gaussian_seeds(".ply"), read_any_gaussians),
     "ply-ascii": Reader(ascii_ply, read_any_gaussians),
@@ -403,14 +304,14 @@ READERS: dict[str, Reader] = {
     "splat": Reader(gaussian_seeds(".splat"), read_any_gaussians),
     "glb": Reader(gaussian_seeds(".glb"), read_any_gaussians, unpack_glb, pack_glb),
     "npz": Reader(gaussian_seeds(".npz"), read_any_gaussians, unpack_zip, pack_zip),
-    "npy": Reader(depth_seeds, _only(read_npy)),
+    "npy": Reader(depth_seeds, of_file(read_npy)),
     "jpeg": Reader(photo_seeds(".jpg"), read_photo),
-    "png": Reader(photo_seeds(".png"), read_photo, _same, pack_png),
+    "png": Reader(photo_seeds(".png"), read_photo, same, pack_png),
     "tiff": Reader(photo_seeds(".tif"), read_photo),
     "webp": Reader(photo_seeds(".webp"), read_photo, weight=0.5),
     "bmp": Reader(photo_seeds(".bmp"), read_photo, weight=0.5),
     "avif": Reader(photo_seeds(".avif"), read_photo, weight=0.2),
     "heic": Reader(photo_seeds(".heic"), read_photo, weight=0.2),
-    "exr": Reader(exr_seeds, _only(read_exr), weight=0.3),
-    "video": Reader(video_seeds, _only(read_video_facts), weight=0.1),
+    "exr": Reader(exr_seeds, of_file(read_exr), weight=0.3),
+    "video": Reader(video_seeds, of_file(read_video_facts), weight=0.1),
 }

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 import os
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -96,6 +97,23 @@ def test_results_that_cannot_be_written(data, monkeypatch):
     # Finished results may be read-only: there is nothing to write.
     (results / "metrics.json").write_text("{}")
     assert runs()[0] == ["good", "other"]
+
+
+def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, monkeypatch, capfd):
+    results = data.parent / "results" / "good"
+    results.mkdir(parents=True)
+    (results / "metrics.json").write_text("{}")
+    job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"))
+    batch = SimpleNamespace(wildcards=SimpleNamespace())
+    dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
+    project = SnakemakeProject({}, str(Path(__file__).parents[2]))
+    jobs = SimpleNamespace(dag=dag, non_local_exec=False)
+    project.before_jobs(jobs)
+    monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "good")
+    with pytest.raises(SystemExit):
+        project.before_jobs(jobs)
+    said = capfd.readouterr().err
+    assert "results/good: this folder of results cannot be written" in said
 
 
 def test_a_data_root_without_permission(data, monkeypatch, capfd):

@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
+import os
+import re
 from pathlib import Path
 from typing import Any
 
 import pytest
 
+from pipeline.command import workflow
+from pipeline.command.main import main
 from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project
 from pipeline.config.runs import MAX_NAME_BYTES, name_fault
@@ -77,6 +81,33 @@ def test_a_configuration_file_is_refused_before_snakemake_reads_it(tmp_path, cas
     with pytest.raises(UserError, match=expected) as caught:
         check_config_file(file)
     assert caught.value.file == file and len(str(caught.value)) < 600
+
+
+@pytest.mark.parametrize("command", ["run", "plan"])
+@pytest.mark.parametrize("case", FILES)
+def test_a_file_given_to_a_command_is_refused(tmp_path, monkeypatch, capfd, case, command):
+    monkeypatch.setattr(workflow, "replace_process", lambda _: pytest.fail("Snakemake started"))
+    data, expected = FILES[case]
+    good, bad = tmp_path / "good.yaml", tmp_path / "bad.yaml"
+    good.write_text("preset: fast\n")
+    bad.write_bytes(data)
+    for words in (["--configfile", str(good), str(bad), "-p"], [f"--configfiles={bad}"]):
+        assert main([command, str(tmp_path), *words]) == 2
+        said = capfd.readouterr().err
+        assert re.search(f"bad.yaml: .*{expected}", said) and "what to do" in said
+        assert len(said) < 600
+
+
+@pytest.mark.parametrize("name", ["gone.yaml", ".", "/dev/zero"])
+def test_a_configuration_file_that_is_none(tmp_path, name):
+    with pytest.raises(UserError, match=r"cannot be read: No such file|expected a file"):
+        check_config_file(tmp_path / name)
+
+
+def test_the_output_of_a_command_is_left_to_snakemake(tmp_path):
+    """It can be read once."""
+    os.mkfifo(tmp_path / "pipe")
+    check_config_file(tmp_path / "pipe")
 
 
 @pytest.mark.parametrize("text", ["", "# nothing\n", "preset: fast\n", "\ufeffpreset: fast\n"])

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Config
+from pipeline.geometry.cube import panorama_face_side
 from pipeline.io.colmap import read_model, write_model
 from pipeline.plan.plan import describe
 from pipeline.plan.scan import Scan, scan
@@ -293,6 +294,21 @@ def test_panoramas_have_spherical_cameras_and_six_views_each(tmp_path):
     plan = make_plan(seen.model_copy(update={"manifest": mixed}), Config())
     assert plan.config.sfm.camera_model == "SIMPLE_RADIAL"
     assert any("3 panoramas" in line for line in plan.stages["sfm"].decisions)
+
+
+@pytest.mark.parametrize(("panoramas", "part"), [(40, "a panorama"), (1, "a view")])
+def test_the_views_of_a_panorama_show_different_parts_of_the_scene(tmp_path, panoramas, part):
+    """Its budget is that of its views together, unless most views are of other photographs."""
+    size = {"width": lambda i: 1200 if i < panoramas else 640}
+    size["height"] = lambda i: 600 if i < panoramas else 480
+    plan = make_plan(many(tmp_path, 80, panorama=lambda i: i < panoramas, **size), Config())
+    side = panorama_face_side(1200)
+    pixels = 6 * side**2 if part == "a panorama" else 640 * 480
+    budget = plan.config.train.density.max_gaussians
+    assert budget == round(pixels / 2)
+    assert (
+        f"at most {budget} Gaussians: one per 2 pixels of {part}" in plan.stages["train"].decisions
+    )
 
 
 def test_photographs_of_2_to_1_are_panoramas_only_if_the_options_say_so(tmp_path):

@@ -100,3 +100,43 @@ def turned(folder: Path) -> float:
 
 def test_panoramas_that_only_turn_have_no_parallax(tmp_path: Path) -> None:
     assert run_isolated(turned, tmp_path) == pytest.approx(0, abs=1e-5)
+
+
+def covisibility(folded: bool) -> float:
+    """``_missing_covisibility`` of photographs and panoramas side by side, which observe six and
+    one of ten points. ``folded``: every other photograph observes points of its own."""
+    import numpy as np
+    import pycolmap
+
+    from pipeline.sfm.consistency import _missing_covisibility, _View
+
+    rng = np.random.default_rng(0)
+    model = pycolmap.Reconstruction()
+    for number, (kind, width, params) in enumerate(
+        [("PINHOLE", 640, [500, 500, 320, 240]), ("EQUIRECTANGULAR", 960, [960, 480])], 1
+    ):
+        camera = pycolmap.Camera(model=kind, width=width, height=480, params=params)
+        camera.camera_id = number
+        model.add_camera_with_trivial_rig(camera)
+    for xyz in rng.uniform(-0.5, 0.5, (600, 3)):
+        model.add_point3D(xyz, pycolmap.Track())
+    ids = np.array(sorted(model.points3D))
+    views = {}
+    for number in range(1, 13):
+        angle, panorama = np.radians(2.0 * number), number % 3 == 0
+        c, s = np.cos(angle), np.sin(angle)
+        rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
+        translation = np.array([0, 0, 3.0])
+        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
+        image = pycolmap.Image(name=f"{number}", camera_id=1 + panorama, image_id=number)
+        model.add_image_with_trivial_frame(image, pose)
+        own = ids[number % 2 :: 2] if folded and not panorama else ids
+        seen = np.sort(rng.choice(own, len(own) * (1 if panorama else 6) // 10, replace=False))
+        empty = np.zeros((0, 2))
+        views[number] = _View(rotation, translation, empty, None, seen, 640.0, 500.0)
+    return _missing_covisibility(model, views)
+
+
+def test_photographs_among_panoramas_share_few_points_with_them() -> None:
+    assert run_isolated(covisibility, False) == 0
+    assert run_isolated(covisibility, True) > 0.2

@@ -13,6 +13,8 @@ from pipeline.runtime.errors import UserError
 
 _CARTESIAN = ("cartesianX", "cartesianY", "cartesianZ")
 _SPHERICAL = ("sphericalRange", "sphericalAzimuth", "sphericalElevation")
+# Points of several coordinates that vary take more bits.
+_POINTS_PER_BYTE = 8
 _COLOUR = ("colorRed", "colorGreen", "colorBlue")
 
 
@@ -33,10 +35,20 @@ def read_e57(path: Path) -> Chunks:
         ) from None
     try:
         file = libe57.ImageFile(str(path), "r")
-        for node in file.root()["data3D"]:
-            yield from _scan(ScanHeader(node), file, path)
+        headers = [ScanHeader(node) for node in file.root()["data3D"]]
+        _check_count(sum(header.point_count for header in headers), path)
+        for header in headers:
+            yield from _scan(header, file, path)
     except (libe57.E57Exception, RuntimeError, ValueError, KeyError) as error:
         raise damaged(path, f"the points cannot be read: {str(error)[:200]}") from None
+
+
+def _check_count(claimed: int, path: Path) -> None:
+    """Check the number of points: coordinates that are constant take no bytes, so that a small file
+    may claim any number, and take days to read."""
+    size = path.stat().st_size
+    if claimed > _POINTS_PER_BYTE * size:
+        raise damaged(path, f"expected points, found a header of {claimed} in {size} bytes")
 
 
 def _scan(header: Any, file: Any, path: Path) -> Chunks:

@@ -85,12 +85,16 @@ def reconstruct(
     for frame in frames:
         by_name.setdefault(frame.name, frame)
     cameras: dict[tuple[Any, ...], int] = {}
+    made: dict[tuple[Lens, int, int], Camera] = {}  # Some lenses are fitted, which takes time.
     by_id: dict[int, Camera] = {}
     images: dict[int, PosedImage] = {}
     found = match_names(list(by_name), sizes)
     for number, (photo, name) in enumerate(sorted(found.items()), 1):
         frame = by_name[name]
-        camera = frame.lens.make(*sizes[photo])
+        use = (frame.lens, *sizes[photo])
+        if use not in made:
+            made[use] = frame.lens.make(*sizes[photo])
+        camera = made[use]
         key = (camera.model, camera.width, camera.height, *camera.params.tolist())
         camera_id = cameras.setdefault(key, len(cameras) + 1)
         by_id[camera_id] = camera

@@ -8,6 +8,9 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.lens_fit import fit_camera
+from pipeline.io.poses import lenses
+from pipeline.io.poses.frames import reconstruct
 from pipeline.io.poses.realitycapture import csv_frames, xmp_frames
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
@@ -181,3 +184,19 @@ def test_damaged_xmp(tmp_path, data):
     sample = xmp_text(known, known.images[1], "brown3", "-0.1 0.03 0.01 0 0 0")
     (tmp_path / "images" / "p0.xmp").write_bytes(data.draw(mutated(sample)))
     error_or_valid(xmp_frames, tmp_path / "images")
+
+
+def test_photographs_with_one_lens_are_fitted_once(tmp_path, monkeypatch):
+    """A fit takes a tenth of a second, and there are thousands of photographs."""
+    calls = []
+
+    def counted(*arguments):
+        calls.append(arguments)
+        return fit_camera(*arguments)
+
+    monkeypatch.setattr(lenses, "fit_camera", counted)
+    known = known_scene(camera(-0.1, 0.03, 1e-3, -2e-3), 9)
+    (tmp_path / "cameras.csv").write_text(csv_text(known, k4=1e-3))
+    frames = csv_frames(tmp_path / "cameras.csv")
+    sizes = dict.fromkeys(known.by_name(), (WIDTH, HEIGHT))
+    assert len(reconstruct(frames, sizes).images) == 9 and len(calls) == 1

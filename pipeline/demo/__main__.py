@@ -33,7 +33,8 @@ def run_room(arguments: list[str]) -> None:
     parser = argparse.ArgumentParser(
         prog="python -m pipeline.demo",
         description="Write the demo scene: photographs of a ray-traced room with exact truth.",
-        epilog="python -m pipeline.demo town FOLDER writes a town of any size; town --help.",
+        epilog="A town of any size: python -m pipeline.demo town FOLDER --photographs N; "
+        "its options: python -m pipeline.demo town --help.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument

@@ -194,7 +194,7 @@ def _street(x: Floats, y: Floats, blur: Floats, layers: list[Floats]) -> tuple[F
 
 
 def _asphalt(layers: list[Floats]) -> Floats:
-    colour = _tinted((0.155, 0.155, 0.16), 1 + _mix(layers, 0, 0.24, 0.16, 0.06))
+    colour = _tinted((0.155, 0.155, 0.16), 1 + _mix(layers, 0, 0.2, 0.11, 0.06))
     repaired = np.clip((layers[2][:, 1] - np.float32(1.4)) * 6, 0, np.float32(0.5))
     crack = np.abs(_mix(layers, 2, 0.05, 0.2, 1.0))
     dark = np.clip(1 - crack * 40, 0, np.float32(0.6))

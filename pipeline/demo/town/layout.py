@@ -116,7 +116,7 @@ def _fill(cell: Cell, seed: int, solids: list[Solid], paved: list[Array]) -> Non
             at = left + float(rng.uniform(2.3, pitch - 2.3)), y0 + front * (ROAD - 1.0)
             solids += _car(rng, at)
     for side in (-1.0, 1.0):
-        solids += _lamp(rng, x0 + STREET + 1 + float(rng.uniform(0, 30)), y0 + side * 3.3)
+        solids += _lamp(rng, x0 + STREET + 1 + float(rng.uniform(0, 30)), y0 + side * 4.95)
 
 
 def _plot(

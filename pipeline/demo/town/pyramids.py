@@ -23,7 +23,6 @@ class Pyramid:
         packed: (H, W, K) uint8.
         left, top: (L,) corner of each level in ``packed``.
         width, height: (L,) size of each level.
-        scale: (2,) texels of level 0 per metre.
         periodic: the image repeats; each level has its first column and row again at its end.
     """
 
@@ -57,8 +56,8 @@ class Pyramid:
         u -= np.float32(0.5)
         v -= np.float32(0.5)
         if self.periodic:
-            u %= width
-            v %= height
+            u -= np.floor(u / width) * width  # faster than the remainder
+            v -= np.floor(v / height) * height
         else:
             np.clip(u, 0, width - 1, out=u)
             np.clip(v, 0, height - 1, out=v)

@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Colour, Finish
+from pipeline.demo.town.finishes import Colour, Finish, Plain, Wall
 from pipeline.demo.town.houses import Plot, axes, fresh, house, pick
 from pipeline.demo.town.solids import UP, Ellipsoid, Frame, Solid, box, prism
 
@@ -26,6 +26,7 @@ ROAD = 2.9  # half the width of the roadway
 STREET = 5.2  # half the width with the pavements
 PLOTS = 3  # on each side
 GREENERY: tuple[Colour, ...] = ((0.07, 0.15, 0.04), (0.10, 0.17, 0.04), (0.05, 0.11, 0.05))
+BORDERS: tuple[Wall | Plain, ...] = ("hedge", "fence", "stone", "brick")
 PAINTS: tuple[Colour, ...] = (
     *((0.45, 0.04, 0.04), (0.05, 0.10, 0.28), (0.55, 0.55, 0.56), (0.04, 0.04, 0.05)),
     *((0.35, 0.33, 0.28), (0.08, 0.22, 0.14), (0.50, 0.34, 0.05), (0.24, 0.28, 0.33)),
@@ -112,11 +113,11 @@ def _fill(cell: Cell, seed: int, solids: list[Solid], paved: list[Array]) -> Non
             _park(rng, left, y0, pitch, front, solids, paved)
         else:
             _plot(rng, left, y0, pitch, front, solids, paved)
-        if rng.random() < 0.75:
+        if rng.random() < 0.55:
             at = left + float(rng.uniform(2.3, pitch - 2.3)), y0 + front * (ROAD - 1.0)
             solids += _car(rng, at)
     for side in (-1.0, 1.0):
-        solids += _lamp(rng, x0 + STREET + 1 + float(rng.uniform(0, 30)), y0 + side * 4.95)
+        solids += _lamp(rng, x0 + STREET + 1 + float(rng.uniform(0, 30)), y0 + side * (ROAD + 0.3))
 
 
 def _plot(
@@ -211,7 +212,7 @@ def _border(
     tall: bool = False,
 ) -> Solid:
     """A hedge, fence or low wall between plots."""
-    kind = rng.choice(["hedge", "fence", "stone", "brick"], p=[0.4, 0.3, 0.15, 0.15])
+    kind = BORDERS[rng.choice(len(BORDERS), p=[0.4, 0.3, 0.15, 0.15])]
     height = float(rng.uniform(1.4, 1.8) if tall else rng.uniform(0.6, 1.1))
     colours: dict[str, tuple[Colour, ...]] = {
         "hedge": GREENERY,
@@ -294,5 +295,5 @@ def _lamp(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
     return [
         box((x, y), (0.12, 0.12, 4.6), 0.0, 0.0, post),
         box((x, y), (0.5, 0.3, 0.25), 4.6, 0.0, post),
-        box((x, y), (0.7, 0.14, 0.5), 1.9, float(rng.normal(0, 0.2)), plate),
+        box((x, y), (0.5, 0.14, 0.4), 2.3, float(rng.normal(0, 0.2)), plate),
     ]

@@ -30,8 +30,8 @@ ELEVATIONS = (80, 70, 60, 50, 40, 31, 22, 14, 7)
 STEPS = 17
 TURN = 3
 SWING = (10.0, 110.0)  # directions to the right of the way at its begin and end, degrees
-HEIGHT = 1.65
-PAVEMENT = 4.1
+HEIGHT = 1.7
+PAVEMENT = 4.7  # at its outer edge: parked cars hide less of the other side
 EDGE = 2.0  # distance of the walk's ends from those of the cell
 
 PHOTOGRAPHS_PER_CELL = SHOTS * len(STRIPS) + 1 + len(ELEVATIONS) + 2 * STEPS + TURN

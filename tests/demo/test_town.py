@@ -18,7 +18,7 @@ from pipeline.demo.render import rays
 from pipeline.demo.shapes import Box, Sphere
 from pipeline.demo.town.finishes import Finish
 from pipeline.demo.town.layout import LENGTH, WIDTH, build
-from pipeline.demo.town.paths import PHOTOGRAPHS_PER_CELL, cells_of, way
+from pipeline.demo.town.paths import PHOTOGRAPHS_PER_CELL, camera_path, cells_of
 from pipeline.demo.town.pyramids import pyramid
 from pipeline.demo.town.solids import Ellipsoid, Prism, Solid, box
 from pipeline.demo.town.visibility import GROUND, SKY, Grid, Shapes, visible
@@ -102,7 +102,7 @@ def test_same_bytes_at_any_number_of_processes_and_along_any_order(
     assert moved > 2
 
 
-@pytest.mark.parametrize(("order", "sequence"), [("way", True), ("scattered", False)])
+@pytest.mark.parametrize(("order", "sequence"), [("sequence", True), ("scattered", False)])
 def test_exif_has_the_lens_and_times_that_give_the_order(
     folder: Path, tmp_path: Path, order: str, sequence: bool
 ) -> None:
@@ -136,7 +136,7 @@ def test_given_poses_are_the_true_ones(tmp_path: Path) -> None:
 
 
 def test_area_grows_with_the_photographs_and_the_first_ones_stay() -> None:
-    few, many = (way([f"{i}" for i in range(n)], 0) for n in (80, 700))
+    few, many = (camera_path([f"{i}" for i in range(n)], 0) for n in (80, 700))
     for a, b in zip(few, many, strict=False):
         np.testing.assert_array_equal(a.centre, b.centre)
         np.testing.assert_array_equal(a.rotation, b.rotation)
@@ -144,7 +144,7 @@ def test_area_grows_with_the_photographs_and_the_first_ones_stay() -> None:
         cells = cells_of(photographs)
         assert len(set(cells)) == len(cells)
         assert 0 <= len(cells) * PHOTOGRAPHS_PER_CELL - photographs < PHOTOGRAPHS_PER_CELL
-        where = np.array([posed.centre for posed in way(["x"] * photographs, 0)])
+        where = np.array([posed.centre for posed in camera_path(["x"] * photographs, 0)])
         area = len(cells) * LENGTH * WIDTH
         assert np.ptp(where[:, 0]) * np.ptp(where[:, 1]) < 2.5 * area  # about square
         # Every photograph is taken over or in a cell of the town, or near its edge.
@@ -155,7 +155,7 @@ def test_area_grows_with_the_photographs_and_the_first_ones_stay() -> None:
 
 def test_each_photograph_overlaps_with_the_one_before() -> None:
     camera = lens("none", 64, 43)
-    views = way([f"{i}" for i in range(2 * PHOTOGRAPHS_PER_CELL)], 0)
+    views = camera_path([f"{i}" for i in range(2 * PHOTOGRAPHS_PER_CELL)], 0)
     shapes = Shapes.of(list(build(cells_of(len(views)), 0).solids))
     through = rays(camera)
     grid = Grid(through.centres[0], through.centres[1])
@@ -173,7 +173,7 @@ def test_each_photograph_overlaps_with_the_one_before() -> None:
 
 
 def test_no_camera_is_inside_of_a_solid() -> None:
-    views = way([f"{i}" for i in range(400)], 0)
+    views = camera_path([f"{i}" for i in range(400)], 0)
     centres = np.array([posed.centre for posed in views])
     for solid in build(cells_of(400), 0).solids:
         if isinstance(solid, Prism):
@@ -190,7 +190,7 @@ def test_cost_of_a_ray_does_not_grow_with_the_town() -> None:
     costs = []
     for photographs in (PHOTOGRAPHS_PER_CELL, 1000):
         shapes = Shapes.of(list(build(cells_of(photographs), 0).solids))
-        views = way([f"{i}" for i in range(PHOTOGRAPHS_PER_CELL)], 0)[::6]
+        views = camera_path([f"{i}" for i in range(PHOTOGRAPHS_PER_CELL)], 0)[::6]
         costs.append(np.mean([visible(shapes, v, grid).tests for v in views]) / grid.x.size)
     assert costs[1] < 1.3 * costs[0] and costs[1] < 3
 
@@ -269,6 +269,8 @@ def test_wrong_options_and_foreign_folders(
 ) -> None:
     assert main(["town", str(tmp_path / "a"), "--photographs", "0"]) == 2
     assert "0 photographs" in capsys.readouterr().err
+    assert main(["town", str(tmp_path / "a"), "--size", "9000x20"]) == 2
+    assert "9000x20" in capsys.readouterr().err and not (tmp_path / "a").exists()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "holiday.jpg").write_bytes(b"")
     with pytest.raises(UserError, match="no synthetic town"):

@@ -29,7 +29,7 @@ def run(arguments: list[str]) -> None:
         "--order",
         choices=get_args(Order),
         default=default.order,
-        help="names and times of the photographs: along the way, or at random",
+        help="names and times of the photographs: along the camera path, or at random",
     )
     add("--poses", choices=get_args(Poses), default=default.poses, help="poses given as input")
     add("--seed", type=int, default=default.seed, help="another seed, another town")

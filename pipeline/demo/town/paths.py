@@ -1,7 +1,7 @@
-"""The photographer's way through the town: a flight over each cell, then a walk along its street.
+"""The camera path through the town: a flight over each cell, then a walk along its street.
 
 Each photograph overlaps well with the one before, and flights over neighbouring cells with each
-other; so the first photographs of a way are connected whatever their number.
+other, so the first photographs are connected whatever their number.
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def cells_of(photographs: int) -> tuple[Cell, ...]:
     return spiral(max(1, -(-photographs // PHOTOGRAPHS_PER_CELL)))
 
 
-def way(names: list[str], seed: int) -> list[PosedImage]:
+def camera_path(names: list[str], seed: int) -> list[PosedImage]:
     """Cameras in order; the first are the same for any number of photographs."""
     cells = cells_of(len(names))
     shots = (shot for cell in cells for shot in _cell(cell, seed))

@@ -57,8 +57,8 @@ class Textures:
 
 
 @dataclass(frozen=True)
-class Stage:
-    """A town, ready to be photographed through a lens.
+class Capture:
+    """A town and a lens, prepared for photographs.
 
     Attributes:
         fine, centres: rays as in ``pipeline.demo.render.Rays``; ``fine`` in single precision.
@@ -75,9 +75,9 @@ class Stage:
     height: int
 
 
-def stage(town: Town, camera: Camera, through: Rays) -> Stage:
+def capture(town: Town, camera: Camera, through: Rays) -> Capture:
     x, y = (np.ascontiguousarray(v, np.float32) for v in through.fine[:2])
-    return Stage(
+    return Capture(
         Shapes.of(list(town.solids)),
         ground_of(town),
         Textures(),
@@ -89,7 +89,7 @@ def stage(town: Town, camera: Camera, through: Rays) -> Stage:
     )
 
 
-def photograph(town: Stage, posed: PosedImage) -> tuple[Array, Floats]:
+def photograph(town: Capture, posed: PosedImage) -> tuple[Array, Floats]:
     """(H, W, 3) linear light, and (H, W) float32 depth (z) at pixel centres, 0 for the sky."""
     light = _light(town, posed, visible(town.shapes, posed, town.fine))
     inverse = visible(town.shapes, posed, town.centres).inverse
@@ -97,7 +97,7 @@ def photograph(town: Stage, posed: PosedImage) -> tuple[Array, Floats]:
     return developed(light, town.width, town.height), depth.astype(np.float32)
 
 
-def _light(town: Stage, posed: PosedImage, hits: Hits) -> Floats:
+def _light(town: Capture, posed: PosedImage, hits: Hits) -> Floats:
     """(R, C, 3) linear light of the fine rays."""
     light = np.empty((hits.label.size, 3), np.float32)
     labels = hits.label.ravel()

@@ -25,8 +25,8 @@ from pipeline.demo.output import (
 from pipeline.demo.render import rays
 from pipeline.demo.sensor import srgb, to_bytes, write_picture
 from pipeline.demo.town.layout import build
-from pipeline.demo.town.paths import cells_of, way
-from pipeline.demo.town.view import Stage, photograph, stage
+from pipeline.demo.town.paths import camera_path, cells_of
+from pipeline.demo.town.view import Capture, capture, photograph
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.runtime.atomic import write_json
@@ -35,13 +35,15 @@ from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
-Order = Literal["way", "scattered"]
+Order = Literal["sequence", "scattered"]
 
-MAX_PHOTOGRAPHS = 99_999  # names have five digits
+# Limits of the memory for the town's solids, and for the rays of a photograph.
+MAX_PHOTOGRAPHS = 20_000
+MIN_SIDE, MAX_SIDE = 16, 4096  # pixels
 START = datetime(2026, 1, 1, 8)
-# Between photographs: seconds along the way; minutes where they are in no order, so that nothing
+# Between photographs: seconds along the path; minutes where they are in no order, so that nothing
 # takes them for a sequence.
-INTERVALS = {"way": timedelta(seconds=2), "scattered": timedelta(minutes=1)}
+INTERVALS = {"sequence": timedelta(seconds=2), "scattered": timedelta(minutes=1)}
 LENS_CHOICES = tuple(name for name in LENSES if name not in WIDE and "fisheye" not in name)
 
 
@@ -53,7 +55,7 @@ class TownSpec:
         photographs: the town's area is proportional to their number.
         width, height: pixels.
         distortion: one of ``LENS_CHOICES``.
-        order: names and times along the way, or "scattered" at random.
+        order: names and times along the camera path, or "scattered" at random.
         poses: poses given as an input: "none", "colmap" (sparse/0) or "transforms" (.json).
         seed: another seed, another town.
     """
@@ -62,7 +64,7 @@ class TownSpec:
     width: int = 640
     height: int = 427
     distortion: str = "simple_radial"
-    order: Order = "way"
+    order: Order = "sequence"
     poses: Poses = "none"
     seed: int = 0
 
@@ -72,8 +74,12 @@ class TownSpec:
             raise UserError(
                 f"a town of {self.photographs} photographs", fix=f"1 to {MAX_PHOTOGRAPHS}."
             )
-        if self.width < 16 or self.height < 16:
-            raise UserError("photographs have at least 16x16 pixels", fix="Choose another --size.")
+        sides = self.width, self.height
+        if min(sides) < MIN_SIDE or max(sides) > MAX_SIDE:
+            raise UserError(
+                f"photographs of {self.width}x{self.height} pixels",
+                fix=f"Sides of {MIN_SIDE} to {MAX_SIDE}.",
+            )
         if self.distortion not in LENS_CHOICES:
             raise UserError(f"unknown lens {self.distortion!r}", fix=f"One of {[*LENS_CHOICES]}.")
         if self.order not in get_args(Order) or self.poses not in get_args(Poses):
@@ -132,13 +138,13 @@ def _camera(spec: TownSpec) -> Camera:
 
 @lru_cache(maxsize=1)
 def _views(spec: TownSpec) -> list[PosedImage]:
-    """Along the way, with their names."""
-    return way([f"town_{number:05d}.jpg" for number in _numbers(spec)], spec.seed)
+    """Along the path, with their names."""
+    return camera_path([f"town_{number:05d}.jpg" for number in _numbers(spec)], spec.seed)
 
 
 @lru_cache(maxsize=1)
 def _numbers(spec: TownSpec) -> list[int]:
-    """The number in the name of each photograph along the way."""
+    """The number in the name of each photograph along the path."""
     numbers = np.arange(spec.photographs)
     if spec.order == "scattered":
         numbers = np.random.default_rng([spec.seed, 14]).permutation(numbers)
@@ -146,10 +152,10 @@ def _numbers(spec: TownSpec) -> list[int]:
 
 
 @lru_cache(maxsize=1)
-def _stage(spec: TownSpec) -> Stage:
+def _capture(spec: TownSpec) -> Capture:
     """The town, built once per process."""
     camera = _camera(spec)
-    return stage(build(cells_of(spec.photographs), spec.seed), camera, rays(camera))
+    return capture(build(cells_of(spec.photographs), spec.seed), camera, rays(camera))
 
 
 def _depth_file(folder: Path, name: str) -> Path:
@@ -157,9 +163,9 @@ def _depth_file(folder: Path, name: str) -> Path:
 
 
 def _write_photograph(folder: Path, spec: TownSpec, step: int) -> tuple[str, NDArray[np.uint8]]:
-    """Write the photograph at a step of the way; returns its name and colours for its points."""
+    """Write the photograph at a step of the path; returns its name and colours for its points."""
     posed, number = _views(spec)[step], _numbers(spec)[step]
-    light, depth = photograph(_stage(spec), posed)
+    light, depth = photograph(_capture(spec), posed)
     colour = to_bytes(srgb(light))
     taken = START + number * INTERVALS[spec.order]
     write_picture(folder / "images" / posed.name, colour, f"{taken:%Y:%m:%d %H:%M:%S}")

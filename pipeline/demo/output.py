@@ -28,7 +28,7 @@ POINTS_PER_VIEW = 200
 # Relative tolerance of depths for the visibility of a point: depth varies within a pixel.
 DEPTH_AGREEMENT = 0.01
 # Views that a process takes at once: neighbours share what is computed for the first of them.
-MAX_CHUNK = 32
+MAX_CHUNK = 8
 
 
 @contextmanager

@@ -9,7 +9,6 @@ from pipeline.plan.stage import StageSpec, if_blocks
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.training.loop.counters import TrainCounters
-from stages.coarse import memory_mb
 from stages.workflow import blocks
 
 if TYPE_CHECKING:
@@ -37,6 +36,6 @@ SPEC = StageSpec(
     options=blocks.OPTIONS,
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,
-    memory_mb=memory_mb,
+    memory_mb=blocks.memory_mb,
     per_block=True,
 )

@@ -45,8 +45,6 @@ MIN_WINDOW = 48
 MARGIN_SHARE, MIN_MARGIN, MAX_MARGIN = 0.9, 0.01, 0.1
 # The extent of a scene along an axis: between these quantiles of the explained pixels.
 EXTENT_QUANTILES = 0.02, 0.98
-# Gaussians of a block: for the pixels that it explains in its views, by this quantile.
-TYPICAL_VIEW = 0.9
 MIN_BLOCK_GAUSSIANS = 1000
 
 
@@ -201,7 +199,7 @@ def _block(
 ) -> Block:
     count, typical = 0, 0.0
     if found.views:
-        typical = float(np.quantile(found.pixels, TYPICAL_VIEW))
+        typical = sum(found.pixels) / len(found.pixels)
         count = round(sum(found.pixels) / options.pixels_per_gaussian)
     limit = min(round(options.max_gaussians * min(1.0, typical / options.view_pixels)), count)
     steps = round(options.steps * len(found.views) / num_views)

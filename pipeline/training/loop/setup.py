@@ -28,6 +28,9 @@ from pipeline.training.density import make_strategy
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam
 
+# Memory of a pixel with the layers around a block, in pixels without.
+LAYERED_PIXELS = 3
+
 Warn = Callable[[str], None]
 
 
@@ -80,7 +83,7 @@ def load_scene(
     Raises:
         UserError: an image cannot be read, or the masks hide all views.
     """
-    store = choose_image_store(inputs.views, config, memory_mb)
+    store = choose_image_store(inputs, config, memory_mb)
     noise = experiments.salt_and_pepper_share
     targets = Targets(inputs.views, threads, noise, seed, store, inputs.layers)
     near = near_plane(inputs.extent)
@@ -92,9 +95,11 @@ def load_scene(
     return TrainingScene(inputs, targets, gains, background, near)
 
 
-def choose_image_store(views: Sequence[View], config: Train, limit_mb: int | None) -> ImageStore:
+def choose_image_store(inputs: Inputs, config: Train, limit_mb: int | None) -> ImageStore:
     """Memory if the views' pixels fit beside the Gaussians, else a file."""
-    pixels = sum(view.width * view.height for view in views)
+    pixels = sum(view.width * view.height for view in inputs.views)
+    if inputs.layers is not None:
+        pixels *= LAYERED_PIXELS
     limit = min(machine_mb(), limit_mb or math.inf)
     fits = memory_mb(pixels, config.density.max_gaussians) <= limit
     return MemoryStore() if fits else DiskStore()

@@ -10,10 +10,16 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
+from tests.e2e.forking import ForkServer
+
 ROOT = Path(__file__).resolve().parents[2]
+
+# What each run of Snakemake would import anew.
+SERVER = ForkServer("snakemake.cli", "numpy", "pydantic")
 
 # Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
@@ -82,16 +88,21 @@ def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]
 def snakemake(
     project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
-    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
-    done = subprocess.run(
-        command(*args, config=config, cores=cores),
-        cwd=project,
-        env=environment(project),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=900,
-    )
+    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``.
+
+    In a fork of a process that has imported it: ``start_and_kill`` starts a new Python.
+    """
+    line = command(*args, config=config, cores=cores)
+    with tempfile.NamedTemporaryFile("r", encoding="utf-8") as output:
+        code = SERVER.run(
+            "snakemake",
+            line[line.index("snakemake") + 1 :],
+            folder=project,
+            environment=environment(project),
+            output=Path(output.name),
+            timeout_s=900,
+        )
+        done = subprocess.CompletedProcess(line, code, output.read())
     if check and done.returncode != 0:
         raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
     return done

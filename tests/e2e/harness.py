@@ -18,8 +18,12 @@ from tests.e2e.forking import ForkServer
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# What each run of Snakemake would import anew.
-SERVER = ForkServer("snakemake.cli", "numpy", "pydantic")
+# What each run of Snakemake, and each of its jobs that need torch, would import anew.
+RUNS = ForkServer("snakemake.cli", "numpy", "pydantic")
+JOBS = ForkServer("torch", "cv2", "PIL.Image", "numpy", "pydantic")
+TORCH_JOBS = [
+    f"-m stages {stage}" for stage in ("train", "evaluate", "coverage", "export", "report")
+]
 
 # Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
@@ -90,27 +94,35 @@ def snakemake(
 ) -> subprocess.CompletedProcess[str]:
     """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``.
 
-    In a fork of a process that has imported it: ``start_and_kill`` starts a new Python.
+    It and the jobs that need torch are forks of processes that have imported these packages:
+    what ``start_and_kill`` and installed programs start is a new Python.
     """
     line = command(*args, config=config, cores=cores)
-    with tempfile.NamedTemporaryFile("r", encoding="utf-8") as output:
-        code = SERVER.run(
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+        code = RUNS.run(
             "snakemake",
             line[line.index("snakemake") + 1 :],
             folder=project,
             environment=environment(project),
-            output=Path(output.name),
+            output=output.fileno(),
             timeout_s=900,
+            python=JOBS.python(TORCH_JOBS),
         )
+        output.seek(0)
         done = subprocess.CompletedProcess(line, code, output.read())
     if check and done.returncode != 0:
         raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
     return done
 
 
-def rules_run(done: subprocess.CompletedProcess[str]) -> set[str]:
-    """Names of the rules of which jobs were started."""
-    return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
+    """Names of the rules of which jobs were started, for one scene or for all."""
+    if scene is None:
+        return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+    jobs = re.findall(
+        r"^(?:local)?rule (\w+):\n(?: .*\n)*? +wildcards: scene=(\S+)$", done.stdout, re.M
+    )
+    return {rule for rule, of in jobs if of == scene}
 
 
 def start_and_kill(

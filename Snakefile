@@ -16,7 +16,7 @@ if os.path.exists("config/config.yaml"):
 
 project = SnakemakeProject(config, workflow.basedir)
 RUN = (
-    "python -m stages {rule} --out results/{wildcards.scene:q}/{rule} --key {params.key:q}"
+    "python -m stages {rule} --out {params.out:q} --key {params.key:q}"
     " --input {params.inputs:q} --publish {params.publish:q} --threads {threads}"
     " --memory-mb {resources.mem_mb} --log {log:q}"
 )
@@ -35,6 +35,7 @@ onerror:
 
 wildcard_constraints:
     scene=r"[^/]+",
+    block=r"[1-9][0-9]*",
 
 
 localrules:
@@ -108,14 +109,15 @@ for spec in project.stages:
                 )
                 for number, (file, caption) in enumerate(spec.publishes.items())
             },
-            stage=f"results/{{scene}}/{spec.name}/stage.json",
+            stage=f"results/{{scene}}/{project.folder(spec)}/stage.json",
         log:
-            f"results/{{scene}}/logs/{spec.name}.log",
+            f"results/{{scene}}/logs/{project.folder(spec)}.log",
         threads: project.threads(workflow)
         resources:
             mem_mb=project.memory_mb(spec, workflow),
             runtime=project.minutes(spec),
         params:
+            out=subpath(output.stage, parent=True),
             key=project.key(spec),
             inputs=project.folders(spec),
             publish=project.published(spec),

@@ -1,5 +1,6 @@
-"""Optimise the Gaussians. Outputs: ``gaussians.npz``, ``curve.json``, ``exposure.json``; and
-``sparse/0`` if poses or intrinsics were refined."""
+"""Optimise the Gaussians, or unite those of the blocks that the scene was trained in. Outputs:
+``gaussians.npz``, ``curve.json``, ``exposure.json``; and ``sparse/0`` if poses or intrinsics were
+refined."""
 
 from __future__ import annotations
 
@@ -11,7 +12,7 @@ from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.job import Job
 from pipeline.training.loop.counters import TrainCounters
-from stages.workflow import inputs
+from stages.workflow import blocks, inputs
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -28,16 +29,20 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         *(why[name] for name in (*settled_options, "views.masks")),
         memory_line(scan, config),
     ]
-    return StagePlan(
-        run=True, reason=length_line(config), decisions=[text for text in decisions if text]
-    )
+    blocks = int(config.partition.blocks)
+    reason = length_line(config)
+    if blocks > 1:
+        reason = f"{blocks} blocks of together about {reason}, united"
+    return StagePlan(run=True, reason=reason, decisions=[text for text in decisions if text])
 
 
 def work(job: Job) -> None:
-    from pipeline.io.colmap import write_model
-    from pipeline.io.npz import read_npz, write_npz
+    from pipeline.io.npz import read_npz
     from pipeline.training.scene import train_scene
 
+    if "partition" in job.inputs:
+        blocks.unite(job)
+        return
     trained = train_scene(
         inputs.input_views(job),
         inputs.read_manifest(job, "views"),
@@ -51,13 +56,7 @@ def work(job: Job) -> None:
         checkpoint_dir=job.scratch / "checkpoints",
         logs=job.logs,
     )
-    write_npz(job.out / "gaussians.npz", trained.result.gaussians)
-    if trained.model is not None:
-        write_model(job.out / "sparse" / "0", trained.model)
-    trained.result.curve.write(job.out)
-    trained.gains.write(job.out)
-    job.record(trained.counters, trained.decisions, trained.warnings)
-    job.timings = trained.timings
+    inputs.write_trained(job, trained)
 
 
 def memory_mb(plan: Plan) -> int:
@@ -70,7 +69,15 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=TrainCounters,
-    inputs={"views": inputs.VIEWS, "model": inputs.MODEL, "init": ("init",)},
+    inputs={
+        "views": inputs.VIEWS,
+        "model": inputs.MODEL,
+        "init": ("init",),
+        "coarse": ("coarse",),
+        "partition": ("partition",),
+        "polish": ("polish",),
+    },
+    optional=("coarse", "partition", "polish"),
     options=("train", "views", "split", "experiments.train"),
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,

@@ -43,6 +43,7 @@ _RECORDS = {
     "georeference.json": "pipeline.scene.georeference:Georeference",
     "frame.json": "pipeline.io.frame_json:Frame",
     "path.json": "pipeline.surface.path:PathFile",
+    "partition.json": "pipeline.scene.blocks:Partition",
 }
 
 # Stage -> the model of its counters; a test compares them with the declarations.
@@ -55,6 +56,10 @@ COUNTERS = {
     "sfm": "pipeline.sfm.counters:SfmCounters",
     "undistort": "pipeline.photos.counters:UndistortCounters",
     "init": "pipeline.splats.counters:InitCounters",
+    "coarse": "pipeline.training.loop.counters:TrainCounters",
+    "partition": "pipeline.training.blocks.counters:PartitionCounters",
+    "block": "pipeline.training.loop.counters:TrainCounters",
+    "polish": "pipeline.training.loop.counters:TrainCounters",
     "train": "pipeline.training.loop.counters:TrainCounters",
     "evaluate": "pipeline.metrics.counters:EvaluateCounters",
     "coverage": "pipeline.runtime.counters:NoCounters",

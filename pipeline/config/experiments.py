@@ -41,6 +41,9 @@ class MatchesExperiments(Section):
     max_ratio: Share = Field(
         0.8, description="Lowe's ratio test: nearest distance over second nearest."
     )
+    min_inliers: Annotated[int, Field(gt=0), Unit("matches")] = Field(
+        15, description="Pairs with fewer verified matches are discarded."
+    )
 
 
 class InitExperiments(Section):

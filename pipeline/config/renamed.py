@@ -7,6 +7,7 @@ from __future__ import annotations
 RENAMED: dict[str, tuple[str, ...]] = {
     "split.holdout_every": ("split.test_every",),
     "matches.max_ratio": ("experiments.matches.max_ratio",),
+    "matches.min_inliers": ("experiments.matches.min_inliers",),
     "init.num_random": ("experiments.init.num_random",),
     "init.opacity": ("experiments.init.opacity",),
     "train.sh_interval": ("experiments.train.sh_degree_interval",),

@@ -131,9 +131,6 @@ class Matches(Section):
     neighbours: Annotated[int, Field(gt=0), Unit("per image")] = Field(
         16, description="Pairs per image of sequential, spatial and retrieval matching."
     )
-    min_inliers: Annotated[int, Field(gt=0), Unit("matches")] = Field(
-        15, description="Pairs with fewer verified matches are discarded."
-    )
 
 
 class Sfm(Section):
@@ -352,6 +349,15 @@ class Train(Section):
     )
 
 
+class Partition(Section):
+    """Division of large scenes into blocks that are trained in jobs of their own."""
+
+    blocks: Literal["auto"] | Count = Field(
+        "auto",
+        description="Number of blocks. auto: 1 for up to 400 photographs, else one for every 200.",
+    )
+
+
 class Evaluate(Section):
     """Test views compared with renders."""
 
@@ -420,6 +426,7 @@ class Config(Section):
     undistort: Undistort = Field(default_factory=Undistort)
     init: Init = Field(default_factory=Init)
     train: Train = Field(default_factory=Train)
+    partition: Partition = Field(default_factory=Partition)
     evaluate: Evaluate = Field(default_factory=Evaluate)
     export: Export = Field(default_factory=Export)
     experiments: Experiments = Field(default_factory=Experiments)

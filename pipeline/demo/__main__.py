@@ -1,36 +1,46 @@
-"""``python -m pipeline.demo FOLDER``: write the demo scene."""
+"""``python -m pipeline.demo FOLDER``: write the demo scene. ``... town FOLDER``: the town."""
 
 from __future__ import annotations
 
 import argparse
-import re
 import sys
 from pathlib import Path
 from typing import get_args
 
 from pipeline.demo.cameras import LENSES
+from pipeline.demo.options import picture_size
+from pipeline.demo.town.command import run as run_town
 from pipeline.demo.write import DemoSpec, Format, Poses, write_demo
 from pipeline.runtime.errors import UserError
 
 
-def _size(text: str) -> tuple[int, int]:
-    match = re.fullmatch(r"(\d+)x(\d+)", text)
-    if not match:
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, found {text!r}")
-    return int(match[1]), int(match[2])
-
-
 def main(arguments: list[str] | None = None) -> int:
+    arguments = sys.argv[1:] if arguments is None else arguments
+    try:
+        if arguments[:1] == ["town"]:
+            run_town(arguments[1:])
+        else:
+            run_room(arguments)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+def run_room(arguments: list[str]) -> None:
+    """Raises UserError where options do not go together."""
     default = DemoSpec()
     parser = argparse.ArgumentParser(
         prog="python -m pipeline.demo",
         description="Write the demo scene: photographs of a ray-traced room with exact truth.",
+        epilog="A town of any size: python -m pipeline.demo town FOLDER --photographs N; "
+        "its options: python -m pipeline.demo town --help.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
     add("folder", type=Path, help="scene folder to write, for example data/demo")
     add("--views", type=int, default=default.views, help="number of photographs")
-    add("--size", type=_size, default=f"{default.width}x{default.height}", help="pixels")
+    add("--size", type=picture_size, default=f"{default.width}x{default.height}", help="pixels")
     add("--format", choices=get_args(Format), default=default.format)
     add("--distortion", choices=[*LENSES], default=default.distortion, help="the lens")
     add("--poses", choices=get_args(Poses), default=default.poses, help="poses given as input")
@@ -44,12 +54,7 @@ def main(arguments: list[str] | None = None) -> int:
     folder, processes = options.pop("folder"), options.pop("processes")
     options["width"], options["height"] = options.pop("size")
     options["points"] = not options.pop("no_points")
-    try:
-        write_demo(folder, DemoSpec(**options), processes)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
+    write_demo(folder, DemoSpec(**options), processes)
 
 
 if __name__ == "__main__":

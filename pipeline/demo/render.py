@@ -103,10 +103,7 @@ def render(
         light = np.where(seen, light, 0.0)
         layers[:3, part], layers[3, part] = light, inside
     picture = np.ascontiguousarray(layers.reshape(4, rows, columns).transpose(1, 2, 0))
-    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), LENS_SIGMA * SAMPLES), np.float64)
-    height, width = camera.height + 2 * MARGIN, camera.width + 2 * MARGIN
-    picture = picture.reshape(height, SAMPLES, width, SAMPLES, 4).mean(axis=(1, 3))
-    picture = picture[MARGIN:-MARGIN, MARGIN:-MARGIN]
+    picture = developed(picture, camera.width, camera.height)
 
     centres = through.centres.reshape(3, -1)
     origin, direction = _world(posed, _or_forward(centres))
@@ -114,6 +111,17 @@ def render(
     nothing = ((index == BACKGROUND) & transparent) | ~np.isfinite(centres[0])
     depth = np.where(nothing, 0.0, t).astype(np.float32)
     return Rendered(picture[..., :3], picture[..., 3], depth.reshape(camera.height, camera.width))
+
+
+def developed(picture: NDArray, width: int, height: int) -> NDArray:
+    """(height, width, K) pixels of the light along the fine rays, through the lens blur.
+
+    Args:
+        picture: (R, C, K), a value for each ray of ``Rays.fine``.
+    """
+    picture = np.asarray(cv2.GaussianBlur(picture, (0, 0), LENS_SIGMA * SAMPLES))
+    shape = (height + 2 * MARGIN, SAMPLES, width + 2 * MARGIN, SAMPLES, picture.shape[-1])
+    return picture.reshape(shape).mean(axis=(1, 3))[MARGIN:-MARGIN, MARGIN:-MARGIN]
 
 
 def _grid(camera: Camera, samples: int, margin: int, wide: bool) -> Array:

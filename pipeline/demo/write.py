@@ -2,42 +2,38 @@
 
 from __future__ import annotations
 
-import os
-import shutil
-from collections.abc import Iterator
-from concurrent.futures import ProcessPoolExecutor
-from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from functools import lru_cache, partial
-from multiprocessing import get_context
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Literal, get_args
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
 from pipeline.demo.cameras import FISHEYE_HALF_ANGLE, LENSES, WIDE, lens, orbit
+from pipeline.demo.output import (
+    Poses,
+    in_processes,
+    new_scene,
+    pick_pixels,
+    surface_points,
+    transforms,
+)
 from pipeline.demo.render import Rays, rays, render
 from pipeline.demo.scene import OBJECTS, VISITOR, SceneObject
 from pipeline.demo.sensor import expose, srgb, to_bytes, write_dng, write_picture
 from pipeline.demo.shapes import Sphere
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.distortion import project, unproject
 from pipeline.io.colmap import write_model
-from pipeline.runtime.atomic import replace_folder, write_json
+from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import usable_cores
 from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 Format = Literal["jpg", "png", "dng"]
-Poses = Literal["none", "colmap", "transforms"]
 Written = tuple[NDArray[np.float32], NDArray[np.uint8]]  # a view's depth and colours
-
-POINTS_PER_VIEW = 200
-# Relative tolerance of depths for the visibility of a point: depth varies within a pixel.
-DEPTH_AGREEMENT = 0.01
 
 
 @dataclass(frozen=True)
@@ -105,26 +101,17 @@ def write_demo(folder: Path, spec: DemoSpec, processes: int | None = 1) -> None:
         UserError: options that do not go together, or ``folder`` holds something else.
     """
     spec.check()
-    if folder.exists() and any(folder.iterdir()) and not (folder / "demo.json").exists():
-        raise UserError(
-            "is there already and is no demo scene", file=folder, fix="Choose another folder."
-        )
-    work = folder.with_name(f".{folder.name}.{os.getpid()}.tmp")
-    shutil.rmtree(work, ignore_errors=True)
-    for name in ("images", "depth_gt", *(["masks"] if spec.masks else [])):
-        (work / name).mkdir(parents=True)
-    try:
+    with new_scene(folder, "demo.json", "demo scene") as work:
+        for name in ("images", "depth_gt", *(["masks"] if spec.masks else [])):
+            (work / name).mkdir(parents=True)
         _write(work, spec, processes or usable_cores())
-        replace_folder(work, folder)
-    finally:
-        shutil.rmtree(work, ignore_errors=True)
 
 
 def _write(folder: Path, spec: DemoSpec, processes: int) -> None:
     camera, views = _camera(spec), _views(spec)
     progress = Progress("rendering the demo scene", spec.views, "views")
     depths, colours = [], []
-    with _written_views(folder, spec, min(processes, spec.views)) as written:
+    with in_processes(partial(_write_view, folder, spec), spec.views, processes) as written:
         for depth, colour in written:
             depths.append(depth)
             colours.append(colour)
@@ -136,23 +123,8 @@ def _write(folder: Path, spec: DemoSpec, processes: int) -> None:
         given = Reconstruction(truth.cameras, truth.images, points)
         write_model(folder / "sparse" / "0", given)
     if spec.poses == "transforms":
-        write_json(folder / "transforms.json", _transforms(camera, views))
+        write_json(folder / "transforms.json", transforms(camera, views))
     write_json(folder / "demo.json", asdict(spec))
-
-
-@contextmanager
-def _written_views(folder: Path, spec: DemoSpec, processes: int) -> Iterator[Iterator[Written]]:
-    """Renders and writes all views; yields the results of ``_write_view`` in order.
-
-    Processes, not threads: rendering is many short numpy calls, which hold the interpreter's lock.
-    Spawned, not forked: the caller may have started threads.
-    """
-    write = partial(_write_view, folder, spec)
-    if processes == 1:
-        yield map(write, range(spec.views))
-        return
-    with ProcessPoolExecutor(processes, mp_context=get_context("spawn")) as pool:
-        yield pool.map(write, range(spec.views))
 
 
 def _camera(spec: DemoSpec) -> Camera:
@@ -216,69 +188,6 @@ def _points(
     colours: list[NDArray[np.uint8]],
     seed: int,
 ) -> Points:
-    """Points on the surfaces with exact positions, and the views in which they are visible."""
-    camera = truth.cameras[1]
-    rng = np.random.default_rng([seed, 3])
-    xyz, rgb = [], []
-    for posed, depth, colour in zip(truth.images.values(), depths, colours, strict=True):
-        column = rng.integers(0, camera.width, POINTS_PER_VIEW)
-        row = rng.integers(0, camera.height, POINTS_PER_VIEW)
-        z = depth[row, column].astype(np.float64)
-        column, row, z = column[z > 0], row[z > 0], z[z > 0]
-        flat = unproject(camera, np.stack([column + 0.5, row + 0.5], axis=-1))
-        local = np.concatenate([flat, np.ones((len(z), 1))], axis=1) * z[:, None]
-        xyz.append((local - posed.translation) @ posed.rotation)
-        rgb.append(colour[row, column])
-    points, colour = np.concatenate(xyz), np.concatenate(rgb)
-    seen = np.zeros((len(points), len(depths)), bool)
-    where = np.zeros((len(points), len(depths), 2))
-    for i, (posed, depth) in enumerate(zip(truth.images.values(), depths, strict=True)):
-        local = points @ posed.rotation.T + posed.translation
-        front = local[:, 2] > 0.05
-        xy = project(camera, local[:, :2] / np.where(front, local[:, 2], 1.0)[:, None])
-        inside = front & np.all((xy >= 0) & (xy < (camera.width, camera.height)), axis=1)
-        column, row = np.where(inside[:, None], xy, 0).astype(np.intp).T
-        agree = np.abs(depth[row, column] - local[:, 2]) < DEPTH_AGREEMENT * local[:, 2]
-        seen[:, i], where[:, i] = inside & agree, xy
-    kept = seen.sum(axis=1) >= 2
-    seen, where = seen[kept], where[kept]
-    ids = np.array(list(truth.images), np.int64)
-    return Points(
-        xyz=points[kept],
-        rgb=colour[kept],
-        error=np.zeros(int(kept.sum())),
-        track_start=np.concatenate([[0], np.cumsum(seen.sum(axis=1))]).astype(np.int64),
-        track_image_id=ids[np.nonzero(seen)[1]],
-        track_xy=where[seen],
-    )
-
-
-def _transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
-    """nerfstudio's transforms.json: camera to world, x right, y up, z backwards."""
-    fx, fy, cx, cy = camera.pinhole
-    rest = [float(v) for v in camera.params[len(camera.intrinsics_names) :]]
-    fisheye = "FISHEYE" in camera.model
-    if camera.is_spherical:
-        listed = {"camera_model": camera.model, "w": camera.width, "h": camera.height}
-        return {**listed, "frames": _frames(views)}
-    names = ("k1", "k2", "k3", "k4") if fisheye else ("k1", "k2", "p1", "p2")
-    rest += [0.0] * (4 - len(rest))
-    return {
-        "camera_model": "OPENCV_FISHEYE" if fisheye else "OPENCV",
-        "w": camera.width,
-        "h": camera.height,
-        "fl_x": fx,
-        "fl_y": fy,
-        "cx": cx,
-        "cy": cy,
-        **dict(zip(names, rest, strict=True)),
-        "frames": _frames(views),
-    }
-
-
-def _frames(views: list[PosedImage]) -> list[dict[str, Any]]:
-    frames = []
-    for posed in views:
-        pose = np.linalg.inv(posed.world_to_camera) @ np.diag([1.0, -1.0, -1.0, 1.0])
-        frames.append({"file_path": f"images/{posed.name}", "transform_matrix": pose.tolist()})
-    return frames
+    picks = pick_pixels(truth.cameras[1], len(depths), seed)
+    rgb = [colour[rows, columns] for colour, (columns, rows) in zip(colours, picks, strict=True)]
+    return surface_points(truth, picks, rgb, depths.__getitem__)

@@ -26,7 +26,7 @@ from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.names import suffix_of
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
-from pipeline.scene.views import View
+from pipeline.scene.views import Crop, View
 
 Picture = NDArray[Any]
 FIX = "Replace the file by an undamaged one, or remove it from the folder."
@@ -146,7 +146,10 @@ def load_view(view: View) -> ViewPixels:
     Raises:
         UserError: as ``load_rgb``, or the image or mask has another aspect ratio than the view.
     """
-    width, height = view.width, view.height
+    crop = view.crop
+    width, height = (
+        (view.width, view.height) if crop is None else (crop.full_width, crop.full_height)
+    )
     rgb, alpha = load_rgba(view.image, view.image_digest)
     _check_shape(rgb, width, height, Path(view.image))
     mask = None
@@ -154,7 +157,18 @@ def load_view(view: View) -> ViewPixels:
         mask = load_mask(view.mask, view.mask_digest)
         _check_shape(mask, width, height, Path(view.mask))
         mask = resize_mask(mask, width, height)
-    return ViewPixels(*resize_rgba(rgb, alpha, width, height), mask)
+    pixels = ViewPixels(*resize_rgba(rgb, alpha, width, height), mask)
+    return pixels if crop is None else _cropped(pixels, view, crop)
+
+
+def _cropped(pixels: ViewPixels, view: View, crop: Crop) -> ViewPixels:
+    rows = slice(crop.top, crop.top + view.height)
+    columns = slice(crop.left, crop.left + view.width)
+    return ViewPixels(
+        np.ascontiguousarray(pixels.rgb[rows, columns]),
+        None if pixels.alpha is None else np.ascontiguousarray(pixels.alpha[rows, columns]),
+        None if pixels.mask is None else np.ascontiguousarray(pixels.mask[rows, columns]),
+    )
 
 
 def resize_rgba(

@@ -54,13 +54,26 @@ def _matches(plan: Plan) -> float:
 
 
 def _train(plan: Plan) -> float:
+    if plan.config.partition.blocks != 1:
+        return _PROGRAM
+    return _PROGRAM + 0.2 * _photos(plan) + _steps(plan)
+
+
+def _steps(plan: Plan) -> float:
+    """Training of a whole scene."""
     train = plan.config.train
     width, height = plan.facts.view_size
     step = 0.005 + 1e-7 * train.density.max_gaussians + 6e-8 * width * height
-    length = train.steps * step
-    if train.budget_minutes is not None:
-        length = 60 * train.budget_minutes
-    return _PROGRAM + 0.2 * _photos(plan) + length
+    return train.steps * step if train.budget_minutes is None else 60 * train.budget_minutes
+
+
+def _coarse(plan: Plan) -> float:
+    return _PROGRAM + 0.2 * _photos(plan) + _steps(plan)
+
+
+def _block(plan: Plan) -> float:
+    # A block has at most all views, but its windows in them are smaller.
+    return _PROGRAM + _photos(plan) + _steps(plan)
 
 
 _ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
@@ -72,6 +85,10 @@ _ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
     "refine": _per_photo(2.0),
     "undistort": _per_photo(0.5),
     "init": _per_photo(1.0),
+    "coarse": _coarse,
+    "partition": _per_photo(1.0),
+    "block": _block,
+    "polish": _block,
     "train": _train,
     "evaluate": _per_photo(0.5),
     "coverage": _per_photo(1.0),

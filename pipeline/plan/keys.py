@@ -18,13 +18,16 @@ _version = cache(version)
 _source_hash = cache(stage_source_hash)
 
 
-def stage_key(spec: StageSpec, plan: Plan) -> str:
+def stage_key(spec: StageSpec, plan: Plan, block: int | None = None) -> str:
     """The stage's key as a canonical JSON string.
 
     The key consists of the declared options as settled by the plan, a hash of the code that the
     stage can reach, the versions of the declared packages, the seed if the stage is seeded, and the
     declared facts. Time, memory, threads and hosts are not part of it. It is a single string
     because Snakemake compares parameters as a set of ``repr(value)``, which would miss changes.
+
+    Args:
+        block: number of the block, of a stage with a job for each.
     """
     key: dict[str, Any] = {
         "stage": spec.name,
@@ -33,6 +36,8 @@ def stage_key(spec: StageSpec, plan: Plan) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
+    if block is not None:
+        key["block"] = block
     if spec.shows_plan:
         key["plan"] = plan_record(plan).model_dump(mode="json")
     return canonical(key | spec.facts(plan))

@@ -56,10 +56,25 @@ def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:
 
 
 def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
-    return {
-        role: next(name for name in candidates if name in running)
-        for role, candidates in spec.inputs.items()
-    }
+    found = {}
+    for role, candidates in spec.inputs.items():
+        providers = [name for name in candidates if name in running]
+        if providers or role not in spec.optional:
+            found[role] = providers[0]
+    return found
+
+
+def input_folders(spec: StageSpec, plan: Plan) -> dict[str, str]:
+    """Role of the stage's input -> folder in ``results/<scene>/``. An input with a folder for each
+    block has a role for each: with the number of the block."""
+    found = {}
+    for role, stage in upstream(spec, plan).items():
+        folders = plan.stages[stage].folders(stage)
+        if len(folders) == 1:
+            found[role] = folders[0]
+        else:
+            found |= {f"{role}_{block}": name for block, name in enumerate(folders, 1)}
+    return found
 
 
 def plan_record(plan: Plan) -> PlanRecord:

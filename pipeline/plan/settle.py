@@ -33,6 +33,8 @@ MIXED_GROUP_SHARE = 0.5
 # Up to this many photographs, a loss on the depths of sparse points improves test views.
 FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
+# Scenes of more photographs are trained in blocks, one for so many.
+MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 400, 200
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
@@ -66,6 +68,7 @@ def settle(scan: Scan, config: Config) -> Settled:
         "train.depth_loss_weight": _depth_loss_weight(scan, config),
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
+    blocks, blocks_reason = _blocks(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
     settled = _updated(
         config,
@@ -80,6 +83,7 @@ def settle(scan: Scan, config: Config) -> Settled:
                 "max_points": min(config.init.max_points, max(1, budget // 2)),
                 "points_file": scan.cloud.path if scan.cloud else "none",
             },
+            "partition": {"blocks": blocks},
             "train": {
                 "background": value["train.background"],
                 "depth_loss_weight": value["train.depth_loss_weight"],
@@ -89,6 +93,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     )
     why = {path: reason for path, (_, reason) in chosen.items()}
     why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
+    why["partition.blocks"] = blocks_reason
     return Settled(settled, why)
 
 
@@ -197,6 +202,17 @@ def _background(scan: Scan, config: Config) -> Choice:
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
     few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
     return "black", f"black background: {few}"
+
+
+def _blocks(scan: Scan, config: Config) -> tuple[int, str]:
+    """The number of blocks of the scene."""
+    wanted, count = config.partition.blocks, len(scan.planned)
+    if wanted != "auto":
+        return wanted, f"{wanted} blocks, as configured" if wanted > 1 else ""
+    if count <= MAX_PHOTOS_OF_ONE_BLOCK:
+        return 1, ""
+    blocks = math.ceil(count / PHOTOS_PER_BLOCK)
+    return blocks, f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
 
 
 def _masks(scan: Scan, config: Config) -> str:

@@ -23,6 +23,14 @@ def unless_posed(scan: Scan, reason: str, decisions: list[str]) -> StagePlan:
     return StagePlan(run=False, reason=f"poses are given: {poses.label}")
 
 
+def if_blocks(settled: Settled, reason: str, *, per_block: bool = False) -> StagePlan:
+    """The plan of a stage that runs only if the scene is trained in blocks."""
+    blocks = int(settled.config.partition.blocks)
+    if blocks == 1:
+        return StagePlan(run=False, reason="the scene is trained as one block")
+    return StagePlan(run=True, reason=reason, jobs=blocks if per_block else 1)
+
+
 def _none(plan: Plan) -> dict[str, Any]:
     return {}
 
@@ -49,6 +57,8 @@ class StageSpec:
             report.
         shows_plan: whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
         facts: facts that affect the result besides code, options, packages, seed and inputs.
+        per_block: whether each block of the scene is a job; its number is in ``Job.key["block"]``.
+        optional: roles that have no input if the plan runs none of their stages.
     """
 
     name: str
@@ -63,6 +73,8 @@ class StageSpec:
     publishes: Mapping[str, str] = field(default_factory=dict)
     shows_plan: bool = False
     facts: Callable[[Plan], dict[str, Any]] = _none
+    per_block: bool = False
+    optional: tuple[str, ...] = ()
 
     @property
     def module(self) -> str:

@@ -32,7 +32,6 @@ DILATION = 0.3
 ALPHA_MIN = 1 / 255
 ALPHA_MAX = 0.999
 TRANSMITTANCE_MIN = 1e-4
-FRUSTUM_MARGIN = 0.3
 QUAT_NORM2_MIN = 1e-8
 COMPENSATION_MIN = 2.5e-5
 COVARIANCE_MAX = 1e30
@@ -129,15 +128,8 @@ def project(
     index, cam = index[in_front], cam[in_front]
     x, y, z = cam.unbind(-1)
 
-    tan_x, tan_y = 0.5 * camera.width / camera.fx, 0.5 * camera.height / camera.fy
-    u = (x / z).clamp(
-        -camera.cx / camera.fx - FRUSTUM_MARGIN * tan_x,
-        (camera.width - camera.cx) / camera.fx + FRUSTUM_MARGIN * tan_x,
-    )
-    v = (y / z).clamp(
-        -camera.cy / camera.fy - FRUSTUM_MARGIN * tan_y,
-        (camera.height - camera.cy) / camera.fy + FRUSTUM_MARGIN * tan_y,
-    )
+    min_u, max_u, min_v, max_v = camera.slopes
+    u, v = (x / z).clamp(min_u, max_u), (y / z).clamp(min_v, max_v)
     zero = torch.zeros_like(z)
     jacobian = torch.stack(
         [camera.fx / z, zero, -camera.fx * u / z, zero, camera.fy / z, -camera.fy * v / z], -1

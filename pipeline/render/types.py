@@ -14,6 +14,10 @@ if TYPE_CHECKING:
 Color = tuple[float, float, float]
 """RGB in [0, 1]."""
 
+# The projection's Jacobian is evaluated at most this share of tan(fov / 2) outside the image on
+# each side (3DGS): further out the linearisation stretches Gaussians too much.
+FRUSTUM_MARGIN = 0.3
+
 BACKGROUNDS: dict[str, Color] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 
 
@@ -27,6 +31,8 @@ class RasterCamera:
         width, height: image size in pixels.
         fx, fy, cx, cy: focal lengths and principal point in pixels.
         world_to_camera: (4, 4) float32 or float64, rigid.
+        part_of: the camera of the whole image, if this one shows a part of it with the same focal
+            lengths and pose: a part is rendered as the whole image is.
     """
 
     width: int
@@ -36,6 +42,21 @@ class RasterCamera:
     cx: float
     cy: float
     world_to_camera: torch.Tensor
+    part_of: RasterCamera | None = None
+
+    @property
+    def slopes(self) -> tuple[float, float, float, float]:
+        """The smallest and largest x / z, and y / z, at which the projection's Jacobian is
+        evaluated: in the whole image, and in a border of ``FRUSTUM_MARGIN``."""
+        whole = self.part_of or self
+        margin_x = FRUSTUM_MARGIN * 0.5 * whole.width / whole.fx
+        margin_y = FRUSTUM_MARGIN * 0.5 * whole.height / whole.fy
+        return (
+            -whole.cx / whole.fx - margin_x,
+            (whole.width - whole.cx) / whole.fx + margin_x,
+            -whole.cy / whole.fy - margin_y,
+            (whole.height - whole.cy) / whole.fy + margin_y,
+        )
 
 
 @dataclass(frozen=True)

@@ -41,15 +41,14 @@ def raster_camera(view: View, factor: int = 1) -> RasterCamera:
     """The rasterizer's camera of a view, downscaled by ``factor``."""
     width, height = reduced_size(view, factor)
     sx, sy = width / view.width, height / view.height
-    return RasterCamera(
-        width,
-        height,
-        view.fx * sx,
-        view.fy * sy,
-        view.cx * sx,
-        view.cy * sy,
-        torch.from_numpy(np.ascontiguousarray(view.world_to_camera, np.float64)),
-    )
+    crop, part_of = view.crop, None
+    pose = torch.from_numpy(np.ascontiguousarray(view.world_to_camera, np.float64))
+    focal = view.fx * sx, view.fy * sy
+    if crop is not None:
+        whole = round(crop.full_width * sx), round(crop.full_height * sy)
+        centre = (view.cx + crop.left) * sx, (view.cy + crop.top) * sy
+        part_of = RasterCamera(*whole, *focal, *centre, pose)
+    return RasterCamera(width, height, *focal, view.cx * sx, view.cy * sy, pose, part_of)
 
 
 def limit_sh_degree(options: RasterOptions, gaussians: Gaussians) -> RasterOptions:

@@ -38,8 +38,9 @@ def collect_metrics(
         UserError: a stage's record is missing or damaged, or its counters are.
     """
     ran = [name for name, step in plan.stages.items() if step.run and name != "report"]
+    folders = [job for name in ran for job in plan.stages[name].folders(name)]
     warnings = list(plan.warnings)
-    for name in ran:
+    for name in folders:
         told = read_stage(folder / name).warnings
         warnings += [f"{name}: {text}" for text in told if text not in plan.warnings]
     inspect = read_counters(folder / "inspect", InspectCounters)
@@ -60,7 +61,7 @@ def collect_metrics(
             "sfm_verdict": sfm.verdict if sfm else None,
             "georeference": sfm.georeference if sfm else None,
             "stages": {
-                name: {"skipped": not step.run, "reason": step.reason}
+                name: {"skipped": not step.run, "reason": step.reason, "jobs": step.jobs}
                 for name, step in plan.stages.items()
             },
             "versions": versions,

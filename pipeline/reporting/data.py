@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
+from pipeline.scene.blocks import Partition
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -65,6 +66,29 @@ class TrainedScene:
     normalization: Normalization = IDENTITY
 
 
+class BlockRun(NamedTuple):
+    """The training of one block, both rounds together.
+
+    Attributes:
+        gaussians: number of trained Gaussians, its margin included.
+        psnr: of its training views at the end, dB, over its windows.
+        wall_s, peak_rss_mb: time, and largest memory.
+    """
+
+    gaussians: int
+    psnr: float
+    wall_s: float
+    peak_rss_mb: float
+
+
+@dataclass(frozen=True)
+class BlocksSection:
+    """The blocks of a scene and their trainings, by number."""
+
+    partition: Partition
+    runs: Sequence[BlockRun]
+
+
 @dataclass(frozen=True)
 class CoverageSection:
     """Coverage of the scene by its photographs.
@@ -103,6 +127,7 @@ class ReportData:
         comparisons: views to show, worst first.
         trained: the Gaussians and their views.
         coverage: None without a record.
+        blocks: None for a scene that was trained as one block.
         points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
         reprojection_errors: pixels, one per sparse point.
         track_lengths: number of images, one per sparse point.
@@ -116,6 +141,7 @@ class ReportData:
     comparisons: Sequence[Comparison] = ()
     trained: TrainedScene | None = None
     coverage: CoverageSection | None = None
+    blocks: BlocksSection | None = None
     points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
     points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
     reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))

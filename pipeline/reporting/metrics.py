@@ -5,13 +5,14 @@ How long the stages took stands in their ``run.json``; ``with_times`` brings bot
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar, Literal
 
 from pydantic import Field
 
 from pipeline.metrics.evaluation import SceneQuality
+from pipeline.plan.values import job_folders
 from pipeline.runtime.json_file import JsonFile, JsonObject
 from pipeline.runtime.record import RunRecord, read_run
 from pipeline.scene.georeference import GeoreferenceSummary
@@ -22,6 +23,7 @@ class StageStatus(JsonObject):
 
     skipped: bool = Field(description="Whether the plan leaves it out.")
     reason: str = Field(description="Why it is needed, or is not.")
+    jobs: int = Field(1, ge=1, description="Number of its jobs: one for each block of the scene.")
 
 
 class Metrics(JsonFile, SceneQuality):
@@ -66,8 +68,21 @@ def read_runs(metrics: Metrics, folder: Path, without: str = "") -> dict[str, Ru
     Raises:
         UserError: one is missing or damaged.
     """
-    ran = (n for n, stage in metrics.stages.items() if not stage.skipped and n != without)
-    return {name: read_run(folder / name) for name in ran}
+    return {
+        name: together([read_run(folder / job) for job in job_folders(name, stage.jobs)])
+        for name, stage in metrics.stages.items()
+        if not stage.skipped and name != without
+    }
+
+
+def together(runs: Sequence[RunRecord]) -> RunRecord:
+    """The runs of a stage's jobs as one: times are summed, memory is the largest."""
+    if len(runs) == 1:
+        return runs[0]
+    summed = {name: sum(getattr(run, name) for run in runs) for name in ("wall_s", "cpu_s")}
+    summed["earlier_s"] = sum(run.earlier_s for run in runs)
+    peak = max(run.peak_rss_mb for run in runs)
+    return runs[-1].model_copy(update={**summed, "peak_rss_mb": peak, "curve_seconds": None})
 
 
 def with_times(metrics: Metrics, runs: Mapping[str, RunRecord]) -> dict[str, Any]:

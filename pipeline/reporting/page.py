@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.reporting.blocks import blocks_section
 from pipeline.reporting.charts import histogram, line_chart
 from pipeline.reporting.coverage import coverage_section
 from pipeline.reporting.data import Comparison, ReportData
@@ -56,6 +57,8 @@ def report_html(data: ReportData) -> str:
         ("stages", "Stages", stages_table(data.metrics.get("stages") or {})),
         ("how", "Decisions and protocol", _how(data)),
     ]
+    if blocks := blocks_section(data):
+        sections.insert(2, ("blocks", "Blocks", blocks))
     max_bytes = _MAX_BYTES - len(viewer) - sum(len(inside) for _, _, inside in sections)
     sections.insert(0, ("scene", "Scene", space_section(data, max_bytes)))
     links = "".join(f'<a href="#{key}">{title}</a>' for key, title, _ in sections)

@@ -16,6 +16,8 @@ from pipeline.metrics.evaluation import Evaluation
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.data import (
+    BlockRun,
+    BlocksSection,
     Comparison,
     CoverageSection,
     ReportData,
@@ -23,13 +25,17 @@ from pipeline.reporting.data import (
     TrainingRecord,
     ranked,
 )
+from pipeline.reporting.metrics import together
+from pipeline.runtime.counters import read_counters
 from pipeline.runtime.json_file import mismatch
 from pipeline.runtime.record import read_run, read_stage
+from pipeline.scene.blocks import Partition
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.curve import TrainingCurve
 
 
@@ -85,6 +91,7 @@ def report_data(results: SceneResults, evaluation: Evaluation, shown: int) -> Re
             normalization=Georeference.normalization_of(results.folders["poses"]),
         ),
         coverage=_coverage(results.folders["coverage"]),
+        blocks=_blocks(results.plan, results.folders["inspect"].parent),
         points_xyz=points.xyz,
         points_rgb=points.rgb,
         reprojection_errors=points.error[points.error >= 0],
@@ -127,6 +134,22 @@ def _coverage(folder: Path) -> CoverageSection:
     return CoverageSection(record, pictures)
 
 
+def _blocks(plan: PlanRecord, results: Path) -> BlocksSection | None:
+    """The blocks of the scene; None if it was trained as one."""
+    if not plan.runs("partition"):
+        return None
+    runs = []
+    for number in range(1, plan.stages["polish"].jobs + 1):
+        folders = [results / f"{stage}_{number}" for stage in ("block", "polish")]
+        run = together([read_run(folder) for folder in folders])
+        counters = read_counters(folders[-1], TrainCounters)
+        last = TrainingCurve.read(folders[-1]).root[-1]
+        runs.append(
+            BlockRun(counters.num_gaussians, last.psnr, run.wall_s + run.earlier_s, run.peak_rss_mb)
+        )
+    return BlocksSection(Partition.read(results / "partition"), runs)
+
+
 def _curve(folder: Path) -> list[TrainingRecord]:
     """The training curve with the times of the run that recorded it."""
     seconds = read_run(folder).curve_seconds or []
@@ -144,7 +167,12 @@ def _decisions(plan: PlanRecord, results: Path) -> dict[str, list[str]]:
     """The decisions of each stage that ran: those of the plan, then those of the stage."""
     return {
         name: step.decisions
-        + (list(read_stage(results / name).decisions) if name != "report" else [])
+        + [
+            text
+            for job in step.folders(name)
+            if name != "report"
+            for text in read_stage(results / job).decisions
+        ]
         for name, step in plan.stages.items()
         if step.run
     }

@@ -175,6 +175,11 @@ dt { color: var(--soft); } dd { margin: 0; overflow-wrap: anywhere; }
 details { margin-top: 16px; } summary { cursor: pointer; color: var(--accent); font-size: 14px; }
 pre { overflow: auto; max-height: 460px; font-size: 12.5px; line-height: 1.45; margin: 10px 0 0;
   background: var(--page); padding: 14px; border-radius: 10px; }
+.blocks { width: min(100%, 560px); height: auto; display: block; margin: 8px 0; }
+.blocks rect { fill: none; stroke: var(--accent); stroke-width: 1.6; }
+.blocks .region { stroke-width: 1; stroke-dasharray: 4 3; opacity: .55; }
+.blocks .camera { fill: var(--ink); opacity: .7; }
+.blocks text { fill: var(--accent); font: 600 15px system-ui, sans-serif; }
 .foot { color: var(--soft); font-size: 13px; padding: 4px 20px 44px; text-align: center; }
 @media (max-width: 760px) {
   main, .top { padding-left: 12px; padding-right: 12px; }

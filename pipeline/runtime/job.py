@@ -64,7 +64,8 @@ class Job:
     """The interface of a running stage.
 
     Attributes:
-        stage, scene: names.
+        stage: name of the stage's folder.
+        scene: name of the scene or run.
         key: the stage's key as a parsed JSON object (see ``pipeline.plan.keys``).
         inputs: role ("photos", "model", ...) -> folder.
         out: folder for the outputs, which becomes the stage's folder when the stage has finished.
@@ -98,6 +99,11 @@ class Job:
     def seed(self) -> int:
         """The run's seed; only for stages whose key contains it."""
         return int(self.key["seed"])
+
+    @property
+    def block(self) -> int:
+        """Number of the block; only for stages with a job for each."""
+        return int(self.key["block"])
 
     def section(self, model: type[S]) -> S:
         """The config section of type ``model``, with the options that the stage declares."""
@@ -135,7 +141,12 @@ class Job:
 
 @dataclass(frozen=True)
 class Request:
-    """The arguments of a stage's command line."""
+    """The arguments of a stage's command line.
+
+    Attributes:
+        stage: name of the stage. That of its folder ``out`` has the number of the block besides,
+            if each block is a job.
+    """
 
     stage: str
     key: dict[str, Any]
@@ -145,6 +156,11 @@ class Request:
     log: Path | None
     publish: dict[str, Path]
     memory_mb: int | None = None
+
+    @property
+    def name(self) -> str:
+        """Name of the folder, under which the job is recorded."""
+        return self.out.name
 
 
 def run_stage(
@@ -171,10 +187,10 @@ def run_stage(
             _say_error(request, error)
             return EXIT_USER_ERROR
         except KeyboardInterrupt:
-            print(f"{request.stage}: interrupted", file=sys.stderr, flush=True)
+            print(f"{request.name}: interrupted", file=sys.stderr, flush=True)
             return EXIT_INTERRUPTED
         except Terminated:
-            name = f"{request.stage} of {request.out.parent.name}"
+            name = f"{request.name} of {request.out.parent.name}"
             print(f"{name} was terminated (SIGTERM)", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
         except MemoryError:
@@ -198,7 +214,7 @@ def run_stage(
 
 def _say_error(request: Request, error: UserError) -> None:
     scene = request.out.parent.name
-    print(f"error in {request.stage} of {scene}: {error}", file=sys.stderr, flush=True)
+    print(f"error in {request.name} of {scene}: {error}", file=sys.stderr, flush=True)
 
 
 def _run_locked(
@@ -207,15 +223,15 @@ def _run_locked(
     scene_folder = request.out.parent
     scratch_root = scene_folder / ".scratch"
     scratch_root.mkdir(parents=True, exist_ok=True)
-    with locked(scratch_root / f"{request.stage}.lock", request.stage, request.out):
+    with locked(scratch_root / f"{request.name}.lock", request.name, request.out):
         digests = {role: content_digest(folder) for role, folder in request.inputs.items()}
         _recover(request.out)
         if _is_done(request, digests, counters):
             write_bytes(request.out / STAGE, (request.out / HIDDEN_STAGE).read_bytes())
             _publish(request)
-            print(f"{request.stage}: up to date, nothing to do", file=sys.stderr)
+            print(f"{request.name}: up to date, nothing to do", file=sys.stderr)
             return 0
-        stage_scratch = scratch_root / request.stage
+        stage_scratch = scratch_root / request.name
         scratch = stage_scratch / identity(request.key, digests)[:16]
         out = scratch / "out"
         if out.exists():
@@ -226,13 +242,13 @@ def _run_locked(
             return 0
         check_outputs(request.inputs.values(), request.threads)
         job = Job(
-            stage=request.stage,
+            stage=request.name,
             scene=scene_folder.name,
             key=request.key,
             inputs=request.inputs,
             out=out,
             scratch=scratch,
-            shared_cache=scratch_root / f"{request.stage}-cache",
+            shared_cache=scratch_root / f"{request.name}-cache",
             threads=request.threads,
             memory_mb=request.memory_mb,
             logs=scene_folder / "logs" if request.log is None else request.log.parent,
@@ -293,7 +309,7 @@ def _reuse_other_run(
     files instead of writing into them.
     """
     required = identity(request.key, inputs)
-    for hidden in sorted(request.out.parents[1].glob(f"*/{request.stage}/{HIDDEN_STAGE}")):
+    for hidden in sorted(request.out.parents[1].glob(f"*/{request.name}/{HIDDEN_STAGE}")):
         source = hidden.parent
         record = _finished(source, counters)
         if source == request.out or record is None or record.identity != required:
@@ -309,7 +325,7 @@ def _reuse_other_run(
             _write(out, record.model_copy(update={"scene": request.out.parent.name}), reused)
             replace_folder(out, request.out)
             _publish(request)
-            print(f"{request.stage}: reused from {source.parent.name}", file=sys.stderr)
+            print(f"{request.name}: reused from {source.parent.name}", file=sys.stderr)
             return True
         shutil.rmtree(out)
         out.mkdir()

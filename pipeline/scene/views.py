@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import posixpath
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +13,21 @@ from pipeline.config import schema
 from pipeline.geometry.up_direction import up_direction
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
+
+
+@dataclass(frozen=True)
+class Crop:
+    """The part of an image that a view shows, pixels of the whole image at the view's scale.
+
+    Attributes:
+        left, top: of the part.
+        full_width, full_height: of the whole image.
+    """
+
+    left: int
+    top: int
+    full_width: int
+    full_height: int
 
 
 @dataclass(frozen=True)
@@ -31,6 +46,7 @@ class View:
         has_listed_split: whether the scene's own split says if this is a test view.
         image_digest, mask_digest: digests of the files, checked when they are read; None: no check.
         source: name of the photograph of which this is a part; None for a whole photograph.
+        crop: the part of the image that the view shows; None: all of it.
     """
 
     name: str
@@ -49,6 +65,18 @@ class View:
     mask_digest: str | None = None
     has_listed_split: bool = False
     source: str | None = None
+    crop: Crop | None = None
+
+    def cropped(self, left: int, top: int, width: int, height: int) -> View:
+        """The part of this view with its upper left corner at pixel (``left``, ``top``)."""
+        return replace(
+            self,
+            width=width,
+            height=height,
+            cx=self.cx - left,
+            cy=self.cy - top,
+            crop=Crop(left, top, self.width, self.height),
+        )
 
     @property
     def centre(self) -> NDArray[np.float64]:

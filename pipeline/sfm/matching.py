@@ -84,7 +84,7 @@ def match_features(
     images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
     pairs, decision = resolve_pairs(manifest, features, config)
     initial = set_initial_focals(cameras, images, features, pairs, experiments.max_ratio, seed)
-    settings = MatchingSettings(experiments.max_ratio, config.min_inliers, seed)
+    settings = MatchingSettings(experiments.max_ratio, experiments.min_inliers, seed)
     database = out / "database.db"
     num_cached = build_database(
         database, cameras, images, features, pairs, settings, cache=cache, threads=threads
@@ -96,7 +96,7 @@ def match_features(
     if not verified:
         raise UserError(
             f"no two of the {len(names)} photographs overlap: {len(pairs)} pairs were matched, and "
-            f"none has a two-view geometry with {config.min_inliers} inliers",
+            f"none has a two-view geometry with {experiments.min_inliers} inliers",
             fix="photograph a static, textured scene from all sides in constant light, each "
             "photograph overlapping the previous one by two thirds",
         )

@@ -77,7 +77,7 @@ def triangulate(
         cache = cache or Path(folder) / "cache"
         feature_warnings = run_isolated(_extract, manifest, features, found, cache, threads)
         points = run_isolated(
-            _triangulate, manifest, sparse, out, found, matches, experiments.max_ratio, seed
+            _triangulate, manifest, sparse, out, found, matches, experiments, seed
         )
     return TriangulationReport(
         **vars(points),
@@ -103,7 +103,7 @@ def _triangulate(
     out: Path,
     features: Path,
     config: schema.Matches,
-    max_ratio: float,
+    experiments: MatchesExperiments,
     seed: int,
 ) -> TriangulatedPoints:
     import pycolmap
@@ -142,7 +142,7 @@ def _triangulate(
             images,
             features,
             pairs,
-            MatchingSettings(max_ratio, config.min_inliers, seed),
+            MatchingSettings(experiments.max_ratio, experiments.min_inliers, seed),
         )
         verified = verified_inliers(database)
         points = posed_model(list(cameras.values()), images, poses)

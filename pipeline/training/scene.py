@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -32,6 +32,7 @@ from pipeline.training.density.floaters import empty_depths
 from pipeline.training.loop import metrics_log
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.result import TrainResult
+from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.train import train
 
 # Standard deviation in stops from which photographs are taken as differently exposed: with fixed
@@ -67,8 +68,8 @@ class TrainedScene:
 
 
 @dataclass
-class _Notes:
-    """Messages, and the counters that only some options have."""
+class Notes:
+    """Messages about a training, and the counters that only some options have."""
 
     decisions: list[str] = field(default_factory=list)
     warnings: list[str] = field(default_factory=list)
@@ -88,6 +89,7 @@ def train_scene(
     memory_mb: int | None,
     checkpoint_dir: Path,
     logs: Path,
+    part: Part = WHOLE_RUN,
 ) -> TrainedScene:
     """Train on the views that are not test views.
 
@@ -95,14 +97,55 @@ def train_scene(
         memory_mb: memory limit; see ``training.loop.train``.
         checkpoint_dir: where a killed training is resumed from.
         logs: folder of the metrics log.
+        part: of the schedule.
 
     Raises:
         UserError: see ``training.loop.train``.
     """
-    notes = _Notes()
+    notes = Notes()
     has_alpha = any(photo.alpha for photo in manifest.photos)
     gains = NO_GAINS if has_alpha else _choose_gains(views, model, config, notes)
-    inputs = _inputs(views, manifest, model, initial, gains, config, notes)
+    trained = run_training(
+        scene_inputs(views, manifest, model, initial, gains, config, notes),
+        config,
+        experiments,
+        seed=seed,
+        threads=threads,
+        memory_mb=memory_mb,
+        checkpoint_dir=checkpoint_dir,
+        logs=logs,
+        part=part,
+        notes=notes,
+    )
+    result, refined = trained.result, model
+    if result.intrinsics is not None:
+        refined = with_intrinsics(refined, result.intrinsics)
+        trained.decisions.append(describe_intrinsics(result.intrinsics))
+    if result.poses is not None:
+        refined = with_poses(refined, with_common_motion(views, result.poses))
+        trained.decisions.append(describe_poses(views, result.poses))
+    return replace(trained, model=None if refined is model else refined, gains=gains)
+
+
+def run_training(
+    inputs: Inputs,
+    config: Train,
+    experiments: TrainExperiments,
+    *,
+    seed: int,
+    threads: int,
+    memory_mb: int | None,
+    checkpoint_dir: Path,
+    logs: Path,
+    part: Part = WHOLE_RUN,
+    notes: Notes | None = None,
+) -> TrainedScene:
+    """Train, and describe the result; arguments and errors as ``train_scene``.
+
+    Args:
+        notes: messages and counters of the inputs.
+    """
+    notes = notes or Notes()
     start = time.perf_counter()
     result = train(
         inputs,
@@ -114,17 +157,11 @@ def train_scene(
         checkpoint_dir=checkpoint_dir,
         metrics_log=logs / metrics_log.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
+        part=part,
     )
     # Seconds that earlier, killed processes spent on this training.
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
-    _describe(result, len(inputs.views), config, notes)
-    refined = model
-    if result.intrinsics is not None:
-        refined = with_intrinsics(refined, result.intrinsics)
-        notes.decisions.append(describe_intrinsics(result.intrinsics))
-    if result.poses is not None:
-        refined = with_poses(refined, with_common_motion(views, result.poses))
-        notes.decisions.append(describe_poses(views, result.poses))
+    _describe(result, len(inputs.views), config, part, notes)
     counters = TrainCounters(
         num_gaussians=len(result.gaussians),
         steps=result.steps,
@@ -139,8 +176,8 @@ def train_scene(
     }
     return TrainedScene(
         result=result,
-        model=None if refined is model else refined,
-        gains=gains,
+        model=None,
+        gains=NO_GAINS,
         decisions=notes.decisions,
         warnings=notes.warnings,
         counters=counters,
@@ -148,15 +185,22 @@ def train_scene(
     )
 
 
-def _inputs(
+def scene_inputs(
     views: list[View],
     manifest: Manifest,
     model: Reconstruction,
     initial: Gaussians,
     gains: ExposureGains,
     config: Train,
-    notes: _Notes,
+    notes: Notes | None = None,
 ) -> Inputs:
+    """The inputs of training a scene.
+
+    Args:
+        gains: of all views; empty if exposure is not modelled.
+        notes: receives messages and counters about depth maps.
+    """
+    notes = notes or Notes()
     training = [view for view in views if not view.is_test]
     points = point_depths(training, model)
     extent = scene_extent(views)
@@ -180,7 +224,7 @@ def _known_depths(
     manifest: Manifest,
     points: list[KnownDepths],
     initial: Gaussians,
-    notes: _Notes,
+    notes: Notes,
 ) -> list[KnownDepths]:
     """Depths of the sparse points and of the user's depth maps, by view."""
     files = {p.name: (p.depth, p.depth_digest) if p.depth else None for p in manifest.photos}
@@ -202,7 +246,7 @@ def _known_depths(
 
 
 def _choose_gains(
-    views: list[View], model: Reconstruction, config: Train, notes: _Notes
+    views: list[View], model: Reconstruction, config: Train, notes: Notes
 ) -> ExposureGains:
     """The gains of all views; empty if the photographs are exposed alike."""
     if config.exposure == "off":
@@ -222,10 +266,11 @@ def _choose_gains(
     return ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
 
 
-def _describe(result: TrainResult, num_views: int, config: Train, notes: _Notes) -> None:
+def _describe(result: TrainResult, num_views: int, config: Train, part: Part, notes: Notes) -> None:
     notes.warnings += result.warnings
     minutes = config.budget_minutes
-    if few := too_few_epochs(result.steps, num_views, result.seconds, minutes):
+    whole = part == WHOLE_RUN
+    if whole and (few := too_few_epochs(result.steps, num_views, result.seconds, minutes)):
         notes.warnings.append(few)
     if minutes is not None:
         notes.decisions.append(

@@ -17,6 +17,7 @@ from pipeline.scene.views import View, load_views
 
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians
+    from pipeline.training.scene import TrainedScene
 
 # The stages that can provide an input, the latest in the DAG first.
 PHOTOS = ("decode", "inspect")
@@ -62,6 +63,31 @@ def trained_model(job: Job) -> Reconstruction:
     ``train.refine_intrinsics``)."""
     refined = job.inputs["train"] / "sparse" / "0"
     return read_model(refined) if has_model(refined) else input_model(job)
+
+
+def coarse_model(job: Job) -> Reconstruction:
+    """The model with cameras as refined by the coarse run, for scenes in blocks."""
+    refined = job.inputs["coarse"] / "sparse" / "0"
+    return read_model(refined) if has_model(refined) else input_model(job)
+
+
+def coarse_views(job: Job) -> list[View]:
+    """All views, with the cameras of ``coarse_model``."""
+    return _views(job, coarse_model(job))
+
+
+def write_trained(job: Job, trained: TrainedScene) -> None:
+    """Write the outputs of a training, and record what it counted and decided."""
+    from pipeline.io.colmap import write_model
+    from pipeline.io.npz import write_npz
+
+    write_npz(job.out / "gaussians.npz", trained.result.gaussians)
+    if trained.model is not None:
+        write_model(job.out / "sparse" / "0", trained.model)
+    trained.result.curve.write(job.out)
+    trained.gains.write(job.out)
+    job.record(trained.counters, trained.decisions, trained.warnings)
+    job.timings = trained.timings
 
 
 def input_views(job: Job) -> list[View]:

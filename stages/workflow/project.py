@@ -16,7 +16,7 @@ from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, name_fault, parse_run
 from pipeline.plan import duration
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import describe, make_plan, plan_record, upstream
+from pipeline.plan.plan import describe, input_folders, make_plan, plan_record
 from pipeline.plan.scan import scan
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
@@ -92,6 +92,10 @@ class SnakemakeProject:
         """The declarations of all stages, in the order of the DAG."""
         return STAGES.values()
 
+    def folder(self, spec: StageSpec) -> str:
+        """The stage's folder in ``results/<scene>/``, with a wildcard if each block is a job."""
+        return f"{spec.name}_{{block}}" if spec.per_block else spec.name
+
     def packaged(self, file: str) -> str:
         """The absolute path of a file of the packages, which are not in the Snakefile's folder if
         the program is installed."""
@@ -124,7 +128,9 @@ class SnakemakeProject:
 
     def key(self, spec: StageSpec) -> Callable[[Any], str]:
         """Params function: the stage's key."""
-        return lambda wildcards: stage_key(spec, self._plan(wildcards.scene))
+        return lambda wildcards: stage_key(
+            spec, self._plan(wildcards.scene), int(wildcards.block) if spec.per_block else None
+        )
 
     def threads(self, workflow: Any) -> Callable[[Any], int]:
         """Threads function: the cores of this machine that Snakemake may use; on a cluster those of
@@ -166,7 +172,7 @@ class SnakemakeProject:
         return canonical(plan_record(self._plan(wildcards.scene)).model_dump(mode="json"))
 
     def _inputs(self, spec: StageSpec, name: str) -> dict[str, Path]:
-        sources = upstream(spec, self._plan(name))
+        sources = input_folders(spec, self._plan(name))
         return {role: RESULTS / name / source for role, source in sources.items()}
 
     def _plan(self, name: str) -> Plan:
@@ -296,10 +302,12 @@ class SnakemakeProject:
         """The outcome of a run of the batch."""
         plan = self._make_plan(run.name)
         for stage in filter(plan.runs, plan.stages):
-            folder = RESULTS / run.name
-            key = stage_key(STAGES[stage], plan)
-            if not is_current(folder / stage, key, self._inputs(STAGES[stage], run.name)):
-                log = folder / "logs" / f"{stage}.log"
+            folder, spec = RESULTS / run.name, STAGES[stage]
+            for block, name in enumerate(plan.stages[stage].folders(stage), 1):
+                key = stage_key(spec, plan, block if spec.per_block else None)
+                if is_current(folder / name, key, self._inputs(spec, run.name)):
+                    continue
+                log = folder / "logs" / f"{name}.log"
                 if not self._has_run(log):
                     return _outcome(run, "another failure stopped the batch", "not run", stage)
                 unknown = f"it ended without a message (it may have been killed): see {log}"

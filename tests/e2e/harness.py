@@ -10,10 +10,20 @@ import shutil
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
+from tests.e2e.forking import ForkServer
+
 ROOT = Path(__file__).resolve().parents[2]
+
+# What each run of Snakemake, and each of its jobs that need torch, would import anew.
+RUNS = ForkServer("snakemake.cli", "numpy", "pydantic")
+JOBS = ForkServer("torch", "cv2", "PIL.Image", "numpy", "pydantic")
+TORCH_JOBS = [
+    f"-m stages {stage}" for stage in ("train", "evaluate", "coverage", "export", "report")
+]
 
 # Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
@@ -82,24 +92,37 @@ def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]
 def snakemake(
     project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
-    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
-    done = subprocess.run(
-        command(*args, config=config, cores=cores),
-        cwd=project,
-        env=environment(project),
-        stdout=subprocess.PIPE,
-        stderr=subprocess.STDOUT,
-        text=True,
-        timeout=900,
-    )
+    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``.
+
+    It and the jobs that need torch are forks of processes that have imported these packages:
+    what ``start_and_kill`` and installed programs start is a new Python.
+    """
+    line = command(*args, config=config, cores=cores)
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+        code = RUNS.run(
+            "snakemake",
+            line[line.index("snakemake") + 1 :],
+            folder=project,
+            environment=environment(project),
+            output=output.fileno(),
+            timeout_s=900,
+            python=JOBS.python(TORCH_JOBS),
+        )
+        output.seek(0)
+        done = subprocess.CompletedProcess(line, code, output.read())
     if check and done.returncode != 0:
         raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
     return done
 
 
-def rules_run(done: subprocess.CompletedProcess[str]) -> set[str]:
-    """Names of the rules of which jobs were started."""
-    return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
+    """Names of the rules of which jobs were started, for one scene or for all."""
+    if scene is None:
+        return set(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
+    jobs = re.findall(
+        r"^(?:local)?rule (\w+):\n(?: .*\n)*? +wildcards: scene=(\S+)$", done.stdout, re.M
+    )
+    return {rule for rule, of in jobs if of == scene}
 
 
 def start_and_kill(

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config import schema
+from pipeline.config.experiments import MatchesExperiments
 from pipeline.scene.manifest import Manifest
 
 
@@ -36,7 +37,7 @@ def match(
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import match_features
 
-    config = schema.Matches.model_validate({"pairs": pairs, "min_inliers": min_inliers})
+    config = schema.Matches.model_validate({"pairs": pairs})
     report = match_features(
         manifest,
         features,
@@ -46,6 +47,7 @@ def match(
         cache=out.with_name("cache"),
         threads=threads,
         seed=0,
+        experiments=MatchesExperiments(min_inliers=min_inliers),
     )
     return flat(report)
 

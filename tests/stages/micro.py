@@ -22,7 +22,7 @@ from pipeline.config.schema import Config
 from pipeline.demo.write import DemoSpec, write_demo
 from pipeline.io.colmap import read_model
 from pipeline.plan.keys import stage_key
-from pipeline.plan.plan import upstream
+from pipeline.plan.plan import input_folders, upstream
 from pipeline.plan.scan import scan
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
@@ -103,11 +103,14 @@ class Runner:
             plan = self._plan(scene, json.dumps(options))
             if not plan.runs(stage):
                 return {}
-            folder = self._run(run, plan, stage, machine)
+            folders = self._run(run, plan, stage, machine)
         except UserError as error:
             return {"error": str(error)}
         return {
-            name: _without_numbers(folder / name) if name.endswith(".html") else digest
+            name if len(folders) == 1 else f"{folder.name}/{name}": (
+                _without_numbers(folder / name) if name.endswith(".html") else digest
+            )
+            for folder in folders
             for name, digest in output_digests(folder).items()
         }
 
@@ -117,13 +120,30 @@ class Runner:
         found = scan(folder, scene, config, cache=self._folder / f"{scene}.json")
         return make_plan(found, config, str(folder))
 
-    def _run(self, run: str, plan: Plan, stage: str, machine: Mapping[str, int]) -> Path:
+    def _run(self, run: str, plan: Plan, stage: str, machine: Mapping[str, int]) -> list[Path]:
+        """The folders of a stage's jobs, which are run."""
         # Results of another machine's run are not linked: they are in a folder of their own.
-        root = self._folder / ("other-machine" if machine else "results")
-        spec, out = STAGES[stage], root / run / stage
-        sources = upstream(spec, plan)
-        folders = {role: self._run(run, plan, name, machine) for role, name in sources.items()}
-        key = json.loads(stage_key(spec, plan))
+        root = self._folder / ("other-machine" if machine else "results") / run
+        for name in upstream(STAGES[stage], plan).values():
+            self._run(run, plan, name, machine)
+        sources = input_folders(STAGES[stage], plan)
+        folders = {role: root / name for role, name in sources.items()}
+        names = plan.stages[stage].folders(stage)
+        for block, name in enumerate(names, 1):
+            self._run_job(plan, stage, block, root / name, folders, machine)
+        return [root / name for name in names]
+
+    def _run_job(
+        self,
+        plan: Plan,
+        stage: str,
+        block: int,
+        out: Path,
+        folders: dict[str, Path],
+        machine: Mapping[str, int],
+    ) -> None:
+        spec = STAGES[stage]
+        key = json.loads(stage_key(spec, plan, block if spec.per_block else None))
         digests = {role: content_digest(folder) for role, folder in folders.items()}
         done = out, identity(key | machine, digests)
         if done not in self._done:
@@ -135,9 +155,8 @@ class Runner:
                 tempfile.tempdir = None  # was the stage's scratch folder
             if code == EXIT_USER_ERROR:
                 raise UserError(f"{stage} ended with an error")
-            assert code == 0, f"{stage} failed for {run}"
+            assert code == 0, f"{out.name} failed for {out.parent.name}"
             self._done.add(done)
-        return out
 
 
 def _without_numbers(page: Path) -> str:

@@ -124,7 +124,8 @@ def test_runs_with_different_seeds_share_stages_that_are_not_seeded():
 def test_configurations_share_the_stages_before_their_difference():
     """The stages after it read options of train as well."""
     other = Config.model_validate({"train": {"sh_degree": 0}})
-    after = {"train", "evaluate", "coverage", "export", "report"}
+    blocks = {"coarse", "partition", "block", "polish"}
+    after = blocks | {"train", "evaluate", "coverage", "export", "report"}
     # The report does not read this option.
     assert differing(full_plan(Config()), full_plan(other)) == after - {"report"}
 
@@ -135,7 +136,7 @@ def test_runs_with_equal_options_share_all_stages_but_the_report():
 
 def test_the_plan_lists_each_stages_inputs():
     plan = full_plan(Config())
-    assert plan.stages["train"].inputs == ["init", "undistort"]
+    assert plan.stages["evaluate"].inputs == ["inspect", "sfm", "train", "undistort"]
     for name, spec in STAGES.items():
         assert set(plan.stages[name].inputs) == set(upstream(spec, plan).values())
 

@@ -56,6 +56,7 @@ ALL_SMALL = under(poses="keep", experiments__train__gradient__split_scale=10.0)
 DARK = under(poses="keep", experiments__train__sh0_learning_rate=1.0)
 LARGE = under(poses="keep", views__max_long_side_px=200)
 FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_gaussians=320)
+BLOCKS = under(poses="keep", partition__blocks=2)
 MESH = under(poses="keep", export__formats=["mesh"])
 
 _T, _G, _M = "experiments.train", "experiments.train.gradient", "experiments.train.mcmc"
@@ -85,7 +86,7 @@ FLIPS = {
     "features.max_long_side_px": Flip(150, ESTIMATED),
     "matches.pairs": Flip("sequential", ESTIMATED | {"matches": {"neighbours": 2}}),
     "matches.neighbours": Flip(2, ESTIMATED | {"matches": {"pairs": "sequential"}}),
-    "matches.min_inliers": Flip(60, ESTIMATED),
+    "experiments.matches.min_inliers": Flip(60, ESTIMATED),
     "experiments.matches.max_ratio": Flip(0.6, ESTIMATED),
     "sfm.mapper": Flip("global", ESTIMATED),
     "sfm.camera_model": Flip("SIMPLE_PINHOLE", ESTIMATED),
@@ -144,6 +145,7 @@ FLIPS = {
     f"{_M}.prune_opacity": Flip(0.25, MCMC),
     f"{_M}.growth_share": Flip(0.2, MCMC),
     f"{_M}.noise": Flip(False, MCMC),
+    "partition.blocks": Flip(3, BLOCKS),
     "evaluate.lpips_net": Flip("none", POSED),
     "export.formats": Flip(["ply"], POSED),
     "export.sh_degree": Flip(1, POSED),
@@ -281,3 +283,15 @@ def test_options_that_no_stage_declares_change_no_output(outputs):
         assert expected
         found = outputs("machine", "photos", other, stage, threads=2, memory_mb=1)
         assert found == expected
+
+
+def test_a_scene_in_blocks_has_the_same_bits_at_any_number_of_threads(outputs):
+    """And each block is a job with an output of its own."""
+    for stage in ("coarse", "partition", "block", "polish", "train", "report"):
+        expected = outputs("blocks", "photos", BLOCKS, stage)
+        assert expected, stage
+        found = outputs("blocks", "photos", BLOCKS, stage, threads=2, memory_mb=1)
+        assert found == expected, stage
+    assert {"polish_1/gaussians.npz", "polish_2/gaussians.npz"} <= outputs(
+        "blocks", "photos", BLOCKS, "polish"
+    ).keys()

@@ -31,7 +31,7 @@ class Projected:
     """Result of ``project``; layouts are in csrc/types.h."""
 
     inputs: Parameters
-    view: torch.Tensor  # (17,) float64
+    view: torch.Tensor  # (21,) float64
     size: tuple[int, int]  # width, height
     options: RasterOptions
     records: torch.Tensor  # (N, 16)
@@ -80,10 +80,11 @@ def _threads(threads: int) -> int:
 
 
 def _pack_view(camera: RasterCamera, near: float) -> torch.Tensor:
-    """(17,) float64: fx fy cx cy, rotation by rows, translation, near."""
+    """(21,) float64: fx fy cx cy, rotation by rows, translation, near, bounds of u and v in the
+    Jacobian."""
     pose = camera.world_to_camera.detach().double()
     head = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    tail = torch.tensor([near], dtype=torch.float64)
+    tail = torch.tensor([near, *camera.slopes], dtype=torch.float64)
     return torch.cat([head, pose[:3, :3].reshape(-1), pose[:3, 3], tail])
 
 

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.data.targets import LayerSource
 
 
 @dataclass(frozen=True)
@@ -30,6 +31,8 @@ class Inputs:
         depths: known depths of each view for the depth loss (``training.losses.depth``).
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
+        layers: the layers around the Gaussians in each view, for a block of a scene; None: the
+            Gaussians are the whole scene.
     """
 
     views: Sequence[View]
@@ -39,6 +42,7 @@ class Inputs:
     gains: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
     empty_depths: NDArray[np.float64] | None = None
+    layers: LayerSource | None = None
 
     @property
     def size(self) -> float:

@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from pipeline.photos.load import ViewPixels, load_view, resize_area
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 from pipeline.training.data.image_store import ImageStore, MemoryStore, Planes
+from pipeline.training.data.surroundings import Surroundings
 
 # Shorter side, pixels, below which SSIM's windows of 11 pixels mostly cover borders.
 MIN_SHORT_SIDE = 64
@@ -31,11 +32,13 @@ class Target:
         rgb: (H, W, 3) uint8, multiplied by alpha; 0 where ignored.
         alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
         ignored: (H, W) bool, True for ignored pixels, or None if there are none.
+        surroundings: the layers around a block, or None if the whole scene is trained.
     """
 
     rgb: Tensor
     alpha: Tensor | None
     ignored: Tensor | None
+    surroundings: Surroundings | None = None
 
     def over(self, background: tuple[float, float, float]) -> Tensor:
         """The image over ``background`` (in [0, 1]): (H, W, 3), uint8 if the view is opaque, else
@@ -55,6 +58,27 @@ class Target:
         return -10 * math.log10(max(error, 1e-10))
 
 
+@dataclass(frozen=True)
+class Layers:
+    """A view of a scene of which one block is trained.
+
+    Attributes:
+        surroundings: the layers around the block.
+        used: (H, W) bool, the pixels in which the block is trained.
+        coarse: (H, W, 3) uint8, the scene before training, which replaces the photograph in all
+            other pixels: other blocks explain them.
+        background: behind the scene, and behind photographs with alpha.
+    """
+
+    surroundings: Surroundings
+    used: Tensor
+    coarse: Tensor
+    background: tuple[float, float, float]
+
+
+LayerSource = Callable[[View], Layers]
+
+
 class Targets:
     """The pixels of all views. Images of a reduced resolution are computed at their first use; only
     one reduced resolution is stored at a time.
@@ -63,6 +87,7 @@ class Targets:
         noise: share of the pixels that become black or white, deterministic by ``seed`` and the
             view's name.
         store: holds the pixels; None: in memory.
+        layers: of each view, if a block is trained.
     """
 
     def __init__(
@@ -72,6 +97,7 @@ class Targets:
         noise: float = 0.0,
         seed: int = 0,
         store: ImageStore | None = None,
+        layers: LayerSource | None = None,
     ):
         self._store = MemoryStore() if store is None else store
 
@@ -79,7 +105,10 @@ class Targets:
             pixels = load_view(view)
             if noise:
                 _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
-            return _StoredTarget(_target(pixels), self._store)
+            target = _target(pixels)
+            if layers is not None:
+                target = _among(target, layers(view))
+            return _StoredTarget(target, self._store)
 
         with ThreadPoolExecutor(max(1, threads)) as pool:
             self._full = list(
@@ -119,12 +148,20 @@ class _StoredTarget:
     def __init__(self, target: Target, store: ImageStore):
         self.has_alpha = target.alpha is not None
         self.hidden = target.ignored is not None and bool(target.ignored.all())
-        self._read: Callable[[], Planes] = store.add((target.rgb, target.alpha, target.ignored))
+        planes: Planes = (target.rgb, target.alpha, target.ignored)
+        if (around := target.surroundings) is not None:
+            planes += (around.behind, around.alpha, around.front, around.transmittance)
+        self._read: Callable[[], Planes] = store.add(planes)
 
     def get(self) -> Target:
-        rgb, alpha, ignored = self._read()
+        (rgb, alpha, ignored), layers = (planes := self._read())[:3], planes[3:]
         assert rgb is not None
-        return Target(rgb, alpha, ignored)
+        if not layers:
+            return Target(rgb, alpha, ignored)
+        behind, block_alpha, front, transmittance = layers
+        assert behind is not None and block_alpha is not None
+        around = Surroundings(behind, block_alpha, front, transmittance)
+        return Target(rgb, alpha, ignored, around)
 
 
 def usable_factor(views: Sequence[View], factor: int) -> int:
@@ -154,6 +191,14 @@ def _target(pixels: ViewPixels) -> Target:
     if alpha is not None and alpha.min() == 255:
         alpha = None
     return Target(_tensor(rgb), _tensor_or_none(alpha), _tensor_or_none(ignored))
+
+
+def _among(target: Target, layers: Layers) -> Target:
+    photograph = target.over(layers.background)
+    if target.alpha is not None:
+        photograph = (photograph * 255).round().to(torch.uint8)
+    rgb = torch.where(layers.used[..., None], photograph, layers.coarse)
+    return replace(target, rgb=rgb, alpha=None, surroundings=layers.surroundings)
 
 
 def _reduce(target: Target, factor: int) -> Target:

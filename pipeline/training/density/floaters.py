@@ -15,8 +15,8 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
+from pipeline.render.contributions import contributions, in_grey
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.init import SH_C0
 from pipeline.training.data.known_depths import KnownDepths
 
 #: Space closer than this share of the depth of a view's nearest sparse points is taken as empty.
@@ -95,8 +95,7 @@ def floaters(
     """(N,) bool: Gaussians with most of their weight in one view, or in a hundredth of the views,
     and there closer than ``depths``.
 
-    The weight of a Gaussian in a view is the sum over pixels of alpha times transmittance: the
-    gradient of the sum of the image with respect to the Gaussian's colour.
+    The weight of a Gaussian in a view is its ``render.contributions``.
 
     Args:
         cameras: of all training views, at a reduced size if need be.
@@ -106,17 +105,14 @@ def floaters(
         backend: None: the default.
     """
     backend = backend or make_backend()
-    grey = gaussians.with_sh_degree(0)
-    grey = replace(grey, sh=torch.zeros_like(grey.sh))
+    grey = in_grey(gaussians)
     options = replace(options, sh_degree=0, background=None)
     total = torch.zeros(len(grey))
     # The largest weights so far, and the part of each that is in empty space.
     few = max(1, round(len(cameras) / VIEWS_PER_FLOATER_VIEW))
     largest, largest_empty = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
     for camera, depth in zip(cameras, depths, strict=True):
-        rendered = backend.forward(*grey.parameters(), camera, options)
-        d_color = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
-        weight = backend.backward(rendered, d_color, means2d_abs=False).sh[:, 0, 0]
+        weight = contributions(grey, camera, options, pixel, backend)
         total += weight
         x, y, z, shift = camera.world_to_camera[2].to(torch.float32).tolist()
         # Not a matrix product: BLAS may round differently with the number of threads.

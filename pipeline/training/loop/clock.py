@@ -13,19 +13,21 @@ class Clock:
     Args:
         steps: length of the schedule.
         minutes: the time budget; None for a run of ``steps`` optimiser steps.
+        part: first step of the schedule, counted from 0, and the step after the last.
     """
 
-    def __init__(self, steps: int, minutes: float | None):
-        self.steps = steps
+    def __init__(self, steps: int, minutes: float | None, part: range):
+        self.steps, self.part = steps, part
         self.estimator = None if minutes is None else StepTimeEstimator(60 * minutes)
 
     def advance(self, state: TrainState) -> range:
         """Begin an optimiser step; returns the steps of the schedule that it covers."""
         state.step += 1
-        before, state.clock = state.clock, state.step
+        before, state.clock = state.clock, self.part.start + state.step
         if self.estimator is not None:
-            reached = int(self.steps * state.seconds / self.estimator.budget)
-            state.clock = max(1, before, min(self.steps, reached))
+            reached = int(len(self.part) * state.seconds / self.estimator.budget)
+            state.clock = self.part.start + max(1, min(len(self.part), reached))
+            state.clock = max(before, state.clock)
         return range(before + 1, state.clock + 1)
 
     def observe(self, state: TrainState, factor: int) -> None:
@@ -39,12 +41,14 @@ class Clock:
         rates begin low."""
         if self.estimator is None:
             return self.steps
-        return state.step * self.steps / state.clock
+        return state.step * self.steps / (state.clock - self.part.start)
 
     def budget(self, state: TrainState, limit: int) -> int:
         """Upper limit of the number of Gaussians: ``limit``, or as many as the steps that the time
         budget allows can train."""
         if self.estimator is None:
             return limit
-        steps = self.estimator.steps(state.step, state.seconds, self.run_length(state))
+        default = self.run_length(state) * len(self.part) / self.steps
+        steps = self.estimator.steps(state.step, state.seconds, default)
+        steps *= self.steps / len(self.part)
         return min(limit, round(GAUSSIANS_PER_STEP * steps))

@@ -27,6 +27,25 @@ CAMERA_DECAY = 0.01
 
 
 @dataclass(frozen=True)
+class Part:
+    """A part of a run's schedule.
+
+    Attributes:
+        begin, end: shares of the schedule.
+    """
+
+    begin: float = 0.0
+    end: float = 1.0
+
+    def of(self, steps: int) -> range:
+        """The steps of a schedule of so many steps, counted from 0."""
+        return range(round(self.begin * steps), max(1, round(self.end * steps)))
+
+
+WHOLE_RUN = Part()
+
+
+@dataclass(frozen=True)
 class Schedule:
     """The phases of one run.
 

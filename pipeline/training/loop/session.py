@@ -21,7 +21,7 @@ class Session:
     """Everything around the steps of one process that does not change the result.
 
     Args:
-        steps: length of the schedule.
+        part: steps of the schedule, counted from 0.
         build: ``Backend.facts``.
         identity: of the run (``checkpoints.identity``).
         metrics_log: path of the metrics log, or None.
@@ -32,7 +32,7 @@ class Session:
     def __init__(
         self,
         state: TrainState,
-        steps: int,
+        part: range,
         *,
         build: Mapping[str, str],
         identity: str,
@@ -42,16 +42,16 @@ class Session:
         threads: int,
         unit: str,
     ):
-        self.state, self.steps, self.log = state, steps, log
+        self.state, self.part, self.log = state, part, log
         self.identity, self.checkpoint_dir = identity, checkpoint_dir
         self.build = dict(build)
         self._resume()
         self.started = self.saved = time.monotonic()
         self.seconds_before = state.seconds
-        self.progress = Progress("training", steps, unit=unit)
-        self.progress.start_at(state.clock)
+        self.progress = Progress("training", len(part), unit=unit)
+        self.progress.start_at(state.clock - part.start)
         self.metrics_log = MetricsLog(metrics_log, state.step)
-        self.timer = StepTimer(self.build, threads, steps - state.clock)
+        self.timer = StepTimer(self.build, threads, part.stop - state.clock)
 
     def after_step(self, before: int, factor: int) -> None:
         """Log, record and save what is due after a step.
@@ -60,19 +60,19 @@ class Session:
             before: ``state.clock`` before the step.
             factor: by which images are reduced.
         """
-        state, steps = self.state, self.steps
+        state, last = self.state, self.part.stop
         now = time.monotonic()
         state.seconds = self.seconds_before + now - self.started
         if text := self.timer.after_step(state.seconds, factor):
             self.log(text)
-        interval = max(1, steps // CURVE_RECORDS)
-        if state.clock // interval > before // interval or state.clock == steps:
+        interval = max(1, len(self.part) // CURVE_RECORDS)
+        if state.clock // interval > before // interval or state.clock == last:
             state.record()
-        if now - self.saved >= CHECKPOINT_SECONDS and state.clock < steps:
+        if now - self.saved >= CHECKPOINT_SECONDS and state.clock < last:
             self._save()
             self.saved = now
         self.progress.advance(state.clock - before, note=self._note())
-        self.metrics_log.write(state, steps, factor, self.progress.seconds_left())
+        self.metrics_log.write(state, last, factor, self.progress.seconds_left())
         if termination.requested():
             self._save()
             self.log(f"terminated (SIGTERM) after {state.step} steps, which a checkpoint keeps")

@@ -28,6 +28,9 @@ from pipeline.training.density import make_strategy
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam
 
+# Memory of a pixel with the layers around a block, in pixels without.
+LAYERED_PIXELS = 3
+
 Warn = Callable[[str], None]
 
 
@@ -80,9 +83,9 @@ def load_scene(
     Raises:
         UserError: an image cannot be read, or the masks hide all views.
     """
-    store = choose_image_store(inputs.views, config, memory_mb)
+    store = choose_image_store(inputs, config, memory_mb)
     noise = experiments.salt_and_pepper_share
-    targets = Targets(inputs.views, threads, noise, seed, store)
+    targets = Targets(inputs.views, threads, noise, seed, store, inputs.layers)
     near = near_plane(inputs.extent)
     inputs = _without_hidden_views(inputs, targets, warn)
     background = config.background
@@ -92,9 +95,11 @@ def load_scene(
     return TrainingScene(inputs, targets, gains, background, near)
 
 
-def choose_image_store(views: Sequence[View], config: Train, limit_mb: int | None) -> ImageStore:
+def choose_image_store(inputs: Inputs, config: Train, limit_mb: int | None) -> ImageStore:
     """Memory if the views' pixels fit beside the Gaussians, else a file."""
-    pixels = sum(view.width * view.height for view in views)
+    pixels = sum(view.width * view.height for view in inputs.views)
+    if inputs.layers is not None:
+        pixels *= LAYERED_PIXELS
     limit = min(machine_mb(), limit_mb or math.inf)
     fits = memory_mb(pixels, config.density.max_gaussians) <= limit
     return MemoryStore() if fits else DiskStore()
@@ -107,13 +112,15 @@ def initial_state(
     backend: Backend,
     *,
     steps: int,
+    start: int,
     seed: int,
     warn: Warn,
 ) -> TrainState:
-    """The state before the first step of a schedule of ``steps`` steps."""
+    """The state after ``start`` steps of a schedule of ``steps`` steps. In the middle of it, the
+    degree of spherical harmonics is that of the initial Gaussians."""
     inputs = scene.inputs
     rng = np.random.Generator(np.random.PCG64(seed))
-    gaussians = inputs.initial.with_sh_degree(0).clone()
+    gaussians = (inputs.initial if start else inputs.initial.with_sh_degree(0)).clone()
     gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
     density = make_strategy(
         config.density, experiments, steps=steps, scale=inputs.size, extent=inputs.extent
@@ -123,7 +130,7 @@ def initial_state(
     order = rng.permutation(len(scene.views))
     own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
     adam = Adam(gaussians, experiments.adam_beta1, own_frames, backend)
-    return TrainState(gaussians, adam, density, cameras, rng, order)
+    return TrainState(gaussians, adam, density, cameras, rng, order, clock=start)
 
 
 def learning_rate_unit(inputs: Inputs, experiments: TrainExperiments) -> float:

@@ -20,7 +20,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.training.checkpoints.identity import identity_of
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.result import TrainResult, result_of
-from pipeline.training.loop.schedule import Schedule
+from pipeline.training.loop.schedule import WHOLE_RUN, Part, Schedule
 from pipeline.training.loop.session import Session
 from pipeline.training.loop.setup import initial_state, load_scene
 from pipeline.training.loop.trainer import Trainer
@@ -38,6 +38,7 @@ def train(
     metrics_log: Path | None = None,
     on_log: Callable[[str], None] | None = None,
     backend: Backend | None = None,
+    part: Part = WHOLE_RUN,
 ) -> TrainResult:
     """Optimise the initial Gaussians so that their renders match the views.
 
@@ -52,6 +53,7 @@ def train(
         metrics_log: file for the progress (``training.loop.metrics_log``).
         on_log: called with each warning, and with the instruction set and the time per step.
         backend: of the rasterizer; None: the default.
+        part: of the schedule.
 
     Raises:
         UserError: no views or no Gaussians, unreadable images, no view sees a Gaussian, the loss is
@@ -81,12 +83,13 @@ def train(
             inputs, config, experiments, seed=seed, threads=threads, memory_mb=memory_mb, warn=warn
         )
         steps = Schedule.of(config, experiments).steps
+        span = part.of(steps)
         state = initial_state(
-            scene, config, experiments, backend, steps=steps, seed=seed, warn=warn
+            scene, config, experiments, backend, steps=steps, start=span.start, seed=seed, warn=warn
         )
         session = Session(
             state,
-            steps,
+            span,
             build=backend.facts(),
             identity=identity,
             checkpoint_dir=checkpoint_dir,
@@ -95,9 +98,9 @@ def train(
             threads=threads,
             unit="steps" if config.budget_minutes is None else "parts",
         )
-        trainer = Trainer(scene, state, config, experiments, backend, threads)
+        trainer = Trainer(scene, state, config, experiments, backend, threads, span)
         with termination.deferred():
-            while state.clock < steps:
+            while state.clock < span.stop:
                 before = state.clock
                 trainer.step()
                 session.after_step(before, trainer.factor())

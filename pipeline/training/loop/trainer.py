@@ -38,11 +38,12 @@ class Trainer:
         experiments: TrainExperiments,
         backend: Backend,
         threads: int,
+        part: range,
     ):
         self.scene, self.state, self.backend, self.threads = scene, state, backend, threads
         self.config, self.experiments = config, experiments
         self.schedule = Schedule.of(config, experiments)
-        self.clock = Clock(self.schedule.steps, config.budget_minutes)
+        self.clock = Clock(self.schedule.steps, config.budget_minutes, part)
         self.rate_unit = learning_rate_unit(scene.inputs, experiments)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))
         depths = scene.inputs.empty_depths
@@ -63,8 +64,8 @@ class Trainer:
         rendered = self.backend.forward(
             *state.gaussians.parameters(), camera, self.options(background)
         )
-        d_color = self.color_loss(rendered, target, index, background)
-        d_alpha, d_depth = self.other_losses(rendered, target, index)
+        d_color, d_alpha = self.color_loss(rendered, target, index, background)
+        d_alpha, d_depth = self.other_losses(rendered, target, index, d_alpha)
         run_length = self.clock.run_length(state)
         rates = self.schedule.learning_rates(state.clock, run_length, self.rate_unit)
         gradients = self.backend.backward(
@@ -86,12 +87,17 @@ class Trainer:
 
     def color_loss(
         self, rendered: Forward, target: Target, index: int, background: Color
-    ) -> Tensor:
-        """Gradient of L1, squared error and D-SSIM with respect to the rendered colours."""
-        state = self.state
+    ) -> tuple[Tensor, Tensor | None]:
+        """Gradients of L1, squared error and D-SSIM with respect to the rendered colours and, for a
+        block among its surroundings, alpha."""
+        state, around = self.state, target.surroundings
         image = target.over(background)
         gain = None if self.scene.gains is None else self.scene.gains[index]
-        color = rendered.color if gain is None else rendered.color * gain
+        color = rendered.color
+        if around is not None:
+            color = around.compose(color, rendered.alpha)
+        if gain is not None:
+            color = color * gain
         loss = self.backend.l1_ssim(
             color,
             image,
@@ -106,26 +112,32 @@ class Trainer:
         if (state.step - 1) % self.psnr_interval == 0:
             state.window.psnr += target.psnr(color, image)
             state.window.samples += 1
-        return loss.grad if gain is None else loss.grad * gain
+        d_color = loss.grad if gain is None else loss.grad * gain
+        if around is None:
+            return d_color, None
+        d_color, d_alpha = around.gradients(d_color)
+        return d_color, d_alpha + around.alpha_gradient(rendered.alpha)
 
     def other_losses(
-        self, rendered: Forward, target: Target, index: int
+        self, rendered: Forward, target: Target, index: int, by_color: Tensor | None
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Gradients of the losses on alpha and depth; None without these losses."""
-        d_alpha = alpha_gradient(
+        """Gradients with respect to alpha and depth, with that of the colour loss; None without
+        these losses."""
+        by_alpha = alpha_gradient(
             rendered.alpha,
             target,
             self.config.mask_loss_weight,
             self.experiments.alpha_loss_weight,
             self.experiments.squared_error_loss_weight,
         )
+        d_alpha = _sum(by_color, by_alpha)
         depths, weight = self.scene.inputs.depths, self.config.depth_loss_weight
         known = None if depths is None else depths[index]
         if not known or weight == "auto" or self.state.step % DEPTH_INTERVAL:
             return d_alpha, None
         view = self.scene.views[index]
         by_depth, d_depth = depth_gradients(rendered, known, view, weight * DEPTH_INTERVAL)
-        return by_depth if d_alpha is None else by_depth + d_alpha, d_depth
+        return _sum(by_depth, d_alpha), d_depth
 
     def control_density(self, steps: range, run_length: float) -> None:
         """Add noise, densify, prune and reset opacities after these steps of the schedule."""
@@ -200,6 +212,8 @@ class Trainer:
             self.state.adam.resize_bands(degree)
 
     def draw_background(self) -> Color:
+        if self.scene.inputs.layers is not None:
+            return BACKGROUNDS["black"]  # The background is in the layer behind the block.
         if self.scene.background == "random":
             red, green, blue = self.state.rng.random(3, np.float32).tolist()
             return red, green, blue
@@ -221,3 +235,9 @@ class Trainer:
                 fix="check that the poses and the points have the same frame and that the poses "
                 "are world to camera, x right, y down, z forward",
             )
+
+
+def _sum(first: Tensor | None, second: Tensor | None) -> Tensor | None:
+    if first is None or second is None:
+        return first if second is None else second
+    return first + second

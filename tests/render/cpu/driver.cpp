@@ -75,19 +75,27 @@ void expect_finite(Array<T>& values, const char* what) {
         }
 }
 
+void set_slopes(View& view) {
+    const double margin_x = 0.15 * view.width / view.fx, margin_y = 0.15 * view.height / view.fy;
+    view.min_u = -view.cx / view.fx - margin_x;
+    view.max_u = (view.width - view.cx) / view.fx + margin_x;
+    view.min_v = -view.cy / view.fy - margin_y;
+    view.max_v = (view.height - view.cy) / view.fy + margin_y;
+}
+
 // Runs all kernels over one view; writes the image and the gradients to `out`, if any.
 void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, std::FILE* out) {
-    const View view = {width,
-                       height,
-                       0.9 * width,
-                       0.9 * width,
-                       0.48 * width,
-                       0.53 * height,
-                       {1, 0, 0, 0, 1, 0, 0, 0, 1},
-                       {0.1, -0.1, 0.2},
-                       0.01,
-                       antialias,
-                       s.degree};
+    View view = {width,
+                 height,
+                 0.9 * width,
+                 0.9 * width,
+                 0.48 * width,
+                 0.53 * height,
+                 {1, 0, 0, 0, 1, 0, 0, 0, 1},
+                 {0.1, -0.1, 0.2},
+                 0.01};
+    view.antialias = antialias, view.sh_degree = s.degree;
+    set_slopes(view);
     const Gaussians in = {
         s.count,       (s.degree + 1) * (s.degree + 1), s.means.get(), s.log_scales.get(),
         s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
@@ -198,10 +206,11 @@ int run_file(const char* input, const char* output) {
         read(in, image->get(), image->size);
     std::fclose(in);
 
-    View view = {h.width, h.height,         h.fx,         h.fy, h.cx, h.cy, {}, {},
-                 h.near,  h.antialias != 0, int(h.degree)};
+    View view = {h.width, h.height, h.fx, h.fy, h.cx, h.cy, {}, {}, h.near};
+    view.antialias = h.antialias != 0, view.sh_degree = int(h.degree);
     std::memcpy(view.rotation, h.rotation, sizeof(view.rotation));
     std::memcpy(view.translation, h.translation, sizeof(view.translation));
+    set_slopes(view);
     const int threads = int(h.threads);
     const float background[3] = {float(h.background[0]), float(h.background[1]),
                                  float(h.background[2])};
@@ -263,8 +272,9 @@ int main(int argc, char** argv) {
         return 0;
     }
     constexpr float infinity = std::numeric_limits<float>::infinity();
-    const float extreme[] = {std::nanf(""), infinity, -infinity, 0,   1e-45f, 1e38f,  -1e38f, 3.4e38f,
-                          1e-12f,        1e12f,    88,        -88, 27.6f,  -27.6f, 12,     100};
+    const float extreme[] = {std::nanf(""), infinity, -infinity, 0,     1e-45f, 1e38f,
+                             -1e38f,        3.4e38f,  1e-12f,    1e12f, 88,     -88,
+                             27.6f,         -27.6f,   12,        100};
     const int64_t sizes[][2] = {{1, 1}, {2, 3}, {17, 31}, {16, 16}, {53, 7}, {5, 90}};
     for (int round = 0; round < 300; round++) {
         Scene scene = ordinary(random, random() % 40, int(random() % 4));

@@ -134,9 +134,11 @@ def test_absolute_gradients_are_summed_over_pixels() -> None:
     found = render.backward(render.forward(*scene, cam, options), d_color)
     _, projection, image = reference_image(scene, cam, options)
     per_pixel = (image.color * d_color).sum(-1).reshape(-1)
-    expected = torch.zeros(len(projection.index), 2, dtype=torch.float64)
-    for value in per_pixel:
-        expected += torch.autograd.grad(value, projection.means2d, retain_graph=True)[0].abs()
+    each = torch.eye(len(per_pixel), dtype=torch.float64)
+    (gradients,) = torch.autograd.grad(
+        per_pixel, projection.means2d, each, is_grads_batched=True
+    )  # pixels, Gaussians, 2
+    expected = gradients.abs().sum(0)
     assert found.means2d_abs is not None
     assert relative(found.means2d_abs[projection.index], expected) <= 1e-5
     assert (
@@ -275,3 +277,23 @@ def test_invalid_arguments_are_errors_that_name_them() -> None:
     fwd = render.forward(*scene, cam, RasterOptions())
     with pytest.raises(ValueError, match="d_color"):
         render.backward(fwd, torch.zeros(8, 9, 3))
+
+
+@pytest.mark.parametrize("antialias", [False, True])
+def test_a_part_of_an_image_is_rendered_as_the_whole_is(antialias: bool) -> None:
+    """Also Gaussians whose Jacobian is clamped to the part's frustum, if it were an image."""
+    scene, whole = random_scene(8, 400, size=0.4), camera(96, 80)
+    left, top, width, height = 37, 21, 23, 30
+    part = replace(
+        whole, width=width, height=height, cx=whole.cx - left, cy=whole.cy - top, part_of=whole
+    )
+    options = RasterOptions(antialias=antialias)
+    expected = render.forward(*scene, whole, options).color
+    expected = expected[top : top + height, left : left + width]
+    torch.testing.assert_close(
+        render.forward(*scene, part, options).color, expected, atol=2e-5, rtol=0
+    )
+    alone = render.forward(*scene, replace(part, part_of=None), options).color
+    assert (alone - expected).abs().max() > 1e-3
+    _, _, image = reference_image(scene, part, options)
+    assert relative(render.forward(*scene, part, options).color, image.color) < 1e-5

@@ -104,8 +104,9 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
 
 def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
     config = tiny_config(coarse_share=0.3)
-    assert isinstance(setup.choose_image_store(scene.views, config.train, None), MemoryStore)
-    assert isinstance(setup.choose_image_store(scene.views, config.train, 1), DiskStore)
+    inputs = Inputs(scene.views, scene.initial, scene.extent)
+    assert isinstance(setup.choose_image_store(inputs, config.train, None), MemoryStore)
+    assert isinstance(setup.choose_image_store(inputs, config.train, 1), DiskStore)
     little = run(scene, tmp_path / "b", config, memory_mb=1)
     assert_same(run(scene, tmp_path / "a", config), little)
 

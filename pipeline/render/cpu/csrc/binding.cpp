@@ -46,12 +46,17 @@ Tensor new_longs(const std::vector<int64_t>& shape) {
     return new_tensor<int64_t>(shape, ScalarType::Long);
 }
 
-// view: 17 float64, fx fy cx cy, rotation, translation, near.
+// view: 21 float64, fx fy cx cy, rotation, translation, near, bounds of u and v in the Jacobian.
 splat::View view_from(const Tensor& packed, int64_t width, int64_t height, int64_t sh_degree,
                       bool antialias) {
     const double* v = packed.const_data_ptr<double>();
-    splat::View view = {width, height, v[0],  v[1],      v[2],          v[3],
-                        {},    {},     v[16], antialias, int(sh_degree)};
+    splat::View view = {};
+    view.width = width, view.height = height;
+    view.fx = v[0], view.fy = v[1], view.cx = v[2], view.cy = v[3];
+    view.near = v[16];
+    view.min_u = v[17], view.max_u = v[18], view.min_v = v[19], view.max_v = v[20];
+    view.antialias = antialias;
+    view.sh_degree = int(sh_degree);
     for (int i = 0; i < 9; i++) view.rotation[i] = v[4 + i];
     for (int i = 0; i < 3; i++) view.translation[i] = v[13 + i];
     return view;

@@ -25,10 +25,6 @@ constexpr float kAlphaMax = 0.999f;
 // 8-bit step in total.
 constexpr float kTransmittanceMin = 1e-4f;
 
-// The projection's Jacobian is evaluated at most this share of tan(fov / 2) outside the image on
-// each side: further out the linearisation stretches Gaussians too much.
-constexpr double kFrustumMargin = 0.3;
-
 // Squared norm below which a quaternion is invalid: its direction is lost in float32.
 constexpr double kQuatNorm2Min = 1e-8;
 

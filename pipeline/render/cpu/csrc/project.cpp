@@ -1,5 +1,6 @@
 #include "project.h"
 
+#include <algorithm>
 #include <atomic>
 #include <cmath>
 
@@ -42,12 +43,12 @@ class OutOfView {
   public:
     explicit OutOfView(const View& view) : view_(view) {
         // The Jacobian's rows have the length f / z |(1, u)|, u clamped.
-        const auto length = [](double focal, double center, double size) {
-            const double u = (center > size - center ? center : size - center) / focal;
-            return kMostReach * focal * std::hypot(1.0, u + kFrustumMargin * 0.5 * size / focal);
+        const auto length = [](double focal, double lowest, double highest) {
+            const double u = std::max(std::abs(lowest), std::abs(highest));
+            return kMostReach * focal * std::hypot(1.0, u);
         };
-        reach_x_ = length(view.fx, view.cx, double(view.width));
-        reach_y_ = length(view.fy, view.cy, double(view.height));
+        reach_x_ = length(view.fx, view.min_u, view.max_u);
+        reach_y_ = length(view.fy, view.min_v, view.max_v);
     }
     // Whether none of a part's Gaussians can be visible or dropped, according to conservative
     // bounds on their ellipses.

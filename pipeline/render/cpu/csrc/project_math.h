@@ -80,10 +80,8 @@ SPLAT_INLINE Projected project(const Inputs& in, const View& view) {
     p.x = view.fx * u + view.cx;
     p.y = view.fy * v + view.cy;
 
-    const double margin_x = kFrustumMargin * 0.5 * view.width / view.fx;
-    const double margin_y = kFrustumMargin * 0.5 * view.height / view.fy;
-    p.u = clamp(u, -view.cx / view.fx - margin_x, (view.width - view.cx) / view.fx + margin_x);
-    p.v = clamp(v, -view.cy / view.fy - margin_y, (view.height - view.cy) / view.fy + margin_y);
+    p.u = clamp(u, view.min_u, view.max_u);
+    p.v = clamp(v, view.min_v, view.max_v);
     const Vec3 forward = row(view.rotation, 2);
     p.t[0] = (view.fx * p.inv_z) * (row(view.rotation, 0) - p.u * forward);
     p.t[1] = (view.fy * p.inv_z) * (row(view.rotation, 1) - p.v * forward);

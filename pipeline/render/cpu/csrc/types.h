@@ -17,6 +17,7 @@ struct View {
     double fx, fy, cx, cy;
     double rotation[9], translation[3];  // world to camera, row major
     double near;
+    double min_u, max_u, min_v, max_v;  // between which the Jacobian clamps x / z and y / z
     bool antialias;
     int sh_degree;
     bool clamp_color_gradient = false;  // a colour clamped to 0 has no gradient at all (3DGS)

@@ -1,0 +1,67 @@
+"""The layers around a block, rendered from the coarse Gaussians."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from pipeline.render import Backend, Color, Forward, RasterOptions
+from pipeline.render.views import raster_camera
+from pipeline.scene.blocks import Box
+from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.data.surroundings import Surroundings
+from pipeline.training.data.targets import Layers
+
+# A pixel trains a block that explains at least this share of it, in front of all others.
+USED_SHARE = 0.1
+# Fronts of less alpha everywhere are left out.
+MIN_FRONT = 2 / 255
+
+
+@dataclass(frozen=True)
+class BlockLayers:
+    """Renders the layers around a block in any view (``training.data.targets.LayerSource``).
+
+    Attributes:
+        coarse: the Gaussians of the whole scene before the blocks are trained.
+        region: of the block, with its margin.
+        background: behind the scene.
+        options: as in training, without a background.
+    """
+
+    coarse: Gaussians
+    region: Box
+    background: Color
+    options: RasterOptions
+    backend: Backend
+
+    def __call__(self, view: View) -> Layers:
+        means = self.coarse.means.numpy()
+        own = self.region.contains(means)
+        behind = self.region.between(view.centre, means) & ~own
+        front = self._render(view, ~own & ~behind)
+        block = self._render(view, own)
+        back = self._render(view, behind, self.background)
+        around = Surroundings(_bytes(back.color), _bytes(block.alpha))
+        if float(front.alpha.max()) >= MIN_FRONT:
+            transmittance = _bytes(1 - front.alpha)
+            around = replace(around, front=_bytes(front.color), transmittance=transmittance)
+        return Layers(
+            surroundings=around,
+            used=(1 - front.alpha) * block.alpha > USED_SHARE,
+            coarse=_bytes(around.compose(block.color, block.alpha)),
+            background=self.background,
+        )
+
+    def _render(self, view: View, which: np.ndarray, background: Color | None = None) -> Forward:
+        chosen = self.coarse.select(torch.from_numpy(np.flatnonzero(which)))
+        options = replace(self.options, background=background)
+        return self.backend.forward(*chosen.parameters(), raster_camera(view), options)
+
+
+def _bytes(values: Tensor) -> Tensor:
+    return (values.clamp(0, 1) * 255).round().to(torch.uint8)

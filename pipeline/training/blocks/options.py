@@ -1,0 +1,73 @@
+"""The options of the parts of a training in blocks.
+
+A coarse run on reduced images gives every block its first Gaussians and its surroundings, and
+refines the cameras if that is configured. Then each block is trained twice.
+"""
+
+from __future__ import annotations
+
+from pipeline.config.experiments import TrainExperiments
+from pipeline.config.schema import Train, Views
+from pipeline.scene.blocks import Block
+from pipeline.training.loop.schedule import Part, Schedule
+
+# The parts of a run's schedule: on the whole scene at reduced resolution, in blocks among the
+# coarse Gaussians, and in blocks among what the other blocks have become. Alternating over
+# subdomains that overlap is the Schwarz method of domain decomposition.
+COARSE, FIRST, SECOND = Part(0.0, 0.2), Part(0.2, 0.7), Part(0.7, 1.0)
+# Images of the coarse run are reduced by this factor, beside the schedule's own reduction.
+COARSE_IMAGE_FACTOR = 2
+# View-dependent colours are left to the blocks.
+COARSE_SH_DEGREE = 1
+
+
+def coarse_views(views: Views) -> Views:
+    """The views of the coarse run."""
+    size = max(1, views.max_long_side_px // COARSE_IMAGE_FACTOR)
+    return views.model_copy(update={"max_long_side_px": size})
+
+
+def coarse_options(train: Train) -> Train:
+    """The options of the coarse run of a scene that ``train`` trains in blocks."""
+    return train.model_copy(
+        update={
+            "budget_minutes": _minutes(train, COARSE, 1.0),
+            "sh_degree": min(COARSE_SH_DEGREE, train.sh_degree),
+        }
+    )
+
+
+def block_options(
+    train: Train, experiments: TrainExperiments, block: Block, part: Part, share: float
+) -> tuple[Train, TrainExperiments]:
+    """The options of a part of the training of a block.
+
+    Learning rates are those of a run of the whole scene, in which each Gaussian is seen in as many
+    steps.
+
+    Args:
+        share: of the block in the cost of all.
+    """
+    whole = Schedule.of(train, experiments)
+    factor = experiments.learning_rate_factor
+    if train.budget_minutes is None:
+        factor = whole.learning_rate_factor(whole.steps)
+    density = train.density.model_copy(update={"max_gaussians": block.max_gaussians})
+    return (
+        train.model_copy(
+            update={
+                "steps": block.steps,
+                "budget_minutes": _minutes(train, part, share),
+                "refine_poses": False,
+                "refine_intrinsics": False,
+                "density": density,
+            }
+        ),
+        experiments.model_copy(update={"coarse_share": 0.0, "learning_rate_factor": factor}),
+    )
+
+
+def _minutes(train: Train, part: Part, share: float) -> float | None:
+    """The time budget of a part of the training."""
+    minutes = train.budget_minutes
+    return None if minutes is None else minutes * (part.end - part.begin) * share

@@ -1,0 +1,65 @@
+"""What a view shows around a block: the Gaussians of other blocks, as images.
+
+Blocks are convex. The other Gaussians on a ray that meets a block are therefore either in front of
+it or behind it, and the image of the whole scene is a composition of three layers (Porter and Duff
+1984): the front, the block, and what is behind it.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+# Without a loss on alpha, each of two blocks on a ray could leave a pixel to the other one.
+ALPHA_LOSS_WEIGHT, ALPHA_TOLERANCE = 1.0, 0.25
+
+
+@dataclass(frozen=True)
+class Surroundings:
+    """The layers around a block in one view.
+
+    Attributes:
+        behind: (H, W, 3) uint8, the scene behind the block over the background.
+        alpha: (H, W) uint8 of the block before training.
+        front: (H, W, 3) uint8, the scene in front of the block, multiplied by its alpha; None if
+            nothing is.
+        transmittance: (H, W) uint8 of the front, 255 where there is none; None if nothing is.
+    """
+
+    behind: Tensor
+    alpha: Tensor
+    front: Tensor | None = None
+    transmittance: Tensor | None = None
+
+    def compose(self, color: Tensor, alpha: Tensor) -> Tensor:
+        """(H, W, 3) float32 image of the whole scene.
+
+        Args:
+            color: (H, W, 3) float32 of the block, without a background.
+            alpha: (H, W) float32 of the block.
+        """
+        image = color + (1 - alpha)[..., None] * _unit(self.behind)
+        if self.front is None or self.transmittance is None:
+            return image
+        return _unit(self.front) + _unit(self.transmittance)[..., None] * image
+
+    def alpha_gradient(self, alpha: Tensor) -> Tensor:
+        """(H, W) float32 gradient of ``ALPHA_LOSS_WEIGHT`` times the mean square of the part of
+        the change of the block's ``alpha`` (H, W) that exceeds ``ALPHA_TOLERANCE``."""
+        change = alpha - _unit(self.alpha)
+        beyond = change - change.clamp(-ALPHA_TOLERANCE, ALPHA_TOLERANCE)
+        return beyond * (2 * ALPHA_LOSS_WEIGHT / beyond.numel())
+
+    def gradients(self, d_image: Tensor) -> tuple[Tensor, Tensor]:
+        """Gradients with respect to ``color`` (H, W, 3) and ``alpha`` (H, W) of ``compose``, from
+        the gradient with respect to its image (H, W, 3), float32."""
+        d_color = d_image
+        if self.transmittance is not None:
+            d_color = d_image * _unit(self.transmittance)[..., None]
+        return d_color, -(d_color * _unit(self.behind)).sum(-1)
+
+
+def _unit(values: Tensor) -> Tensor:
+    return values.to(torch.float32) * (1 / 255)

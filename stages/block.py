@@ -1,0 +1,41 @@
+"""Train a block among the coarse Gaussians of the others, a job for each block. Outputs:
+``gaussians.npz`` and ``curve.json``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.plan.stage import StageSpec, if_blocks
+from pipeline.plan.values import StagePlan
+from pipeline.runtime.job import Job
+from pipeline.training.loop.counters import TrainCounters
+from stages.workflow import blocks
+
+if TYPE_CHECKING:
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
+
+
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    return if_blocks(settled, "each block among coarse surroundings", per_block=True)
+
+
+def work(job: Job) -> None:
+    from pipeline.io.npz import read_npz
+    from pipeline.training.blocks.options import FIRST
+
+    blocks.train(job, read_npz(job.inputs["coarse"] / "gaussians.npz"), FIRST)
+
+
+SPEC = StageSpec(
+    name="block",
+    work=work,
+    decide=decide,
+    counters=TrainCounters,
+    inputs=blocks.INPUTS,
+    options=blocks.OPTIONS,
+    packages=("torch", "numpy", "opencv-contrib-python-headless"),
+    seeded=True,
+    memory_mb=blocks.memory_mb,
+    per_block=True,
+)

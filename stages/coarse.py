@@ -1,0 +1,64 @@
+"""A short training of the whole scene on reduced images, before it is divided into blocks.
+Outputs: as of ``train``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.config.experiments import Experiments
+from pipeline.config.schema import Split, Train, Views
+from pipeline.plan.stage import StageSpec, if_blocks
+from pipeline.plan.values import Plan, StagePlan
+from pipeline.runtime.job import Job
+from pipeline.training.loop.counters import TrainCounters
+from stages.workflow import inputs
+
+if TYPE_CHECKING:
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
+
+
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    return if_blocks(settled, "a short training on reduced images: the surroundings of blocks")
+
+
+def work(job: Job) -> None:
+    from pipeline.io.npz import read_npz
+    from pipeline.scene.views import load_views
+    from pipeline.training.blocks.options import COARSE, coarse_options, coarse_views
+    from pipeline.training.scene import train_scene
+
+    manifest, model = inputs.read_manifest(job, "views"), inputs.input_model(job)
+    trained = train_scene(
+        load_views(manifest, model, coarse_views(job.section(Views)), job.section(Split)),
+        manifest,
+        model,
+        read_npz(job.inputs["init"] / "gaussians.npz"),
+        coarse_options(job.section(Train)),
+        job.section(Experiments).train,
+        seed=job.seed,
+        threads=job.threads,
+        memory_mb=job.memory_mb,
+        checkpoint_dir=job.scratch / "checkpoints",
+        logs=job.logs,
+        part=COARSE,
+    )
+    inputs.write_trained(job, trained)
+
+
+def memory_mb(plan: Plan) -> int:
+    """The configured limit, or 1.5 times the plan's estimate."""
+    return plan.config.train.memory_mb or round(1.5 * plan.facts.training_memory_mb)
+
+
+SPEC = StageSpec(
+    name="coarse",
+    work=work,
+    decide=decide,
+    counters=TrainCounters,
+    inputs={"views": inputs.VIEWS, "model": inputs.MODEL, "init": ("init",)},
+    options=("train", "views", "split", "experiments.train"),
+    packages=("torch", "numpy", "opencv-contrib-python-headless"),
+    seeded=True,
+    memory_mb=memory_mb,
+)

@@ -1,0 +1,75 @@
+"""The three layers of a view compose to the image of the whole scene, and their gradients are those
+of autograd."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+
+from pipeline.render import RasterOptions, make_backend
+from pipeline.render.views import raster_camera
+from pipeline.training.blocks.layers import BlockLayers
+from pipeline.training.data.surroundings import ALPHA_LOSS_WEIGHT, ALPHA_TOLERANCE, Surroundings
+from tests.training.blocks.conftest import NEAR, DividedScene
+
+WHITE = (1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("number", [1, 2])
+def test_layers_compose_to_the_whole_scene(divided: DividedScene, number: int) -> None:
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    region = divided.partition.box(number)
+    layers = BlockLayers(divided.gaussians, region, WHITE, options, make_backend())
+    whole = RasterOptions(sh_degree=1, near=NEAR, background=WHITE, threads=1)
+    for view in divided.views:
+        expected = make_backend().forward(
+            *divided.gaussians.parameters(), raster_camera(view), whole
+        )
+        found = layers(view).coarse.float() / 255
+        # Layers are 8-bit. Gaussians across the face are in one layer, and blended in order of
+        # their centres in the whole scene.
+        error = (found - expected.color.clamp(0, 1)).abs()
+        assert error.mean() < 0.006
+        assert error.quantile(0.95) < 0.01
+
+
+def random_surroundings(front: bool) -> Surroundings:
+    torch.manual_seed(0)
+    image = lambda *size: torch.randint(0, 256, size, dtype=torch.uint8)  # noqa: E731
+    behind, alpha = image(5, 7, 3), image(5, 7)
+    if not front:
+        return Surroundings(behind, alpha)
+    return Surroundings(behind, alpha, image(5, 7, 3), image(5, 7))
+
+
+@pytest.mark.parametrize("front", [False, True])
+def test_gradients_of_the_composition_are_those_of_autograd(front: bool) -> None:
+    around = random_surroundings(front)
+    color = torch.rand(5, 7, 3, requires_grad=True)
+    alpha = torch.rand(5, 7, requires_grad=True)
+    weight = torch.rand(5, 7, 3)
+    (around.compose(color, alpha) * weight).sum().backward()
+    d_color, d_alpha = around.gradients(weight)
+    torch.testing.assert_close(d_color, color.grad)
+    torch.testing.assert_close(d_alpha, alpha.grad)
+
+
+def test_gradient_of_the_loss_on_alpha_is_that_of_autograd() -> None:
+    around = random_surroundings(front=False)
+    alpha = torch.rand(5, 7, requires_grad=True)
+    change = (alpha - around.alpha / 255).abs()
+    loss = ALPHA_LOSS_WEIGHT * (change - ALPHA_TOLERANCE).clamp(min=0).square().mean()
+    loss.backward()
+    torch.testing.assert_close(around.alpha_gradient(alpha.detach()), alpha.grad)
+
+
+def test_layers_of_a_cropped_view_are_cropped_layers(divided: DividedScene) -> None:
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    layers = BlockLayers(
+        divided.gaussians, divided.partition.box(1), WHITE, options, make_backend()
+    )
+    view = divided.views[1]
+    whole, part = layers(view), layers(view.cropped(32, 16, 64, 80))
+    cut = whole.coarse[16:96, 32:96].int()
+    assert (cut - part.coarse.int()).abs().max() <= 1
+    assert (whole.used[16:96, 32:96] ^ part.used).float().mean() < 0.01

@@ -1,0 +1,94 @@
+"""Blocks hold every Gaussian once, have similar cost, and get the views that show them."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from pipeline.render import RasterOptions, make_backend
+from pipeline.scene.blocks import Partition
+from pipeline.training.blocks.layers import BlockLayers
+from pipeline.training.blocks.union import inside, union
+from tests.training.blocks.conftest import NEAR, DividedScene, divide
+
+
+def owners(partition: Partition, means: np.ndarray) -> np.ndarray:
+    numbers = range(1, len(partition.blocks) + 1)
+    return np.stack([partition.box(number).contains(means) for number in numbers])
+
+
+@pytest.mark.parametrize("blocks", [2, 3, 4, 7])
+def test_each_gaussian_is_in_exactly_one_block(divided: DividedScene, blocks: int) -> None:
+    partition = divide(divided.gaussians, divided.views, blocks)
+    assert len(partition.blocks) == blocks
+    assert (owners(partition, divided.gaussians.means.numpy()).sum(0) == 1).all()
+
+
+def test_points_far_outside_of_the_scene_are_in_exactly_one_block(divided: DividedScene) -> None:
+    far = np.random.default_rng(3).normal(size=(200, 3)) * 1e6
+    assert (owners(divide(divided.gaussians, divided.views, 5), far).sum(0) == 1).all()
+
+
+def test_blocks_explain_similar_numbers_of_pixels(divided: DividedScene) -> None:
+    shares = [sum(v.share for v in block.views) for block in divided.partition.blocks]
+    assert max(shares) < 1.6 * min(shares)
+
+
+def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedScene) -> None:
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    views = {view.name: view for view in divided.views}
+    for number, block in enumerate(divided.partition.blocks, 1):
+        region = divided.partition.region(number)
+        layers = BlockLayers(divided.gaussians, region, (0, 0, 0), options, make_backend())
+        assert block.views
+        for shown in block.views:
+            left, top, width, height = shown.window
+            used = layers(views[shown.name]).used
+            outside = used.clone()
+            outside[top : top + height, left : left + width] = False
+            assert outside.sum() <= 0.01 * used.sum()
+
+
+def test_a_view_without_the_block_is_not_among_its_views(divided: DividedScene) -> None:
+    """With a wall in front of the second cluster, views from that side do not show it."""
+    partition = divided.partition
+    away = divided.views[0]
+    turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ away.world_to_camera
+    looking_away = type(away)(**{**vars(away), "name": "away", "world_to_camera": turned})
+    found = divide(divided.gaussians, [*divided.views, looking_away], 2)
+    for block, other in zip(found.blocks, partition.blocks, strict=True):
+        assert "away" not in {view.name for view in block.views}
+        assert len(block.views) == len(other.views)
+
+
+def test_a_partition_has_the_same_bits_at_any_number_of_threads(divided: DividedScene) -> None:
+    one = divide(divided.gaussians, divided.views, 3, threads=1)
+    assert one == divide(divided.gaussians, divided.views, 3, threads=2)
+
+
+def test_a_partition_survives_its_file(divided: DividedScene, tmp_path) -> None:
+    divided.partition.write(tmp_path)
+    assert Partition.read(tmp_path) == divided.partition
+
+
+def test_margins_reach_beyond_inner_faces_alone(divided: DividedScene) -> None:
+    for block in divided.partition.blocks:
+        for bound, margin in zip(
+            (*block.lower, *block.upper), (*block.margin_below, *block.margin_above), strict=True
+        ):
+            assert (margin > 0) == (bound is not None)
+
+
+def test_the_union_of_regions_is_the_scene(divided: DividedScene) -> None:
+    """Each block is trained with its margin, and keeps its box."""
+    partition, gaussians = divided.partition, divided.gaussians
+    parts = []
+    for number in (1, 2):
+        region = partition.region(number).contains(gaussians.means.numpy())
+        trained = gaussians.select(torch.from_numpy(np.flatnonzero(region)))
+        parts.append(inside(trained, partition, number))
+    joined = union(parts)
+    assert len(joined) == len(gaussians)
+    order = lambda means: means[np.lexsort(means.T)]  # noqa: E731
+    np.testing.assert_array_equal(order(joined.means.numpy()), order(gaussians.means.numpy()))

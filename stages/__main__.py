@@ -41,7 +41,6 @@ def main() -> int:
         threads=threads,
         log=args.log,
         publish=_pairs(args.publish),
-        memory_mb=memory_mb,
     )
     spec = importlib.import_module(f"stages.{args.stage}").SPEC
     return run_stage(request, spec.work, spec.counters)

@@ -45,5 +45,4 @@ SPEC = StageSpec(
     inputs={**inputs.TRAINED, "evaluate": ("evaluate",)},
     options=("views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
-    memory_mb=3000,
 )

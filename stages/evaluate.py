@@ -77,6 +77,5 @@ SPEC = StageSpec(
     inputs={**inputs.TRAINED, "inspect": ("inspect",)},
     options=("evaluate", "views", "split", *inputs.DRAWING_OPTIONS, *FIT_OPTIONS),
     packages=("torch", "numpy", "scipy", "opencv-contrib-python-headless"),
-    memory_mb=3000,
     facts=facts,
 )

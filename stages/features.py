@@ -48,5 +48,4 @@ SPEC = StageSpec(
     inputs={"photos": inputs.PHOTOS},
     options=("features",),
     packages=("opencv-contrib-python-headless", "pycolmap"),
-    memory_mb=3000,
 )

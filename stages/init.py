@@ -106,5 +106,4 @@ SPEC = StageSpec(
     options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,
-    memory_mb=3000,
 )

@@ -49,5 +49,4 @@ SPEC = StageSpec(
     options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
     packages=("pycolmap",),
     seeded=True,
-    memory_mb=3000,
 )

@@ -35,6 +35,5 @@ SPEC = StageSpec(
     options=blocks.OPTIONS,
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,
-    memory_mb=blocks.memory_mb,
     per_block=True,
 )

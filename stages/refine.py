@@ -67,5 +67,4 @@ SPEC = StageSpec(
     inputs={"model": inputs.GIVEN},
     options=("sfm.refine_radial", "sfm.refine_principal_point"),
     packages=("pycolmap", "numpy", "scipy"),
-    memory_mb=4000,
 )

@@ -62,5 +62,4 @@ SPEC = StageSpec(
     options=("sfm",),
     packages=("pycolmap", "numpy", "scipy"),
     seeded=True,
-    memory_mb=4000,
 )

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import Plan, StagePlan
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.training.loop.counters import TrainCounters
 from stages.workflow import blocks, inputs
@@ -59,11 +59,6 @@ def work(job: Job) -> None:
     inputs.write_trained(job, trained)
 
 
-def memory_mb(plan: Plan) -> int:
-    """The configured limit, or 1.5 times the plan's estimate."""
-    return plan.config.train.memory_mb or round(1.5 * plan.facts.training_memory_mb)
-
-
 SPEC = StageSpec(
     name="train",
     work=work,
@@ -81,5 +76,4 @@ SPEC = StageSpec(
     options=("train", "views", "split", "experiments.train"),
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,
-    memory_mb=memory_mb,
 )

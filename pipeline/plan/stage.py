@@ -52,7 +52,6 @@ class StageSpec:
         packages: packages whose version affects the result.
         seeded: whether the stage draws random numbers. Only these keys contain the seed, so that
             runs with different seeds share the results of the other stages.
-        memory_mb: memory that a cluster reserves, in MB, or a function of the plan.
         publishes: output that is copied to ``results/<scene>/`` -> its caption in Snakemake's
             report.
         shows_plan: whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
@@ -69,7 +68,6 @@ class StageSpec:
     options: tuple[str, ...] = ()
     packages: tuple[str, ...] = ()
     seeded: bool = False
-    memory_mb: int | Callable[[Plan], int] = 2000
     publishes: Mapping[str, str] = field(default_factory=dict)
     shows_plan: bool = False
     facts: Callable[[Plan], dict[str, Any]] = _none

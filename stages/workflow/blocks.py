@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import Train
-from pipeline.plan import training_memory
-from pipeline.plan.values import Plan
 from pipeline.runtime.job import Job
 from pipeline.scene.blocks import Partition
 from stages.workflow import inputs
@@ -24,12 +22,6 @@ INPUTS = {
     "partition": ("partition",),
 }
 OPTIONS = ("train", "views", "split", "experiments.train")
-
-
-def memory_mb(plan: Plan) -> int:
-    """The configured limit, or 1.5 times what a block takes whose images are read from disk."""
-    gaussians = plan.config.train.density.max_gaussians
-    return plan.config.train.memory_mb or round(1.5 * training_memory.memory_mb(0, gaussians))
 
 
 def read_partition(job: Job) -> Partition:

@@ -14,7 +14,7 @@ from typing import Any, NoReturn
 from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, name_fault, parse_run
-from pipeline.plan import duration
+from pipeline.plan import duration, stage_memory
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import describe, input_folders, make_plan, plan_record
 from pipeline.plan.scan import scan
@@ -147,15 +147,13 @@ class SnakemakeProject:
 
         return count
 
-    def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int], int]:
+    def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int, int], int]:
         """Resources function: memory in MB that the stage may use, and what a cluster's job needs
         besides. A job that is tried again gets more: the last may have been killed for memory."""
 
-        def megabytes(wildcards: Any, attempt: int) -> int:
-            declared = spec.memory_mb
-            if not isinstance(declared, int):
-                declared = declared(self._plan(wildcards.scene))
-            needed = round(declared * MORE_MEMORY ** (attempt - 1))
+        def megabytes(wildcards: Any, threads: int, attempt: int) -> int:
+            estimate = stage_memory.memory_mb(spec.name, self._plan(wildcards.scene), threads)
+            needed = round(estimate * MORE_MEMORY ** (attempt - 1))
             remote = workflow.remote_exec or workflow.non_local_exec
             return needed + (OVERHEAD_MB if remote else 0)
 

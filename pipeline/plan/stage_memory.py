@@ -1,0 +1,152 @@
+"""Estimates of the stages' memory, which clusters reserve for their jobs.
+
+Fitted to the peaks in the ``run.json`` of scenes of 20 to 128 photographs of up to 20 megapixels.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+
+from pipeline.plan import training_memory
+from pipeline.plan.values import Plan
+from pipeline.scene.views import view_size
+
+# What a cluster reserves is this many times the estimate.
+MARGIN = 1.25
+# Python with numpy and OpenCV or pycolmap; Python with torch, and with scipy besides.
+_PROGRAM, _TORCH, _TORCH_SCIPY = 140.0, 270.0, 340.0
+# Bytes per pixel of a photograph in one thread: decoded and reduced; scanned; undistorted;
+# developed by LibRaw. Bytes per pixel of SIFT's scale space.
+_DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0, 195.0
+# MB per photograph of features and matches, and of the mapper's model, for 3000 features.
+_MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
+# Bytes per Gaussian of rendering, and of writing all formats.
+_RENDERED, _WRITTEN = 1000.0, 2300.0
+# Bytes per pixel of a view of the measures of images.
+_MEASURED = 550.0
+
+Estimate = Callable[[Plan, int], float]
+
+
+def memory_mb(stage: str, plan: Plan, threads: int) -> int:
+    """Memory in MB that the stage's job may use: what is configured for training, else the
+    estimate with a margin."""
+    limit = plan.config.train.memory_mb
+    if limit is not None and stage in _TRAINING:
+        return limit
+    return math.ceil(MARGIN * _ESTIMATES[stage](plan, threads))
+
+
+def _largest(plan: Plan) -> tuple[int, int]:
+    """Width and height of the largest photographs among the most frequent sizes."""
+    sizes = [tuple(map(int, size.split("x"))) for size in plan.facts.sizes if size != "others"]
+    width, height = max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
+    return width, height
+
+
+def _pixels(plan: Plan) -> float:
+    """Megapixels of the largest photographs."""
+    width, height = _largest(plan)
+    return width * height / 1e6
+
+
+def _view_pixels(plan: Plan) -> float:
+    """Megapixels of a view."""
+    width, height = plan.facts.view_size
+    return width * height / 1e6
+
+
+def _photos(plan: Plan) -> int:
+    return plan.facts.photographs + plan.facts.max_frames
+
+
+def _gaussians(plan: Plan) -> float:
+    """The largest number of trained Gaussians, millions. Views show several blocks, each of which
+    has fewer Gaussians than the whole scene as one block."""
+    blocks = int(plan.config.partition.blocks)
+    return plan.config.train.density.max_gaussians * (1 + blocks) / 2 / 1e6
+
+
+def _inspect(plan: Plan, threads: int) -> float:
+    return _PROGRAM + threads * _SCANNED * _pixels(plan)
+
+
+def _decode(plan: Plan, threads: int) -> float:
+    return _PROGRAM + threads * (_DEVELOPED if plan.facts.linear else _SCANNED) * _pixels(plan)
+
+
+def _features(plan: Plan, threads: int) -> float:
+    reduced = view_size(*_largest(plan), plan.config.features.max_long_side_px)
+    scale_space = _SCALE_SPACE * reduced[0] * reduced[1] / 1e6
+    return _PROGRAM + threads * (scale_space + _DECODED * _pixels(plan))
+
+
+def _per_photo(megabytes: float) -> Estimate:
+    def estimate(plan: Plan, threads: int) -> float:
+        share = plan.config.features.max_features / _FEATURES
+        return _PROGRAM + 25 + megabytes * share * _photos(plan)
+
+    return estimate
+
+
+def _undistort(plan: Plan, threads: int) -> float:
+    return _PROGRAM + threads * _UNDISTORTED * _pixels(plan)
+
+
+def _init(plan: Plan, threads: int) -> float:
+    poses = plan.facts.given_poses
+    triangulated = poses is not None and not poses.num_points
+    return max(_features(plan, threads), _mapping(plan, threads)) if triangulated else _PROGRAM + 10
+
+
+def _train(plan: Plan, threads: int) -> float:
+    if plan.config.partition.blocks == 1:
+        return plan.facts.training_memory_mb
+    return _TORCH + _WRITTEN * _gaussians(plan)
+
+
+def _coarse(plan: Plan, threads: int) -> float:
+    """On images of half the size."""
+    gaussians = training_memory.memory_mb(0, plan.config.train.density.max_gaussians)
+    return gaussians + max(0, plan.facts.training_memory_mb - gaussians) / 4
+
+
+def _block(plan: Plan, threads: int) -> float:
+    """Images are read from disk where they do not fit."""
+    return training_memory.memory_mb(0, plan.config.train.density.max_gaussians)
+
+
+def _evaluate(plan: Plan, threads: int) -> float:
+    return _TORCH + _MEASURED * _view_pixels(plan) + _RENDERED * _gaussians(plan)
+
+
+def _coverage(plan: Plan, threads: int) -> float:
+    return _TORCH_SCIPY + _RENDERED * _gaussians(plan) + 0.4 * _photos(plan)
+
+
+def _export(plan: Plan, threads: int) -> float:
+    return _TORCH + _WRITTEN * _gaussians(plan)
+
+
+_mapping = _per_photo(_MAPPING)
+_TRAINING = ("coarse", "block", "polish", "train")
+_ESTIMATES: Mapping[str, Estimate] = {
+    "inspect": _inspect,
+    "decode": _decode,
+    "features": _features,
+    "matches": _per_photo(_MATCHES),
+    "sfm": _mapping,
+    "refine": _mapping,
+    "undistort": _undistort,
+    "init": _init,
+    "coarse": _coarse,
+    "partition": lambda plan, threads: _TORCH + _RENDERED * _gaussians(plan),
+    "block": _block,
+    "polish": _block,
+    "train": _train,
+    "evaluate": _evaluate,
+    "coverage": _coverage,
+    "export": _export,
+    "report": lambda plan, threads: _TORCH + 40 + _WRITTEN * _gaussians(plan),
+}

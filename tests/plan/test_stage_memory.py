@@ -1,0 +1,107 @@
+"""Memory that jobs reserve: at least what stages took on real scenes, and not much more."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import pytest
+
+from pipeline.config.load import scene_config
+from pipeline.config.schema import Config
+from pipeline.plan.stage_memory import memory_mb
+from pipeline.plan.values import Plan
+from stages.workflow.registry import STAGES
+from tests.plans import FACTS
+
+
+class Scene(NamedTuple):
+    """Photographs, their size, the size of views, and Gaussians."""
+
+    photographs: int
+    size: tuple[int, int]
+    view: tuple[int, int]
+    gaussians: int
+
+
+SOUTH_BUILDING = Scene(128, (1024, 768), (640, 480), 76_800)
+TOWN = Scene(125, (640, 427), (640, 427), 68_320)
+COLOSSEUM = Scene(35, (640, 360), (640, 360), 57_600)
+FOX = Scene(50, (720, 1280), (360, 640), 57_600)
+LARGE = Scene(8, (3375, 6000), (360, 640), 20_000)  # fox, enlarged
+
+# Peak memory in MB with two threads and the preset fast, from run.json.
+USED = {
+    SOUTH_BUILDING: {
+        "inspect": 141,
+        "features": 484,
+        "matches": 267,
+        "sfm": 352,
+        "undistort": 141,
+        "init": 148,
+        "train": 711,
+        "evaluate": 528,
+        "coverage": 482,
+        "export": 456,
+        "report": 465,
+    },
+    TOWN: {
+        "features": 217,
+        "matches": 264,
+        "sfm": 399,
+        "train": 678,
+        "evaluate": 499,
+        "coverage": 457,
+        "export": 438,
+        "report": 448,
+    },
+    COLOSSEUM: {"matches": 179, "sfm": 264, "train": 545, "evaluate": 458, "export": 406},
+    FOX: {"features": 470, "matches": 210, "sfm": 259, "train": 545},
+    LARGE: {"inspect": 369, "features": 580, "undistort": 528},
+}
+
+
+def plan_of(scene: Scene, config: Config) -> Plan:
+    width, height = scene.view
+    pixels = scene.photographs * width * height
+    facts = FACTS.model_copy(
+        update={
+            "photographs": scene.photographs,
+            "sizes": {f"{scene.size[0]}x{scene.size[1]}": scene.photographs},
+            "view_size": scene.view,
+            "training_memory_mb": round(400 + 3.75e-6 * pixels + 2.5e-3 * scene.gaussians),
+        }
+    )
+    density = config.train.density.model_copy(update={"max_gaussians": scene.gaussians})
+    settled = config.model_copy(
+        update={
+            "train": config.train.model_copy(update={"density": density}),
+            "partition": config.partition.model_copy(update={"blocks": 1}),
+        }
+    )
+    return Plan(scene="x", stages={}, warnings=[], config=settled, facts=facts)
+
+
+@pytest.mark.parametrize("scene", USED)
+def test_jobs_reserve_what_stages_take_and_at_most_half_more(scene: Scene) -> None:
+    plan = plan_of(scene, scene_config({"preset": "fast"}, "x", None, None))
+    for stage, used in USED[scene].items():
+        assert used <= memory_mb(stage, plan, 2) <= 1.5 * used, stage
+
+
+def test_more_threads_and_larger_photographs_take_more() -> None:
+    config = Config()
+    for stage in ("inspect", "features", "undistort"):
+        assert memory_mb(stage, plan_of(LARGE, config), 8) > memory_mb(
+            stage, plan_of(LARGE, config), 2
+        )
+        assert memory_mb(stage, plan_of(LARGE, config), 2) > memory_mb(
+            stage, plan_of(FOX, config), 2
+        )
+
+
+def test_every_stage_has_an_estimate_and_training_its_limit() -> None:
+    limited = Config.model_validate({"train": {"memory_mb": 777}})
+    for stage in STAGES:
+        assert memory_mb(stage, plan_of(FOX, Config()), 1) > 100
+    for stage in ("train", "coarse", "block", "polish"):
+        assert memory_mb(stage, plan_of(FOX, limited), 1) == 777

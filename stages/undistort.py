@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 from pipeline.config.schema import Undistort, Views
 from pipeline.photos.counters import UndistortCounters
 from pipeline.plan.stage import StageSpec
-from pipeline.plan.values import Plan, StagePlan
+from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 
@@ -72,13 +72,6 @@ def work(job: Job) -> None:
     job.record(counters, report.decisions, report.warnings)
 
 
-def memory_mb(plan: Plan) -> int:
-    """For one of the largest photographs at a time, with the maps of its views."""
-    sizes = [size.split("x") for size in plan.facts.sizes if size != "others"]
-    largest = max((int(width) * int(height) for width, height in sizes), default=0)
-    return max(2000, round(300 + 30e-6 * largest))
-
-
 SPEC = StageSpec(
     name="undistort",
     work=work,
@@ -87,5 +80,4 @@ SPEC = StageSpec(
     inputs={"photos": inputs.PHOTOS, "model": inputs.POSES},
     options=("undistort", "views.max_long_side_px"),
     packages=("opencv-contrib-python-headless",),
-    memory_mb=memory_mb,
 )

@@ -19,6 +19,8 @@ _PROGRAM, _TORCH, _TORCH_SCIPY = 140.0, 270.0, 340.0
 # Bytes per pixel of a photograph in one thread: decoded and reduced; scanned; undistorted;
 # developed by LibRaw. Bytes per pixel of SIFT's scale space.
 _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0, 195.0
+# Bytes per pixel of a panorama of the maps of its views, which all threads share.
+_VIEW_MAPS = 15.0
 # MB per photograph of features and matches, and of the mapper's model, for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
 # Bytes per Gaussian of rendering, and of writing all formats.
@@ -91,7 +93,8 @@ def _per_photo(megabytes: float) -> Estimate:
 
 
 def _undistort(plan: Plan, threads: int) -> float:
-    return _PROGRAM + threads * _UNDISTORTED * _pixels(plan)
+    maps = _VIEW_MAPS * _pixels(plan) if plan.facts.panoramas else 0.0
+    return _PROGRAM + maps + threads * _UNDISTORTED * _pixels(plan)
 
 
 def _init(plan: Plan, threads: int) -> float:

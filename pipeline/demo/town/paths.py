@@ -119,7 +119,7 @@ def _walk() -> list[tuple[Array, Array]]:
 
 
 def _standing(x: float, y: float, heading: float) -> tuple[Array, Array]:
-    """A camera at eye height; heading in degrees from +x towards +y."""
+    """A camera at the height of a pedestrian; heading in degrees from +x towards +y."""
     centre = np.array([x, y, HEIGHT])
     angle = np.radians(heading)
     ahead = np.array([np.cos(angle), np.sin(angle), 0.06])

@@ -213,8 +213,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "exposure_gradient": Mutant(
         "pipeline/training/loop/trainer.py",
-        "return loss.grad if gain is None else loss.grad * gain",
-        "return loss.grad",
+        "d_color = loss.grad if gain is None else loss.grad * gain",
+        "d_color = loss.grad",
         "exposure left out of the gradient",
         ("tests/training/loop/test_first_step.py",),
     ),

@@ -34,6 +34,14 @@ FACTS = SceneFacts(
 )
 
 
+BLOCK_STAGES = ("coarse", "partition", "block", "polish")
+
+
+def skipped(plan: Plan) -> list[str]:
+    """The stages that the plan leaves out, but for those of scenes in blocks."""
+    return [n for n, stage in plan.stages.items() if not stage.run and n not in BLOCK_STAGES]
+
+
 def make_plan(scan: Scan, config: Config, folder: str = "") -> Plan:
     return plans.make_plan(scan, config, STAGES, folder)
 

@@ -20,7 +20,7 @@ from tests.io.test_llff import llff_row
 from tests.io.test_transforms import frame, write
 from tests.pictures import photos, picture
 from tests.plan.test_scan import write_dng, write_sparse
-from tests.plans import make_plan
+from tests.plans import BLOCK_STAGES, make_plan, skipped
 
 
 def look(folder: Path, **sections) -> Scan:
@@ -29,10 +29,6 @@ def look(folder: Path, **sections) -> Scan:
 
 def plan_of(folder: Path, **sections) -> Plan:
     return make_plan(look(folder, **sections), Config.model_validate(sections))
-
-
-def skipped(plan: Plan) -> list[str]:
-    return [name for name, stage in plan.stages.items() if not stage.run]
 
 
 def many(folder: Path, count: int, **changes) -> Scan:
@@ -467,3 +463,15 @@ def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gauss
     ]
     with pytest.raises(UserError, match=r"train.memory_mb: 449 MB .* at least 450 are needed"):
         planned(449)
+
+
+@pytest.mark.parametrize("count, blocks", [(400, 1), (401, 3), (1000, 5)])
+def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, blocks):
+    scan = many(tmp_path, count)
+    plan = make_plan(scan, Config())
+    assert plan.config.partition.blocks == blocks
+    assert all(plan.runs(stage) == (blocks > 1) for stage in BLOCK_STAGES)
+    folders = plan.stages["polish"].folders("polish")
+    assert folders == (["polish"] if blocks == 1 else [f"polish_{i + 1}" for i in range(blocks)])
+    chosen = make_plan(scan, Config.model_validate({"partition": {"blocks": 2}}))
+    assert chosen.config.partition.blocks == 2 and chosen.stages["block"].jobs == 2

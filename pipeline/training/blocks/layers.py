@@ -17,7 +17,7 @@ from pipeline.training.data.surroundings import Surroundings
 from pipeline.training.data.targets import Layers
 
 # A pixel trains a block that explains at least this share of it, in front of all others.
-USED_SHARE = 0.1
+USED_SHARE = 0.02
 # Fronts of less alpha everywhere are left out.
 MIN_FRONT = 2 / 255
 

@@ -203,8 +203,8 @@ class TrainExperiments(Section):
     )
     learning_rate_factor: Literal["auto"] | Factor = Field(
         "auto",
-        description="Factor of all learning rates. auto: sqrt(30000 / steps), between 1 and 4 "
-        "(3DGS: 1).",
+        description="Factor of all learning rates. auto: sqrt(30000 / steps), between 1 and 4, "
+        "or less than 4 if fewer than half of the views see a Gaussian (3DGS: 1).",
     )
     learning_rate_decay_start: PartOfRun = Field(
         0.7,

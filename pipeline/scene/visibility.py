@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -12,6 +13,7 @@ from pipeline.scene.views import View
 # Occlusion: side of the cells of a coarse depth map in pixels, and the share by which a visible
 # point may be behind the nearest one in its cell.
 _CELL, _BEHIND = 8, 1.05
+_MAX_SAMPLES = 5000
 
 
 class Projection(NamedTuple):
@@ -40,6 +42,16 @@ def projected(xyz: NDArray[np.float64], view: View) -> Projection:
         xy += (view.cx, view.cy)
     inside = front & ((xy >= 0) & (xy < (view.width, view.height))).all(1)
     return Projection(xy, z, inside)
+
+
+def seen_share(xyz: NDArray[np.float64], views: Sequence[View]) -> float:
+    """The mean share of ``views`` whose image contains a point, hidden or not, over at most
+    ``_MAX_SAMPLES`` of (N, 3) points; 1 without points."""
+    sample = xyz[:: max(1, len(xyz) // _MAX_SAMPLES)]
+    if not len(sample) or not views:
+        return 1.0
+    inside = sum(int(projected(sample, view).inside.sum()) for view in views)
+    return inside / (len(sample) * len(views))
 
 
 def visible(found: Projection, view: View) -> NDArray[np.intp]:

@@ -17,6 +17,7 @@ from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
 from pipeline.scene.views import View, scene_extent
+from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.intrinsics import describe_intrinsics, with_intrinsics
 from pipeline.training.cameras.poses import describe_poses, with_common_motion
@@ -216,6 +217,7 @@ def scene_inputs(
             else None
         ),
         empty_depths=empty_depths(points),
+        seen_share=seen_share(initial.means.double().numpy(), training),
     )
 
 

@@ -38,7 +38,13 @@ def coarse_options(train: Train) -> Train:
 
 
 def block_options(
-    train: Train, experiments: TrainExperiments, block: Block, part: Part, share: float
+    train: Train,
+    experiments: TrainExperiments,
+    block: Block,
+    part: Part,
+    *,
+    share: float,
+    seen_share: float,
 ) -> tuple[Train, TrainExperiments]:
     """The options of a part of the training of a block.
 
@@ -47,8 +53,9 @@ def block_options(
 
     Args:
         share: of the block in the cost of all.
+        seen_share: mean share of its views that see one of its Gaussians.
     """
-    whole = Schedule.of(train, experiments)
+    whole = Schedule.of(train, experiments, seen_share)
     factor = experiments.learning_rate_factor
     if train.budget_minutes is None:
         factor = whole.learning_rate_factor(whole.steps)

@@ -17,6 +17,7 @@ from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
+from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.options import block_options
@@ -60,10 +61,12 @@ def train_block(
     if not block.views or not block.gaussians:
         raise UserError(f"no training view sees block {number}", fix="lower partition.blocks")
     share = block.pixels / max(1, sum(other.pixels for other in partition.blocks))
-    options, experiments = block_options(config, experiments, block, part, share)
-    whole = scene_inputs(views, manifest, model, scene, gains, options)
+    whole = scene_inputs(views, manifest, model, scene, gains, config)
     background = config.background if config.background in BACKGROUNDS else "black"
-    inputs = block_inputs(whole, partition, number, options, BACKGROUNDS[background])
+    inputs = block_inputs(whole, partition, number, config, BACKGROUNDS[background])
+    options, experiments = block_options(
+        config, experiments, block, part, share=share, seen_share=inputs.seen_share
+    )
     return run_training(
         inputs,
         options,
@@ -98,15 +101,17 @@ def block_inputs(
         near=near_plane(scene.extent),
         threads=1,
     )
+    initial = coarse.select(own)
     return Inputs(
         views=views,
-        initial=coarse.select(own),
+        initial=initial,
         extent=scene.extent,
         scale=scene.scale,
         gains=None if scene.gains is None else scene.gains[kept],
         depths=scene.depths
         and [_cropped(scene.depths[index], windows[scene.views[index].name]) for index in kept],
         empty_depths=None if scene.empty_depths is None else scene.empty_depths[kept],
+        seen_share=seen_share(initial.means.double().numpy(), views),
         layers=BlockLayers(coarse, region, background, options, make_backend()),
     )
 

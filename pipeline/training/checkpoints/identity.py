@@ -13,7 +13,7 @@ from pipeline.config.schema import Train
 from pipeline.training.data.inputs import Inputs
 
 # Increment when the contents of checkpoints or their meaning change.
-STATE_VERSION = 16
+STATE_VERSION = 17
 
 
 def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, seed: int) -> str:
@@ -24,7 +24,7 @@ def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, se
         (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
         for v in inputs.views
     ]
-    sizes = (inputs.extent, inputs.size)
+    sizes = (inputs.extent, inputs.size, inputs.seen_share)
     gains = None if inputs.gains is None else inputs.gains.tolist()
     empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
     options = [config.model_dump(), experiments.model_dump()]

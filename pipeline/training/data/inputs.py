@@ -31,6 +31,7 @@ class Inputs:
         depths: known depths of each view for the depth loss (``training.losses.depth``).
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
+        seen_share: mean share of the views that see a Gaussian (``scene.visibility``).
         layers: the layers around the Gaussians in each view, for a block of a scene; None: the
             Gaussians are the whole scene.
     """
@@ -42,6 +43,7 @@ class Inputs:
     gains: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
     empty_depths: NDArray[np.float64] | None = None
+    seen_share: float = 1.0
     layers: LayerSource | None = None
 
     @property

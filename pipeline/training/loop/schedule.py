@@ -22,6 +22,10 @@ COARSE_STEPS, COARSE_MINUTES, MAX_COARSE_MINUTES = 0.15, 0.1, 1.2
 # (as for batch sizes), at most by MAX_FACTOR.
 PAPER_STEPS = 30_000
 MAX_FACTOR = 4.0
+# The factor is at most MAX_FACTOR if a Gaussian is seen by this share of the views, and less in
+# large scenes: Adam's second moment is a mean over all steps, so that the step of a Gaussian that
+# is seen in a share p of them grows by 1 / sqrt(p).
+USUAL_SEEN_SHARE = 0.5
 # Learning rate of cameras in the last step over that in the first: as for the means in 3DGS.
 CAMERA_DECAY = 0.01
 
@@ -55,6 +59,7 @@ class Schedule:
         coarse_steps: steps at reduced resolution: the first half at 1/4, the others at 1/2.
         max_gaussians: upper limit of the number of Gaussians at full resolution.
         experiments: learning rates and their decay.
+        seen_share: mean share of the views that see a Gaussian.
     """
 
     steps: int
@@ -63,9 +68,10 @@ class Schedule:
     coarse_steps: int
     max_gaussians: int
     experiments: TrainExperiments
+    seen_share: float = 1.0
 
     @staticmethod
-    def of(config: Train, experiments: TrainExperiments) -> Schedule:
+    def of(config: Train, experiments: TrainExperiments, seen_share: float = 1.0) -> Schedule:
         """The schedule of ``config.steps`` steps, or of ``config.budget_minutes``."""
         minutes = config.budget_minutes
         steps = config.steps if minutes is None else NOMINAL_STEPS
@@ -81,6 +87,7 @@ class Schedule:
             coarse_steps=int(coarse * steps),
             max_gaussians=config.density.max_gaussians,
             experiments=experiments,
+            seen_share=seen_share,
         )
 
     def resolution_factor(self, step: int) -> int:
@@ -136,7 +143,8 @@ class Schedule:
         factor = self.experiments.learning_rate_factor
         if factor != "auto":
             return factor
-        return min(MAX_FACTOR, math.sqrt(max(1.0, PAPER_STEPS / run_length)))
+        limit = MAX_FACTOR * math.sqrt(min(1.0, self.seen_share / USUAL_SEEN_SHARE))
+        return min(max(1.0, limit), math.sqrt(max(1.0, PAPER_STEPS / run_length)))
 
     def camera_rate(self, step: int, updates: float) -> float:
         """Learning rate of a camera, as a share of the upper limit of its total change: log-linear

@@ -42,7 +42,7 @@ class Trainer:
     ):
         self.scene, self.state, self.backend, self.threads = scene, state, backend, threads
         self.config, self.experiments = config, experiments
-        self.schedule = Schedule.of(config, experiments)
+        self.schedule = Schedule.of(config, experiments, scene.inputs.seen_share)
         self.clock = Clock(self.schedule.steps, config.budget_minutes, part)
         self.rate_unit = learning_rate_unit(scene.inputs, experiments)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))

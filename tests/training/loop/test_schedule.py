@@ -74,3 +74,13 @@ def test_the_learning_rates_of_a_camera_sum_to_its_limit(steps: int, views: int)
     rates = [schedule.camera_rate(step, steps / views) for step in range(1, steps + 1)]
     assert sum(rates) / views == pytest.approx(1.0, rel=1e-2)
     assert rates[-1] == pytest.approx(CAMERA_DECAY * rates[0], rel=1e-2)
+
+
+@pytest.mark.parametrize("seen, factor", [(1.0, 4.0), (0.5, 4.0), (0.125, 2.0), (0.001, 1.0)])
+def test_learning_rates_are_lower_where_few_views_see_a_gaussian(
+    seen: float, factor: float
+) -> None:
+    """Its steps would be larger than those of others, and scenes of hundreds of views diverge."""
+    schedule = Schedule.of(Train(steps=1500), TrainExperiments(), seen)
+    assert schedule.learning_rate_factor(1500) == pytest.approx(factor)
+    assert schedule.learning_rate_factor(30_000) == 1.0

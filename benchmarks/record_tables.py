@@ -15,6 +15,7 @@ from benchmarks.judge.truth import Grade
 from benchmarks.markdown import cell
 from benchmarks.measured import Record, Result
 from benchmarks.results import (
+    BlocksResult,
     CoverageResult,
     GrowthResult,
     JudgeResult,
@@ -213,6 +214,28 @@ def video(records: Sequence[Stored]) -> str:
     return markdown.table(rows)
 
 
+def blocks(records: Sequence[Stored]) -> str:
+    rows = [
+        [
+            *("scene", "photographs", "blocks", "PSNR (dB)", "in blocks", "SSIM", "in blocks"),
+            *("Gaussians", "in blocks", "memory of a training job (MB)", "in blocks"),
+            *("CPU s of training", "in blocks", "of the largest block", "seams"),
+        ]
+    ]
+    for r in results(records, Record[BlocksResult]):
+        rows.append(
+            [
+                *(r.scene, str(r.photographs), str(r.blocks)),
+                *(f"{value:.2f}" for value in r.psnr),
+                *(f"{value:.4f}" for value in r.ssim),
+                *(f"{value / 1000:.0f}k" for value in r.gaussians),
+                *(f"{value:.0f}" for value in (*r.peak_rss_mb, *r.training_cpu_s)),
+                *(f"{r.largest_block_cpu_s:.0f}", f"{r.seam_gradient:.2f}"),
+            ]
+        )
+    return markdown.table(rows)
+
+
 def wide(records: Sequence[Stored]) -> str:
     return lenses(results(records, Record[WideResult]))
 
@@ -247,6 +270,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "stability": stability,
     "page": page,
     "raster_stress": raster_stress,
+    "blocks": blocks,
     "video": video,
     "wide": wide,
 }

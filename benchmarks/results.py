@@ -241,6 +241,34 @@ class VideoFrames:
     even_sharpness: float
 
 
+# ---- benchmarks.blocks ----
+
+
+@dataclass(frozen=True)
+class BlocksResult:
+    """A scene in blocks beside the same scene as one block; pairs are in this order.
+
+    Attributes:
+        psnr, ssim: of the test views.
+        gaussians: numbers of trained Gaussians.
+        peak_rss_mb: largest memory of a training job, MiB.
+        training_cpu_s: CPU seconds of all training jobs.
+        largest_block_cpu_s: of the block that takes longest.
+        seam_gradient: mean gradient of the error images across seams, divided by that elsewhere.
+    """
+
+    scene: str
+    photographs: int
+    blocks: int
+    psnr: tuple[float, float]
+    ssim: tuple[float, float]
+    gaussians: tuple[int, int]
+    peak_rss_mb: tuple[float, float]
+    training_cpu_s: tuple[float, float]
+    largest_block_cpu_s: float
+    seam_gradient: float
+
+
 # ---- benchmarks.wide ----
 
 

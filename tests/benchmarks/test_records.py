@@ -14,6 +14,7 @@ from benchmarks.judge.truth import Truth
 from benchmarks.measured import Record, command_line, measured, write_record
 from benchmarks.results import (
     Accuracy,
+    BlocksResult,
     CoverageResult,
     GrowthResult,
     JudgeResult,
@@ -32,6 +33,15 @@ from pipeline.runtime.errors import UserError
 
 BOTH = {"test": 30.0, "removed": 20.0}
 EXAMPLES: dict[str, tuple[Any, Any, str]] = {
+    "blocks": (
+        Record[BlocksResult],
+        BlocksResult(
+            *("town", 300, 4, (26.0, 27.125), (0.8, 0.85), (68_000, 90_400), (850.0, 480.0)),
+            *((60.0, 150.0), 41.0, 1.02),
+        ),
+        "| town | 300 | 4 | 26.00 | 27.12 | 0.8000 | 0.8500 | 68k | 90k | 850 | 480 | 60 | 150 | "
+        "41 | 1.02 |",
+    ),
     "video": (
         Record[VideoFrames],
         VideoFrames("walk.mp4", 900, 60, 120.4, 100.0),

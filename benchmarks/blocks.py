@@ -1,0 +1,159 @@
+"""Scenes in blocks beside the same scenes as one block: quality, memory, time and seams.
+
+    python -m benchmarks.blocks results town town@four south_building south_building@four
+
+Runs are finished folders of results, in pairs: as one block, and in blocks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from PIL import Image
+
+from benchmarks.measured import add_record_options, measured, write_record
+from benchmarks.results import BlocksResult
+from pipeline.io.npz import read_npz
+from pipeline.metrics.evaluation import Evaluation
+from pipeline.photos.load import load_view
+from pipeline.plan.posed_scene import posed_scene
+from pipeline.plan.record import read_plan
+from pipeline.render import RasterOptions, make_backend
+from pipeline.render.views import near_plane, raster_camera
+from pipeline.reporting.metrics import read_metrics, read_runs
+from pipeline.runtime.record import read_run
+from pipeline.scene.blocks import Partition
+from pipeline.scene.views import View, scene_extent
+from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import SH_C0
+
+# Neighbouring pixels are on one surface if their depths differ by less than this share.
+SAME_SURFACE = 0.02
+# Stages that exist because of blocks, or whose work they take over.
+TRAINING = ("coarse", "partition", "block", "polish", "train")
+
+
+def compare(results: Path, whole: str, divided: str) -> BlocksResult:
+    """A finished run in blocks beside one of the same scene as one block."""
+    one, many = (read_metrics(results / run) for run in (whole, divided))
+    plan = read_plan(results / divided)
+    return BlocksResult(
+        scene=whole,
+        photographs=one.registered_images or 0,
+        blocks=plan.stages["polish"].jobs,
+        psnr=(one.psnr, many.psnr),
+        ssim=(one.ssim, many.ssim),
+        gaussians=(one.num_gaussians, many.num_gaussians),
+        peak_rss_mb=(_peak(results / whole), _peak(results / divided)),
+        training_cpu_s=(_cpu(results / whole), _cpu(results / divided)),
+        largest_block_cpu_s=_largest_block(results / divided),
+        seam_gradient=_seams(results / divided),
+    )
+
+
+def _peak(folder: Path) -> float:
+    """Largest memory of a training job, MiB."""
+    runs = read_runs(read_metrics(folder), folder)
+    return max(run.peak_rss_mb for stage, run in runs.items() if stage in TRAINING)
+
+
+def _cpu(folder: Path) -> float:
+    runs = read_runs(read_metrics(folder), folder)
+    return sum(run.cpu_s for stage, run in runs.items() if stage in TRAINING)
+
+
+def _largest_block(folder: Path) -> float:
+    """CPU seconds of the block that takes longest, both rounds together."""
+    jobs = read_plan(folder).stages["polish"].jobs
+    return max(
+        sum(read_run(folder / f"{stage}_{number}").cpu_s for stage in ("block", "polish"))
+        for number in range(1, jobs + 1)
+    )
+
+
+@dataclass
+class _Sum:
+    total: float = 0.0
+    count: int = 0
+
+    def add(self, values: NDArray[np.float64]) -> None:
+        self.total += float(values.sum())
+        self.count += values.size
+
+
+def _seams(folder: Path) -> float:
+    """Mean gradient of the error images of the test views across seams, divided by that elsewhere.
+
+    Both are over pairs of neighbouring pixels on one surface. A seam is between pixels that
+    different blocks explain most of.
+    """
+    scene = posed_scene(folder, None, None)
+    partition = Partition.read(folder / "partition")
+    gaussians = read_npz(folder / "train" / "gaussians.npz")
+    renders = {view.name: view.render for view in Evaluation.read(folder / "evaluate").per_view}
+    options = RasterOptions(sh_degree=0, near=near_plane(scene_extent(list(scene.views))))
+    at_seams, elsewhere = _Sum(), _Sum()
+    for view in scene.views:
+        if view.name not in renders:
+            continue
+        with Image.open(folder / "evaluate" / "renders" / renders[view.name]) as picture:
+            error = np.abs(np.asarray(picture, np.float64) - load_view(view).rgb).mean(2)
+        owner, depth = _owners(gaussians, partition, view, options)
+        for axis in (0, 1):
+            first = np.take(depth, range(depth.shape[axis] - 1), axis)
+            step = np.abs(np.diff(depth, axis=axis))
+            surface = (first > 0) & (step < SAME_SURFACE * first)
+            crossing = np.diff(owner, axis=axis) != 0
+            change = np.abs(np.diff(error, axis=axis))
+            at_seams.add(change[surface & crossing])
+            elsewhere.add(change[surface & ~crossing])
+    if not at_seams.count or not elsewhere.total:
+        return float("nan")
+    return at_seams.total / at_seams.count / (elsewhere.total / elsewhere.count)
+
+
+def _owners(
+    gaussians: Gaussians, partition: Partition, view: View, options: RasterOptions
+) -> tuple[NDArray[np.int64], NDArray[np.float32]]:
+    """(H, W) the block that explains most of each pixel, and the median depth."""
+    means, count = gaussians.means.numpy(), len(partition.blocks)
+    shares, white = [], 0.5 / SH_C0
+    depth = None
+    for start in range(1, count + 1, 3):
+        numbers = range(start, min(start + 3, count + 1))
+        sh = torch.full((len(gaussians), 1, 3), -white)
+        for channel, number in enumerate(numbers):
+            inside = torch.from_numpy(partition.box(number).contains(means))
+            sh[inside, 0, channel] = white
+        painted = replace(gaussians.with_sh_degree(0), sh=sh)
+        rendered = make_backend().forward(*painted.parameters(), raster_camera(view), options)
+        shares += [rendered.color[..., channel].numpy() for channel in range(len(numbers))]
+        depth = rendered.median_depth.numpy()
+    assert depth is not None
+    return np.argmax(np.stack(shares), 0), depth
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    parser = argparse.ArgumentParser(prog="python -m benchmarks.blocks", description=__doc__)
+    parser.add_argument("results", type=Path, help="folder of results")
+    parser.add_argument("runs", nargs="+", metavar="RUN", help="pairs: as one block, in blocks")
+    add_record_options(parser)
+    options = parser.parse_args(arguments)
+    if len(options.runs) % 2:
+        parser.error("runs are pairs: as one block, and in blocks")
+    pairs = zip(options.runs[::2], options.runs[1::2], strict=True)
+    results = [compare(options.results, whole, divided) for whole, divided in pairs]
+    print(json.dumps([asdict(result) for result in results], indent=2))
+    if options.json is not None:
+        write_record(options.json, measured("blocks", options.note, arguments), results)
+
+
+if __name__ == "__main__":
+    main()

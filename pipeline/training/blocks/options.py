@@ -45,6 +45,7 @@ def block_options(
     *,
     share: float,
     seen_share: float,
+    initial: int,
 ) -> tuple[Train, TrainExperiments]:
     """The options of a part of the training of a block.
 
@@ -54,12 +55,14 @@ def block_options(
     Args:
         share: of the block in the cost of all.
         seen_share: mean share of its views that see one of its Gaussians.
+        initial: number of its first Gaussians, all of which are kept.
     """
     whole = Schedule.of(train, experiments, seen_share)
     factor = experiments.learning_rate_factor
     if train.budget_minutes is None:
         factor = whole.learning_rate_factor(whole.steps)
-    density = train.density.model_copy(update={"max_gaussians": block.max_gaussians})
+    limit = max(block.max_gaussians, initial)
+    density = train.density.model_copy(update={"max_gaussians": limit})
     return (
         train.model_copy(
             update={

@@ -65,7 +65,13 @@ def train_block(
     background = config.background if config.background in BACKGROUNDS else "black"
     inputs = block_inputs(whole, partition, number, config, BACKGROUNDS[background])
     options, experiments = block_options(
-        config, experiments, block, part, share=share, seen_share=inputs.seen_share
+        config,
+        experiments,
+        block,
+        part,
+        share=share,
+        seen_share=inputs.seen_share,
+        initial=len(inputs.initial),
     )
     return run_training(
         inputs,

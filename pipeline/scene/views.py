@@ -204,6 +204,21 @@ def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]
     return views
 
 
+def reduced(view: View, factor: int) -> View:
+    """The view at 1 / ``factor`` of its size."""
+    width, height = reduced_size(view, factor)
+    sx, sy = width / view.width, height / view.height
+    return replace(
+        view,
+        width=width,
+        height=height,
+        fx=view.fx * sx,
+        fy=view.fy * sy,
+        cx=view.cx * sx,
+        cy=view.cy * sy,
+    )
+
+
 def reduced_size(view: View, factor: int) -> tuple[int, int]:
     """(width, height) of the view divided by ``factor``, rounded, at least 1."""
     return max(1, round(view.width / factor)), max(1, round(view.height / factor))

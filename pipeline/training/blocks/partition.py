@@ -28,6 +28,7 @@ from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 from pipeline.training.blocks.layers import USED_SHARE
+from pipeline.training.blocks.options import OVERVIEW_EVERY
 from pipeline.training.data.targets import usable_factor
 
 Array = NDArray[np.float64]
@@ -202,7 +203,8 @@ def _block(
         typical = sum(found.pixels) / len(found.pixels)
         count = round(sum(found.pixels) / options.pixels_per_gaussian)
     limit = min(round(options.max_gaussians * min(1.0, typical / options.view_pixels)), count)
-    steps = round(options.steps * len(found.views) / num_views)
+    seen = len(found.views) + len(range(0, num_views, OVERVIEW_EVERY))
+    steps = round(options.steps * seen / num_views)
     return Block(
         lower=bounds_of(cell.lower),
         upper=bounds_of(cell.upper),

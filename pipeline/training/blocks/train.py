@@ -16,13 +16,14 @@ from pipeline.scene.blocks import Partition
 from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
-from pipeline.scene.views import View
+from pipeline.scene.views import View, reduced
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.options import block_options
+from pipeline.training.blocks.options import OVERVIEW_EVERY, OVERVIEW_FACTOR, block_options
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.data.targets import usable_factor
 from pipeline.training.loop.schedule import Part
 from pipeline.training.scene import TrainedScene, run_training, scene_inputs
 
@@ -97,8 +98,10 @@ def block_inputs(
     """
     region, block = partition.region(number), partition.blocks[number - 1]
     windows = {view.name: view.window for view in block.views}
-    kept = [index for index, view in enumerate(scene.views) if view.name in windows]
-    views = [scene.views[index].cropped(*windows[scene.views[index].name]) for index in kept]
+    shown = [index for index, view in enumerate(scene.views) if view.name in windows]
+    views = [scene.views[index].cropped(*windows[scene.views[index].name]) for index in shown]
+    overviews = range(0, len(scene.views), OVERVIEW_EVERY)
+    kept = [*shown, *overviews]
     coarse = scene.initial
     own = torch.from_numpy(np.flatnonzero(region.contains(coarse.means.numpy())))
     options = RasterOptions(
@@ -109,17 +112,31 @@ def block_inputs(
     )
     initial = coarse.select(own)
     return Inputs(
-        views=views,
+        views=[*views, *(_overview(scene.views[index]) for index in overviews)],
         initial=initial,
         extent=scene.extent,
         scale=scene.scale,
         gains=None if scene.gains is None else scene.gains[kept],
         depths=scene.depths
-        and [_cropped(scene.depths[index], windows[scene.views[index].name]) for index in kept],
+        and [
+            *(_cropped(scene.depths[i], windows[scene.views[i].name]) for i in shown),
+            *(_scaled(scene.depths[i], scene.views[i]) for i in overviews),
+        ],
         empty_depths=None if scene.empty_depths is None else scene.empty_depths[kept],
         seen_share=seen_share(initial.means.double().numpy(), views),
         layers=BlockLayers(coarse, region, background, options, make_backend()),
     )
+
+
+def _overview(view: View) -> View:
+    return reduced(view, usable_factor([view], OVERVIEW_FACTOR))
+
+
+def _scaled(known: KnownDepths, view: View) -> KnownDepths:
+    """The known depths of the overview of a view."""
+    small = _overview(view)
+    xy = known.xy * (small.width / view.width, small.height / view.height)
+    return KnownDepths(xy, known.z, known.weight)
 
 
 def _cropped(known: KnownDepths, window: tuple[int, int, int, int]) -> KnownDepths:

@@ -354,7 +354,7 @@ class Partition(Section):
 
     blocks: Literal["auto"] | Count = Field(
         "auto",
-        description="Number of blocks. auto: 1 for up to 400 photographs, else one for every 200.",
+        description="Number of blocks. auto: 1 for up to 1000 photographs, else one for every 250.",
     )
 
 

@@ -34,7 +34,7 @@ MIXED_GROUP_SHARE = 0.5
 FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
 # Scenes of more photographs are trained in blocks, one for so many.
-MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 400, 200
+MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]

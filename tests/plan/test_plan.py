@@ -465,7 +465,7 @@ def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gauss
         planned(449)
 
 
-@pytest.mark.parametrize("count, blocks", [(400, 1), (401, 3), (1000, 5)])
+@pytest.mark.parametrize("count, blocks", [(1000, 1), (1001, 5), (2000, 8)])
 def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, blocks):
     scan = many(tmp_path, count)
     plan = make_plan(scan, Config())

@@ -39,8 +39,9 @@ IMAGE_FACTOR = 4
 MIN_VIEW_SHARE = 0.005
 # Windows are this much larger than the block in them, pixels of the view.
 WINDOW_MARGIN = 8
-# SSIM's windows of 11 pixels mostly cover borders of smaller ones.
-MIN_WINDOW = 48
+# Sides of windows are multiples of this, pixels: in smaller ones, SSIM's windows of 11 pixels
+# mostly cover borders, and buffers of few sizes are reused.
+WINDOW_UNIT = 64
 # Margins cover the extent (3 standard deviations) of this share of the Gaussians near a face, and
 # are at least and at most these shares of the scene's extent along the axis.
 MARGIN_SHARE, MIN_MARGIN, MAX_MARGIN = 0.9, 0.01, 0.1
@@ -295,8 +296,5 @@ def _span(used: Any, size: int) -> tuple[int, int]:
     scale = size / len(used)
     begin = int(found[0] * scale) - WINDOW_MARGIN
     end = int(np.ceil((found[-1] + 1) * scale)) + WINDOW_MARGIN
-    missing = max(0, min(MIN_WINDOW, size) - (end - begin))
-    begin, end = begin - missing // 2, end + missing - missing // 2
-    begin = max(0, min(begin, size - min(MIN_WINDOW, size)))
-    end = min(size, max(end, begin + min(MIN_WINDOW, size)))
-    return begin, end - begin
+    length = min(size, -(-(end - begin) // WINDOW_UNIT) * WINDOW_UNIT)
+    return max(0, min((begin + end - length) // 2, size - length)), length

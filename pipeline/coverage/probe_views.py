@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.photos.load import load_mask, resize_mask
 from pipeline.render.views import Render
-from pipeline.scene.views import View, view_size
+from pipeline.scene.views import View, resized, view_size
 
 Floats = NDArray[np.float32]
 Doubles = NDArray[np.float64]
@@ -96,17 +96,7 @@ class Visibility:
 
 def reduced(view: View, side: int = SIDE) -> View:
     """The view scaled down so that no side is longer than ``side`` pixels."""
-    width, height = view_size(view.width, view.height, side)
-    sx, sy = width / view.width, height / view.height
-    return replace(
-        view,
-        width=width,
-        height=height,
-        fx=view.fx * sx,
-        fy=view.fy * sy,
-        cx=view.cx * sx,
-        cy=view.cy * sy,
-    )
+    return resized(view, *view_size(view.width, view.height, side))
 
 
 def render_probe(view: View, render: Renderer) -> ProbeView:

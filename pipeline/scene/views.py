@@ -204,9 +204,8 @@ def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]
     return views
 
 
-def reduced(view: View, factor: int) -> View:
-    """The view at 1 / ``factor`` of its size."""
-    width, height = reduced_size(view, factor)
+def resized(view: View, width: int, height: int) -> View:
+    """The view at another size, with intrinsics scaled by the exact ratios."""
     sx, sy = width / view.width, height / view.height
     return replace(
         view,

@@ -13,7 +13,7 @@ from pipeline.scene.views import View
 # Occlusion: side of the cells of a coarse depth map in pixels, and the share by which a visible
 # point may be behind the nearest one in its cell.
 _CELL, _BEHIND = 8, 1.05
-_MAX_SAMPLES = 5000
+_SAMPLES = 5000
 
 
 class Projection(NamedTuple):
@@ -45,9 +45,11 @@ def projected(xyz: NDArray[np.float64], view: View) -> Projection:
 
 
 def seen_share(xyz: NDArray[np.float64], views: Sequence[View]) -> float:
-    """The mean share of ``views`` whose image contains a point, hidden or not, over at most
-    ``_MAX_SAMPLES`` of (N, 3) points; 1 without points."""
-    sample = xyz[:: max(1, len(xyz) // _MAX_SAMPLES)]
+    """The mean share of ``views`` whose image contains a point, hidden or not; 1 without points.
+
+    Of more than twice ``_SAMPLES`` points (N, 3), it is that of an even sample.
+    """
+    sample = xyz[:: max(1, len(xyz) // _SAMPLES)]
     if not len(sample) or not views:
         return 1.0
     inside = sum(int(projected(sample, view).inside.sum()) for view in views)

@@ -16,7 +16,7 @@ from pipeline.scene.blocks import Partition
 from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
-from pipeline.scene.views import View, reduced
+from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.blocks.layers import BlockLayers
@@ -129,7 +129,7 @@ def block_inputs(
 
 
 def _overview(view: View) -> View:
-    return reduced(view, usable_factor([view], OVERVIEW_FACTOR))
+    return resized(view, *reduced_size(view, usable_factor([view], OVERVIEW_FACTOR)))
 
 
 def _scaled(known: KnownDepths, view: View) -> KnownDepths:

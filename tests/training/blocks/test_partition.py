@@ -51,7 +51,7 @@ def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedSce
 
 
 def test_a_view_without_the_block_is_not_among_its_views(divided: DividedScene) -> None:
-    """With a wall in front of the second cluster, views from that side do not show it."""
+    """A camera that faces away from both blocks."""
     partition = divided.partition
     away = divided.views[0]
     turned = np.diag([-1.0, 1.0, -1.0, 1.0]) @ away.world_to_camera

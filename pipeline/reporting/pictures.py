@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from functools import cache
 from typing import Any
 
+import cv2
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
@@ -22,7 +23,7 @@ The scale is fixed, so that maps of different views and scenes are comparable.""
 
 MASKED_GREY = 128
 
-_ERROR_COLOURS, _TRUST_COLOURS = "inferno", "viridis"
+_ERROR_COLOURS, _TRUST_COLOURS = cv2.COLORMAP_INFERNO, cv2.COLORMAP_VIRIDIS
 _PAGE_SIDE = 900
 _JPEG_QUALITY = 86
 # Bytes of JPEG in one page; base64 adds a third.
@@ -56,10 +57,10 @@ def trust_colours(trust: Picture) -> Picture:
 
 
 @cache
-def _colours(name: str) -> Picture:
-    from matplotlib import colormaps
-
-    return np.rint(colormaps[name](np.arange(256))[:, :3] * 255).astype(np.uint8)
+def _colours(colour_map: int) -> Picture:
+    """(256, 3) uint8 RGB of one of OpenCV's colour maps."""
+    bgr = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[:, None], colour_map)
+    return np.asarray(bgr[:, 0, ::-1], np.uint8)
 
 
 def scale_gradient() -> str:
@@ -72,8 +73,8 @@ def trust_gradient() -> str:
     return _gradient(_TRUST_COLOURS)
 
 
-def _gradient(name: str) -> str:
-    stops = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _colours(name)[:: 255 // 15]]
+def _gradient(colour_map: int) -> str:
+    stops = [f"#{r:02x}{g:02x}{b:02x}" for r, g, b in _colours(colour_map)[:: 255 // 15]]
     return f"linear-gradient(to right, {', '.join(stops)})"
 
 

@@ -9,7 +9,7 @@ import torch
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.coverage.measure import WorldFrame, measure_coverage
+from pipeline.coverage.measure import WorldFrame, measure_coverage, spearman
 from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluate import choose_protocol, evaluate_views
 from pipeline.render.views import to_bytes
@@ -93,3 +93,12 @@ def test_without_test_views_no_error_is_reported(tmp_path) -> None:
     assert found.views == () and found.error is not None
     assert found.error.rank_correlation is None and found.error.by_trust == ()
     assert found.viewpoints
+
+
+def test_rank_correlation_gives_equal_values_their_mean_rank() -> None:
+    rising = np.array([1.0, 2.0, 3.0, 4.0])
+    assert spearman(rising, np.array([10.0, 30.0, 20.0, 40.0])) == pytest.approx(0.8)
+    tied = np.array([1.0, 2.0, 2.0, 5.0])
+    assert spearman(tied, -tied) == pytest.approx(-1)
+    # Pearson's correlation of the ranks 1, 2.5, 2.5, 4 and 1, 2, 3, 4.
+    assert spearman(tied, rising) == pytest.approx(4.5 / np.sqrt(4.5 * 5))

@@ -143,7 +143,7 @@ def test_the_plan_lists_each_stages_inputs():
 
 def test_declarations_import_nothing_heavy():
     """The Snakefile imports all declarations before any job starts."""
-    heavy = ("torch", "cv2", "pycolmap", "scipy", "skimage", "matplotlib", "rawpy")
+    heavy = ("torch", "cv2", "pycolmap", "scipy", "skimage", "rawpy")
     code = (
         "import sys; import stages.workflow.registry; "
         f"print([name for name in {heavy!r} if name in sys.modules])"

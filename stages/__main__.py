@@ -39,6 +39,7 @@ def main() -> int:
         inputs=_pairs(args.input),
         out=args.out,
         threads=threads,
+        memory_mb=memory_mb,
         log=args.log,
         publish=_pairs(args.publish),
     )

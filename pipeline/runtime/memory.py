@@ -1,5 +1,6 @@
-"""Peak memory of this process."""
+"""Memory of this process."""
 
+import ctypes
 import resource
 import sys
 from pathlib import Path
@@ -10,6 +11,12 @@ def peak_memory_mb() -> float:
     usages = [resource.getrusage(kind) for kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
     unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes on macOS, KiB on Linux
     return max(usage.ru_maxrss for usage in usages) / unit
+
+
+def release_free_memory() -> None:
+    """Return freed memory to the system, which glibc keeps where allocations differ in size."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
+        libc.malloc_trim(0)
 
 
 def limit_address_space(size: int) -> None:

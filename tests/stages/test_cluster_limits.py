@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import signal
+import sys
 import time
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from pipeline.plan import duration
 from pipeline.plan.plan import make_plan
 from pipeline.plan.scan import scan
 from pipeline.runtime import termination
+from stages import __main__ as main
 from stages.workflow import cluster
 from stages.workflow.registry import STAGES
 from tests.pictures import photos
@@ -58,6 +60,21 @@ def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
     assert cluster.granted_cpus() == 16
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
     assert cluster.granted_cpus() == 2
+
+
+def test_a_stage_gets_the_threads_and_the_memory_of_its_job(tmp_path, monkeypatch):
+    """On a cluster without the memory of the Snakemakes around it."""
+    requests = []
+    monkeypatch.setattr(main, "run_stage", lambda request, *_: requests.append(request))
+    arguments = ["init", "--out", str(tmp_path), "--key", "{}", "--threads", "4"]
+    monkeypatch.setattr(sys, "argv", ["stages", *arguments, "--memory-mb", "900"])
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    main.main()
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
+    main.main()
+    limits = [(request.threads, request.memory_mb) for request in requests]
+    assert limits == [(4, 900), (2, 900 - cluster.OVERHEAD_MB)]
 
 
 def test_time_limits_grow_with_the_scene_and_the_steps(tmp_path):

@@ -13,6 +13,12 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from pipeline.runtime.memory import release_free_memory
+
+# Freed memory is returned to the system after so many images: those of a block differ in size, and
+# the heap would grow to several times the memory in use.
+IMAGES_PER_RELEASE = 32
+
 Planes = tuple[Tensor | None, ...]
 """The tensors of one image, uint8 or bool; None for those that it does not have."""
 
@@ -42,11 +48,24 @@ class DiskStore:
 
     def __init__(self) -> None:
         self._file = tempfile.TemporaryFile()  # noqa: SIM115 (open as long as the store)
-        self._end, self._lock = 0, Lock()
+        self._end, self._images, self._lock = 0, 0, Lock()
 
     def add(self, planes: Planes) -> Callable[[], Planes]:
+        self._count()
         readers = [None if plane is None else self._write(plane) for plane in planes]
-        return lambda: tuple(None if read is None else read() for read in readers)
+
+        def read() -> Planes:
+            self._count()
+            return tuple(None if read is None else read() for read in readers)
+
+        return read
+
+    def _count(self) -> None:
+        with self._lock:
+            self._images += 1
+            due = self._images % IMAGES_PER_RELEASE == 0
+        if due:
+            release_free_memory()
 
     def _write(self, plane: Tensor) -> Callable[[], Tensor]:
         array = plane.contiguous().numpy()

@@ -47,26 +47,13 @@ class Box:
         """The box with its faces moved outwards by (3,) distances."""
         return Box(self.axes, self.lower - below, self.upper + above)
 
-    def between(self, origin: Array, points: Array) -> NDArray[np.bool_]:
-        """(N,) whether the segment from ``origin`` (3,) to each of (N, 3) points meets the box.
-
-        Slab method (Kay and Kajiya 1986).
-        """
-        start = self.along_axes(origin[None])[0]
-        step = self.along_axes(points) - start
-        enter, leave = np.zeros(len(step)), np.ones(len(step))
-        for axis in range(3):
-            move = step[:, axis]
-            moving = move != 0
-            safe = np.where(moving, move, 1.0)
-            first = (self.lower[axis] - start[axis]) / safe
-            second = (self.upper[axis] - start[axis]) / safe
-            near, far = np.minimum(first, second), np.maximum(first, second)
-            inside = self.lower[axis] <= start[axis] < self.upper[axis]
-            near = np.where(moving, near, -np.inf if inside else np.inf)
-            far = np.where(moving, far, np.inf if inside else -np.inf)
-            enter, leave = np.maximum(enter, near), np.minimum(leave, far)
-        return np.asarray(enter <= leave)
+    def hides(self, origin: Array, points: Array) -> NDArray[np.bool_]:
+        """(N,) whether each of (N, 3) points outside of the box is farther from ``origin`` (3,)
+        than the point of the box that is nearest to it: what surrounds it is behind the box, where
+        they overlap in an image."""
+        start, local = self.along_axes(origin[None]), self.along_axes(points)
+        nearest = np.clip(local, self.lower, self.upper)
+        return np.asarray(((nearest - start) ** 2).sum(1) < ((local - start) ** 2).sum(1))
 
 
 class BlockView(JsonObject):

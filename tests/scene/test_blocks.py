@@ -25,19 +25,30 @@ def sampled(space: Box, start: Array, end: Array) -> bool:
     return bool(space.contains(start + t * (end - start)).any())
 
 
-@given(arrays(float, 3, elements=coordinates), arrays(float, 3, elements=coordinates))
-def test_a_segment_meets_a_box_if_one_of_its_points_is_inside(start: Array, end: Array) -> None:
-    space = box(np.array([-2.0, -np.inf, 0.5]), np.array([3.0, 4.0, np.inf]))
-    if sampled(space, start, end):
-        assert space.between(start, end[None])[0]
+SPACE = box(np.array([-2.0, -np.inf, 0.5]), np.array([3.0, 4.0, np.inf]))
+places = arrays(float, 3, elements=coordinates)
 
 
-@given(arrays(float, 3, elements=coordinates), arrays(float, 3, elements=coordinates))
-def test_a_segment_that_meets_a_box_comes_close_to_its_inside(start: Array, end: Array) -> None:
-    space = box(np.array([-2.0, -np.inf, 0.5]), np.array([3.0, 4.0, np.inf]))
-    grown = space.expanded(np.full(3, 0.02), np.full(3, 0.02))
-    if space.between(start, end[None])[0]:
-        assert sampled(grown, start, end)
+@given(places, places)
+def test_a_box_hides_what_is_behind_it(camera: Array, point: Array) -> None:
+    if not SPACE.contains(point[None])[0] and sampled(SPACE, camera, point):
+        assert SPACE.hides(camera, point[None])[0]
+
+
+@given(places, places, st.floats(0.1, 0.9))
+def test_a_box_does_not_hide_what_is_in_front_of_it(
+    camera: Array, inside: Array, share: float
+) -> None:
+    point = camera + share * (inside - camera)
+    if SPACE.contains(inside[None])[0] and not sampled(SPACE, camera, point):
+        assert not SPACE.hides(camera, point[None])[0]
+
+
+def test_a_box_hides_the_far_field_beside_it() -> None:
+    """The sky over a box: large Gaussians, parts of which are behind it in the image."""
+    cube = box(np.full(3, -1.0), np.full(3, 1.0))
+    camera, sky = np.array([0.0, -9.0, 3.0]), np.array([[40.0, 80.0, 30.0], [0.0, 90.0, 60.0]])
+    assert cube.hides(camera, sky).all()
 
 
 def test_halves_of_a_box_share_no_point_and_lose_none() -> None:
@@ -52,4 +63,4 @@ def test_halves_of_a_box_share_no_point_and_lose_none() -> None:
 
 def test_a_camera_inside_has_everything_else_behind_the_box() -> None:
     space = box(np.full(3, -1.0), np.full(3, 1.0))
-    assert space.between(np.zeros(3), np.array([[5.0, 0, 0], [0, -3, 0]])).all()
+    assert space.hides(np.zeros(3), np.array([[5.0, 0, 0], [0, -3, 0]])).all()

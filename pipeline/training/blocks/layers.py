@@ -42,7 +42,7 @@ class BlockLayers:
     def __call__(self, view: View) -> Layers:
         means = self.coarse.means.numpy()
         own = self.region.contains(means)
-        behind = self.region.between(view.centre, means) & ~own
+        behind = self.region.hides(view.centre, means) & ~own
         front = self._render(view, ~own & ~behind)
         block = self._render(view, own)
         back = self._render(view, behind, self.background)

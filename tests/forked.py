@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 from collections.abc import Iterator
 from contextlib import contextmanager
-from multiprocessing import context, forkserver
+from multiprocessing import context, forkserver, util
 from typing import Any
 
 # OpenCV before pycolmap. Modules that cannot be imported are left out.
@@ -33,8 +33,7 @@ class _Process(context.ForkServerProcess):
     def run(self) -> None:
         os.environ.clear()
         os.environ.update(self._environment)
-        with spawning(_Context()):  # processes of this process too
-            super().run()
+        super().run()
 
 
 class _Context(context.ForkServerContext):
@@ -58,6 +57,7 @@ def forked_spawns() -> Iterator[None]:
     """Meanwhile, multiprocessing's start method "spawn" forks a server of this process."""
     forking = _Context()
     forking.set_forkserver_preload([*PRELOADED])
+    util.get_temp_dir()  # for the server's socket: a stage's scratch folder has too long a path
     with spawning(forking):
         yield
     forkserver._forkserver._stop()  # type: ignore[attr-defined]

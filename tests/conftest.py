@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator
+from collections.abc import Generator, Iterator
 
 import pytest
 
+from tests.forked import forked_spawns
 from tests.tools import fail_skipped
 
 # torch's own threads would spin beside the other worker's, and the references' arrays are small.
@@ -29,6 +30,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             for group in groups
             for item in group[len(group) * worker // workers : len(group) * (worker + 1) // workers]
         ]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def forks() -> Iterator[None]:
+    with forked_spawns():
+        yield
 
 
 @pytest.hookimpl(wrapper=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
+from functools import cache
 from typing import Any, get_args
 
 from pydantic import BaseModel
@@ -32,6 +33,11 @@ def option_paths(model: type[BaseModel] = Config, prefix: str = "") -> Iterator[
             yield prefix + name
 
 
+@cache
+def _all_paths() -> tuple[str, ...]:
+    return tuple(option_paths())
+
+
 def select(config: Config, paths: Iterable[str]) -> dict[str, Any]:
     """The values of the options at or below ``paths``, nested as in the schema, JSON types.
 
@@ -39,10 +45,9 @@ def select(config: Config, paths: Iterable[str]) -> dict[str, Any]:
         KeyError: there is no such option.
     """
     dumped = config.model_dump(mode="json")
-    known = list(option_paths())
     selected: dict[str, Any] = {}
     for path in paths:
-        below = [name for name in known if name == path or name.startswith(f"{path}.")]
+        below = [name for name in _all_paths() if name == path or name.startswith(f"{path}.")]
         if not below:
             raise KeyError(path)
         for name in below:

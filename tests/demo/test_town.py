@@ -158,19 +158,19 @@ def test_area_grows_with_the_photographs_and_the_first_ones_stay() -> None:
 
 
 def test_each_photograph_overlaps_with_the_one_before() -> None:
-    camera = lens("none", 64, 43)
+    camera = lens("none", 32, 22)
     views = camera_path([f"{i}" for i in range(2 * PHOTOGRAPHS_PER_CELL)], 0)
     shapes = Shapes.of(list(build(cells_of(len(views)), 0).solids))
     through = rays(camera)
     grid = Grid(through.centres[0], through.centres[1])
-    x, y = np.meshgrid(np.arange(64) + 0.5, np.arange(43) + 0.5)
+    x, y = np.meshgrid(np.arange(32) + 0.5, np.arange(22) + 0.5)
     shares = []
     for before, after in pairwise(views):
         inverse = visible(shapes, before, grid).inverse
         where = inverse > 0
         xyz = to_world(camera, before, np.stack([x, y], -1)[where], 1 / inverse[where])
         xy, z = to_view(camera, after, xyz)
-        shares.append(np.mean((z > 0) & np.all((xy > 0) & (xy < (64, 43)), axis=-1)))
+        shares.append(np.mean((z > 0) & np.all((xy > 0) & (xy < (32, 22)), axis=-1)))
     jump = PHOTOGRAPHS_PER_CELL - 1  # from the end of a walk to the flight over the next cell
     shares = np.delete(shares, jump)
     assert shares.min() > 0.35 and np.median(shares) > 0.6

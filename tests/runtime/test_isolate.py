@@ -5,12 +5,21 @@ from __future__ import annotations
 import multiprocessing
 import os
 import time
+from collections.abc import Iterator
+from multiprocessing.context import SpawnContext
 
 import pytest
 
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import run_isolated
+from tests.forked import spawning
 from tests.sfm import jobs
+
+
+@pytest.fixture(autouse=True)
+def new_processes() -> Iterator[None]:
+    with spawning(SpawnContext()):
+        yield
 
 
 def test_the_value_is_returned():

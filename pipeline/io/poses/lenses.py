@@ -12,8 +12,8 @@ The Brown-Conrady model, with the coefficients' names of OpenCV's "Camera Calibr
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -90,7 +90,7 @@ def brown_camera(file: Path, where: str, width: float, height: float, lens: Brow
     camera = checked_camera(file, where, model, width, height, params)
     if _is_exact(lens):
         return camera
-    return fitted(file, where, camera, model, rest, lens.project)
+    return fitted(file, where, camera, model, rest, lens)
 
 
 def brown_model(lens: Brown) -> str:
@@ -110,26 +110,33 @@ def _is_exact(lens: Brown) -> bool:
     return not (lens.skew or fourth or (any(lens.p) and any(lens.p_radial)))
 
 
+@lru_cache(maxsize=64)
+def _nearest(
+    model: str, width: int, height: int, start: tuple[float, ...], lens: Brown
+) -> tuple[Camera, float]:
+    """``fit_camera``, once for all photographs of a lens: some programs write it for each."""
+    return fit_camera(model, width, height, start, lens.project)
+
+
 def fitted(
     file: Path,
     where: str,
     near: Camera,
     model: str,
     start: tuple[float, ...],
-    lens: Callable[[Array], Array],
+    lens: Brown,
 ) -> Camera:
     """The camera of a ``model`` that is fitted to ``lens``.
 
     Args:
         near: a camera with the size and intrinsics to start from.
         start: the distortion coefficients to start from.
-        lens: see ``fit_camera``.
 
     Raises:
         UserError: its largest error is ``MAX_RESIDUAL_PX`` or more.
     """
     first = (*near.pinhole, *start)
-    camera, residual = fit_camera(model, near.width, near.height, first, lens)
+    camera, residual = _nearest(model, near.width, near.height, first, lens)
     if not residual < MAX_RESIDUAL_PX:
         found = f"{residual:.3g} px" if np.isfinite(residual) else "more than any limit"
         raise malformed(

@@ -186,7 +186,8 @@ def test_damaged_xmp(tmp_path, data):
     error_or_valid(xmp_frames, tmp_path / "images")
 
 
-def test_photographs_with_one_lens_are_fitted_once(tmp_path, monkeypatch):
+@pytest.mark.parametrize("form", ["csv", "xmp"])
+def test_photographs_with_one_lens_are_fitted_once(tmp_path, monkeypatch, form):
     """A fit takes a tenth of a second, and there are thousands of photographs."""
     calls = []
 
@@ -195,8 +196,13 @@ def test_photographs_with_one_lens_are_fitted_once(tmp_path, monkeypatch):
         return fit_camera(*arguments)
 
     monkeypatch.setattr(lenses, "fit_camera", counted)
-    known = known_scene(camera(-0.1, 0.03, 1e-3, -2e-3), 9)
-    (tmp_path / "cameras.csv").write_text(csv_text(known, k4=1e-3))
-    frames = csv_frames(tmp_path / "cameras.csv")
+    lenses._nearest.cache_clear()
+    known = known_scene(camera(-0.1, 0.03, 1e-3, -2e-3), 9, names="p{}")
+    if form == "csv":
+        (tmp_path / "cameras.csv").write_text(csv_text(known, k4=1e-3))
+        frames = csv_frames(tmp_path / "cameras.csv")
+    else:
+        write_xmp(tmp_path, known, "brown4t2", "-0.1 0.03 0 1e-3 0.001 -0.002")
+        frames = xmp_frames(tmp_path / "images")
     sizes = dict.fromkeys(known.by_name(), (WIDTH, HEIGHT))
     assert len(reconstruct(frames, sizes).images) == 9 and len(calls) == 1

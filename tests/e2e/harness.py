@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 
@@ -54,20 +55,10 @@ def copy_project(target: Path) -> Path:
 
 def make_scene(project: Path, scene: str, *options: str) -> None:
     """Make a tiny demo scene in ``data/<scene>`` of a project."""
-    subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pipeline.demo",
-            f"data/{scene}",
-            *TINY_DEMO,
-            *("--processes", "1"),  # starting more takes longer than they save
-            *options,
-        ],
-        cwd=project,
-        env=environment(project),
-        check=True,
-    )
+    # One process: starting more takes longer than they save.
+    words = [f"data/{scene}", *TINY_DEMO, "--processes", "1", *options]
+    code, said = run_fork(OTHER_JOBS, "pipeline.demo", words, project, Path(sys.executable))
+    assert code == 0, said
 
 
 def copy_run(source: Path, target: Path) -> Path:
@@ -135,20 +126,33 @@ def start_snakemake(
     )
 
 
+def run_fork(
+    server: ForkServer, module: str, words: Sequence[str], project: Path, python: Path
+) -> tuple[int, str]:
+    """The exit status of a module, and its stdout and stderr together."""
+    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
+        run = server.start(
+            module,
+            words,
+            folder=project,
+            environment=environment(project),
+            output=output.fileno(),
+            python=python,
+        )
+        code = run.wait(timeout_s=900)
+        output.seek(0)
+        return code, output.read()
+
+
 def snakemake(
     project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
     """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        run = start_snakemake(project, *args, output=output.fileno(), config=config, cores=cores)
-        code = run.wait(timeout_s=900)
-        output.seek(0)
-        done = subprocess.CompletedProcess(
-            command(*args, config=config, cores=cores), code, output.read()
-        )
-    if check and done.returncode != 0:
-        raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
-    return done
+    words = arguments(*args, config=config, cores=cores)
+    code, said = run_fork(RUNS, "snakemake", words, project, forking_python())
+    if check and code != 0:
+        raise AssertionError(f"snakemake ended with {code}:\n{said}")
+    return subprocess.CompletedProcess(words, code, said)
 
 
 def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:

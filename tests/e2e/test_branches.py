@@ -40,12 +40,8 @@ def masked(tmp_path_factory):
     return made_once(tmp_path_factory, "e2e-masked", make) / "data/masked"
 
 
-SMALL = (
-    "--views",
-    "15",
-    "--size",
-    "100x76",
-)  # for scenes with poses: too small for structure from motion
+# For scenes with poses: too small for structure from motion.
+SMALL = ("--views", "15", "--size", "100x76")
 SCENES = {
     "raw": (("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
     "raw_posed": (

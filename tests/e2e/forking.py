@@ -9,6 +9,8 @@ The server imports nothing of the program: each fork imports it from its own fol
 from __future__ import annotations
 
 import atexit
+import contextlib
+import gc
 import importlib
 import json
 import os
@@ -21,6 +23,7 @@ import socket
 import subprocess
 import sys
 import tempfile
+import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
@@ -51,6 +54,11 @@ class ForkServer:
         self._server = server
         return folder
 
+    @property
+    def address(self) -> Path:
+        """The server's socket."""
+        return self._folder / "socket"
+
     @staticmethod
     def _end(server: subprocess.Popen[bytes], folder: Path) -> None:
         assert server.stdin is not None
@@ -58,22 +66,13 @@ class ForkServer:
         server.wait()
         shutil.rmtree(folder, ignore_errors=True)
 
-    def python(self, starts: Sequence[str]) -> Path:
-        """A ``python`` that runs a command that begins with one of ``starts``, each ``-m MODULE``
-        and an argument, in a fork. Others start a new process."""
-        script = self._folder / "bin" / "python"
-        if not script.exists():
-            script.parent.mkdir()
-            here, real = shlex.quote(__file__), shlex.quote(sys.executable)
-            address = shlex.quote(str(self._folder / "socket"))
-            script.write_text(
-                f'#!/bin/sh\ncase "$1 $2 $3" in\n{"|".join(map(shlex.quote, starts))})\n'
-                f'exec {real} -I -S {here} call {address} "$@";;\nesac\nexec {real} "$@"\n'
-            )
-            script.chmod(0o755)
-        return script
+    def handles(self, starts: Sequence[str]) -> str:
+        """A branch of a shell's ``case "$1 $2 $3"``: these commands, each ``-m MODULE`` and an
+        argument, run in a fork."""
+        call = shlex.join([sys.executable, "-I", "-S", __file__, "call", str(self.address)])
+        return f'{"|".join(map(shlex.quote, starts))})\nexec {call} "$@";;\n'
 
-    def run(
+    def start(
         self,
         module: str,
         arguments: Sequence[str],
@@ -81,10 +80,9 @@ class ForkServer:
         folder: Path,
         environment: Mapping[str, str],
         output: int,
-        timeout_s: float,
         python: Path,
-    ) -> int:
-        """The exit status of ``python -m module``; minus the signal that killed it.
+    ) -> Fork:
+        """``python -m module`` in a session of its own.
 
         Args:
             output: descriptor of the file that receives stdout and stderr.
@@ -96,24 +94,49 @@ class ForkServer:
             "folder": str(folder),
             "environment": dict(environment),
             "python": str(python),
+            "session": True,
         }
         with open(os.devnull) as nothing:
-            files = [nothing.fileno(), output, output]
-            try:
-                return _call(str(self._folder / "socket"), request, files, timeout_s)
-            except TimeoutError:
-                os.killpg(self._server.pid, signal.SIGKILL)
-                raise
+            return Fork(str(self.address), request, [nothing.fileno(), output, output])
 
 
-def _call(address: str, request: object, files: list[int], timeout_s: float | None) -> int:
-    with socket.socket(socket.AF_UNIX) as connection:
-        connection.settimeout(timeout_s)
-        connection.connect(address)
-        socket.send_fds(connection, [b"."], files)
-        connection.sendall(json.dumps(request).encode())
-        connection.shutdown(socket.SHUT_WR)
-        return int(connection.recv(16))
+class Fork:
+    """A module that runs in a fork of a server, which kills it if this process ends.
+
+    Attributes:
+        pid: its process.
+    """
+
+    def __init__(self, address: str, request: object, files: list[int]):
+        with socket.socket(socket.AF_UNIX) as connection:
+            connection.connect(address)
+            socket.send_fds(connection, [b"."], files)
+            connection.sendall(json.dumps(request).encode())
+            connection.shutdown(socket.SHUT_WR)
+            self._answers = connection.makefile("rb", buffering=0)
+        self.pid = int(self._answers.readline())
+
+    def ended(self, timeout_s: float | None = 0.0) -> bool:
+        return bool(select.select([self._answers], [], [], timeout_s)[0])
+
+    def wait(self, timeout_s: float | None = None) -> int:
+        """The exit status; minus the signal that killed it."""
+        if not self.ended(timeout_s):
+            os.killpg(self.pid, signal.SIGKILL)
+            raise TimeoutError
+        with self._answers:
+            return int(self._answers.readline())
+
+
+def write_python(script: Path, *branches: str) -> Path:
+    """Write a ``python`` that runs what the branches handle (``ForkServer.handles``) in forks, and
+    starts a new process for everything else."""
+    script.write_text(
+        f'#!/bin/sh\ncase "$1 $2 $3" in\n{"".join(branches)}esac\n'
+        f'exec {shlex.quote(sys.executable)} "$@"\n'
+    )
+    script.chmod(0o755)
+    return script
 
 
 def call(address: str, module: str, *arguments: str) -> int:
@@ -124,7 +147,7 @@ def call(address: str, module: str, *arguments: str) -> int:
         "folder": os.getcwd(),
         "environment": dict(os.environ),
     }
-    code = _call(address, request, [0, 1, 2], None)
+    code = Fork(address, request, [0, 1, 2]).wait()
     return code if code >= 0 else 128 - code
 
 
@@ -132,6 +155,7 @@ def serve(address: str, *packages: str) -> None:
     """Run what is requested, each in a process of its own, until standard input is closed."""
     for package in packages:
         importlib.import_module(package)
+    gc.freeze()  # The forks' collections leave the packages' objects, and their pages, alone.
     children: set[int] = set()
     with socket.socket(socket.AF_UNIX) as listener:
         listener.bind(address)
@@ -152,7 +176,8 @@ def serve(address: str, *packages: str) -> None:
 
 
 def _answer(connection: socket.socket) -> None:
-    """Run one request in a child and send its exit status."""
+    """Run one request in a child, send its process and its exit status. If the connection is closed
+    before, the child is killed."""
     _, files, _, _ = socket.recv_fds(connection, 1, 3)
     with connection.makefile("rb") as stream:
         request = json.load(stream)
@@ -161,8 +186,16 @@ def _answer(connection: socket.socket) -> None:
         connection.close()
         _become(files, **request)
         return
+    connection.sendall(b"%d\n" % pid)
+    events = select.poll()
+    child = os.pidfd_open(pid)
+    events.register(child, select.POLLIN)
+    events.register(connection, 0)  # a hang-up only
+    if all(file != child for file, _ in events.poll()):
+        os.kill(pid, signal.SIGKILL)
     code = os.waitstatus_to_exitcode(os.waitpid(pid, 0)[1])
-    connection.sendall(str(code).encode())
+    with contextlib.suppress(BrokenPipeError):
+        connection.sendall(b"%d\n" % code)
     os._exit(0)
 
 
@@ -173,8 +206,12 @@ def _become(
     folder: str,
     environment: Mapping[str, str],
     python: str = sys.executable,
+    session: bool = False,
 ) -> None:
-    """Run a module in this process as ``python -m`` would."""
+    """Run a module in this process as ``python -m`` would, but for the tear-down of the packages'
+    modules and objects, which takes longer than many a stage."""
+    if session:
+        os.setsid()
     os.chdir(folder)
     os.environ.clear()
     os.environ.update(environment)
@@ -184,7 +221,18 @@ def _become(
         os.dup2(file, target)
         os.close(file)
     sys.argv = [module, *arguments]
-    runpy.run_module(module, run_name="__main__", alter_sys=True)
+    status = 0
+    try:
+        runpy.run_module(module, run_name="__main__", alter_sys=True)
+    except SystemExit as leaving:
+        if not isinstance(leaving.code, int | None):
+            raise
+        status = leaving.code or 0
+    threading._shutdown()
+    atexit._run_exitfuncs()
+    sys.stdout.flush()
+    sys.stderr.flush()
+    os._exit(status)
 
 
 if __name__ == "__main__":

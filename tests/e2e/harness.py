@@ -12,18 +12,24 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
+from functools import cache
 from pathlib import Path
 
-from tests.e2e.forking import ForkServer
+from tests.e2e.forking import Fork, ForkServer, write_python
 
 ROOT = Path(__file__).resolve().parents[2]
 
-# What each run of Snakemake, and each of its jobs that need torch, would import anew.
+# What each run of Snakemake and each of its jobs would import anew. Stages with pycolmap share no
+# process with those with torch, and cv2 comes first: see CONTRIBUTING.md.
+COMMON = ("cv2", "PIL.Image", "pydantic", "numpy.random", "scipy.sparse.csgraph", "scipy.spatial")
 RUNS = ForkServer("snakemake.cli", "numpy", "pydantic")
-JOBS = ForkServer("torch", "cv2", "PIL.Image", "numpy", "pydantic")
-TORCH_JOBS = [
-    f"-m stages {stage}" for stage in ("train", "evaluate", "coverage", "export", "report")
-]
+TORCH_JOBS = ForkServer(
+    *("torch", *COMMON, "scipy.ndimage", "scipy.stats", "matplotlib.colors", "matplotlib.cm")
+)
+OTHER_JOBS = ForkServer(*COMMON, "pycolmap")
+TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
+OTHER_STAGES = ("inspect", "decode", "features", "matches", "sfm", "refine", "undistort", "init")
 
 # Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
@@ -49,20 +55,10 @@ def copy_project(target: Path) -> Path:
 
 def make_scene(project: Path, scene: str, *options: str) -> None:
     """Make a tiny demo scene in ``data/<scene>`` of a project."""
-    subprocess.run(
-        [
-            sys.executable,
-            "-m",
-            "pipeline.demo",
-            f"data/{scene}",
-            *TINY_DEMO,
-            *("--processes", "1"),  # starting more takes longer than they save
-            *options,
-        ],
-        cwd=project,
-        env=environment(project),
-        check=True,
-    )
+    # One process: starting more takes longer than they save.
+    words = [f"data/{scene}", *TINY_DEMO, "--processes", "1", *options]
+    code, said = run_fork(OTHER_JOBS, "pipeline.demo", words, project, Path(sys.executable))
+    assert code == 0, said
 
 
 def copy_run(source: Path, target: Path) -> Path:
@@ -82,37 +78,79 @@ def environment(project: Path) -> dict[str, str]:
     }
 
 
-def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]:
-    line = [sys.executable, "-m", "snakemake", "--cores", str(cores), *args]
+def arguments(*args: str, config: dict | None = None, cores: int = 2) -> list[str]:
+    """Snakemake's command line behind the program's name."""
+    line = ["--cores", str(cores), *args]
     if config is not None:
         line += ["--config", *(f"{name}={json.dumps(value)}" for name, value in config.items())]
     return line
 
 
-def snakemake(
-    project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
-) -> subprocess.CompletedProcess[str]:
-    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``.
+def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]:
+    return [sys.executable, "-m", "snakemake", *arguments(*args, config=config, cores=cores)]
 
-    It and the jobs that need torch are forks of processes that have imported these packages:
-    what ``start_and_kill`` and installed programs start is a new Python.
+
+@cache
+def forking_python() -> Path:
+    """The ``python`` of Snakemake's jobs."""
+    folder = TORCH_JOBS.address.parent / "bin"
+    folder.mkdir()
+    return write_python(
+        folder / "python",
+        TORCH_JOBS.handles(
+            ["-m stages.workflow.batch --results", *(f"-m stages {s}" for s in TORCH_STAGES)]
+        ),
+        OTHER_JOBS.handles(
+            ["-m stages.workflow.plan --out", *(f"-m stages {s}" for s in OTHER_STAGES)]
+        ),
+    )
+
+
+def start_snakemake(
+    project: Path, *args: str, output: int, config: dict | None = None, cores: int = 2
+) -> Fork:
+    """Start Snakemake in ``project``; ``output`` receives stdout and stderr.
+
+    It and its jobs are forks of processes that have imported large packages. If Snakemake and the
+    rest of its process group are killed, so is its job.
     """
-    line = command(*args, config=config, cores=cores)
+    return RUNS.start(
+        "snakemake",
+        arguments(*args, config=config, cores=cores),
+        folder=project,
+        environment=environment(project),
+        output=output,
+        python=forking_python(),
+    )
+
+
+def run_fork(
+    server: ForkServer, module: str, words: Sequence[str], project: Path, python: Path
+) -> tuple[int, str]:
+    """The exit status of a module, and its stdout and stderr together."""
     with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        code = RUNS.run(
-            "snakemake",
-            line[line.index("snakemake") + 1 :],
+        run = server.start(
+            module,
+            words,
             folder=project,
             environment=environment(project),
             output=output.fileno(),
-            timeout_s=900,
-            python=JOBS.python(TORCH_JOBS),
+            python=python,
         )
+        code = run.wait(timeout_s=900)
         output.seek(0)
-        done = subprocess.CompletedProcess(line, code, output.read())
-    if check and done.returncode != 0:
-        raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
-    return done
+        return code, output.read()
+
+
+def snakemake(
+    project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
+) -> subprocess.CompletedProcess[str]:
+    """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
+    words = arguments(*args, config=config, cores=cores)
+    code, said = run_fork(RUNS, "snakemake", words, project, forking_python())
+    if check and code != 0:
+        raise AssertionError(f"snakemake ended with {code}:\n{said}")
+    return subprocess.CompletedProcess(words, code, said)
 
 
 def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
@@ -136,24 +174,18 @@ def start_and_kill(
 ) -> None:
     """Start Snakemake and SIGKILL it, with its jobs or alone, once a file matching ``ready``
     (a glob below the project) exists."""
-    process = subprocess.Popen(
-        command(target, config=config, cores=cores),
-        cwd=project,
-        env=environment(project),
-        stdout=subprocess.DEVNULL,
-        stderr=subprocess.DEVNULL,
-        start_new_session=True,
-    )
+    with open(os.devnull, "w") as nothing:
+        run = start_snakemake(project, target, output=nothing.fileno(), config=config, cores=cores)
     deadline = time.monotonic() + 300
     while not any(project.glob(ready)):
-        assert process.poll() is None, f"snakemake ended before {ready} appeared"
+        assert not run.ended(), f"snakemake ended before {ready} appeared"
         assert time.monotonic() < deadline, f"{ready} never appeared"
         time.sleep(0.01)
     if only_snakemake:
-        process.kill()
+        os.kill(run.pid, signal.SIGKILL)
     else:
-        os.killpg(process.pid, signal.SIGKILL)
-    process.wait()
+        os.killpg(run.pid, signal.SIGKILL)
+    run.wait()
 
 
 def unlock(project: Path) -> None:

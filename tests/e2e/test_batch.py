@@ -28,7 +28,8 @@ def rows(project) -> dict[str, dict[str, str]]:
 
 def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path):
     project = copy_project(tmp_path / "project")
-    make_scene(project, "good", "--poses", "colmap", "--distortion", "none")
+    small = ("--views", "15", "--size", "100x76")
+    make_scene(project, "good", "--poses", "colmap", "--distortion", "none", *small)
     noise(project / "data/broken/images", 4)
     (project / "data/notes").mkdir()
 

@@ -40,7 +40,8 @@ def masked(tmp_path_factory):
     return made_once(tmp_path_factory, "e2e-masked", make) / "data/masked"
 
 
-SMALL = ("--size", "100x76")  # for scenes with poses: too small for structure from motion
+# For scenes with poses: too small for structure from motion.
+SMALL = ("--views", "15", "--size", "100x76")
 SCENES = {
     "raw": (("--format", "dng"), ALWAYS | SFM | {"decode", "undistort"}),
     "raw_posed": (
@@ -113,16 +114,16 @@ def test_frames_of_a_video_become_a_scene(project, masked):
 def test_panoramas_and_photographs_become_one_scene(project):
     folder = project / "data" / "mixed" / "images"
     folder.mkdir(parents=True)
-    panoramas = ("--views", "12", "--size", "512x256", "--distortion", "equirectangular")
-    for part, options in (("whole", panoramas), ("part", ("--size", "240x180"))):
+    panoramas = ("--views", "8", "--size", "400x200", "--distortion", "equirectangular")
+    for part, options in (("whole", panoramas), ("part", ("--views", "16"))):
         make_scene(project, part, *options)
         for photo in (project / "data" / part / "images").iterdir():
             photo.rename(folder / f"{part}_{photo.name}")
-    done = snakemake(project, "results/mixed/metrics.json", config=TINY)
+    done = snakemake(project, "results/mixed/metrics.json", config=SHORT)
     assert rules_run(done) == ALWAYS | SFM | {"undistort"}
     found = json.loads((project / "results/mixed/metrics.json").read_text())
-    assert found["input"].startswith("32 photographs (12 panoramas)")
-    assert found["registered_images"] == 32 and found["psnr"] > 18
+    assert found["input"].startswith("24 photographs (8 panoramas)")
+    assert found["registered_images"] == 24 and found["psnr"] > 18
     views = {view["name"].split("_")[0] for view in found["per_view"]}
     assert views == {"whole", "part"}
     sfm = json.loads((project / "results/mixed/sfm/stage.json").read_text())
@@ -140,7 +141,7 @@ def test_cameras_that_training_moves_are_what_comes_out(project, masked):
     shutil.copytree(masked, project / "data/moving")
     moves = {"refine_poses": True, "refine_intrinsics": True}
     limits = {"max_pose_change": 0.003, "max_intrinsics_change": 0.003}
-    config = {**TINY, "train": {**TINY["train"], **moves}, "experiments": {"train": limits}}
+    config = {**SHORT, "train": {**SHORT["train"], **moves}, "experiments": {"train": limits}}
     snakemake(project, "results/moving/metrics.json", config=config)
     results = project / "results" / "moving"
     found = json.loads((results / "metrics.json").read_text())

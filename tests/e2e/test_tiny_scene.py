@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import json
+import os
 import re
 import shlex
 import shutil
-import subprocess
 
 import pytest
 from PIL import Image
@@ -25,14 +25,13 @@ from stages.workflow.registry import STAGES
 from tests.documented import commands
 from tests.e2e.harness import (
     TINY,
-    command,
     copy_run,
-    environment,
     metrics,
     model_digests,
     rules_run,
     snakemake,
     start_and_kill,
+    start_snakemake,
     unlock,
 )
 
@@ -249,17 +248,11 @@ def test_two_runs_at_once_on_one_scene(project, finished):
     """Snakemake's own lock turns the second away; the first one's result is whole."""
     shutil.rmtree(project / "results/tiny/export")
     (project / TARGET).unlink()
-    first, second = (
-        subprocess.Popen(
-            command(TARGET, config=TINY),
-            cwd=project,
-            env=environment(project),
-            stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL,
-        )
-        for _ in range(2)
-    )
-    codes = sorted([first.wait(), second.wait()])
+    with open(os.devnull, "w") as nothing:
+        runs = [
+            start_snakemake(project, TARGET, output=nothing.fileno(), config=TINY) for _ in range(2)
+        ]
+    codes = sorted(run.wait() for run in runs)
     assert codes[0] == 0
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
 

@@ -81,6 +81,8 @@ def test_clocks_that_were_set_back(project, finished):
 
 def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project):
     (project / "results" / "tiny" / "train" / "stage.json").unlink()
+    progress = project / "results" / "tiny" / ".scratch" / "progress.json"
+    progress.unlink()
     long = TINY | {"train": TINY["train"] | {"steps": 50_000}}
     process = subprocess.Popen(
         command(TARGET, config=long),
@@ -92,11 +94,11 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
         start_new_session=True,
     )
     deadline = time.monotonic() + 200
-    while not list(project.glob("results/tiny/.scratch/train/*/out")):
+    while not progress.exists():
         assert process.poll() is None, "snakemake ended before the training"
         assert time.monotonic() < deadline
         time.sleep(0.05)
-    time.sleep(2.0)
+    assert list(project.glob("results/tiny/.scratch/train/*/out"))
     os.killpg(process.pid, signal.SIGINT)
     said, _ = process.communicate(timeout=120)
     assert process.returncode != 0

@@ -11,8 +11,8 @@ from pathlib import Path
 
 from tests.e2e.harness import ROOT
 
-PROGRAMS = ("bash", "cat", "env", "mkdir", "rm", "sh", "uname")
-"""What Snakemake's jobs may call beside Python."""
+PROGRAMS = ("bash", "cat", "env", "mkdir", "rm", "sh", "uname", "which")
+"""What Snakemake, its plugins and its jobs may call beside Python."""
 
 
 def copy_sources(target: Path) -> Path:

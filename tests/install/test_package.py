@@ -10,10 +10,13 @@ import json
 import re
 import subprocess
 import sys
+from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 
+from pipeline.runtime import targets
+from pipeline.runtime.native import cache_folder
 from tests.e2e.harness import ROOT, TINY, copy_run
 from tests.install.package import (
     copy_sources,
@@ -23,11 +26,12 @@ from tests.install.package import (
     variables,
 )
 from tests.once import made_once
+from tests.render.cpu.compiled import compiled_library
 
 EXAMPLE = re.search(
     r"```python\n(.+?)```", (ROOT / "docs" / "reference" / "api.md").read_text(), re.S
 )
-CACHE = ROOT / "build" / "native"
+CACHE = cache_folder()
 CONFIG = [f"{name}={json.dumps(value)}" for name, value in TINY.items()]
 
 
@@ -58,6 +62,64 @@ def _install(folder: Path) -> None:
 def installed(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """An environment in which the program is installed from its sources."""
     return made_once(tmp_path_factory, "installed", _install) / "environment"
+
+
+@dataclass(frozen=True)
+class Reconstruction:
+    """A scene that was reconstructed without a compiler.
+
+    Attributes:
+        environment: has the program, installed from a wheel with kernels.
+        photos, work: the photographs, and the folder in which the program ran.
+        cache: the folder in which the program would compile libraries.
+    """
+
+    environment: Path
+    photos: Path
+    work: Path
+    cache: Path
+
+    def run(self, *command: str, cwd: Path) -> str:
+        """The output of one of the environment's programs, which finds no compiler."""
+        path = f"{self.environment / 'bin'}:{self.environment.parent / 'programs'}"
+        bare = {"PATH": path, "SPLATMAKE_CACHE": str(self.cache), "CXX": ""}
+        return run(self.environment, *command, cwd=cwd, **bare).stdout
+
+
+@pytest.fixture(scope="session")
+def reconstruction(tmp_path_factory: pytest.TempPathFactory, finished: Path) -> Reconstruction:
+    """The photographs of ``finished``, reconstructed by the program of a wheel with kernels, in a
+    folder that has packages of the program's names, which are the user's."""
+    pytest.importorskip("build")
+    for target in targets.of_this_architecture():
+        compiled_library(tmp_path_factory, target.name)
+
+    def paths(folder: Path) -> Reconstruction:
+        names = ("environment", "my photos/tiny", "work", "cache")
+        return Reconstruction(*(folder / name for name in names))
+
+    def make(folder: Path) -> None:
+        made, sources = paths(folder), copy_sources(folder / "sources")
+        subprocess.run(
+            ["python", "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder), "."],
+            cwd=sources,
+            env=variables(Path(sys.prefix), CACHE) | {"SPLATMAKE_PREBUILT": "1"},
+            check=True,
+        )
+        (wheel,) = folder.glob("*.whl")
+        install(make_environment(made.environment), wheel)
+        programs_without_compilers(folder / "programs")
+        copy_run(finished / "data", made.photos.parent)
+        for name in ("pipeline", "stages"):
+            (made.work / name).mkdir(parents=True)
+            (made.work / name / "__init__.py").write_text("raise SystemExit('not this one')\n")
+        scene, config = str(made.photos), ("--config", *CONFIG)
+        planned = made.run("splatmake", "plan", scene, *config, cwd=made.work)
+        assert "dry-run" in planned and not (made.work / "results/tiny/train").exists()
+        made.run("splatmake", "run", scene, "--cores", "2", *config, cwd=made.work)
+        made.run("splatmake", "run", scene, "--report", "report.zip", *config, cwd=made.work)
+
+    return paths(made_once(tmp_path_factory, "reconstruction", make))
 
 
 def site_packages(environment: Path) -> Path:
@@ -101,34 +163,25 @@ def test_libraries_are_not_compiled_into_the_installation(installed: Path, tmp_p
 
 
 @pytest.mark.slow
-def test_photographs_to_measurements(installed: Path, finished: Path, tmp_path: Path) -> None:
+def test_photographs_to_measurements(
+    reconstruction: Reconstruction, finished: Path, tmp_path: Path
+) -> None:
     """``splatmake run`` on photographs elsewhere gives what a checkout gives, and the example of
     docs/reference/api.md loads it."""
-    photos = copy_run(finished / "data", tmp_path / "my photos") / "tiny"
-    work = tmp_path / "work"
-    work.mkdir()
-    for name in ("pipeline", "stages"):  # the user's own, not ours
-        (work / name).mkdir()
-        (work / name / "__init__.py").write_text("raise SystemExit('not this one')\n")
-    planned = run(installed, "splatmake", "plan", str(photos), "--config", *CONFIG, cwd=work)
-    assert "dry-run" in planned.stdout and not (work / "results" / "tiny" / "train").exists()
-    run(installed, "splatmake", "run", str(photos), "--cores", "2", "--config", *CONFIG, cwd=work)
+    work = reconstruction.work
     ours, theirs = (
         json.loads((place / "results/tiny/metrics.json").read_text()) for place in (work, finished)
     )
     for name in ("psnr", "ssim", "num_gaussians"):
         assert ours[name] == theirs[name]
-    run(
-        *(installed, "splatmake", "run", str(photos), "--report", "report.zip"),
-        *("--config", *CONFIG),
-        cwd=work,
-    )
+    assert (work / "report.zip").exists()
 
     assert EXAMPLE is not None
     example = EXAMPLE[1].replace("results/garden", "results/tiny")
     assert len(example.splitlines()) <= 10
     (tmp_path / "example.py").write_text(example)
-    printed = run(installed, "python", "../example.py", cwd=work).stdout
+    (tmp_path / "results").symlink_to(work / "results")
+    printed = reconstruction.run("python", "example.py", cwd=tmp_path)
     assert f"{ours['psnr']:.2f} dB" in printed
 
 
@@ -139,6 +192,8 @@ def test_the_example_passes_a_type_checker(installed: Path, tmp_path: Path) -> N
     assert EXAMPLE is not None
     text = EXAMPLE[1] + "\nreveal_type(scene.measure().psnr)\nreveal_type(splatmake.load)\n"
     (tmp_path / "example.py").write_text(text)
+    # The example uses nothing of torch, which takes most of the time.
+    (tmp_path / "mypy.ini").write_text("[mypy]\n[mypy-torch.*]\nfollow_imports = skip\n")
     found = run(
         *(installed, "python", "-m", "mypy", "--strict", "--follow-imports=silent", "example.py"),
         cwd=tmp_path,
@@ -148,27 +203,13 @@ def test_the_example_passes_a_type_checker(installed: Path, tmp_path: Path) -> N
 
 
 @pytest.mark.slow
-def test_a_wheel_with_kernels_needs_no_compiler(finished: Path, tmp_path: Path) -> None:
-    """The first steps of a reconstruction, with every native library from the wheel."""
-    pytest.importorskip("build")
-    sources = copy_sources(tmp_path / "sources")
-    subprocess.run(
-        ["python", "-m", "build", "--wheel", "--no-isolation", "--outdir", str(tmp_path), "."],
-        cwd=sources,
-        env=variables(Path(sys.prefix), CACHE) | {"SPLATMAKE_PREBUILT": "1"},
-        check=True,
-    )
-    (wheel,) = tmp_path.glob("*.whl")
-    environment = tmp_path / "environment"
-    install(make_environment(environment), wheel)
-    cache = tmp_path / "cache"
-    path = f"{environment / 'bin'}:{programs_without_compilers(tmp_path / 'programs')}"
-    bare = {"PATH": path, "SPLATMAKE_CACHE": str(cache), "CXX": ""}
-    report = run(environment, "splatmake", "doctor", cwd=tmp_path, **bare).stdout
+def test_a_wheel_with_kernels_needs_no_compiler(
+    reconstruction: Reconstruction, tmp_path: Path
+) -> None:
+    """A reconstruction with every native library from the wheel."""
+    report = reconstruction.run("splatmake", "doctor", cwd=tmp_path)
     assert "compiler g++" in report and "ready to run" in report
-    config = [f"views={json.dumps(TINY['views'])}", 'train={"steps": 20}']
-    photos = finished / "data" / "tiny"
-    run(environment, "splatmake", "run", str(photos), "--config", *config, cwd=tmp_path, **bare)
-    used = json.loads((tmp_path / "results/tiny/train/run.json").read_text())
+    used = json.loads((reconstruction.work / "results/tiny/train/run.json").read_text())
     assert used["versions"]["splatmake"] == "0.1.0" and used["commit"] is None
+    cache = reconstruction.cache
     assert not cache.exists() or not list(cache.rglob("*.so"))

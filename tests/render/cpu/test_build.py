@@ -13,7 +13,7 @@ import pytest
 from pipeline.render.cpu import build
 from pipeline.runtime import native, targets
 from pipeline.runtime.errors import UserError
-from tests.render.cpu.compiled import compiled
+from tests.render.cpu.compiled import compiled, linked_driver
 from tests.tools import need_sanitizers, unsupported
 
 REPOSITORY = Path(__file__).parents[3]
@@ -138,7 +138,7 @@ def test_other_instruction_sets_give_equal_results(
         unsupported("one target alone runs on this processor")
     results = []
     for name in names:
-        program = compiled(tmp_path_factory, build.compiler(), build.flags(name)) / "driver"
+        program = linked_driver(tmp_path_factory, name)
         output = tmp_path / f"out-{name}"
         subprocess.run([program, output], check=True, timeout=600)
         results.append(np.fromfile(output, np.float32).astype(np.float64))

@@ -20,7 +20,7 @@ import torch
 from pipeline.render import DenseAdam, RasterCamera, RasterOptions, reference
 from pipeline.render.cpu import build
 from pipeline.runtime import processor, targets
-from tests.render.cpu.compiled import compiled
+from tests.render.cpu.compiled import compiled, linked_driver
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 from tests.tools import need, unsupported
 
@@ -158,7 +158,10 @@ def test_every_target_matches_the_reference(
     results."""
     chosen = targets.named(target)
     command, emulator = toolchain(COMPILER, chosen)
-    driver = compiled(tmp_path_factory, command, build.flags(target)) / "driver"
+    if chosen.architecture == processor.architecture():
+        driver = linked_driver(tmp_path_factory, target)
+    else:
+        driver = compiled(tmp_path_factory, command, build.flags(target)) / "driver"
     if not emulator and chosen.missing:
         unsupported(f"compiled, but the processor lacks {', '.join(chosen.missing)}")
     for case in cases:

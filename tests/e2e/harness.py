@@ -24,9 +24,7 @@ ROOT = Path(__file__).resolve().parents[2]
 # process with those with torch, and cv2 comes first: see CONTRIBUTING.md.
 COMMON = ("cv2", "PIL.Image", "pydantic", "numpy.random", "scipy.sparse.csgraph", "scipy.spatial")
 RUNS = ForkServer("snakemake.cli", "numpy", "pydantic")
-TORCH_JOBS = ForkServer(
-    *("torch", *COMMON, "scipy.ndimage", "scipy.stats", "matplotlib.colors", "matplotlib.cm")
-)
+TORCH_JOBS = ForkServer("torch", *COMMON, "scipy.ndimage", "scipy.spatial")
 OTHER_JOBS = ForkServer(*COMMON, "pycolmap")
 TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
 OTHER_STAGES = ("inspect", "decode", "features", "matches", "sfm", "refine", "undistort", "init")

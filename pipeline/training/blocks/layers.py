@@ -16,6 +16,8 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.surroundings import Surroundings
 from pipeline.training.data.targets import Layers
 
+# A pixel trains a block that explains at least this share of it, in front of all others.
+USED_SHARE = 0.02
 # Fronts of less alpha everywhere are left out.
 MIN_FRONT = 2 / 255
 
@@ -50,7 +52,7 @@ class BlockLayers:
             around = replace(around, front=_bytes(front.color), transmittance=transmittance)
         return Layers(
             surroundings=around,
-            share=(1 - front.alpha) * block.alpha,
+            used=(1 - front.alpha) * block.alpha > USED_SHARE,
             coarse=_bytes(around.compose(block.color, block.alpha)),
             background=self.background,
         )

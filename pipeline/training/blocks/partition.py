@@ -27,6 +27,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
+from pipeline.training.blocks.layers import USED_SHARE
 from pipeline.training.blocks.options import OVERVIEW_EVERY
 from pipeline.training.data.targets import usable_factor
 
@@ -36,8 +37,6 @@ Array = NDArray[np.float64]
 IMAGE_FACTOR = 4
 # A view belongs to the blocks that explain at least this share of its pixels.
 MIN_VIEW_SHARE = 0.005
-# The window of a block contains the pixels of which it explains at least this share.
-USED_SHARE = 0.02
 # Windows are this much larger than the block in them, pixels of the view.
 WINDOW_MARGIN = 8
 # Sides of windows are multiples of this, pixels: in smaller ones, SSIM's windows of 11 pixels

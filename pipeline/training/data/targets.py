@@ -64,13 +64,14 @@ class Layers:
 
     Attributes:
         surroundings: the layers around the block.
-        share: (H, W) float32 in [0, 1] of each pixel that the block explains.
-        coarse: (H, W, 3) uint8, the scene before training.
+        used: (H, W) bool, the pixels in which the block is trained.
+        coarse: (H, W, 3) uint8, the scene before training, which replaces the photograph in all
+            other pixels: other blocks explain them.
         background: behind the scene, and behind photographs with alpha.
     """
 
     surroundings: Surroundings
-    share: Tensor
+    used: Tensor
     coarse: Tensor
     background: tuple[float, float, float]
 
@@ -196,10 +197,7 @@ def _among(target: Target, layers: Layers) -> Target:
     photograph = target.over(layers.background)
     if target.alpha is not None:
         photograph = (photograph * 255).round().to(torch.uint8)
-    # Of the difference between photograph and scene, a block corrects the share that it explains.
-    # The other blocks correct theirs, behind or in front of it.
-    rgb = torch.lerp(layers.coarse.float(), photograph.float(), layers.share[..., None])
-    rgb = rgb.round().to(torch.uint8)
+    rgb = torch.where(layers.used[..., None], photograph, layers.coarse)
     return replace(target, rgb=rgb, alpha=None, surroundings=layers.surroundings)
 
 

@@ -9,7 +9,6 @@ import torch
 from pipeline.render import RasterOptions, make_backend
 from pipeline.scene.blocks import Partition
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.partition import USED_SHARE
 from pipeline.training.blocks.union import inside, union
 from tests.training.blocks.conftest import NEAR, DividedScene, divide
 
@@ -45,7 +44,7 @@ def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedSce
         assert block.views
         for shown in block.views:
             left, top, width, height = shown.window
-            used = layers(views[shown.name]).share > USED_SHARE
+            used = layers(views[shown.name]).used
             outside = used.clone()
             outside[top : top + height, left : left + width] = False
             assert outside.sum() <= 0.01 * used.sum()

@@ -5,13 +5,13 @@ from __future__ import annotations
 from pathlib import Path
 
 from tests.documented import commands
-from tests.e2e.harness import copy_project, snakemake
+from tests.e2e.harness import make_project, snakemake
 
 
 def test_the_documented_command_unlocks_the_folder(tmp_path: Path) -> None:
     """It names no target, so that it would scan all scenes: none of them can be planned here."""
     (command,) = {tuple(c.words) for c in commands() if "--unlock" in c.words}
-    project = copy_project(tmp_path / "project")
+    project = make_project(tmp_path / "project")
     (project / "data" / "empty").mkdir(parents=True)
     locks = project / ".snakemake" / "locks"
     locks.mkdir(parents=True)

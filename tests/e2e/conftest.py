@@ -6,12 +6,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.e2e.harness import TINY, copy_project, make_scene, snakemake
+from tests.e2e.harness import TINY, make_project, make_scene, snakemake
 from tests.once import made_once
 
 
 def reconstruct(project: Path) -> None:
-    copy_project(project)
+    make_project(project)
     make_scene(project, "tiny")
     snakemake(project, "results/tiny/metrics.json", config=TINY)
 

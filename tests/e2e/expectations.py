@@ -24,7 +24,7 @@ from typing import Any
 from pipeline.runtime.counters import read_counters
 from pipeline.splats.counters import InitCounters
 from pipeline.training.loop.counters import TrainCounters
-from tests.e2e.harness import TINY, TINY_DEMO, copy_project, make_scene, snakemake
+from tests.e2e.harness import TINY, TINY_DEMO, make_project, make_scene, snakemake
 
 FILE = Path(__file__).with_name("expected.json")
 UPDATE = "python -m tests.e2e.expectations --update"
@@ -125,7 +125,7 @@ def measure() -> list[dict[str, Any]]:
     """One run of the tiny scene a seed."""
     runs = []
     with tempfile.TemporaryDirectory(prefix="expectations-") as folder:
-        project = copy_project(Path(folder) / "project")
+        project = make_project(Path(folder) / "project")
         make_scene(project, "tiny")
         for seed in SEEDS:
             snakemake(project, "results/tiny/metrics.json", config=TINY | {"seed": seed})

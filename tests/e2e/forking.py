@@ -1,6 +1,7 @@
 """``python -m MODULE`` in a fork of a process that has imported large packages already.
 
-The server imports nothing of the program: each fork imports it from its own folder.
+Modules of the program that the server has imported are used by forks in folders whose program is
+this one, by symbolic links. Forks in a folder with a program of its own import that one.
 
     python forking.py serve ADDRESS PACKAGE...     # the server
     python forking.py call ADDRESS -m MODULE ...   # as python -m MODULE ..., in a fork
@@ -27,6 +28,9 @@ import threading
 from collections.abc import Mapping, Sequence
 from functools import cached_property
 from pathlib import Path
+
+ROOT = Path(__file__).resolve().parents[2]
+PROGRAM = ("pipeline", "stages")
 
 
 class ForkServer:
@@ -153,6 +157,7 @@ def call(address: str, module: str, *arguments: str) -> int:
 
 def serve(address: str, *packages: str) -> None:
     """Run what is requested, each in a process of its own, until standard input is closed."""
+    sys.path[0] = str(ROOT)
     for package in packages:
         importlib.import_module(package)
     gc.freeze()  # The forks' collections leave the packages' objects, and their pages, alone.
@@ -216,6 +221,9 @@ def _become(
     os.environ.clear()
     os.environ.update(environment)
     sys.path[0] = folder
+    if Path(folder, PROGRAM[0]).resolve() != ROOT / PROGRAM[0]:
+        for name in [name for name in sys.modules if name.split(".")[0] in PROGRAM]:
+            del sys.modules[name]
     sys.executable = python
     for target, file in enumerate(files):
         os.dup2(file, target)

@@ -1,4 +1,4 @@
-"""Runs Snakemake for real on a copy of the project."""
+"""Runs Snakemake for real in folders that have the project's sources by symbolic links."""
 
 from __future__ import annotations
 
@@ -23,11 +23,21 @@ ROOT = Path(__file__).resolve().parents[2]
 # What each run of Snakemake and each of its jobs would import anew. Stages with pycolmap share no
 # process with those with torch, and cv2 comes first: see CONTRIBUTING.md.
 COMMON = ("cv2", "PIL.Image", "pydantic", "numpy.random", "scipy.sparse.csgraph", "scipy.spatial")
-RUNS = ForkServer("snakemake.cli", "numpy", "pydantic")
-TORCH_JOBS = ForkServer("torch", *COMMON, "scipy.ndimage", "scipy.spatial")
-OTHER_JOBS = ForkServer(*COMMON, "pycolmap")
+RUNS = ForkServer("snakemake.cli", "numpy", "pydantic", "stages.workflow.project")
+TORCH_JOBS = ForkServer(
+    *("torch", *COMMON, "scipy.ndimage", "stages.workflow.blocks", "pipeline.training.scene"),
+    *("pipeline.metrics.evaluate", "pipeline.coverage.measure", "pipeline.export.write"),
+    *("pipeline.reporting.collect", "pipeline.reporting.page", "pipeline.reporting.scene"),
+)
+OTHER_JOBS = ForkServer(
+    *(*COMMON, "pycolmap", "stages.workflow.inputs", "pipeline.photos.verify"),
+    *("pipeline.sfm.features", "pipeline.sfm.matching", "pipeline.sfm.mapping"),
+    *("pipeline.photos.undistort", "pipeline.splats.init", "pipeline.demo.write"),
+)
 TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
 OTHER_STAGES = ("inspect", "decode", "features", "matches", "sfm", "refine", "undistort", "init")
+
+SOURCES = ("Snakefile", "pipeline", "stages", "profiles", "pyproject.toml")
 
 # Views 12 degrees apart: fewer overlap, and the test views still lie between others.
 TINY_DEMO = ("--views", "20", "--size", "200x150")
@@ -38,17 +48,21 @@ TINY = {
 }
 
 
-def copy_project(target: Path) -> Path:
-    """Copy the project's sources and their bytecode, without results, data and builds."""
-    names = ("Snakefile", "pipeline", "stages", "profiles", "config", "pyproject.toml")
+def make_project(target: Path) -> Path:
+    """A folder with the project's sources, which tests must not change, and its configuration."""
     target.mkdir(parents=True)
-    for name in names:
-        source = ROOT / name
-        if source.is_dir():
-            shutil.copytree(source, target / name)
-        else:
-            shutil.copy(source, target / name)
+    for name in SOURCES:
+        (target / name).symlink_to(ROOT / name)
+    shutil.copytree(ROOT / "config", target / "config")
     return target
+
+
+def copy_sources(project: Path) -> None:
+    """Replace a project's links to the sources by copies, which tests may change."""
+    for name in SOURCES:
+        (project / name).unlink()
+        copy = shutil.copytree if (ROOT / name).is_dir() else shutil.copy
+        copy(ROOT / name, project / name)
 
 
 def make_scene(project: Path, scene: str, *options: str) -> None:

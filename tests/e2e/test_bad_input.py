@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tests.e2e.harness import TINY, copy_project, copy_run, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_run, make_project, rules_run, snakemake
 from tests.tools import unsupported
 
 pytestmark = pytest.mark.slow
@@ -18,7 +18,7 @@ pytestmark = pytest.mark.slow
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
-    return copy_project(tmp_path_factory.mktemp("bad") / "project")
+    return make_project(tmp_path_factory.mktemp("bad") / "project")
 
 
 @pytest.fixture
@@ -172,7 +172,7 @@ def test_results_that_cannot_be_written(finished, tmp_path):
     if mounted.returncode != 0:
         unsupported("needs the right to mount a small file system")
     try:
-        small = copy_project(tmp_path / "small")
+        small = make_project(tmp_path / "small")
         shutil.copytree(finished / "data", small / "data")
         (small / "results").symlink_to(disk)
         fails(small, "tiny", "disk is full", "what to do")

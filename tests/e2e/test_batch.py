@@ -9,7 +9,7 @@ import shutil
 
 import pytest
 
-from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
+from tests.e2e.harness import TINY, make_project, make_scene, rules_run, snakemake
 from tests.e2e.test_bad_input import noise
 
 pytestmark = pytest.mark.slow
@@ -27,7 +27,7 @@ def rows(project) -> dict[str, dict[str, str]]:
 
 
 def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path):
-    project = copy_project(tmp_path / "project")
+    project = make_project(tmp_path / "project")
     small = ("--views", "15", "--size", "100x76")
     make_scene(project, "good", "--poses", "colmap", "--distortion", "none", *small)
     noise(project / "data/broken/images", 4)

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.io.colmap import read_model, write_model
 from pipeline.scene.normalization import Normalization
-from tests.e2e.harness import TINY, copy_project, make_scene, rules_run, snakemake
+from tests.e2e.harness import TINY, make_project, make_scene, rules_run, snakemake
 from tests.once import made_once
 from tests.videos import write_video
 
@@ -26,7 +26,7 @@ MASKED = ("--poses", "colmap", "--masks", *PINHOLE)
 
 @pytest.fixture(scope="module")
 def project(tmp_path_factory):
-    return copy_project(tmp_path_factory.mktemp("branches") / "project")
+    return make_project(tmp_path_factory.mktemp("branches") / "project")
 
 
 @pytest.fixture(scope="session")
@@ -34,7 +34,7 @@ def masked(tmp_path_factory):
     """The folder of a scene with poses and masks."""
 
     def make(project):
-        copy_project(project)
+        make_project(project)
         make_scene(project, "masked", *MASKED)
 
     return made_once(tmp_path_factory, "e2e-masked", make) / "data/masked"

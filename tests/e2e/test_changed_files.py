@@ -9,7 +9,7 @@ import shutil
 
 import pytest
 
-from tests.e2e.harness import TINY, copy_run, metrics, rules_run, snakemake
+from tests.e2e.harness import TINY, copy_run, copy_sources, metrics, rules_run, snakemake
 
 pytestmark = pytest.mark.slow
 
@@ -33,6 +33,7 @@ def test_a_photograph_replaced_while_snakemake_runs(project):
     shutil.rmtree(project / "results")
     images = project / "data" / "tiny" / "images"
     first, other = sorted(images.iterdir())[:2]
+    copy_sources(project)
     stage = project / "stages" / "inspect.py"
     written = 'manifest.write(job.out / "images.json")'
     assert written in stage.read_text()

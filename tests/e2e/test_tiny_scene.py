@@ -26,6 +26,7 @@ from tests.documented import commands
 from tests.e2e.harness import (
     TINY,
     copy_run,
+    copy_sources,
     metrics,
     model_digests,
     rules_run,
@@ -126,6 +127,7 @@ def test_a_training_option_keeps_the_poses(project):
 
 
 def test_a_touched_photograph_and_a_comment_rerun_nothing(project):
+    copy_sources(project)
     for photo in (project / "data/tiny/images").iterdir():
         photo.touch()
     for name in ("training/loop/trainer.py", "sfm/mapping.py", "io/colmap.py"):
@@ -139,6 +141,7 @@ def test_a_touched_photograph_and_a_comment_rerun_nothing(project):
 
 def test_changed_code_reruns_its_stage_and_unchanged_results_stop_there(project):
     """The export's code changes, its files don't: the page is not made again."""
+    copy_sources(project)
     file = project / "stages/export.py"
     file.write_text(file.read_text() + "\nUNUSED = 1\n")
     page = project / "results/tiny/report/report.html"
@@ -201,6 +204,7 @@ def test_the_commands_of_the_docs_are_planned(project):
 def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
     """From the photographs on, killed in mapping, before training's first checkpoint and after
     one, and in evaluation."""
+    copy_sources(project)
     trainer = project / "pipeline/training/loop/session.py"
     text = trainer.read_text()
     often = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.2")

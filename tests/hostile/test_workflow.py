@@ -16,9 +16,9 @@ from PIL import Image
 from tests.e2e.harness import (
     TINY,
     command,
-    copy_project,
     copy_run,
     environment,
+    make_project,
     metrics,
     rules_run,
     snakemake,
@@ -92,6 +92,8 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
         stderr=subprocess.STDOUT,
         text=True,
         start_new_session=True,
+        # As in a terminal, also where the tests run in the background of a shell.
+        preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),
     )
     deadline = time.monotonic() + 200
     while not progress.exists():
@@ -113,7 +115,7 @@ def test_a_configuration_in_utf_16(project):
 
 
 def test_photographs_that_overlap_by_two_pixels(tmp_path):
-    project = copy_project(tmp_path / "project")
+    project = make_project(tmp_path / "project")
     folder = project / "data" / "strip"
     folder.mkdir(parents=True)
     wide = texture(size=(160 * 4, 120))

@@ -25,7 +25,6 @@ from pipeline.metrics.evaluate import (
     Protocol,
     choose_protocol,
     evaluate_views,
-    photo_over_background,
 )
 from pipeline.metrics.image import psnr, ssim
 from pipeline.photos.load import load_view
@@ -116,9 +115,7 @@ class Scene:
             UserError: its file is missing or cannot be read.
         """
         pixels = load_view(view)
-        return photo_over_background(pixels, self._protocol.background).astype(
-            np.float32
-        ) / np.float32(255)
+        return pixels.over(self._protocol.background).astype(np.float32) / np.float32(255)
 
     def measure(self, views: Sequence[View] = ()) -> Quality:
         """Render views and compare them with their photographs, with the protocol of metrics.json.

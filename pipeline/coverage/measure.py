@@ -38,7 +38,7 @@ from pipeline.coverage.record import (
 from pipeline.coverage.summary import describe
 from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
 from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
-from pipeline.metrics.evaluate import Protocol, photo_over_background
+from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.photos.load import load_view, resize_area
 from pipeline.render.views import Render, render_view, to_bytes
@@ -269,7 +269,7 @@ def _measure_test_views(
     result = []
     for item, view, probe, (trust, observed) in zip(items, views, test_probes, maps, strict=True):
         pixels = load_view(view)
-        photo = photo_over_background(pixels, protocol.background)
+        photo = pixels.over(protocol.background)
         with Image.open(renders / item.render) as image:
             error = ((np.asarray(image) / 255.0 - photo / 255.0) ** 2).mean(axis=2)
         height, width = probe.depth.shape

@@ -21,7 +21,7 @@ from pipeline.metrics.evaluation import (
 )
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
-from pipeline.photos.load import ViewPixels, load_view
+from pipeline.photos.load import load_view
 from pipeline.render import BACKGROUNDS, Color, RasterOptions
 from pipeline.render.views import near_plane, render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
@@ -157,7 +157,7 @@ def evaluate_views(
 
     def render_and_load(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
         pixels = load_view(view)
-        photo = photo_over_background(pixels, protocol.background)
+        photo = pixels.over(protocol.background)
         if train.refine_poses and view.is_test:
             gain, weight = gains.of(view.name), train.ssim_loss_weight
             view = fit_pose(
@@ -268,16 +268,6 @@ def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
 
 def _hides_all(mask: Mask | None) -> bool:
     return mask is not None and not mask.any()
-
-
-def photo_over_background(
-    pixels: ViewPixels, background: tuple[float, float, float]
-) -> NDArray[np.uint8]:
-    """(H, W, 3) uint8 photograph, composited over the background if it has an alpha channel."""
-    if pixels.alpha is None:
-        return pixels.rgb
-    alpha = pixels.alpha[..., None] / 255.0
-    return to_bytes(pixels.rgb / 255.0 * alpha + np.array(background) * (1 - alpha))
 
 
 def _split_photographs(views: Sequence[View]) -> int | None:

@@ -48,6 +48,15 @@ class ViewPixels:
     alpha: NDArray[np.uint8] | None
     mask: NDArray[np.bool_] | None
 
+    def over(self, background: tuple[float, float, float]) -> NDArray[np.uint8]:
+        """(H, W, 3) uint8 photograph, composited over the background (RGB in [0, 1]) if it has an
+        alpha channel."""
+        if self.alpha is None:
+            return self.rgb
+        alpha = self.alpha[..., None] / 255.0
+        color = self.rgb / 255.0 * alpha + np.array(background) * (1 - alpha)
+        return np.rint(np.clip(color, 0, 1) * 255).astype(np.uint8)
+
 
 def load_rgb(path: str | Path, digest: str | None = None) -> Picture:
     """Read an image as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.

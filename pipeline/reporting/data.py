@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,8 +15,10 @@ from pipeline.plan.record import PlanRecord
 from pipeline.scene.blocks import Partition
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View
-from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop.curve import CurveRecord
+
+if TYPE_CHECKING:
+    from pipeline.splats.gaussians import Gaussians
 
 Rank = Literal["worst", "low", "median", "high", "best"]
 

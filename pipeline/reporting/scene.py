@@ -11,7 +11,7 @@ import numpy as np
 from PIL import Image
 
 from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
-from pipeline.metrics.evaluate import Protocol, photo_over_background
+from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
@@ -112,7 +112,7 @@ def _comparisons(results: SceneResults, evaluation: Evaluation, shown: int) -> l
                 Comparison(
                     label=label,
                     name=view.name,
-                    photograph=photo_over_background(pixels, results.protocol.background),
+                    photograph=pixels.over(results.protocol.background),
                     render=np.asarray(render),
                     mask=pixels.mask,
                     psnr=measured.psnr,

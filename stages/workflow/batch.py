@@ -10,7 +10,6 @@ import numpy as np
 from PIL import Image
 
 from pipeline.config.runs import Run
-from pipeline.metrics.evaluate import photo_over_background
 from pipeline.photos.load import ViewPixels, load_rgba, resize_rgba
 from pipeline.plan.record import PlanRecord, read_plan
 from pipeline.reporting.batch import MACHINE, Result, as_csv, as_json
@@ -78,7 +77,7 @@ def batch_of(found: list[Result], results: Path) -> Batch:
             height, width = render.shape[:2]
             rgb, alpha = load_rgba(photo.path, photo.digest)
             pixels = ViewPixels(*resize_rgba(rgb, alpha, width, height), None)
-            photograph = photo_over_background(pixels, metrics.protocol.background)
+            photograph = pixels.over(metrics.protocol.background)
             photos[scene] = thumbnail(photograph, photo.orientation, name)
     return Batch(found, renders, photos, plans, list(STAGES))
 

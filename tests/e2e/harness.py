@@ -109,11 +109,12 @@ def forking_python() -> Path:
     folder.mkdir()
     return write_python(
         folder / "python",
-        TORCH_JOBS.handles(
-            ["-m stages.workflow.batch --results", *(f"-m stages {s}" for s in TORCH_STAGES)]
-        ),
+        TORCH_JOBS.handles([f"-m stages {stage}" for stage in TORCH_STAGES]),
         OTHER_JOBS.handles(
-            ["-m stages.workflow.plan --out", *(f"-m stages {s}" for s in OTHER_STAGES)]
+            [
+                *("-m stages.workflow.plan --out", "-m stages.workflow.batch --results"),
+                *(f"-m stages {stage}" for stage in OTHER_STAGES),
+            ]
         ),
     )
 

@@ -12,7 +12,6 @@ from pipeline.metrics.evaluate import (
     choose_protocol,
     diagnose,
     evaluate_views,
-    photo_over_background,
 )
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
@@ -151,6 +150,6 @@ def test_background_is_that_of_training_and_white_for_random(tmp_path, trained, 
 def test_transparent_photographs_are_composited_over_the_background():
     rgb = np.full((1, 2, 3), 100, np.uint8)
     alpha = np.array([[0, 255]], np.uint8)
-    over = photo_over_background(ViewPixels(rgb, alpha, None), (1.0, 1.0, 1.0))
+    over = ViewPixels(rgb, alpha, None).over((1.0, 1.0, 1.0))
     assert over[0, 0].tolist() == [255] * 3
     assert over[0, 1].tolist() == [100] * 3

@@ -152,6 +152,13 @@ def test_declarations_import_nothing_heavy():
     assert done.stdout.strip() == "[]"
 
 
+def test_the_tables_of_a_batch_need_no_torch():
+    """They are made again whenever a run has finished; importing torch takes longer."""
+    code = "import sys; import stages.workflow.batch; print('torch' in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "False"
+
+
 def test_the_schema_of_counters_has_the_model_that_each_stage_declares():
     declared = {name: spec.counters for name, spec in STAGES.items()}
     assert {n: f"{m.__module__}:{m.__name__}" for n, m in declared.items()} == COUNTERS

@@ -29,10 +29,11 @@ def main() -> int:
     parser.add_argument("--memory-mb", type=int, help="memory that the stage may use, in MB")
     parser.add_argument("--log", type=Path, help="file that messages are also written to")
     args = parser.parse_args()
-    threads, memory_mb = max(1, args.threads), args.memory_mb
+    threads, memory_mb = max(1, args.threads), None
     if (granted := granted_cpus()) is not None:
         threads = min(threads, granted)
-        memory_mb = memory_mb and max(1, memory_mb - OVERHEAD_MB)
+        # Slurm ends a job that takes more. Elsewhere the machine's memory is the limit.
+        memory_mb = args.memory_mb and max(1, args.memory_mb - OVERHEAD_MB)
     request = Request(
         stage=args.stage,
         key=json.loads(args.key),
@@ -41,6 +42,7 @@ def main() -> int:
         threads=threads,
         log=args.log,
         publish=_pairs(args.publish),
+        memory_mb=memory_mb,
     )
     spec = importlib.import_module(f"stages.{args.stage}").SPEC
     return run_stage(request, spec.work, spec.counters)

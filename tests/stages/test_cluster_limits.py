@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import time
@@ -14,13 +15,15 @@ from pipeline.plan import duration
 from pipeline.plan.plan import make_plan
 from pipeline.plan.scan import scan
 from pipeline.runtime import termination
+from stages import __main__ as command
 from stages.workflow import cluster
 from stages.workflow.registry import STAGES
 from tests.pictures import photos
 
 
-def sinfo(folder: Path, text: str, code: int = 0) -> Path:
-    program = folder / "sinfo"
+def program(folder: Path, name: str, text: str, code: int = 0) -> Path:
+    """A folder with a program that prints this."""
+    program = folder / name
     program.write_text(f"#!/bin/sh\nprintf '{text}'\nexit {code}\n")
     program.chmod(0o755)
     return folder
@@ -35,7 +38,7 @@ def sinfo(folder: Path, text: str, code: int = 0) -> Path:
     ],
 )
 def test_the_largest_node_of_the_default_partition(tmp_path, monkeypatch, text, node):
-    monkeypatch.setenv("PATH", str(sinfo(tmp_path, text)), prepend=os.pathsep)
+    monkeypatch.setenv("PATH", str(program(tmp_path, "sinfo", text)), prepend=os.pathsep)
     cluster.largest_node.cache_clear()
     assert cluster.largest_node() == node
     cluster.largest_node.cache_clear()
@@ -46,6 +49,70 @@ def test_without_slurm_no_node_is_known(tmp_path, monkeypatch):
     cluster.largest_node.cache_clear()
     assert cluster.largest_node() is None
     cluster.largest_node.cache_clear()
+
+
+RUN = "12345678-1234-1234-1234-1234567890ab"
+
+
+def test_earlier_jobs_are_those_of_snakemake_in_this_folder(tmp_path, monkeypatch):
+    """Another program's job in this folder may be the Snakemake that looks; it must not wait for
+    itself."""
+    (tmp_path / "link").symlink_to(tmp_path)
+    rows = [
+        f"3|splatmake_{RUN}|{tmp_path}",
+        f"4|{RUN}|{tmp_path}/link",
+        f"5|{RUN}|{tmp_path}/other",
+        f"6|snakemake|{tmp_path}",
+    ]
+    monkeypatch.setenv("PATH", str(program(tmp_path, "squeue", "\\n".join(rows))))
+    assert cluster.earlier_jobs(tmp_path) == ["3", "4"]
+    program(tmp_path, "squeue", "", code=1)
+    assert cluster.earlier_jobs(tmp_path) == []
+
+
+def test_a_run_waits_for_earlier_jobs_with_one_message(tmp_path, monkeypatch, capsys):
+    answers = [["7", "8"], ["8"], []]
+    monkeypatch.setattr(cluster, "earlier_jobs", lambda folder: answers.pop(0))
+    monkeypatch.setattr(cluster, "QUEUE_SECONDS", 0.0)
+    cluster.wait_for_earlier_jobs(tmp_path)
+    assert not answers
+    said = capsys.readouterr().err
+    assert said.count("jobs of an earlier run") == 1
+    assert "scancel 7 8" in said
+
+
+class Executor:
+    """Reports the end of one job, returns another as active, and forgets the others."""
+
+    def __init__(self):
+        self.ended: list[str] = []
+
+    def report_job_success(self, job):
+        self.ended.append(job)
+
+    report_job_error = report_job_success
+
+    async def check_active_jobs(self, active):
+        for job in active:
+            if job == "finished":
+                self.report_job_success(job)
+            elif job == "failed":
+                self.report_job_error(job)
+            elif job == "running":
+                yield job
+
+
+def test_jobs_without_a_status_stay_active():
+    """An executor that forgets them would never report their end."""
+    executor = Executor()
+    cluster.keep_unreported_jobs(executor)
+
+    async def check(*jobs: str) -> list[str]:
+        return [job async for job in executor.check_active_jobs(jobs)]
+
+    active = asyncio.run(check("finished", "running", "unknown", "failed"))
+    assert active == ["running", "unknown"]
+    assert executor.ended == ["finished", "failed"]
 
 
 def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
@@ -85,3 +152,19 @@ def test_sigterm_ends_at_once_or_where_the_work_allows_it():
         assert not termination.requested()
         os.kill(os.getpid(), signal.SIGTERM)
         assert termination.requested()
+
+
+@pytest.mark.parametrize("job, memory_mb", [(True, 1000 - cluster.OVERHEAD_MB), (False, None)])
+def test_a_stage_in_a_slurm_job_uses_no_more_than_its_memory(monkeypatch, tmp_path, job, memory_mb):
+    """What it does not need in memory it reads from disk; Slurm would end it."""
+    for name in ("SLURM_JOB_ID", "SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    if job:
+        monkeypatch.setenv("SLURM_JOB_ID", "7")
+        monkeypatch.setenv("SLURM_CPUS_PER_TASK", "1")
+    requests = []
+    monkeypatch.setattr(command, "run_stage", lambda request, *_: requests.append(request) or 0)
+    line = ["stages", "train", "--out", str(tmp_path), "--key", "{}", "--memory-mb", "1000"]
+    monkeypatch.setattr("sys.argv", line)
+    assert command.main() == 0
+    assert requests[0].memory_mb == memory_mb

@@ -89,11 +89,12 @@ def earlier_jobs(folder: Path) -> Sequence[str]:
     ]
 
 
-def keep_unreported_jobs(executor: Any) -> None:
-    """Let an executor of Snakemake check a job again until it has reported the job's end.
+def watch_jobs(executor: Any, seconds: float) -> None:
+    """Let an executor of Snakemake check its jobs at this interval at most, and each until it has
+    reported the job's end.
 
-    The one for Slurm forgets its jobs when Slurm does not answer, as while the controller is
-    started again: Snakemake would never end.
+    The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
+    does not answer, as while the controller is started again: Snakemake would never end.
     """
     check, finished = executor.check_active_jobs, set()
 
@@ -113,6 +114,8 @@ def keep_unreported_jobs(executor: Any) -> None:
         for job in active:
             if id(job) not in yielded | finished:
                 yield job
+        due = min(seconds, executor.next_seconds_between_status_checks)
+        executor.next_seconds_between_status_checks = due
 
     executor.report_job_success = recording(executor.report_job_success)
     executor.report_job_error = recording(executor.report_job_error)

@@ -31,9 +31,9 @@ from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
     granted_cpus,
-    keep_unreported_jobs,
     largest_node,
     wait_for_earlier_jobs,
+    watch_jobs,
 )
 from stages.workflow.registry import STAGES
 
@@ -281,8 +281,9 @@ class SnakemakeProject:
             except OSError as error:
                 _exit(as_user_error(error) or UserError(f"{error}", file=RESULTS / name))
         if workflow.non_local_exec:
+            interval = workflow.remote_execution_settings.seconds_between_status_checks
             for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
-                keep_unreported_jobs(executor)
+                watch_jobs(executor, interval)
             wait_for_earlier_jobs(Path.cwd())
             for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
                 command = [sys.executable, "-m", module, "--target", "all"]

@@ -86,6 +86,7 @@ class Executor:
 
     def __init__(self):
         self.ended: list[str] = []
+        self.next_seconds_between_status_checks = 5
 
     def report_job_success(self, job):
         self.ended.append(job)
@@ -100,12 +101,13 @@ class Executor:
                 self.report_job_error(job)
             elif job == "running":
                 yield job
+        self.next_seconds_between_status_checks += 10
 
 
-def test_jobs_without_a_status_stay_active():
+def test_jobs_without_a_status_stay_active_and_intervals_are_bounded():
     """An executor that forgets them would never report their end."""
     executor = Executor()
-    cluster.keep_unreported_jobs(executor)
+    cluster.watch_jobs(executor, 20)
 
     async def check(*jobs: str) -> list[str]:
         return [job async for job in executor.check_active_jobs(jobs)]
@@ -113,6 +115,9 @@ def test_jobs_without_a_status_stay_active():
     active = asyncio.run(check("finished", "running", "unknown", "failed"))
     assert active == ["running", "unknown"]
     assert executor.ended == ["finished", "failed"]
+    assert executor.next_seconds_between_status_checks == 15
+    asyncio.run(check("running"))
+    assert executor.next_seconds_between_status_checks == 20
 
 
 def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):

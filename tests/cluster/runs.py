@@ -57,14 +57,14 @@ def until(found: Callable[[], T], what: str, seconds: float = 240) -> T:
 
 
 def project_that_pauses(folder: Path) -> Path:
-    """A copy of the project whose training saves a checkpoint in each second, and pauses at the
+    """A copy of the project whose training saves a checkpoint after each step, and pauses at the
     step that the file ``pause`` names."""
     copy_project(folder)
     loop = folder / "pipeline/training/loop"
     (loop / "pause.py").write_text(PAUSE)
     text = (loop / "session.py").read_text()
     advance = "        self.progress.advance("
-    changed = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.5")
+    changed = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.0")
     assert changed != text and changed.count(advance) == 1
     changed = changed.replace(advance, f"        pause(state.step)\n{advance}")
     first = "from pipeline.training.loop.state import"
@@ -160,10 +160,10 @@ class Jobs:
 
 
 class Training:
-    """The training of a project that pauses."""
+    """A stage of training in a project that pauses."""
 
-    def __init__(self, project: Path):
-        self.project = project
+    def __init__(self, project: Path, stage: str = "train"):
+        self.project, self.stage = project, stage
 
     def pause_at(self, step: int) -> None:
         (self.project / "paused").unlink(missing_ok=True)
@@ -201,7 +201,7 @@ class Training:
 
     def checkpoint(self) -> int:
         """The step of the newest whole checkpoint."""
-        folders = self.project.glob("results/tiny/.scratch/train/*/checkpoints")
+        folders = self.project.glob(f"results/tiny/.scratch/{self.stage}/*/checkpoints")
         names = [file.name for folder in folders for file in folder.glob("checkpoint_*.sha256")]
         return max(int(re.findall(r"\d+", name)[0]) for name in names)
 

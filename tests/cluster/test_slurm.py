@@ -61,7 +61,15 @@ def scene(tmp_path_factory: pytest.TempPathFactory, cluster: Cluster) -> Path:
 
 
 @pytest.fixture(scope="module")
-def reference(scene: Path) -> Path:
+def undisturbed(scene: Path, cluster: Cluster) -> Running:
+    """A whole scene on the cluster, which runs beside the next fixtures."""
+    project = scene.with_name("undisturbed")
+    shutil.copytree(scene, project)
+    return Running(project, *SLURM)
+
+
+@pytest.fixture(scope="module")
+def reference(scene: Path, undisturbed: Running) -> Path:
     """The results of one machine."""
     project = scene.with_name("reference")
     shutil.copytree(scene, project)
@@ -72,14 +80,6 @@ def reference(scene: Path) -> Path:
 def assert_same(project: Path, reference: Path) -> None:
     assert metrics(project, "tiny") == metrics(reference, "tiny")
     assert model_digests(project, "tiny") == model_digests(reference, "tiny")
-
-
-@pytest.fixture(scope="module")
-def undisturbed(scene: Path, reference: Path, cluster: Cluster) -> Running:
-    """A whole scene, beside the training that is interrupted on the other node."""
-    project = scene.with_name("undisturbed")
-    shutil.copytree(scene, project)
-    return Running(project, *SLURM)
 
 
 @pytest.fixture(scope="module")
@@ -120,9 +120,7 @@ class Interrupted:
 
 
 @pytest.fixture(scope="module")
-def interrupted(
-    scene: Path, reference: Path, undisturbed: Running, cluster: Cluster
-) -> Interrupted:
+def interrupted(scene: Path, reference: Path, cluster: Cluster) -> Interrupted:
     project = with_poses(reference, scene.with_name("interrupted"))
     jobs, training = Jobs(cluster), Training(project)
     training.pause_at(50)
@@ -202,12 +200,12 @@ def test_an_undisturbed_scene_is_three_jobs(
     assert_same(undisturbed.project, reference)
 
 
-# --- Snakemake, the controller and other runs -------------------------------------------------
+# --- Snakemake, the controller, other runs and blocks -----------------------------------------
 
 
 @dataclass(frozen=True)
 class Abandoned:
-    """One training that was killed for memory, and whose controller and Snakemake were.
+    """A scene in blocks whose first training was killed for memory, then its Snakemake.
 
     Attributes:
         killed, next_memory: the state of the job that used too much memory; megabytes of it and
@@ -236,16 +234,18 @@ class Abandoned:
 def abandoned(
     scene: Path, reference: Path, undisturbed: Running, local_blocks: Running, cluster: Cluster
 ) -> Abandoned:
+    """In the training of the whole scene, which precedes that of blocks. The blocks need both
+    nodes."""
     undisturbed.finish()
     project = with_poses(reference, scene.with_name("abandoned"))
-    jobs, training = Jobs(cluster), Training(project)
-    training.pause_at(100)
-    run = Running(project, *SLURM)
+    jobs, training = Jobs(cluster), Training(project, "coarse")
+    training.pause_at(15)
+    run = Running(project, *SLURM, config=BLOCKS)
     first = run.next_job(0)
     training.paused(first)
     training.use_memory()
     killed = jobs.ended(first)
-    training.pause_at(150)
+    training.pause_at(30)
     saved = training.checkpoint()
     old = run.next_job(1)
     training.paused(old)
@@ -265,13 +265,13 @@ def abandoned(
     folder = project_that_pauses(scene.with_name("other"))
     for name in ("data", "results"):
         (folder / name).symlink_to(project / name)
-    other = Running(folder, *SLURM)
+    other = Running(folder, *SLURM, config=BLOCKS)
     code = other.process.wait(300)
 
     run.process.send_signal(signal.SIGKILL)
     run.process.wait()
     unlock(project)
-    second = Running(project, *SLURM)
+    second = Running(project, *SLURM, config=BLOCKS)
     until(lambda: "jobs of an earlier run" in second.text(), "the message about the old job")
     queued = jobs.of(project)
     training.go_on()
@@ -315,27 +315,14 @@ def test_a_new_snakemake_holds_no_allocation_beside_the_jobs_of_a_killed_one(
 ) -> None:
     assert abandoned.queued == [abandoned.old]
     assert f"scancel {abandoned.old}" in abandoned.second.text()
-    assert len(abandoned.second.submitted()) == 2
-    log = abandoned.project / "results/tiny/logs/train.log"
-    assert "train: up to date, nothing to do" in log.read_text(), "the old job's result is used"
+    log = abandoned.project / "results/tiny/logs/coarse.log"
+    assert "coarse: up to date, nothing to do" in log.read_text(), "the old job's result is used"
 
 
-def test_abandoned_training_gives_the_same_bits(abandoned: Abandoned, reference: Path) -> None:
-    assert_same(abandoned.project, reference)
-
-
-# --- blocks -----------------------------------------------------------------------------------
-
-
-def test_blocks_are_trained_on_both_nodes_at_once(
-    scene: Path, reference: Path, undisturbed: Running, local_blocks: Running, cluster: Cluster
-) -> None:
-    undisturbed.finish()
-    project = with_poses(reference, scene.with_name("blocks-cluster"))
-    run = Running(project, *SLURM, config=BLOCKS)
-    run.finish()
+def test_blocks_are_trained_on_both_nodes_at_once(abandoned: Abandoned, cluster: Cluster) -> None:
     jobs = Jobs(cluster)
-    records = [jobs.record(job) for job in run.submitted()]
+    records = [jobs.record(job) for job in abandoned.second.submitted()]
+    assert len(records) == 7
     for stage in ("block", "polish"):
         first, second = (
             next(r for r in records if r["Comment"] == f"rule_{stage}_wildcards_tiny_{block}")
@@ -344,5 +331,10 @@ def test_blocks_are_trained_on_both_nodes_at_once(
         assert {first["NodeList"], second["NodeList"]} == {"n0", "n1"}, stage
         assert first["StartTime"] < second["EndTime"], stage
         assert second["StartTime"] < first["EndTime"], stage
+
+
+def test_blocks_on_a_cluster_give_the_same_bits(
+    abandoned: Abandoned, local_blocks: Running
+) -> None:
     local_blocks.finish()
-    assert_same(project, local_blocks.project)
+    assert_same(abandoned.project, local_blocks.project)

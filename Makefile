@@ -8,12 +8,13 @@ BIN := $(VENV)/bin
 
 READERS := tests/io/independent
 
-.PHONY: demo test test-native test-packages lint format docs site viewer setup extension clean
+.PHONY: demo test test-native test-slurm test-packages lint format docs site viewer setup extension clean
 .DEFAULT_GOAL := help
 
 help:
 	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
 	@echo "make test   run the tests;  make test-native  those of the C++ code alone"
+	@echo "make test-slurm  those of faults on a Slurm cluster (root; Debian's slurm-wlm and munge)"
 	@echo "make test-packages  other projects' packages that some tests compare with (needs Node)"
 	@echo "make setup  only set up .venv and the extension"
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
@@ -42,7 +43,7 @@ $(VENV)/product: pyproject.toml
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
 
-$(VENV)/watch $(VENV)/dev $(VENV)/test $(VENV)/docs: $(VENV)/product
+$(VENV)/watch $(VENV)/dev $(VENV)/test $(VENV)/docs $(VENV)/slurm: $(VENV)/product
 	@echo "installing the packages of '$(@F)' into $(VENV)"
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
@@ -64,8 +65,14 @@ demo: extension data/demo/demo.json
 # More than two cores' worth: tests that run Snakemake start many programs, one after the other.
 WORKERS := 3
 
+# These start a Slurm cluster on this machine, of which there is one at a time.
+SLURM_TESTS := tests/cluster
+
 test: setup $(VENV)/dev
-	@$(BIN)/python -m pytest tests -n $(WORKERS) --dist worksteal
+	@$(BIN)/python -m pytest tests --ignore=$(SLURM_TESTS) -n $(WORKERS) --dist worksteal
+
+test-slurm: setup $(VENV)/dev $(VENV)/slurm
+	@$(BIN)/python -m pytest $(SLURM_TESTS)
 
 # What a C++ compiler can change; CXX chooses it.
 NATIVE_TESTS := tests/render tests/sfm/test_matching.py tests/training

@@ -22,6 +22,7 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    SlurmResult,
     StabilityResult,
     StressResult,
     VideoFrames,
@@ -260,6 +261,19 @@ def lenses(found: Sequence[WideResult]) -> str:
     return markdown.table(rows)
 
 
+def slurm(records: Sequence[Stored]) -> str:
+    return slurm_table(results(records, Record[SlurmResult]))
+
+
+def slurm_table(found: Sequence[SlurmResult]) -> str:
+    rows = [["scene", "nodes", "blocks", "jobs", "wall (s)", "a job runs (s)", "none runs (s)"]]
+    for r in found:
+        times = (r.wall_s, r.busy_s, r.wall_s - r.busy_s)
+        counts = (r.nodes, r.blocks, r.jobs)
+        rows.append([r.scene, *map(str, counts), *(f"{seconds:.0f}" for seconds in times)])
+    return markdown.table(rows)
+
+
 TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "mesh": mesh,
     "coverage": coverage,
@@ -271,6 +285,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "page": page,
     "raster_stress": raster_stress,
     "blocks": blocks,
+    "slurm": slurm,
     "video": video,
     "wide": wide,
 }

@@ -300,3 +300,26 @@ class WideResult:
     psnr: float
     ssim: float
     used_share: float | None
+
+
+# ---- benchmarks.slurm ----
+
+
+@dataclass(frozen=True)
+class SlurmResult:
+    """A scene on a Slurm cluster.
+
+    Attributes:
+        nodes: number of nodes, with one core each.
+        blocks: number of the scene's.
+        jobs: number of submissions.
+        wall_s: from the start of Snakemake to its end.
+        busy_s: seconds in which at least one job runs.
+    """
+
+    scene: str
+    nodes: int
+    blocks: int
+    jobs: int
+    wall_s: float
+    busy_s: float

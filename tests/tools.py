@@ -28,15 +28,18 @@ PACKAGES = {
     "node": "nodejs",
     "objdump": "binutils",
     "qemu-aarch64": "qemu-user",
+    "munged": "munge",
+    **dict.fromkeys(("slurmctld", "slurmd", "sbatch", "squeue", "scontrol"), "slurm-wlm"),
 }
 UNSUPPORTED = "not on this machine: "
 
 
 def need(*programs: str) -> None:
     """Skips the test where one is missing."""
-    lacking = [program for program in programs if shutil.which(program) is None]
+    path = os.pathsep.join([os.environ.get("PATH", ""), "/usr/sbin", "/sbin"])
+    lacking = [program for program in programs if shutil.which(program, path=path) is None]
     if lacking:
-        packages = " ".join(PACKAGES.get(program, program) for program in lacking)
+        packages = " ".join(dict.fromkeys(PACKAGES.get(program, program) for program in lacking))
         pytest.skip(f"not run: {', '.join(lacking)} missing (apt-get install {packages})")
 
 

@@ -1,14 +1,54 @@
-"""A running stage's lock and log."""
+"""The locks of a run and of a running stage, and a stage's log."""
 
 from __future__ import annotations
 
+import contextlib
 import fcntl
+import getpass
+import os
+import platform
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import TextIO
 
+from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Console
+
+_held: list[TextIO] = []
+
+
+def lock_run(folder: Path) -> None:
+    """Lock a run's folder of results until this process ends.
+
+    Snakemake's own lock is in its working directory; several can have the same results.
+
+    Raises:
+        UserError: another process has locked it.
+    """
+    path = folder / ".scratch" / "run.lock"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  (open until the process ends)
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        owner = file.read().strip() or "starting"
+        file.close()
+        what = f"another run is writing these results ({owner})"
+        fix = "wait until it has ended or end it, then run the same command again"
+        raise UserError(what, file=folder, fix=fix) from None
+    file.truncate(0)
+    file.write(f"{_user()} on {platform.node()}, process {os.getpid()}\n")
+    file.flush()
+    _held.append(file)
+
+
+def _user() -> str:
+    with contextlib.suppress(OSError, KeyError):
+        return getpass.getuser()
+    return str(os.getuid())
 
 
 @contextmanager

@@ -1,16 +1,26 @@
-"""The nodes of a Slurm cluster, and what it has granted to a job."""
+"""The nodes of a Slurm cluster, its queue, and what it has granted to a job."""
 
 from __future__ import annotations
 
 import os
+import re
 import subprocess
+import sys
+import time
+from collections.abc import AsyncIterator, Callable, Sequence
 from dataclasses import dataclass
 from functools import cache
+from pathlib import Path
+from typing import Any
 
 # Cores that a stage asks for on a cluster whose nodes are unknown: few nodes have fewer.
 DEFAULT_CPUS = 8
 # Memory in MB that the two Snakemakes around a stage take in its job.
 OVERHEAD_MB = 400
+# Seconds between two looks at the queue.
+QUEUE_SECONDS = 10.0
+# Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
+_JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
 
 @dataclass(frozen=True)
@@ -42,3 +52,71 @@ def largest_node() -> Node | None:
     # A "+" marks the least of several values.
     sizes = [(int(row[1].rstrip("+")), int(row[2].rstrip("+"))) for row in default or rows]
     return Node(max(c for c, _ in sizes), max(m for _, m in sizes)) if sizes else None
+
+
+def wait_for_earlier_jobs(folder: Path) -> None:
+    """Wait until no job of an earlier Snakemake in this folder is in the queue. Snakemake does not
+    adopt the jobs of a killed one, and a second job for the same stage would hold its cores and
+    memory while it waits for the first."""
+    waiting = False
+    while jobs := earlier_jobs(folder):
+        if not waiting:
+            waiting = True
+            print(
+                f"{folder}: Slurm's queue has jobs of an earlier run: {' '.join(jobs)}\n"
+                "  this run submits its jobs when they have ended, and uses their results\n"
+                f"  what to do: wait, or end them: scancel {' '.join(jobs)}",
+                file=sys.stderr,
+                flush=True,
+            )
+        time.sleep(QUEUE_SECONDS)
+
+
+def earlier_jobs(folder: Path) -> Sequence[str]:
+    """Ids of the jobs in the queue that a Snakemake in this folder has submitted; none if Slurm
+    does not answer."""
+    command = ["squeue", "-h", "-o", "%i|%j|%Z"]
+    try:
+        done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
+    except (OSError, subprocess.SubprocessError):
+        return []
+    rows = [line.split("|", 2) for line in done.stdout.splitlines() if line.count("|") >= 2]
+    here = os.path.realpath(folder)
+    return [
+        number
+        for number, name, started_in in rows
+        if _JOB_NAME.fullmatch(name) and os.path.realpath(started_in) == here
+    ]
+
+
+def watch_jobs(executor: Any, seconds: float) -> None:
+    """Let an executor of Snakemake check its jobs at this interval at most, and each until it has
+    reported the job's end.
+
+    The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
+    does not answer, as while the controller is started again: Snakemake would never end.
+    """
+    check, finished = executor.check_active_jobs, set()
+
+    def recording(report: Callable[..., None]) -> Callable[..., None]:
+        def reported(job: Any, *args: Any, **options: Any) -> None:
+            finished.add(id(job))
+            report(job, *args, **options)
+
+        return reported
+
+    async def checked(active: Sequence[Any]) -> AsyncIterator[Any]:
+        finished.clear()
+        yielded = set()
+        async for job in check(active):
+            yielded.add(id(job))
+            yield job
+        for job in active:
+            if id(job) not in yielded | finished:
+                yield job
+        due = min(seconds, executor.next_seconds_between_status_checks)
+        executor.next_seconds_between_status_checks = due
+
+    executor.report_job_success = recording(executor.report_job_success)
+    executor.report_job_error = recording(executor.report_job_error)
+    executor.check_active_jobs = checked

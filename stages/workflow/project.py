@@ -22,11 +22,19 @@ from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
-from pipeline.runtime.errors import UserError
+from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
+from pipeline.runtime.lock import lock_run
 from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
-from stages.workflow.cluster import DEFAULT_CPUS, OVERHEAD_MB, granted_cpus, largest_node
+from stages.workflow.cluster import (
+    DEFAULT_CPUS,
+    OVERHEAD_MB,
+    granted_cpus,
+    largest_node,
+    wait_for_earlier_jobs,
+    watch_jobs,
+)
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
@@ -259,15 +267,24 @@ class SnakemakeProject:
     # --- clusters -------------------------------------------------------------------------
 
     def before_jobs(self, workflow: Any) -> None:
-        """Check that the jobs can write, and compile the native libraries before jobs are
-        submitted: a compiler takes more memory than a job may use, and nodes may have none."""
-        names = {getattr(job.wildcards, "scene", None) for job in workflow.dag.needrun_jobs()}
+        """Check that the jobs can write and that no other run does, and compile the native
+        libraries before jobs are submitted: a compiler takes more memory than a job may use, and
+        nodes may have none."""
+        needed = list(workflow.dag.needrun_jobs())
+        names = {getattr(job.wildcards, "scene", None) for job in needed}
         for name in sorted(filter(None, names)):
             try:
                 _check_writable(RESULTS / name)
+                lock_run(RESULTS / name)
             except UserError as error:
                 _exit(error)
+            except OSError as error:
+                _exit(as_user_error(error) or UserError(f"{error}", file=RESULTS / name))
         if workflow.non_local_exec:
+            interval = workflow.remote_execution_settings.seconds_between_status_checks
+            for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
+                watch_jobs(executor, interval)
+            wait_for_earlier_jobs(Path.cwd())
             for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
                 command = [sys.executable, "-m", module, "--target", "all"]
                 subprocess.run(command, check=False, stdout=sys.stderr)

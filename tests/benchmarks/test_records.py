@@ -21,6 +21,7 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    SlurmResult,
     StabilityResult,
     StressResult,
     VideoFrames,
@@ -41,6 +42,11 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
         ),
         "| town | 300 | 4 | 26.00 | 27.12 | 0.8000 | 0.8500 | 68k | 90k | 850 | 480 | 60 | 150 | "
         "41 | 1.02 |",
+    ),
+    "slurm": (
+        Record[SlurmResult],
+        SlurmResult("demo", nodes=2, blocks=1, jobs=3, wall_s=150.4, busy_s=110.0),
+        "| demo | 2 | 1 | 3 | 150 | 110 | 40 |",
     ),
     "video": (
         Record[VideoFrames],

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import os
 import signal
 import sys
@@ -21,8 +22,9 @@ from stages.workflow.registry import STAGES
 from tests.pictures import photos
 
 
-def sinfo(folder: Path, text: str, code: int = 0) -> Path:
-    program = folder / "sinfo"
+def program(folder: Path, name: str, text: str, code: int = 0) -> Path:
+    """A folder with a program that prints this."""
+    program = folder / name
     program.write_text(f"#!/bin/sh\nprintf '{text}'\nexit {code}\n")
     program.chmod(0o755)
     return folder
@@ -37,7 +39,7 @@ def sinfo(folder: Path, text: str, code: int = 0) -> Path:
     ],
 )
 def test_the_largest_node_of_the_default_partition(tmp_path, monkeypatch, text, node):
-    monkeypatch.setenv("PATH", str(sinfo(tmp_path, text)), prepend=os.pathsep)
+    monkeypatch.setenv("PATH", str(program(tmp_path, "sinfo", text)), prepend=os.pathsep)
     cluster.largest_node.cache_clear()
     assert cluster.largest_node() == node
     cluster.largest_node.cache_clear()
@@ -48,6 +50,75 @@ def test_without_slurm_no_node_is_known(tmp_path, monkeypatch):
     cluster.largest_node.cache_clear()
     assert cluster.largest_node() is None
     cluster.largest_node.cache_clear()
+
+
+RUN = "12345678-1234-1234-1234-1234567890ab"
+
+
+def test_earlier_jobs_are_those_of_snakemake_in_this_folder(tmp_path, monkeypatch):
+    """Another program's job in this folder may be the Snakemake that looks; it must not wait for
+    itself."""
+    (tmp_path / "link").symlink_to(tmp_path)
+    rows = [
+        f"3|splatmake_{RUN}|{tmp_path}",
+        f"4|{RUN}|{tmp_path}/link",
+        f"5|{RUN}|{tmp_path}/other",
+        f"6|snakemake|{tmp_path}",
+    ]
+    monkeypatch.setenv("PATH", str(program(tmp_path, "squeue", "\\n".join(rows))))
+    assert cluster.earlier_jobs(tmp_path) == ["3", "4"]
+    program(tmp_path, "squeue", "", code=1)
+    assert cluster.earlier_jobs(tmp_path) == []
+
+
+def test_a_run_waits_for_earlier_jobs_with_one_message(tmp_path, monkeypatch, capsys):
+    answers = [["7", "8"], ["8"], []]
+    monkeypatch.setattr(cluster, "earlier_jobs", lambda folder: answers.pop(0))
+    monkeypatch.setattr(cluster, "QUEUE_SECONDS", 0.0)
+    cluster.wait_for_earlier_jobs(tmp_path)
+    assert not answers
+    said = capsys.readouterr().err
+    assert said.count("jobs of an earlier run") == 1
+    assert "scancel 7 8" in said
+
+
+class Executor:
+    """Reports the end of one job, returns another as active, and forgets the others."""
+
+    def __init__(self):
+        self.ended: list[str] = []
+        self.next_seconds_between_status_checks = 5
+
+    def report_job_success(self, job):
+        self.ended.append(job)
+
+    report_job_error = report_job_success
+
+    async def check_active_jobs(self, active):
+        for job in active:
+            if job == "finished":
+                self.report_job_success(job)
+            elif job == "failed":
+                self.report_job_error(job)
+            elif job == "running":
+                yield job
+        self.next_seconds_between_status_checks += 10
+
+
+def test_jobs_without_a_status_stay_active_and_intervals_are_bounded():
+    """An executor that forgets them would never report their end."""
+    executor = Executor()
+    cluster.watch_jobs(executor, 20)
+
+    async def check(*jobs: str) -> list[str]:
+        return [job async for job in executor.check_active_jobs(jobs)]
+
+    active = asyncio.run(check("finished", "running", "unknown", "failed"))
+    assert active == ["running", "unknown"]
+    assert executor.ended == ["finished", "failed"]
+    assert executor.next_seconds_between_status_checks == 15
+    asyncio.run(check("running"))
+    assert executor.next_seconds_between_status_checks == 20
 
 
 def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):

@@ -13,8 +13,8 @@ from pipeline.training.loop.schedule import Part, Schedule
 
 # The parts of a run's schedule: on the whole scene at reduced resolution, in blocks among the
 # coarse Gaussians, and in blocks among what the other blocks have become. Alternating over
-# subdomains that overlap is the Schwarz method of domain decomposition. The coarse part is long: what
-# it leaves wrong in the surroundings of a block, the block would correct with haze in front of them.
+# subdomains that overlap is the Schwarz method of domain decomposition. The coarse part is long:
+# what it leaves wrong around a block, the block would correct with haze in front of it.
 COARSE, FIRST, SECOND = Part(0.0, 0.5), Part(0.5, 0.8), Part(0.8, 1.0)
 # Images of the coarse run are reduced by this factor, beside the schedule's own reduction.
 COARSE_IMAGE_FACTOR = 2

@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.slurm_cluster import Cluster
-from tests.e2e.harness import TINY, copy_project, copy_run, environment
+from tests.e2e.harness import TINY, copy_run, copy_sources, environment, make_project
 
 T = TypeVar("T")
 
@@ -59,7 +59,7 @@ def until(found: Callable[[], T], what: str, seconds: float = 240) -> T:
 def project_that_pauses(folder: Path) -> Path:
     """A copy of the project whose training saves a checkpoint after each step, and pauses at the
     step that the file ``pause`` names."""
-    copy_project(folder)
+    copy_sources(make_project(folder))
     loop = folder / "pipeline/training/loop"
     (loop / "pause.py").write_text(PAUSE)
     text = (loop / "session.py").read_text()

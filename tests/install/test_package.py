@@ -164,10 +164,10 @@ def test_libraries_are_not_compiled_into_the_installation(installed: Path, tmp_p
 
 @pytest.mark.slow
 def test_photographs_to_measurements(
-    reconstruction: Reconstruction, finished: Path, tmp_path: Path
+    reconstruction: Reconstruction, installed: Path, finished: Path, tmp_path: Path
 ) -> None:
     """``splatmake run`` on photographs elsewhere gives what a checkout gives, and the example of
-    docs/reference/api.md loads it."""
+    docs/reference/api.md loads it, in the program that was installed from its sources."""
     work = reconstruction.work
     ours, theirs = (
         json.loads((place / "results/tiny/metrics.json").read_text()) for place in (work, finished)
@@ -181,7 +181,7 @@ def test_photographs_to_measurements(
     assert len(example.splitlines()) <= 10
     (tmp_path / "example.py").write_text(example)
     (tmp_path / "results").symlink_to(work / "results")
-    printed = reconstruction.run("python", "example.py", cwd=tmp_path)
+    printed = run(installed, "python", "example.py", cwd=tmp_path).stdout
     assert f"{ours['psnr']:.2f} dB" in printed
 
 

@@ -87,9 +87,17 @@ class Cluster:
         return dict(line.split(maxsplit=1) for line in lines)
 
     def start_controller(self) -> None:
-        subprocess.run(["slurmctld"], env=self.environment, check=True)
+        """Start the controller, and again if it crashes, as a service manager does: that of Slurm
+        22.05 sometimes does when a lost node returns."""
+        stopped = self.folder / "stopped"
+        stopped.unlink(missing_ok=True)
+        loop = f"until [ -e {stopped} ]; do slurmctld -D; sleep 1; done"
+        subprocess.Popen(
+            ["sh", "-c", loop], env=self.environment, stderr=subprocess.DEVNULL, cwd=self.folder
+        )
 
     def stop_controller(self) -> None:
+        (self.folder / "stopped").touch()
         _stop(self.folder / "slurmctld.pid")
 
     def start_node(self, name: str) -> None:

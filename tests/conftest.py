@@ -6,6 +6,7 @@ import os
 from collections.abc import Generator, Iterator
 
 import pytest
+from hypothesis import HealthCheck, settings
 
 from tests.forked import forked_spawns
 from tests.tools import fail_skipped
@@ -13,6 +14,10 @@ from tests.tools import fail_skipped
 # torch's own threads would spin beside the other worker's, and the references' arrays are small.
 # Before torch is imported; the kernels' threads are given explicitly.
 os.environ.setdefault("OMP_NUM_THREADS", "1")
+
+# No test fails because the machine is busy.
+settings.register_profile("untimed", deadline=None, suppress_health_check=[HealthCheck.too_slow])
+settings.load_profile("untimed")
 
 
 def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:

@@ -11,6 +11,7 @@ from pathlib import Path
 from pipeline.runtime.errors import EXIT_INTERRUPTED
 from pipeline.runtime.job import Request, run_stage
 from pipeline.runtime.machine import usable_cores
+from pipeline.runtime.memory import share_heap
 from stages.workflow.cluster import OVERHEAD_MB, granted_cpus
 
 
@@ -43,6 +44,7 @@ def main() -> int:
         log=args.log,
         publish=_pairs(args.publish),
     )
+    share_heap()
     spec = importlib.import_module(f"stages.{args.stage}").SPEC
     return run_stage(request, spec.work, spec.counters)
 

@@ -24,7 +24,7 @@ def work(job: Job) -> None:
     from pipeline.io.npz import read_npz
     from pipeline.training.blocks.options import FIRST
 
-    blocks.train(job, read_npz(job.inputs["coarse"] / "gaussians.npz"), FIRST)
+    blocks.train(job, lambda: read_npz(job.inputs["coarse"] / "gaussians.npz"), FIRST)
 
 
 SPEC = StageSpec(

@@ -36,12 +36,8 @@ def work(job: Job) -> None:
         read_npz(job.inputs["init"] / "gaussians.npz"),
         coarse_options(job.section(Train)),
         job.section(Experiments).train,
-        seed=job.seed,
-        threads=job.threads,
-        memory_mb=job.memory_mb,
-        checkpoint_dir=job.scratch / "checkpoints",
-        logs=job.logs,
-        part=COARSE,
+        inputs.training_run(job),
+        COARSE,
     )
     inputs.write_trained(job, trained)
 

@@ -23,7 +23,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.training.blocks.options import SECOND
 
-    blocks.train(job, blocks.union_of(job, "block"), SECOND)
+    blocks.train(job, lambda: blocks.union_of(job, "block"), SECOND)
 
 
 SPEC = StageSpec(

@@ -50,11 +50,7 @@ def work(job: Job) -> None:
         read_npz(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
         job.section(Experiments).train,
-        seed=job.seed,
-        threads=job.threads,
-        memory_mb=job.memory_mb,
-        checkpoint_dir=job.scratch / "checkpoints",
-        logs=job.logs,
+        inputs.training_run(job),
     )
     inputs.write_trained(job, trained)
 

@@ -5,6 +5,8 @@ import resource
 import sys
 from pathlib import Path
 
+_M_ARENA_MAX = -8  # malloc.h of glibc
+
 
 def peak_memory_mb() -> float:
     """Peak resident size in MiB, of this process or its largest finished child process."""
@@ -17,6 +19,13 @@ def release_free_memory() -> None:
     """Return freed memory to the system, which glibc keeps where allocations differ in size."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)
+
+
+def share_heap() -> None:
+    """Let all threads allocate from one heap, before they start: otherwise glibc keeps what each of
+    them has freed for itself."""
+    if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "mallopt"):
+        libc.mallopt(_M_ARENA_MAX, 1)
 
 
 def limit_address_space(size: int) -> None:

@@ -68,6 +68,24 @@ class TrainedScene:
     timings: dict[str, Any]
 
 
+@dataclass(frozen=True)
+class TrainingRun:
+    """How a training runs. Only the seed changes the result.
+
+    Attributes:
+        threads: of the native operators.
+        memory_mb: memory limit; see ``training.loop.train``.
+        checkpoint_dir: where a killed training is resumed from.
+        logs: folder of the metrics log.
+    """
+
+    seed: int
+    threads: int
+    memory_mb: int | None
+    checkpoint_dir: Path
+    logs: Path
+
+
 @dataclass
 class Notes:
     """Messages about a training, and the counters that only some options have."""
@@ -84,20 +102,12 @@ def train_scene(
     initial: Gaussians,
     config: Train,
     experiments: TrainExperiments,
-    *,
-    seed: int,
-    threads: int,
-    memory_mb: int | None,
-    checkpoint_dir: Path,
-    logs: Path,
+    run: TrainingRun,
     part: Part = WHOLE_RUN,
 ) -> TrainedScene:
     """Train on the views that are not test views.
 
     Args:
-        memory_mb: memory limit; see ``training.loop.train``.
-        checkpoint_dir: where a killed training is resumed from.
-        logs: folder of the metrics log.
         part: of the schedule.
 
     Raises:
@@ -110,13 +120,9 @@ def train_scene(
         scene_inputs(views, manifest, model, initial, gains, config, notes),
         config,
         experiments,
-        seed=seed,
-        threads=threads,
-        memory_mb=memory_mb,
-        checkpoint_dir=checkpoint_dir,
-        logs=logs,
-        part=part,
-        notes=notes,
+        run,
+        part,
+        notes,
     )
     result, refined = trained.result, model
     if result.intrinsics is not None:
@@ -132,12 +138,7 @@ def run_training(
     inputs: Inputs,
     config: Train,
     experiments: TrainExperiments,
-    *,
-    seed: int,
-    threads: int,
-    memory_mb: int | None,
-    checkpoint_dir: Path,
-    logs: Path,
+    run: TrainingRun,
     part: Part = WHOLE_RUN,
     notes: Notes | None = None,
 ) -> TrainedScene:
@@ -152,11 +153,11 @@ def run_training(
         inputs,
         config,
         experiments,
-        seed=seed,
-        threads=threads,
-        memory_mb=memory_mb,
-        checkpoint_dir=checkpoint_dir,
-        metrics_log=logs / metrics_log.NAME,
+        seed=run.seed,
+        threads=run.threads,
+        memory_mb=run.memory_mb,
+        checkpoint_dir=run.checkpoint_dir,
+        metrics_log=run.logs / metrics_log.NAME,
         on_log=lambda text: print(text, file=sys.stderr, flush=True),
         part=part,
     )

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections.abc import Callable
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
@@ -13,6 +14,7 @@ from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians
+    from pipeline.training.blocks.train import SceneInBlocks
     from pipeline.training.loop.schedule import Part
 
 INPUTS = {
@@ -41,34 +43,45 @@ def union_of(job: Job, role: str) -> Gaussians:
     )
 
 
-def train(job: Job, scene: Gaussians, part: Part) -> None:
+def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None:
     """Train the job's block and write the result.
 
     Args:
-        scene: the Gaussians of the whole scene.
+        read_gaussians: reads those of the whole scene.
     """
+    from pipeline.training.blocks.train import block_training
+    from pipeline.training.scene import run_training
+
+    inputs.write_trained(
+        job,
+        run_training(
+            # Not a local variable here: what it is made from is not held during training.
+            *block_training(
+                _scene(job, read_gaussians),
+                job.block,
+                job.section(Train),
+                job.section(Experiments).train,
+                part,
+            ),
+            inputs.training_run(job),
+            part,
+        ),
+    )
+
+
+def _scene(job: Job, read_gaussians: Callable[[], Gaussians]) -> SceneInBlocks:
     from pipeline.scene.exposure import ExposureGains
-    from pipeline.training.blocks.train import train_block
+    from pipeline.training.blocks.train import SceneInBlocks
 
     views = inputs.coarse_views(job)
-    trained = train_block(
-        views,
-        inputs.read_manifest(job, "views"),
-        inputs.coarse_model(job),
-        scene,
-        ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
-        read_partition(job),
-        job.block,
-        job.section(Train),
-        job.section(Experiments).train,
-        part,
-        seed=job.seed,
-        threads=job.threads,
-        memory_mb=job.memory_mb,
-        checkpoint_dir=job.scratch / "checkpoints",
-        logs=job.logs,
+    return SceneInBlocks(
+        views=views,
+        manifest=inputs.read_manifest(job, "views"),
+        model=inputs.coarse_model(job),
+        gains=ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
+        partition=read_partition(job),
+        read_gaussians=read_gaussians,
     )
-    inputs.write_trained(job, trained)
 
 
 def unite(job: Job) -> None:

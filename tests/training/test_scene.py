@@ -52,11 +52,7 @@ def test_the_scale_follows_the_depths_of_training_views(
             ball(5, 0),
             Train(depth_loss_weight=0.0),
             TrainExperiments(),
-            seed=0,
-            threads=1,
-            memory_mb=None,
-            checkpoint_dir=tmp_path,
-            logs=tmp_path,
+            stage.TrainingRun(0, 1, None, tmp_path, tmp_path),
         )
     assert [view.name for view in given[0].views] == ["1", "2"]
     assert given[0].extent == 50.0

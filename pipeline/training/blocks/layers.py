@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
+from threading import Lock
 
 import numpy as np
 import torch
@@ -24,7 +25,8 @@ MIN_FRONT = 2 / 255
 
 @dataclass(frozen=True)
 class BlockLayers:
-    """Renders the layers around a block in any view (``training.data.targets.LayerSource``).
+    """Renders the layers around a block in any view (``training.data.targets.LayerSource``), one
+    view at a time: each render needs as much memory as all Gaussians.
 
     Attributes:
         coarse: the Gaussians of the whole scene before the blocks are trained.
@@ -38,8 +40,13 @@ class BlockLayers:
     background: Color
     options: RasterOptions
     backend: Backend
+    _lock: Lock = field(default_factory=Lock, compare=False)
 
     def __call__(self, view: View) -> Layers:
+        with self._lock:
+            return self._layers(view)
+
+    def _layers(self, view: View) -> Layers:
         means = self.coarse.means.numpy()
         own = self.region.contains(means)
         behind = self.region.hides(view.centre, means) & ~own

@@ -1,15 +1,17 @@
-"""Training of one block among its surroundings."""
+"""What the training of one block works on."""
 
 from __future__ import annotations
 
-from pathlib import Path
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 import torch
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.render import BACKGROUNDS, Color, RasterOptions, make_backend
+from pipeline.render import BACKGROUNDS, RasterOptions, make_backend
 from pipeline.render.views import near_plane
 from pipeline.runtime.errors import UserError
 from pipeline.scene.blocks import Partition
@@ -25,46 +27,54 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.data.targets import usable_factor
 from pipeline.training.loop.schedule import Part
-from pipeline.training.scene import TrainedScene, run_training, scene_inputs
+from pipeline.training.scene import scene_inputs
 
 
-def train_block(
-    views: list[View],
-    manifest: Manifest,
-    model: Reconstruction,
-    scene: Gaussians,
-    gains: ExposureGains,
-    partition: Partition,
+@dataclass(frozen=True)
+class SceneInBlocks:
+    """A scene of which blocks are trained.
+
+    Attributes:
+        views: all views.
+        gains: of all views; empty if exposure is not modelled.
+        read_gaussians: reads the Gaussians of the whole scene, from which each block starts and its
+            surroundings are rendered. They are not held while a block is trained.
+    """
+
+    views: list[View]
+    manifest: Manifest
+    model: Reconstruction
+    gains: ExposureGains
+    partition: Partition
+    read_gaussians: Callable[[], Gaussians]
+
+
+class BlockTraining(NamedTuple):
+    """The arguments of ``training.scene.run_training`` for one block."""
+
+    inputs: Inputs
+    config: Train
+    experiments: TrainExperiments
+
+
+def block_training(
+    scene: SceneInBlocks,
     number: int,
     config: Train,
     experiments: TrainExperiments,
     part: Part,
-    *,
-    seed: int,
-    threads: int,
-    memory_mb: int | None,
-    checkpoint_dir: Path,
-    logs: Path,
-) -> TrainedScene:
-    """Train block ``number`` on the training views that see it.
-
-    Args:
-        views: all views of the scene.
-        scene: the Gaussians of the whole scene, from which the block starts and its surroundings
-            are rendered.
-        gains: of all views; empty if exposure is not modelled.
-        part: of the schedule.
+) -> BlockTraining:
+    """What a part of the training of block ``number`` works on: the training views that see it.
 
     Raises:
-        UserError: no view sees the block, or see ``training.loop.train``.
+        UserError: no view sees the block.
     """
+    partition = scene.partition
     block = partition.blocks[number - 1]
     if not block.views or not block.gaussians:
         raise UserError(f"no training view sees block {number}", fix="lower partition.blocks")
     share = block.pixels / max(1, sum(other.pixels for other in partition.blocks))
-    whole = scene_inputs(views, manifest, model, scene, gains, config)
-    background = config.background if config.background in BACKGROUNDS else "black"
-    inputs = block_inputs(whole, partition, number, config, BACKGROUNDS[background])
+    inputs = block_inputs(scene, number, config)
     options, experiments = block_options(
         config,
         experiments,
@@ -74,57 +84,51 @@ def train_block(
         seen_share=inputs.seen_share,
         initial=len(inputs.initial),
     )
-    return run_training(
-        inputs,
-        options,
-        experiments,
-        seed=seed,
-        threads=threads,
-        memory_mb=memory_mb,
-        checkpoint_dir=checkpoint_dir,
-        logs=logs,
-        part=part,
-    )
+    return BlockTraining(inputs, options, experiments)
 
 
-def block_inputs(
-    scene: Inputs, partition: Partition, number: int, config: Train, background: Color
-) -> Inputs:
-    """The inputs of the training of block ``number``.
-
-    Args:
-        scene: the inputs of the whole scene; ``initial`` are the coarse Gaussians.
-        background: behind the scene.
-    """
-    region, block = partition.region(number), partition.blocks[number - 1]
-    windows = {view.name: view.window for view in block.views}
-    shown = [index for index, view in enumerate(scene.views) if view.name in windows]
-    views = [scene.views[index].cropped(*windows[scene.views[index].name]) for index in shown]
-    overviews = range(0, len(scene.views), OVERVIEW_EVERY)
+def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
+    """The inputs of the training of block ``number``: its windows in the views that see it, and
+    overviews."""
+    partition, read_gaussians = scene.partition, scene.read_gaussians
+    gaussians = read_gaussians()
+    whole = scene_inputs(scene.views, scene.manifest, scene.model, gaussians, scene.gains, config)
+    windows = {view.name: view.window for view in partition.blocks[number - 1].views}
+    shown = [index for index, view in enumerate(whole.views) if view.name in windows]
+    views = [whole.views[index].cropped(*windows[whole.views[index].name]) for index in shown]
+    overviews = range(0, len(whole.views), OVERVIEW_EVERY)
     kept = [*shown, *overviews]
-    coarse = scene.initial
-    own = torch.from_numpy(np.flatnonzero(region.contains(coarse.means.numpy())))
+    region = partition.region(number)
+    own = torch.from_numpy(np.flatnonzero(region.contains(gaussians.means.numpy())))
+    initial = gaussians.select(own)
     options = RasterOptions(
-        sh_degree=coarse.sh_degree,
-        antialias=config.antialias,
-        near=near_plane(scene.extent),
-        threads=1,
+        sh_degree=gaussians.sh_degree, antialias=config.antialias, near=near_plane(whole.extent)
     )
-    initial = coarse.select(own)
+    background = config.background if config.background in BACKGROUNDS else "black"
+
+    def open_layers(threads: int) -> BlockLayers:
+        return BlockLayers(
+            read_gaussians(),
+            region,
+            BACKGROUNDS[background],
+            replace(options, threads=threads),
+            make_backend(),
+        )
+
     return Inputs(
-        views=[*views, *(_overview(scene.views[index]) for index in overviews)],
+        views=[*views, *(_overview(whole.views[index]) for index in overviews)],
         initial=initial,
-        extent=scene.extent,
-        scale=scene.scale,
-        gains=None if scene.gains is None else scene.gains[kept],
-        depths=scene.depths
+        extent=whole.extent,
+        scale=whole.scale,
+        gains=None if whole.gains is None else whole.gains[kept],
+        depths=whole.depths
         and [
-            *(_cropped(scene.depths[i], windows[scene.views[i].name]) for i in shown),
-            *(_scaled(scene.depths[i], scene.views[i]) for i in overviews),
+            *(_cropped(whole.depths[i], windows[whole.views[i].name]) for i in shown),
+            *(_scaled(whole.depths[i], whole.views[i]) for i in overviews),
         ],
-        empty_depths=None if scene.empty_depths is None else scene.empty_depths[kept],
+        empty_depths=None if whole.empty_depths is None else whole.empty_depths[kept],
         seen_share=seen_share(initial.means.double().numpy(), views),
-        layers=BlockLayers(coarse, region, background, options, make_backend()),
+        open_layers=open_layers,
     )
 
 

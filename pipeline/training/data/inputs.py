@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -32,8 +32,9 @@ class Inputs:
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
         seen_share: mean share of the views that see a Gaussian (``scene.visibility``).
-        layers: the layers around the Gaussians in each view, for a block of a scene; None: the
-            Gaussians are the whole scene.
+        open_layers: for a block of a scene, makes the source of the layers around it in each view,
+            which renders with so many threads and is not held during training; None: the Gaussians
+            are the whole scene.
     """
 
     views: Sequence[View]
@@ -44,7 +45,7 @@ class Inputs:
     depths: Sequence[KnownDepths] | None = None
     empty_depths: NDArray[np.float64] | None = None
     seen_share: float = 1.0
-    layers: LayerSource | None = None
+    open_layers: Callable[[int], LayerSource] | None = None
 
     @property
     def size(self) -> float:

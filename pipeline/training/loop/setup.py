@@ -17,6 +17,7 @@ from pipeline.plan.training_memory import machine_mb, memory_mb
 from pipeline.render import Backend, RasterCamera
 from pipeline.render.views import near_plane, raster_camera
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.memory import release_free_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
@@ -85,7 +86,11 @@ def load_scene(
     """
     store = choose_image_store(inputs, config, memory_mb)
     noise = experiments.salt_and_pepper_share
-    targets = Targets(inputs.views, threads, noise, seed, store, inputs.layers)
+    release_free_memory()  # That the inputs were read with.
+    layers = inputs.open_layers(threads) if inputs.open_layers else None
+    targets = Targets(inputs.views, threads, noise, seed, store, layers)
+    del layers
+    release_free_memory()
     near = near_plane(inputs.extent)
     inputs = _without_hidden_views(inputs, targets, warn)
     background = config.background
@@ -98,7 +103,7 @@ def load_scene(
 def choose_image_store(inputs: Inputs, config: Train, limit_mb: int | None) -> ImageStore:
     """Memory if the views' pixels fit beside the Gaussians, else a file."""
     pixels = sum(view.width * view.height for view in inputs.views)
-    if inputs.layers is not None:
+    if inputs.open_layers is not None:
         pixels *= LAYERED_PIXELS
     limit = min(machine_mb(), limit_mb or math.inf)
     fits = memory_mb(pixels, config.density.max_gaussians) <= limit

@@ -212,7 +212,7 @@ class Trainer:
             self.state.adam.resize_bands(degree)
 
     def draw_background(self) -> Color:
-        if self.scene.inputs.layers is not None:
+        if self.scene.inputs.open_layers is not None:
             return BACKGROUNDS["black"]  # The background is in the layer behind the block.
         if self.scene.background == "random":
             red, green, blue = self.state.rng.random(3, np.float32).tolist()

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import argparse
 import json
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 
@@ -42,26 +42,30 @@ TRAINING = ("coarse", "partition", "block", "polish", "train")
 
 def compare(results: Path, whole: str, divided: str) -> BlocksResult:
     """A finished run in blocks beside one of the same scene as one block."""
-    one, many = (read_metrics(results / run) for run in (whole, divided))
+    folders = results / whole, results / divided
+    one, many = map(read_metrics, folders)
     plan = read_plan(results / divided)
     return BlocksResult(
-        scene=whole,
+        scene=whole.partition("@")[0],
+        pixels=one.protocol.resolution[0],
         photographs=one.registered_images or 0,
+        test_views=one.protocol.num_views,
         blocks=plan.stages["polish"].jobs,
         psnr=(one.psnr, many.psnr),
         ssim=(one.ssim, many.ssim),
         gaussians=(one.num_gaussians, many.num_gaussians),
-        peak_rss_mb=(_peak(results / whole), _peak(results / divided)),
-        training_cpu_s=(_cpu(results / whole), _cpu(results / divided)),
-        largest_block_cpu_s=_largest_block(results / divided),
-        seam_gradient=_seams(results / divided),
+        training_rss_mb=(_peak(folders[0], TRAINING), _peak(folders[1], TRAINING)),
+        peak_rss_mb=(_peak(folders[0]), _peak(folders[1])),
+        training_cpu_s=(_cpu(folders[0]), _cpu(folders[1])),
+        largest_block_cpu_s=_largest_block(folders[1]),
+        seam_gradient=_seams(*folders),
     )
 
 
-def _peak(folder: Path) -> float:
-    """Largest memory of a training job, MiB."""
+def _peak(folder: Path, stages: Collection[str] | None = None) -> float:
+    """Largest memory of a job of these stages, or of any, MiB."""
     runs = read_runs(read_metrics(folder), folder)
-    return max(run.peak_rss_mb for stage, run in runs.items() if stage in TRAINING)
+    return max(run.peak_rss_mb for stage, run in runs.items() if stages is None or stage in stages)
 
 
 def _cpu(folder: Path) -> float:
@@ -87,36 +91,53 @@ class _Sum:
         self.total += float(values.sum())
         self.count += values.size
 
+    @property
+    def mean(self) -> float:
+        return self.total / self.count if self.count else float("nan")
 
-def _seams(folder: Path) -> float:
-    """Mean gradient of the error images of the test views across seams, divided by that elsewhere.
+
+class _Renders:
+    """The renders of a run's test views, and the gradients of their errors."""
+
+    def __init__(self, folder: Path):
+        self.folder = folder / "evaluate"
+        self.files = {view.name: view.render for view in Evaluation.read(self.folder).per_view}
+        self.at_seams, self.elsewhere = _Sum(), _Sum()
+
+    def error(self, view: View) -> NDArray[np.float64]:
+        """(H, W) mean absolute difference of the channels from the photograph."""
+        with Image.open(self.folder / "renders" / self.files[view.name]) as picture:
+            return np.abs(np.asarray(picture, np.float64) - load_view(view).rgb).mean(2)
+
+
+def _seams(whole: Path, divided: Path) -> tuple[float, float]:
+    """Mean gradient of the error images of the test views across the seams of the second run,
+    divided by that elsewhere, in both runs.
 
     Both are over pairs of neighbouring pixels on one surface. A seam is between pixels that
     different blocks explain most of.
     """
-    scene = posed_scene(folder, None, None)
-    partition = Partition.read(folder / "partition")
-    gaussians = read_npz(folder / "train" / "gaussians.npz")
-    renders = {view.name: view.render for view in Evaluation.read(folder / "evaluate").per_view}
+    scene = posed_scene(divided, None, None)
+    partition = Partition.read(divided / "partition")
+    gaussians = read_npz(divided / "train" / "gaussians.npz")
     options = RasterOptions(sh_degree=0, near=near_plane(scene_extent(list(scene.views))))
-    at_seams, elsewhere = _Sum(), _Sum()
+    runs = [_Renders(folder) for folder in (whole, divided)]
     for view in scene.views:
-        if view.name not in renders:
+        if view.name not in runs[1].files:
             continue
-        with Image.open(folder / "evaluate" / "renders" / renders[view.name]) as picture:
-            error = np.abs(np.asarray(picture, np.float64) - load_view(view).rgb).mean(2)
+        errors = [run.error(view) for run in runs]
         owner, depth = _owners(gaussians, partition, view, options)
         for axis in (0, 1):
             first = np.take(depth, range(depth.shape[axis] - 1), axis)
             step = np.abs(np.diff(depth, axis=axis))
             surface = (first > 0) & (step < SAME_SURFACE * first)
             crossing = np.diff(owner, axis=axis) != 0
-            change = np.abs(np.diff(error, axis=axis))
-            at_seams.add(change[surface & crossing])
-            elsewhere.add(change[surface & ~crossing])
-    if not at_seams.count or not elsewhere.total:
-        return float("nan")
-    return at_seams.total / at_seams.count / (elsewhere.total / elsewhere.count)
+            for run, error in zip(runs, errors, strict=True):
+                change = np.abs(np.diff(error, axis=axis))
+                run.at_seams.add(change[surface & crossing])
+                run.elsewhere.add(change[surface & ~crossing])
+    one, many = (run.at_seams.mean / run.elsewhere.mean for run in runs)
+    return one, many
 
 
 def _owners(

@@ -218,23 +218,33 @@ def video(records: Sequence[Stored]) -> str:
 def blocks(records: Sequence[Stored]) -> str:
     rows = [
         [
-            *("scene", "photographs", "blocks", "PSNR (dB)", "in blocks", "SSIM", "in blocks"),
-            *("Gaussians", "in blocks", "memory of a training job (MB)", "in blocks"),
-            *("CPU s of training", "in blocks", "of the largest block", "seams"),
+            *("scene", "photographs", "test views, pixels", "blocks", "PSNR (dB)", "SSIM"),
+            *(
+                "Gaussians",
+                "memory (MB): training",
+                "any job",
+                "CPU s of training",
+                "largest block",
+            ),
+            *("gradient of the error at seams", "ratio"),
         ]
     ]
     for r in results(records, Record[BlocksResult]):
         rows.append(
             [
-                *(r.scene, str(r.photographs), str(r.blocks)),
-                *(f"{value:.2f}" for value in r.psnr),
-                *(f"{value:.4f}" for value in r.ssim),
-                *(f"{value / 1000:.0f}k" for value in r.gaussians),
-                *(f"{value:.0f}" for value in (*r.peak_rss_mb, *r.training_cpu_s)),
-                *(f"{r.largest_block_cpu_s:.0f}", f"{r.seam_gradient:.2f}"),
+                *(r.scene, str(r.photographs), f"{r.test_views}, {r.pixels}", f"1, {r.blocks}"),
+                *(_pair(r.psnr, ".2f"), _pair(r.ssim, ".4f")),
+                ", ".join(f"{value / 1000:.0f}k" for value in r.gaussians),
+                *(_pair(r.training_rss_mb, ".0f"), _pair(r.peak_rss_mb, ".0f")),
+                *(_pair(r.training_cpu_s, ".0f"), f"{r.largest_block_cpu_s:.0f}"),
+                *(_pair(r.seam_gradient, ".3f"), f"{r.seams:.3f}"),
             ]
         )
     return markdown.table(rows)
+
+
+def _pair(values: Sequence[float], form: str) -> str:
+    return ", ".join(format(value, form) for value in values)
 
 
 def wide(records: Sequence[Stored]) -> str:

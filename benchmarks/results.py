@@ -246,27 +246,39 @@ class VideoFrames:
 
 @dataclass(frozen=True)
 class BlocksResult:
-    """A scene in blocks beside the same scene as one block; pairs are in this order.
+    """A scene as one block, and in blocks; pairs are in this order.
 
     Attributes:
+        pixels: width and height of a view.
         psnr, ssim: of the test views.
         gaussians: numbers of trained Gaussians.
-        peak_rss_mb: largest memory of a training job, MiB.
+        training_rss_mb: largest memory of a job of training, MiB.
+        peak_rss_mb: largest memory of any job, MiB.
         training_cpu_s: CPU seconds of all training jobs.
         largest_block_cpu_s: of the block that takes longest.
-        seam_gradient: mean gradient of the error images across seams, divided by that elsewhere.
+        seam_gradient: mean gradient of the error images of the test views across the seams of the
+            blocks, divided by that elsewhere. The first run has no seams: its value is that of
+            what the photographs show there.
     """
 
     scene: str
     photographs: int
+    pixels: str
+    test_views: int
     blocks: int
     psnr: tuple[float, float]
     ssim: tuple[float, float]
     gaussians: tuple[int, int]
+    training_rss_mb: tuple[float, float]
     peak_rss_mb: tuple[float, float]
     training_cpu_s: tuple[float, float]
     largest_block_cpu_s: float
-    seam_gradient: float
+    seam_gradient: tuple[float, float]
+
+    @property
+    def seams(self) -> float:
+        """The gradient across seams in blocks over that of the run as one block there."""
+        return self.seam_gradient[1] / self.seam_gradient[0]
 
 
 # ---- benchmarks.wide ----

@@ -6,6 +6,7 @@ scene are at infinity, so that distant surroundings belong to the outer blocks.
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import ClassVar, Literal
 
@@ -47,6 +48,19 @@ class Box:
         """The box with its faces moved outwards by (3,) distances."""
         return Box(self.axes, self.lower - below, self.upper + above)
 
+    def clipped(self, lower: Array, upper: Array) -> Box:
+        """Its part within (3,) bounds along the axes."""
+        return Box(self.axes, np.maximum(self.lower, lower), np.minimum(self.upper, upper))
+
+    def crossed(self, origin: Array, directions: Array) -> tuple[Array, Array]:
+        """(N,) distances, in lengths of ``directions`` (N, 3), at which rays from ``origin`` (3,)
+        enter the box and leave it; those that miss it leave before they enter."""
+        start, along = self.along_axes(origin[None]), self.along_axes(directions)
+        along = np.where(along == 0, np.finfo(np.float64).tiny, along)
+        with np.errstate(over="ignore"):
+            first, second = (self.lower - start) / along, (self.upper - start) / along
+        return np.minimum(first, second).max(1), np.maximum(first, second).min(1)
+
     def hides(self, origin: Array, points: Array) -> NDArray[np.bool_]:
         """(N,) whether each of (N, 3) points outside of the box is farther from ``origin`` (3,)
         than the point of the box that is nearest to it: what surrounds it is behind the box, where
@@ -63,9 +77,22 @@ class BlockView(JsonObject):
     window: tuple[int, int, int, int] = Field(
         description="Left, top, width and height of the part that the block is seen in, pixels."
     )
+    size: tuple[int, int] = Field(description="Width and height of the view, pixels.")
     share: float = Field(
         description="Share of the view's pixels that the block explains, in front of others."
     )
+
+    def window_in(self, width: int, height: int) -> tuple[int, int, int, int]:
+        """Left, top, right and bottom of the window in the view at another size, pixels; only
+        pixels that are completely inside of it."""
+        left, top, window_width, window_height = self.window
+        sx, sy = width / self.size[0], height / self.size[1]
+        return (
+            math.ceil(left * sx),
+            math.ceil(top * sy),
+            math.floor((left + window_width) * sx),
+            math.floor((top + window_height) * sy),
+        )
 
 
 class Block(JsonObject):
@@ -83,6 +110,10 @@ class Block(JsonObject):
     max_gaussians: int = Field(description="Upper limit of the number of trained Gaussians.")
     steps: int = Field(description="Number of optimiser steps.")
     views: tuple[BlockView, ...] = Field(description="Its training views, sorted by name.")
+    overviews: tuple[str, ...] = Field(
+        description="Views that look through its training region outside of their windows. These "
+        "parts are trained on at reduced size, so that nothing appears in them."
+    )
 
     @property
     def pixels(self) -> int:

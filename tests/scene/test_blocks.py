@@ -9,7 +9,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from pipeline.geometry.rotations import quat_to_rotation
-from pipeline.scene.blocks import Box
+from pipeline.scene.blocks import BlockView, Box
 
 Array = NDArray[np.float64]
 coordinates = st.floats(-10, 10).map(lambda value: round(value, 3))
@@ -64,3 +64,30 @@ def test_halves_of_a_box_share_no_point_and_lose_none() -> None:
 def test_a_camera_inside_has_everything_else_behind_the_box() -> None:
     space = box(np.full(3, -1.0), np.full(3, 1.0))
     assert space.hides(np.zeros(3), np.array([[5.0, 0, 0], [0, -3, 0]])).all()
+
+
+@given(places, places, st.lists(st.floats(0, 3), min_size=1, max_size=20))
+def test_a_ray_is_in_a_box_between_its_crossings(
+    origin: Array, direction: Array, distances: list[float]
+) -> None:
+    if not direction.any():
+        return
+    enter, leave = SPACE.crossed(origin, direction[None])
+    for distance in distances:
+        if min(abs(distance - enter[0]), abs(distance - leave[0])) > 1e-9:
+            inside = SPACE.contains((origin + distance * direction)[None])[0]
+            assert inside == (enter[0] < distance < leave[0])
+
+
+def test_a_clipped_box_is_the_intersection() -> None:
+    lower, upper = np.array([-1.0, -2.0, -3.0]), np.array([5.0, 6.0, 2.0])
+    points = np.random.default_rng(0).uniform(-8, 8, (500, 3))
+    both = SPACE.contains(points) & box(lower, upper).contains(points)
+    np.testing.assert_array_equal(SPACE.clipped(lower, upper).contains(points), both)
+
+
+def test_a_window_in_a_smaller_view_holds_no_pixel_beside_it() -> None:
+    shown = BlockView(name="a", window=(10, 20, 101, 55), size=(200, 100), share=0.1)
+    left, top, right, bottom = shown.window_in(50, 25)
+    assert (left, top, right, bottom) == (3, 5, 27, 18)
+    assert shown.window_in(200, 100) == (10, 20, 111, 75)

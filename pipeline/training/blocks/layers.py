@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
@@ -11,7 +12,7 @@ from torch import Tensor
 
 from pipeline.render import Backend, Color, Forward, RasterOptions
 from pipeline.render.views import raster_camera
-from pipeline.scene.blocks import Box
+from pipeline.scene.blocks import BlockView, Box
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.surroundings import Surroundings
@@ -33,6 +34,8 @@ class BlockLayers:
         region: of the block, with its margin.
         background: behind the scene.
         options: as in training, without a background.
+        windows: of the views that the block is seen in, by name. Whole views ignore them: the block
+            is trained on the windows themselves.
     """
 
     coarse: Gaussians
@@ -40,6 +43,7 @@ class BlockLayers:
     background: Color
     options: RasterOptions
     backend: Backend
+    windows: Mapping[str, BlockView] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock, compare=False)
 
     def __call__(self, view: View) -> Layers:
@@ -62,7 +66,17 @@ class BlockLayers:
             used=(1 - front.alpha) * block.alpha > USED_SHARE,
             coarse=_bytes(around.compose(block.color, block.alpha)),
             background=self.background,
+            ignored=self._ignored(view),
         )
+
+    def _ignored(self, view: View) -> Tensor | None:
+        shown = self.windows.get(view.name)
+        if shown is None or view.crop is not None:
+            return None
+        ignored = torch.zeros(view.height, view.width, dtype=torch.bool)
+        left, top, right, bottom = shown.window_in(view.width, view.height)
+        ignored[top:bottom, left:right] = True
+        return ignored
 
     def _render(self, view: View, which: np.ndarray, background: Color | None = None) -> Forward:
         chosen = self.coarse.select(torch.from_numpy(np.flatnonzero(which)))

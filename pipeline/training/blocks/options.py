@@ -18,10 +18,8 @@ from pipeline.training.loop.schedule import Part, Schedule
 COARSE, FIRST, SECOND = Part(0.0, 0.5), Part(0.5, 0.8), Part(0.8, 1.0)
 # Images of the coarse run are reduced by this factor, beside the schedule's own reduction.
 COARSE_IMAGE_FACTOR = 2
-# Every n-th view of the scene, whole and at 1 / factor of its size, is trained on as well: without
-# these, Gaussians that views of the block leave free, as those of the sky, would stand in front of
-# other views.
-OVERVIEW_EVERY, OVERVIEW_FACTOR = 4, 4
+# Overviews are trained on at 1 / this of their size.
+OVERVIEW_FACTOR = 4
 # View-dependent colours are left to the blocks.
 COARSE_SH_DEGREE = 1
 

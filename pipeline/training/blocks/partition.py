@@ -28,7 +28,6 @@ from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 from pipeline.training.blocks.layers import USED_SHARE
-from pipeline.training.blocks.options import OVERVIEW_EVERY
 from pipeline.training.data.targets import usable_factor
 
 Array = NDArray[np.float64]
@@ -48,6 +47,9 @@ MARGIN_SHARE, MIN_MARGIN, MAX_MARGIN = 0.9, 0.01, 0.1
 # The extent of a scene along an axis: between these quantiles of the explained pixels.
 EXTENT_QUANTILES = 0.02, 0.98
 MIN_BLOCK_GAUSSIANS = 1000
+# Views that look through the region of a block in this share of their pixels, outside of their
+# window, are its overviews. One in so many reduced pixels is examined, in both directions.
+MIN_THROUGH_SHARE, RAY_STEP = 0.02, 4
 
 
 @dataclass(frozen=True)
@@ -151,18 +153,20 @@ def make_partition(
     cells = _divide(
         _Cell(whole.lower, whole.upper, np.arange(len(coarse))), options.blocks, local, pixels
     )
-    regions, margins = [], []
-    for cell in cells:
-        box = Box(options.axes, cell.lower, cell.upper)
-        below, above = _margins(cell, local, pixels, reach)
-        margins.append((below, above))
-        regions.append(box.expanded(below, above).contains(coarse.means.numpy()))
-    shares = [_Views() for _ in cells]
+    margins = [_margins(cell, local, pixels, reach) for cell in cells]
+    boxes = [
+        Box(options.axes, cell.lower, cell.upper).expanded(*margin)
+        for cell, margin in zip(cells, margins, strict=True)
+    ]
+    regions = [box.contains(coarse.means.numpy()) for box in boxes]
+    hull = _hull(views, whole, local, pixels)
+    shares = [_Views(box.clipped(*hull)) for box in boxes]
     for view, camera in zip(views, cameras, strict=True):
         for start in range(0, len(cells), 3):
-            maps = _shares(grey, regions[start : start + 3], camera, raster, backend)
+            maps, depth = _shares(grey, regions[start : start + 3], camera, raster, backend)
+            rays = _Rays.of(view, depth)
             for found, share in zip(shares[start : start + 3], maps, strict=False):
-                found.add(view, share)
+                found.add(view, share, rays)
     return Partition(
         axes=tuple(map(tuple, options.axes.tolist())),
         blocks=tuple(
@@ -172,23 +176,62 @@ def make_partition(
     )
 
 
-class _Views:
-    """The views of a block."""
+@dataclass(frozen=True)
+class _Rays:
+    """Rays of a view.
 
-    def __init__(self) -> None:
+    Attributes:
+        origin: (3,) the camera's centre in the world.
+        directions: (N, 3), of camera z 1.
+        depth: (N,) camera z of the surface that they meet, infinite without one.
+        x, y: (N,) pixels of the view.
+    """
+
+    origin: Array
+    directions: Array
+    depth: Array
+    x: Array
+    y: Array
+
+    @staticmethod
+    def of(view: View, depth: NDArray[np.float32]) -> _Rays:
+        """Some rays of a view, of which ``depth`` (h, w) is the reduced depth map."""
+        rows, columns = (np.arange(RAY_STEP // 2, size, RAY_STEP) for size in depth.shape)
+        y, x = np.meshgrid(rows, columns, indexing="ij")
+        found = depth[y, x].astype(np.float64).ravel()
+        x = (x.ravel() + 0.5) * view.width / depth.shape[1]
+        y = (y.ravel() + 0.5) * view.height / depth.shape[0]
+        local = np.stack([(x - view.cx) / view.fx, (y - view.cy) / view.fy, np.ones_like(x)], 1)
+        directions = np.einsum("ji,nj->ni", view.world_to_camera[:3, :3], local)
+        return _Rays(view.centre, directions, np.where(found > 0, found, np.inf), x, y)
+
+
+class _Views:
+    """The views of a block with this region, within the scene."""
+
+    def __init__(self, region: Box) -> None:
+        self.region = region
         self.views: list[BlockView] = []
+        self.overviews: list[str] = []
         self.pixels: list[float] = []
 
-    def add(self, view: View, share: NDArray[np.float32]) -> None:
+    def add(self, view: View, share: NDArray[np.float32], rays: _Rays) -> None:
         """Add a view in which the block explains this share (h, w) of each reduced pixel, if it
         explains enough of them."""
         mean = float(share.mean(dtype=np.float64))
         used = share > USED_SHARE
-        if mean < MIN_VIEW_SHARE or not used.any():
-            return
-        window = _window(used, view)
-        self.views.append(BlockView(name=view.name, window=window, share=round(mean, 6)))
-        self.pixels.append(mean * view.width * view.height)
+        enter, leave = self.region.crossed(rays.origin, rays.directions)
+        through = enter.clip(0) < np.minimum(leave, rays.depth)
+        if mean >= MIN_VIEW_SHARE and used.any():
+            left, top, width, height = window = _window(used, view)
+            size = view.width, view.height
+            shown = BlockView(name=view.name, window=window, size=size, share=round(mean, 6))
+            self.views.append(shown)
+            self.pixels.append(mean * view.width * view.height)
+            within = (rays.x >= left) & (rays.x < left + width)
+            through &= ~(within & (rays.y >= top) & (rays.y < top + height))
+        if through.mean() >= MIN_THROUGH_SHARE:
+            self.overviews.append(view.name)
 
 
 def _block(
@@ -204,7 +247,7 @@ def _block(
         typical = sum(found.pixels) / len(found.pixels)
         count = round(sum(found.pixels) / options.pixels_per_gaussian)
     limit = min(round(options.max_gaussians * min(1.0, typical / options.view_pixels)), count)
-    seen = len(found.views) + len(range(0, num_views, OVERVIEW_EVERY))
+    seen = len(found.views) + len(found.overviews)
     steps = round(options.steps * seen / num_views)
     return Block(
         lower=bounds_of(cell.lower),
@@ -215,6 +258,7 @@ def _block(
         max_gaussians=max(MIN_BLOCK_GAUSSIANS, limit),
         steps=max(1, steps),
         views=tuple(found.views),
+        overviews=tuple(found.overviews),
     )
 
 
@@ -253,6 +297,13 @@ def _margins(cell: _Cell, local: Array, pixels: Array, reach: Array) -> tuple[Ar
     return below, above
 
 
+def _hull(views: Sequence[View], whole: Box, local: Array, pixels: Array) -> tuple[Array, Array]:
+    """(3,) lower and upper bounds of the cameras and of the scene's extent along its axes."""
+    centres = whole.along_axes(np.stack([view.centre for view in views]))
+    low, high = np.array([_extent(local[:, axis], pixels) for axis in range(3)]).T
+    return np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+
+
 def _extent(values: Array, weight: Array) -> tuple[float, float]:
     low, high = EXTENT_QUANTILES
     return _quantile(values, weight, low), _quantile(values, weight, high)
@@ -272,15 +323,16 @@ def _shares(
     camera: RasterCamera,
     options: RasterOptions,
     backend: Backend,
-) -> list[NDArray[np.float32]]:
+) -> tuple[list[NDArray[np.float32]], NDArray[np.float32]]:
     """(h, w) share of each pixel that the Gaussians of each of up to three regions explain: the
-    regions are colour channels."""
+    regions are colour channels. And (h, w) the median depth."""
     white = 0.5 / SH_C0
     sh = torch.full((len(grey), 1, 3), -white)
     for channel, region in enumerate(regions):
         sh[torch.from_numpy(region), 0, channel] = white
-    image = backend.forward(*replace(grey, sh=sh).parameters(), camera, options).color
-    return [image[..., channel].numpy() for channel in range(len(regions))]
+    found = backend.forward(*replace(grey, sh=sh).parameters(), camera, options)
+    shares = [found.color[..., channel].numpy() for channel in range(len(regions))]
+    return shares, found.median_depth.numpy()
 
 
 def _window(used: NDArray[np.bool_], view: View) -> tuple[int, int, int, int]:

@@ -22,7 +22,7 @@ from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.options import OVERVIEW_EVERY, OVERVIEW_FACTOR, block_options
+from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.data.targets import usable_factor
@@ -93,10 +93,13 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
     partition, read_gaussians = scene.partition, scene.read_gaussians
     gaussians = read_gaussians()
     whole = scene_inputs(scene.views, scene.manifest, scene.model, gaussians, scene.gains, config)
-    windows = {view.name: view.window for view in partition.blocks[number - 1].views}
+    block = partition.blocks[number - 1]
+    windows, through = {view.name: view for view in block.views}, set(block.overviews)
     shown = [index for index, view in enumerate(whole.views) if view.name in windows]
-    views = [whole.views[index].cropped(*windows[whole.views[index].name]) for index in shown]
-    overviews = range(0, len(whole.views), OVERVIEW_EVERY)
+    views = [
+        whole.views[index].cropped(*windows[whole.views[index].name].window) for index in shown
+    ]
+    overviews = [index for index, view in enumerate(whole.views) if view.name in through]
     kept = [*shown, *overviews]
     region = partition.region(number)
     own = torch.from_numpy(np.flatnonzero(region.contains(gaussians.means.numpy())))
@@ -113,6 +116,7 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
             BACKGROUNDS[background],
             replace(options, threads=threads),
             make_backend(),
+            windows,
         )
 
     return Inputs(
@@ -123,7 +127,7 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
         gains=None if whole.gains is None else whole.gains[kept],
         depths=whole.depths
         and [
-            *(_cropped(whole.depths[i], windows[whole.views[i].name]) for i in shown),
+            *(_cropped(whole.depths[i], windows[whole.views[i].name].window) for i in shown),
             *(_scaled(whole.depths[i], whole.views[i]) for i in overviews),
         ],
         empty_depths=None if whole.empty_depths is None else whole.empty_depths[kept],

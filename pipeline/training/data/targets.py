@@ -6,7 +6,7 @@ import math
 import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -68,12 +68,14 @@ class Layers:
         coarse: (H, W, 3) uint8, the scene before training, which replaces the photograph in all
             other pixels: other blocks explain them.
         background: behind the scene, and behind photographs with alpha.
+        ignored: (H, W) bool, pixels that another view of the block shows; None if there are none.
     """
 
     surroundings: Surroundings
     used: Tensor
     coarse: Tensor
     background: tuple[float, float, float]
+    ignored: Tensor | None = None
 
 
 LayerSource = Callable[[View], Layers]
@@ -198,7 +200,10 @@ def _among(target: Target, layers: Layers) -> Target:
     if target.alpha is not None:
         photograph = (photograph * 255).round().to(torch.uint8)
     rgb = torch.where(layers.used[..., None], photograph, layers.coarse)
-    return replace(target, rgb=rgb, alpha=None, surroundings=layers.surroundings)
+    ignored = target.ignored
+    if layers.ignored is not None:
+        ignored = layers.ignored if ignored is None else ignored | layers.ignored
+    return Target(rgb, None, ignored, layers.surroundings)
 
 
 def _reduce(target: Target, factor: int) -> Target:

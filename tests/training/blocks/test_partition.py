@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
 
 from pipeline.render import RasterOptions, make_backend
 from pipeline.scene.blocks import Partition
+from pipeline.splats.gaussians import concat
 from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.union import inside, union
-from tests.training.blocks.conftest import NEAR, DividedScene, divide
+from tests.training.blocks.conftest import NEAR, DividedScene, divide, moved
+from tests.training.conftest import ball
 
 
 def owners(partition: Partition, means: np.ndarray) -> np.ndarray:
@@ -60,6 +64,31 @@ def test_a_view_without_the_block_is_not_among_its_views(divided: DividedScene) 
     for block, other in zip(found.blocks, partition.blocks, strict=True):
         assert "away" not in {view.name for view in block.views}
         assert len(block.views) == len(other.views)
+
+
+def test_a_view_past_the_gaussians_of_a_block_is_an_overview(divided: DividedScene) -> None:
+    """It looks through the gap between the two clusters."""
+    seen = divided.views[0]
+    narrow = replace(seen, name="narrow", fx=20 * seen.fx, fy=20 * seen.fy)
+    gaussians = concat([moved(ball(60, 1), -1.8), moved(ball(60, 2), 1.8)])
+    found = divide(gaussians, [*divided.views, narrow], 2)
+    assert all("narrow" not in {view.name for view in block.views} for block in found.blocks)
+    assert any("narrow" in block.overviews for block in found.blocks)
+
+
+def test_overviews_are_not_trained_on_where_windows_are(divided: DividedScene) -> None:
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    block, view = divided.partition.blocks[0], divided.views[1]
+    windows = {shown.name: shown for shown in block.views}
+    left, top, width, height = windows[view.name].window
+    layers = BlockLayers(
+        divided.gaussians, divided.partition.region(1), (0, 0, 0), options, make_backend(), windows
+    )
+    ignored = layers(view).ignored
+    assert ignored is not None and ignored.sum() == width * height
+    assert ignored[top : top + height, left : left + width].all()
+    assert layers(view.cropped(left, top, width, height)).ignored is None
+    assert layers(replace(view, name="another")).ignored is None
 
 
 def test_a_partition_has_the_same_bits_at_any_number_of_threads(divided: DividedScene) -> None:

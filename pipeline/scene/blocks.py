@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import Field
 
-from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix3
+from pipeline.runtime.json_file import JsonFile, JsonObject, Matrix3, Vector3
 
 Array = NDArray[np.float64]
 Bound = float | None
@@ -128,7 +128,17 @@ class Partition(JsonFile, JsonObject):
 
     schema_version: Literal[1] = Field(1, description="Version of this file's format.")
     axes: Matrix3 = Field(description="Directions of the blocks' faces as rows, orthonormal.")
+    lower: Vector3 = Field(description="Lower bounds of the scene along the axes, world units.")
+    upper: Vector3 = Field(
+        description="Upper bounds of the scene along the axes, world units. The far field, beyond "
+        "the bounds, stays as the coarse run leaves it."
+    )
     blocks: tuple[Block, ...] = Field(description="The blocks.")
+
+    @property
+    def bounds(self) -> Box:
+        """The scene without its far field."""
+        return Box(np.array(self.axes), np.array(self.lower), np.array(self.upper))
 
     def box(self, number: int) -> Box:
         """The box of block ``number``."""
@@ -138,9 +148,11 @@ class Partition(JsonFile, JsonObject):
         return Box(np.array(self.axes), np.array(lower), np.array(upper))
 
     def region(self, number: int) -> Box:
-        """The box of block ``number`` with its margin: where its Gaussians are trained."""
+        """The box of block ``number`` with its margin, within the scene's bounds: where its
+        Gaussians are trained."""
         block = self.blocks[number - 1]
-        return self.box(number).expanded(np.array(block.margin_below), np.array(block.margin_above))
+        margins = np.array(block.margin_below), np.array(block.margin_above)
+        return self.box(number).expanded(*margins).clipped(*map(np.array, (self.lower, self.upper)))
 
 
 def bounds_of(values: Array) -> Bounds:

@@ -50,23 +50,23 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
         read_gaussians: reads those of the whole scene.
     """
     from pipeline.training.blocks.train import block_training
+    from pipeline.training.blocks.union import far_field, union
     from pipeline.training.scene import run_training
 
-    inputs.write_trained(
-        job,
-        run_training(
-            # Not a local variable here: what it is made from is not held during training.
-            *block_training(
-                _scene(job, read_gaussians),
-                job.block,
-                job.section(Train),
-                job.section(Experiments).train,
-                part,
-            ),
-            inputs.training_run(job),
+    trained = run_training(
+        # Not a local variable here: what it is made from is not held during training.
+        *block_training(
+            _scene(job, read_gaussians),
+            job.block,
+            job.section(Train),
+            job.section(Experiments).train,
             part,
         ),
+        inputs.training_run(job),
+        part,
     )
+    far = far_field(read_gaussians(), read_partition(job), job.block)
+    inputs.write_trained(job, trained, union([trained.result.gaussians, far]))
 
 
 def _scene(job: Job, read_gaussians: Callable[[], Gaussians]) -> SceneInBlocks:

@@ -89,12 +89,17 @@ def training_run(job: Job) -> TrainingRun:
     )
 
 
-def write_trained(job: Job, trained: TrainedScene) -> None:
-    """Write the outputs of a training, and record what it counted and decided."""
+def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:
+    """Write the outputs of a training, and record what it counted and decided.
+
+    Args:
+        gaussians: the result; None: those that were trained.
+    """
     from pipeline.io.colmap import write_model
     from pipeline.io.npz import write_npz
 
-    write_npz(job.out / "gaussians.npz", trained.result.gaussians)
+    found = trained.result.gaussians if gaussians is None else gaussians
+    write_npz(job.out / "gaussians.npz", found)
     if trained.model is not None:
         write_model(job.out / "sparse" / "0", trained.model)
     trained.result.curve.write(job.out)

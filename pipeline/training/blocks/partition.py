@@ -46,6 +46,8 @@ WINDOW_UNIT = 64
 MARGIN_SHARE, MIN_MARGIN, MAX_MARGIN = 0.9, 0.01, 0.1
 # The extent of a scene along an axis: between these quantiles of the explained pixels.
 EXTENT_QUANTILES = 0.02, 0.98
+# The far field begins at this distance from the scene, in extents of the scene.
+FAR_SHARE = 0.5
 MIN_BLOCK_GAUSSIANS = 1000
 # Views that look through the region of a block in this share of their pixels, outside of their
 # window, are its overviews. One in so many reduced pixels is examined, in both directions.
@@ -154,13 +156,13 @@ def make_partition(
         _Cell(whole.lower, whole.upper, np.arange(len(coarse))), options.blocks, local, pixels
     )
     margins = [_margins(cell, local, pixels, reach) for cell in cells]
+    bounds = _bounds(views, whole, local, pixels)
     boxes = [
-        Box(options.axes, cell.lower, cell.upper).expanded(*margin)
+        Box(options.axes, cell.lower, cell.upper).expanded(*margin).clipped(*bounds)
         for cell, margin in zip(cells, margins, strict=True)
     ]
     regions = [box.contains(coarse.means.numpy()) for box in boxes]
-    hull = _hull(views, whole, local, pixels)
-    shares = [_Views(box.clipped(*hull)) for box in boxes]
+    shares = [_Views(box) for box in boxes]
     for view, camera in zip(views, cameras, strict=True):
         for start in range(0, len(cells), 3):
             maps, depth = _shares(grey, regions[start : start + 3], camera, raster, backend)
@@ -169,6 +171,8 @@ def make_partition(
                 found.add(view, share, rays)
     return Partition(
         axes=tuple(map(tuple, options.axes.tolist())),
+        lower=tuple(bounds[0].tolist()),
+        upper=tuple(bounds[1].tolist()),
         blocks=tuple(
             _block(cell, margin, region, found, len(views), options)
             for cell, margin, region, found in zip(cells, margins, regions, shares, strict=True)
@@ -297,11 +301,13 @@ def _margins(cell: _Cell, local: Array, pixels: Array, reach: Array) -> tuple[Ar
     return below, above
 
 
-def _hull(views: Sequence[View], whole: Box, local: Array, pixels: Array) -> tuple[Array, Array]:
-    """(3,) lower and upper bounds of the cameras and of the scene's extent along its axes."""
+def _bounds(views: Sequence[View], whole: Box, local: Array, pixels: Array) -> tuple[Array, Array]:
+    """(3,) lower and upper bounds of the scene along its axes: those of the cameras and of its
+    extent, with ``FAR_SHARE`` of their distance on both sides."""
     centres = whole.along_axes(np.stack([view.centre for view in views]))
     low, high = np.array([_extent(local[:, axis], pixels) for axis in range(3)]).T
-    return np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    low, high = np.minimum(low, centres.min(0)), np.maximum(high, centres.max(0))
+    return low - FAR_SHARE * (high - low), high + FAR_SHARE * (high - low)
 
 
 def _extent(values: Array, weight: Array) -> tuple[float, float]:

@@ -11,6 +11,14 @@ from pipeline.scene.blocks import Partition
 from pipeline.splats.gaussians import Gaussians, concat
 
 
+def far_field(scene: Gaussians, partition: Partition, number: int) -> Gaussians:
+    """The Gaussians of a scene beyond its bounds in the box of block ``number``. All blocks see
+    them behind their own: none may change them while others are trained."""
+    means = scene.means.numpy()
+    found = partition.box(number).contains(means) & ~partition.bounds.contains(means)
+    return scene.select(torch.from_numpy(np.flatnonzero(found)))
+
+
 def inside(trained: Gaussians, partition: Partition, number: int) -> Gaussians:
     """The Gaussians of block ``number`` without those that its training left outside of its box:
     in the margin, which other blocks train as well."""

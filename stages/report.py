@@ -23,8 +23,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.metrics.evaluate import choose_protocol
     from pipeline.metrics.evaluation import Evaluation
+    from pipeline.metrics.protocol import choose_protocol
     from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.headline import headline
     from pipeline.reporting.metrics import read_runs, with_times

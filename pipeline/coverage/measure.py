@@ -38,8 +38,8 @@ from pipeline.coverage.record import (
 from pipeline.coverage.summary import describe
 from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
 from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
-from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view, resize_area
 from pipeline.render.views import Render, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes

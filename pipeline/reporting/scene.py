@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
-from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.data import (

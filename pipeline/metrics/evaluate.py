@@ -28,7 +28,6 @@ from pipeline.runtime.progress import Progress
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.cameras.fit_pose import fit_pose
 
 #: A mean PSNR of training views below this, in dB, indicates inconsistent photographs or poses.
 LOW_TRAIN_PSNR = 22.0
@@ -89,6 +88,8 @@ def evaluate_views(
         pixels = load_view(view)
         photo = pixels.over(protocol.background)
         if train.refine_poses and view.is_test:
+            from pipeline.training.cameras.fit_pose import fit_pose
+
             gain, weight = gains.of(view.name), train.ssim_loss_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
@@ -106,11 +107,11 @@ def evaluate_views(
         image = with_exposure(rgb, view)
         name = f"{index:04d}.png"
         Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
-        a, b = image / 255.0, photo / 255.0
+        quality = psnr(image, photo, mask), ssim(image, photo, mask)
         record = ViewMetrics(
-            name=view.name, psnr=psnr(a, b, mask), ssim=ssim(a, b, mask), lpips=None, render=name
+            name=view.name, psnr=quality[0], ssim=quality[1], lpips=None, render=name
         )
-        return record, psnr(to_bytes(rgb) / 255.0, b, mask) if gains else None
+        return record, psnr(to_bytes(rgb), photo, mask) if gains else None
 
     def collect(future: Future[tuple[ViewMetrics, float | None]]) -> None:
         record, psnr_without_gains = future.result()
@@ -131,7 +132,7 @@ def evaluate_views(
                 continue
             pending.append(pool.submit(measure, index, rgb, photo, mask))
             if lpips is not None:
-                distances.append(lpips(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
+                distances.append(lpips(with_exposure(rgb, view), photo, mask))
             if len(pending) > threads:
                 collect(pending.popleft())
         while pending:
@@ -145,7 +146,7 @@ def evaluate_views(
     for view in protocol.training_views:
         rgb, photo, mask = render_and_load(view)
         if not _hides_all(mask):
-            training.append(psnr(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
+            training.append(psnr(with_exposure(rgb, view), photo, mask))
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")

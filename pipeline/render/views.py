@@ -100,4 +100,6 @@ def _forward(
 
 def to_bytes(image: Any) -> NDArray[np.uint8]:
     """Convert floats in [0, 1] to uint8, rounded."""
-    return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)
+    scaled = np.clip(np.asarray(image), 0, 1)
+    scaled *= 255
+    return np.rint(scaled, out=scaled).astype(np.uint8)

@@ -75,7 +75,7 @@ def ssim(
         UserError: no pixel is left to average, or a side is under 11 pixels with "valid".
     """
     keep = _checked(image, reference, mask)
-    values = np.empty(image.shape)
+    values: NDArray[np.float64] = np.empty(image.shape)
     for rows in _bands(image):
         # The windows of the band's pixels reach beyond it.
         first = max(rows.start - _RADIUS, 0)

@@ -32,7 +32,6 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
-    from pipeline.io.npz import read_gaussian_arrays
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
@@ -42,7 +41,7 @@ def work(job: Job) -> None:
         job.section(Split),
     )
     scene = ExportScene(
-        trained=read_gaussian_arrays(job.inputs["train"] / "gaussians.npz"),
+        trained=inputs.trained_arrays(job),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),

@@ -50,7 +50,7 @@ def work(job: Job) -> None:
         manifest=inputs.read_manifest(job, "views"),
         model=inputs.trained_model(job),
         views=views,
-        gaussians=inputs.trained_gaussians(job),
+        gaussians=inputs.trained_arrays(job),
         protocol=choose_protocol(views, job.section(Split), train),
         antialias=train.antialias,
     )

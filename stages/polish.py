@@ -21,9 +21,12 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.splats.arrays import collect
+    from pipeline.splats.gaussians import Gaussians
     from pipeline.training.blocks.options import SECOND
 
-    blocks.train(job, blocks.union_of(job, "block"), SECOND)
+    scene = Gaussians.sharing(collect(blocks.union_of(job, "block")))
+    blocks.train(job, scene, SECOND)
 
 
 SPEC = StageSpec(

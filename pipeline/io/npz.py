@@ -14,13 +14,13 @@ from pipeline.io.arrays import read_archive, write_chunks
 from pipeline.io.bounded import opened_regular
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import owner_of, rerun
-from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianSource
+from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianSource, array_shapes
 from pipeline.splats.gaussians import Gaussians
 
 
 def write_npz(path: Path, gaussians: GaussianSource) -> None:
     """Write Gaussians chunk by chunk, atomically and deterministically."""
-    shapes = _shapes(len(gaussians), gaussians.sh_degree)
+    shapes = array_shapes(len(gaussians), gaussians.sh_degree)
     write_chunks(
         path,
         {
@@ -28,12 +28,6 @@ def write_npz(path: Path, gaussians: GaussianSource) -> None:
             for name, shape in shapes.items()
         },
     )
-
-
-def _shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
-    width = (sh_degree + 1) ** 2
-    shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, width, 3))
-    return dict(zip(NAMES, shapes, strict=True))
 
 
 def read_npz(path: Path) -> Gaussians:
@@ -60,7 +54,7 @@ def read_gaussian_arrays(path: Path) -> GaussianArrays:
     shapes = {name: array.shape for name, array in single.items()}
     means, sh = shapes["means"], shapes["sh"]
     degree = math.isqrt(sh[1]) - 1 if len(sh) > 1 else 0
-    expected = _shapes(means[0] if means else 0, min(max(degree, 0), 3))
+    expected = array_shapes(means[0] if means else 0, min(max(degree, 0), 3))
     if shapes != expected:
         raise _wrong(path, f"expected arrays of Gaussians of shapes {expected}, found {shapes}")
     return GaussianArrays(**single)

@@ -22,6 +22,13 @@ NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
 CHUNK = 16384
 
 
+def array_shapes(count: int, sh_degree: int) -> dict[str, tuple[int, ...]]:
+    """The arrays' shapes by name."""
+    width = (sh_degree + 1) ** 2
+    shapes = ((count, 3), (count, 3), (count, 4), (count,), (count, width, 3))
+    return dict(zip(NAMES, shapes, strict=True))
+
+
 class GaussianSource(Protocol):
     """Gaussians that can be read in chunks."""
 
@@ -98,3 +105,15 @@ class GaussianRows:
         for start in range(0, len(self), CHUNK):
             rows = self.rows[start : start + CHUNK]
             yield [arrays[name][rows] for name in names]
+
+
+def collect(source: GaussianSource) -> GaussianArrays:
+    """All Gaussians of a source, in memory."""
+    shapes = array_shapes(len(source), source.sh_degree)
+    arrays = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+    start = 0
+    for chunk in source.chunks(*NAMES):
+        for array, values in zip(arrays.values(), chunk, strict=True):
+            array[start : start + len(values)] = values
+        start += len(chunk[0])
+    return GaussianArrays(**arrays)

@@ -13,6 +13,7 @@ from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians
+    from pipeline.training.blocks.union import Union
     from pipeline.training.loop.schedule import Part
 
 INPUTS = {
@@ -28,17 +29,13 @@ def read_partition(job: Job) -> Partition:
     return Partition.read(job.inputs["partition"])
 
 
-def union_of(job: Job, role: str) -> Gaussians:
+def union_of(job: Job, role: str) -> Union:
     """The Gaussians of all blocks, each without those outside of its box."""
-    from pipeline.io.npz import read_npz
-    from pipeline.training.blocks.union import inside, union
+    from pipeline.training.blocks.union import Union
 
     partition = read_partition(job)
     numbers = range(1, len(partition.blocks) + 1)
-    return union(
-        inside(read_npz(job.inputs[f"{role}_{number}"] / "gaussians.npz"), partition, number)
-        for number in numbers
-    )
+    return Union([job.inputs[f"{role}_{i}"] / "gaussians.npz" for i in numbers], partition)
 
 
 def train(job: Job, scene: Gaussians, part: Part) -> None:

@@ -21,12 +21,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.splats.arrays import collect
-    from pipeline.splats.gaussians import Gaussians
     from pipeline.training.blocks.options import SECOND
 
-    scene = Gaussians.sharing(collect(blocks.union_of(job, "block")))
-    blocks.train(job, scene, SECOND)
+    blocks.train(job, blocks.union_of(job, "block"), SECOND)
 
 
 SPEC = StageSpec(

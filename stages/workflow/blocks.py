@@ -29,8 +29,15 @@ def read_partition(job: Job) -> Partition:
     return Partition.read(job.inputs["partition"])
 
 
-def union_of(job: Job, role: str) -> Union:
+def union_of(job: Job, role: str) -> Gaussians:
     """The Gaussians of all blocks, each without those outside of its box."""
+    from pipeline.splats.arrays import collect
+    from pipeline.splats.gaussians import Gaussians
+
+    return Gaussians.sharing(collect(_union(job, role)))
+
+
+def _union(job: Job, role: str) -> Union:
     from pipeline.training.blocks.union import Union
 
     partition = read_partition(job)
@@ -79,7 +86,7 @@ def unite(job: Job) -> None:
     from pipeline.training.loop.counters import TrainCounters
     from pipeline.training.loop.curve import TrainingCurve
 
-    gaussians = union_of(job, "polish")
+    gaussians = _union(job, "polish")
     write_npz(job.out / "gaussians.npz", gaussians)
     coarse = job.inputs["coarse"]
     if has_model(coarse / "sparse" / "0"):

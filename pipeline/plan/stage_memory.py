@@ -31,8 +31,8 @@ _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
-# MB per photograph of a sparse model: read; read, with views; written.
-_MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN = 0.1, 0.5, 0.9
+# MB per photograph of a sparse model: read; read, with views; written; copied.
+_MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
 
 Estimate = Callable[[Plan, int], float]
 
@@ -76,14 +76,16 @@ def _gaussians(plan: Plan) -> float:
     return plan.config.train.density.max_gaussians * (1 + blocks) / 2 / 1e6
 
 
-def _given_model(plan: Plan) -> float:
-    """Of the given poses with their points, where there are any."""
+def _with_model(plan: Plan) -> float:
+    """A program that copies the given poses with their points, where there are any."""
     poses = plan.facts.given_poses
-    return _MODEL_VIEWS * _photos(plan) if poses is not None and poses.num_points else 0.0
+    if poses is None or not poses.num_points:
+        return _PROGRAM
+    return max(_PROGRAM, _NUMPY + 10 + _MODEL_COPIED * _photos(plan))
 
 
 def _inspect(plan: Plan, threads: int) -> float:
-    return _PROGRAM + _given_model(plan) + threads * _SCANNED * _pixels(plan)
+    return _with_model(plan) + threads * _SCANNED * _pixels(plan)
 
 
 def _decode(plan: Plan, threads: int) -> float:
@@ -106,7 +108,7 @@ def _per_photo(megabytes: float) -> Estimate:
 
 def _undistort(plan: Plan, threads: int) -> float:
     maps = _VIEW_MAPS * _pixels(plan) if plan.facts.panoramas else 0.0
-    return _PROGRAM + _given_model(plan) + maps + threads * _UNDISTORTED * _pixels(plan)
+    return _with_model(plan) + maps + threads * _UNDISTORTED * _pixels(plan)
 
 
 def _init(plan: Plan, threads: int) -> float:

@@ -46,8 +46,8 @@ USED = {
         "train": 711,
     },
     TOWN: {
-        "inspect": 199,
-        "undistort": 203,
+        "inspect": 153,
+        "undistort": 162,
         "init": 147,
         "features": 217,
         "matches": 264,
@@ -55,14 +55,14 @@ USED = {
         "train": 711,
         "evaluate": 401,
         "coverage": 384,
-        "export": 182,
+        "export": 139,
         "report": 202,
     },
     COLOSSEUM: {"matches": 179, "sfm": 264, "train": 545},
     FOX: {"features": 470, "matches": 210, "sfm": 259, "train": 545},
     LARGE: {"inspect": 369, "features": 580, "undistort": 528},
-    DENSE: {"evaluate": 383, "coverage": 379, "export": 129, "report": 203, "partition": 344},
-    VAST: {"evaluate": 737, "coverage": 739, "export": 339, "report": 395, "partition": 979},
+    DENSE: {"evaluate": 383, "coverage": 379, "export": 126, "report": 203, "partition": 344},
+    VAST: {"evaluate": 737, "coverage": 739, "export": 338, "report": 395, "partition": 979},
 }
 
 

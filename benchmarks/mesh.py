@@ -19,7 +19,7 @@ from benchmarks.surface import align, measure, true_points
 from pipeline.config.schema import Split, Train, Views
 from pipeline.io.colmap import read_model
 from pipeline.io.npz import read_npz
-from pipeline.metrics.evaluate import choose_protocol
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.runtime.record import read_stage

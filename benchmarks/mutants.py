@@ -290,10 +290,17 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "spz_rounding": Mutant(
         "pipeline/io/spz.py",
-        "to_uint8((log_scales + np.log(shrink) + 10) * 16),",
-        "to_uint8((log_scales + np.log(shrink) + 10) * 16 - 0.5),",
+        "to_uint8((log_scales + np.log(_shrink(means, bits)) + 10) * 16)",
+        "to_uint8((log_scales + np.log(_shrink(means, bits)) + 10) * 16 - 0.5)",
         "SPZ's scales cut off instead of rounded",
         ("tests/io/test_spz.py",),
+    ),
+    "ssim_bands": Mutant(
+        "pipeline/metrics/image.py",
+        "first = max(rows.start - _RADIUS, 0)",
+        "first = rows.start",
+        "SSIM's bands of rows without the rows above that their windows reach",
+        ("tests/metrics/test_image.py",),
     ),
     "psnr_peak": Mutant(
         "pipeline/metrics/image.py",

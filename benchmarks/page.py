@@ -24,8 +24,8 @@ from PIL import Image
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import PageResult
 from pipeline.io.npz import read_npz
-from pipeline.metrics.evaluate import choose_protocol
 from pipeline.metrics.image import psnr
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render.views import render_view, to_bytes
 from pipeline.reporting.space import upright_camera

@@ -16,8 +16,9 @@ from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
 from pipeline.io.photofile import MAX_PIXELS
 from pipeline.io.splat_files import check_suffix, is_exported, read_gaussians, write_gaussians
-from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+from pipeline.metrics.evaluate import evaluate_views
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.plan.given_poses import MAX_COORDINATE
 from pipeline.plan.posed_scene import posed_scene
 from pipeline.render import BACKGROUNDS, RasterOptions
@@ -69,7 +70,7 @@ def convert(
     """
     check_suffix(target)
     found = read_gaussians(source, warnings)
-    made = reduce_gaussians(found, sh_degree, min_opacity, morton_order)
+    made = reduce_gaussians(found.as_arrays(), sh_degree, min_opacity, morton_order)
     write_gaussians(target, made)
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"

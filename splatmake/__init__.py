@@ -21,12 +21,9 @@ from numpy.typing import NDArray
 from pipeline.config.schema import Evaluate, Train
 from pipeline.io import splat_files
 from pipeline.io.camera_files import choose_views
-from pipeline.metrics.evaluate import (
-    Protocol,
-    choose_protocol,
-    evaluate_views,
-)
+from pipeline.metrics.evaluate import evaluate_views
 from pipeline.metrics.image import psnr, ssim
+from pipeline.metrics.protocol import Protocol, choose_protocol
 from pipeline.photos.load import load_view
 from pipeline.plan.posed_scene import PosedScene, posed_scene
 from pipeline.render.views import Render, render_view

@@ -21,8 +21,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.coverage.measure import measure_coverage, world_frame
-    from pipeline.metrics.evaluate import choose_protocol
     from pipeline.metrics.evaluation import Evaluation
+    from pipeline.metrics.protocol import choose_protocol
 
     views, train = inputs.trained_views(job), job.section(Train)
     measure_coverage(

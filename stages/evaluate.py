@@ -33,8 +33,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.io.colmap import read_model
-    from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+    from pipeline.metrics.evaluate import evaluate_views
     from pipeline.metrics.pose import pose_error
+    from pipeline.metrics.protocol import choose_protocol
     from pipeline.scene.exposure import ExposureGains
 
     train, views = job.section(Train), inputs.trained_views(job)

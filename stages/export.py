@@ -41,7 +41,7 @@ def work(job: Job) -> None:
         job.section(Split),
     )
     scene = ExportScene(
-        trained=inputs.trained_gaussians(job),
+        trained=inputs.trained_arrays(job),
         model=model,
         manifest=manifest,
         views=load_views(manifest, model, FULL_SIZE, split),

@@ -23,8 +23,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.metrics.evaluate import choose_protocol
     from pipeline.metrics.evaluation import Evaluation
+    from pipeline.metrics.protocol import choose_protocol
     from pipeline.reporting.collect import collect_metrics
     from pipeline.reporting.headline import headline
     from pipeline.reporting.metrics import read_runs, with_times
@@ -50,7 +50,7 @@ def work(job: Job) -> None:
         manifest=inputs.read_manifest(job, "views"),
         model=inputs.trained_model(job),
         views=views,
-        gaussians=inputs.trained_gaussians(job),
+        gaussians=inputs.trained_arrays(job),
         protocol=choose_protocol(views, job.section(Split), train),
         antialias=train.antialias,
     )

@@ -37,12 +37,13 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.io.npz import read_npz
-    from pipeline.training.scene import train_scene
-
     if "partition" in job.inputs:
         blocks.unite(job)
         return
+
+    from pipeline.io.npz import read_npz
+    from pipeline.training.scene import train_scene
+
     trained = train_scene(
         inputs.input_views(job),
         inputs.read_manifest(job, "views"),

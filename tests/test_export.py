@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.config.schema import Config, ExportFormat
+from pipeline.config.schema import RENDERED_FORMATS, Config, ExportFormat
 from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera
@@ -27,7 +27,6 @@ from pipeline.runtime.job import Job
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
-from pipeline.surface.outputs import RENDERED_FORMATS
 from stages.export import work
 from tests.splats.samples import sample
 

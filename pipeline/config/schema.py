@@ -380,6 +380,8 @@ ExportFormat = Literal[
     "mesh",
     "video",
 ]
+# Formats that need renders of the views.
+RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
 
 class Export(Section):

@@ -77,12 +77,14 @@ def near_floaters(
 
     within = NEAR_SHARE * nearest
     probes = [*training, *test]
-    means = gaussians.means.numpy().astype(np.float64)
     logit = float(np.log(MIN_OPACITY / (1 - MIN_OPACITY)))
-    opaque = means[gaussians.opacity_logits.numpy() >= logit]
-    centres = np.stack([probe.view.centre for probe in probes])
-    distance, _ = cKDTree(centres).query(opaque, distance_upper_bound=within)
-    xyz = opaque[np.isfinite(distance)]
+    tree = cKDTree(np.stack([probe.view.centre for probe in probes]))
+    near = [np.zeros((0, 3))]
+    for means, logits in gaussians.chunks("means", "opacity_logits"):
+        opaque = means[logits >= logit].astype(np.float64)
+        distance, _ = tree.query(opaque, distance_upper_bound=within)
+        near.append(opaque[np.isfinite(distance)])
+    xyz = np.concatenate(near)
     training_count, shown_by = np.zeros(len(xyz), int), np.full(len(xyz), -1)
     for i, probe in enumerate(probes):
         visible = find_visible(probe, xyz, np.zeros(len(xyz), bool)).visible

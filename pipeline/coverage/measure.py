@@ -38,8 +38,8 @@ from pipeline.coverage.record import (
 from pipeline.coverage.summary import describe
 from pipeline.coverage.trust import LOW_TRUST, collect_observations, trust_maps
 from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
-from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view, resize_area
 from pipeline.render.views import Render, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes
@@ -145,18 +145,18 @@ def measure_coverage(
         views: all views with a pose.
         evaluation: the result of ``evaluate_views``.
         renders: folder of the renders that ``evaluation`` names.
-        threads: number of views processed at a time.
+        threads: number of threads; does not affect results.
 
     Returns:
         The content of ``coverage.json``.
     """
-    options = protocol.options(train, threads=1)
+    options = protocol.options(train, threads)
 
     def render(view: View) -> Render:
         return render_view(gaussians, view, options)
 
     training = _evenly([view for view in views if not view.is_test], MAX_TRAINING_VIEWS)
-    rendered = render_probes(training, render, threads)
+    rendered = render_probes(training, render)
     probes = list(track(rendered, "rendering training views", len(training), unit="views"))
     depths = np.concatenate([probe.depth[~probe.empty] for probe in probes])
     record = CoverageRecord(
@@ -176,7 +176,7 @@ def measure_coverage(
     # Photographs of test views exist as well: proposals must not repeat them.
     all_probes = [*probes, *(item.probe for item in tested)]
     cameras = [*training, *(_named(views, item.probe.view.name) for item in tested)]
-    best = propose_viewpoints(cameras, all_probes, render, world.up, background_depth, threads)
+    best = propose_viewpoints(cameras, all_probes, render, world.up, background_depth)
     floaters = near_floaters(gaussians, probes, all_probes[len(probes) :], nearest)
     shown = sorted(
         (item for item in tested if item.record.mean_trust is not None),
@@ -263,7 +263,7 @@ def _measure_test_views(
     by_name = {view.name: view for view in protocol.views if view.is_test}
     items = _evenly([item for item in evaluation.per_view if item.name in by_name], MAX_TEST_VIEWS)
     views = [by_name[item.name] for item in items]
-    test_probes = list(render_probes(views, render, threads))
+    test_probes = list(render_probes(views, render))
     maps = trust_maps(test_probes, probes, background_depth, threads)
     maps = track(maps, "mapping trust", len(items), unit="views")
     result = []
@@ -382,9 +382,9 @@ def _proposals(
 def _write_images(out: Path, name: str, probe: ProbeView, trust: Floats) -> Images:
     """Write the render and the trust map (grey, white is 1) of a probe view."""
     files = Images(f"coverage/{name}_render.png", f"coverage/{name}_trust.png")
-    for file, values in zip(files, (probe.rgb, trust), strict=True):
+    for file, picture in zip(files, (probe.rgb, to_bytes(trust)), strict=True):
         buffer = io.BytesIO()
-        Image.fromarray(to_bytes(values)).save(buffer, "PNG")
+        Image.fromarray(picture).save(buffer, "PNG")
         write_bytes(out / file, buffer.getvalue())
     return files
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.photos.load import load_mask, resize_mask
-from pipeline.render.views import Render
+from pipeline.render.views import Render, to_bytes
 from pipeline.scene.views import View, resized, view_size
 
 Floats = NDArray[np.float32]
@@ -34,7 +33,7 @@ class ProbeView:
     Attributes:
         view: the camera, reduced to ``SIDE``.
         focal: focal length in pixels at the full size: the geometric mean of fx and fy.
-        rgb: (H, W, 3) float32 render in [0, 1].
+        rgb: (H, W, 3) uint8 render.
         depth: (H, W) median depth (camera z, world units); inf if the ray meets no surface.
         min_depth, max_depth: (H, W) range of the finite depths in the 3 x 3 neighbourhood; inf if
             there is none.
@@ -43,7 +42,7 @@ class ProbeView:
 
     view: View
     focal: float
-    rgb: Floats
+    rgb: NDArray[np.uint8]
     depth: Floats
     min_depth: Floats
     max_depth: Floats
@@ -110,17 +109,14 @@ def render_probe(view: View, render: Renderer) -> ProbeView:
         valid = resize_mask(load_mask(view.mask, view.mask_digest), small.width, small.height)
     min_depth, max_depth = _neighbourhood_range(depth)
     focal = float(np.sqrt(view.fx * view.fy))
-    return ProbeView(small, focal, rendered.rgb, depth, min_depth, max_depth, valid)
+    rgb = to_bytes(rendered.rgb)
+    return ProbeView(small, focal, rgb, depth, min_depth, max_depth, valid)
 
 
-def render_probes(views: Sequence[View], render: Renderer, threads: int) -> Iterator[ProbeView]:
-    """``render_probe`` of each view, in order, ``threads`` views at a time.
-
-    Views run in parallel because renders of this size are too small for the rasterizer's own
-    threads.
-    """
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        yield from pool.map(lambda view: render_probe(view, render), views)
+def render_probes(views: Sequence[View], render: Renderer) -> Iterator[ProbeView]:
+    """``render_probe`` of each view, in order; one at a time, since each takes memory for all
+    Gaussians."""
+    return (render_probe(view, render) for view in views)
 
 
 def _neighbourhood_range(depth: Floats) -> tuple[Floats, Floats]:

@@ -104,7 +104,6 @@ def propose_viewpoints(
     render: Renderer,
     up: Doubles,
     background_depth: float,
-    threads: int = 1,
 ) -> NextBestViews:
     """Choose the viewpoints that together raise the mean trust of the scene's surroundings most.
 
@@ -120,9 +119,8 @@ def propose_viewpoints(
         probes: probe views of the same cameras, in the same order.
         up: (3,) up vector of the world.
         background_depth: depth of pixels whose ray meets no surface, world units.
-        threads: number of candidates rendered at a time.
     """
-    candidates, shown = _render_candidates(_candidates(views, probes, up), render, threads)
+    candidates, shown = _render_candidates(_candidates(views, probes, up), render)
     if not candidates:
         return NextBestViews([], [], 0.0, 0.0)
     points, owner = _surfaces(shown, background_depth)
@@ -265,12 +263,12 @@ def _free_places(
 
 
 def _render_candidates(
-    viewpoints: list[Viewpoint], render: Renderer, threads: int
+    viewpoints: list[Viewpoint], render: Renderer
 ) -> tuple[list[Viewpoint], list[ProbeView]]:
     """Render viewpoints; those that show too little, or too near a surface, are dropped."""
     chosen: list[Viewpoint] = []
     shown: list[ProbeView] = []
-    probes = render_probes([viewpoint.view for viewpoint in viewpoints], render, threads)
+    probes = render_probes([viewpoint.view for viewpoint in viewpoints], render)
     probes = track(probes, "rendering viewpoints", len(viewpoints), unit="viewpoints")
     for viewpoint, probe in zip(viewpoints, probes, strict=True):
         nearest = np.percentile(np.where(probe.empty, 1e30, probe.depth), 10)

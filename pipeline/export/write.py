@@ -16,13 +16,14 @@ from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.splat import write_splat
 from pipeline.io.spz import count_out_of_range, write_spz
 from pipeline.io.transforms import write_transforms
-from pipeline.metrics.evaluate import choose_protocol
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.unrounded import Unrounded
 from pipeline.scene.views import View, scene_up
+from pipeline.splats.arrays import GaussianArrays, GaussianRows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
@@ -47,7 +48,7 @@ class ExportScene:
         folder: final folder of the exported files.
     """
 
-    trained: Gaussians
+    trained: GaussianArrays
     model: Reconstruction
     manifest: Manifest
     views: list[View]
@@ -84,7 +85,7 @@ class _Files:
     """
 
     scene: ExportScene
-    gaussians: Gaussians
+    gaussians: GaussianRows
     model: Reconstruction
     views: list[View]
     antialias: bool
@@ -209,13 +210,13 @@ def _write_rendered_formats(
     report: ExportReport,
 ) -> None:
     """Write the formats that need renders of the trained Gaussians."""
-    # Imported here because it is slow to import and rarely used.
+    # Imported here because it imports torch and is rarely used.
     from pipeline.surface.outputs import write_rendered
 
     messages = write_rendered(
         out,
         config.formats,
-        scene.trained,
+        Gaussians.sharing(scene.trained),
         scene.training_size_views,
         choose_protocol(scene.training_size_views, split, train).options(train, threads),
         up=scene_up(scene.views, scene.manifest),

@@ -10,29 +10,45 @@ import io
 import math
 import zipfile
 import zlib
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from pathlib import Path
-from typing import BinaryIO
+from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.lib import format as npy
 from numpy.typing import NDArray
 
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import written
 
 # Largest ratio of the arrays' bytes to those of their archive. Arrays of measured values compress
 # less; a file that is made to exhaust the memory compresses a thousand times.
 _MAX_EXPANSION = 100
 _MAX_MEMBERS = 1000
+# Bytes that are read at a time.
+_PIECE = 1 << 20
 
 
 def write_arrays(path: Path, arrays: Mapping[str, NDArray]) -> None:
     """Write a ``.npz`` file of float32 arrays, atomically and deterministically."""
-    buffer = io.BytesIO()
-    single = {name: np.asarray(array, np.float32, order="C") for name, array in arrays.items()}
-    # Deterministic: numpy writes a fixed date into its archives.
-    np.savez(buffer, **single)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
+    write_chunks(path, {name: (array.shape, [array]) for name, array in arrays.items()})
+
+
+def write_chunks(
+    path: Path, arrays: Mapping[str, tuple[tuple[int, ...], Iterable[NDArray]]]
+) -> None:
+    """Write a ``.npz`` file of float32 arrays as numpy does, atomically and deterministically.
+
+    Args:
+        arrays: name -> shape, and the array in parts along its first axis.
+    """
+    # Deterministic: entries that are opened by name have a fixed date.
+    with written(path) as file, zipfile.ZipFile(file, "w") as archive:
+        for name, (shape, parts) in arrays.items():
+            with archive.open(f"{name}.npy", "w", force_zip64=True) as member:
+                header = {"descr": "<f4", "fortran_order": False, "shape": shape}
+                npy.write_array_header_1_0(member, header)
+                for part in parts:
+                    member.write(np.ascontiguousarray(part, "<f4").data)
 
 
 def read_array(data: bytes) -> NDArray:
@@ -41,7 +57,11 @@ def read_array(data: bytes) -> NDArray:
     Raises:
         ValueError: not such a file, or its size differs from its header's.
     """
-    file = io.BytesIO(data)
+    return _read_array(io.BytesIO(data), len(data))
+
+
+def _read_array(file: IO[bytes], size: int) -> NDArray:
+    """The array of a ``.npy`` file of this size, read in pieces into its memory."""
     try:
         version = npy.read_magic(file)
         read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
@@ -53,12 +73,15 @@ def read_array(data: bytes) -> NDArray:
         raise ValueError(f"expected an array of numbers, found {dtype}")
     if not all(type(side) is int and 0 <= side < 2**31 for side in shape) or len(shape) > 8:
         raise ValueError(f"expected an array of numbers, found the shape {str(shape)[:80]}")
-    expected, found = math.prod(shape) * dtype.itemsize, len(data) - file.tell()
+    expected, found = math.prod(shape) * dtype.itemsize, size - file.tell()
     if expected != found:
         raise ValueError(f"expected {expected} bytes of values after the header, found {found}")
-    if expected == 0:
-        return np.zeros(shape, dtype)
-    values = np.frombuffer(data, dtype, offset=file.tell())
+    values, start = np.empty(math.prod(shape), dtype), 0
+    while piece := file.read(_PIECE):
+        values.view(np.uint8)[start : start + len(piece)] = np.frombuffer(piece, np.uint8)
+        start += len(piece)
+    if start != expected:
+        raise ValueError(f"expected {expected} bytes of values after the header, found {start}")
     return values.reshape(shape, order="F" if fortran else "C")
 
 
@@ -82,10 +105,12 @@ def read_archive(file: BinaryIO) -> dict[str, NDArray]:
             if any(member.compress_size > size for member in members):
                 raise ValueError("expected arrays in the archive, found one larger than the file")
             # zipfile stops at the size that the member's entry gives.
-            return {
-                member.filename.removesuffix(".npy"): read_array(archive.read(member))
-                for member in members
-            }
+            arrays = {}
+            for member in members:
+                with archive.open(member) as entry:
+                    name = member.filename.removesuffix(".npy")
+                    arrays[name] = _read_array(entry, member.file_size)
+            return arrays
     # RuntimeError: encrypted; NotImplementedError: an unknown compression.
     except (zipfile.BadZipFile, zlib.error, EOFError, OSError, RuntimeError) as error:
         raise ValueError(f"expected an archive of numpy (.npz): {error}") from None

@@ -65,16 +65,13 @@ def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> N
     for name in (image.name for image in model.images.values()):
         if not name or any(c in name for c in "\0\n\r"):
             raise ValueError(f"a COLMAP model cannot hold the image name {name!r}")
-    files = {
-        "cameras": form.cameras_bytes(model),
-        "images": form.images_bytes(model, keypoints),
-        "points3D": form.points_bytes(model.points, tracks),
-    }
     for stem in ("cameras", "images", "points3D", "rigs", "frames"):
         for other in (".bin", ".txt"):
             (folder / f"{stem}{other}").unlink(missing_ok=True)
-    for stem, data in files.items():
-        write_bytes(folder / f"{stem}{suffix}", data)
+    write_bytes(folder / f"cameras{suffix}", form.cameras_bytes(model))
+    write_bytes(folder / f"images{suffix}", form.images_bytes(model, keypoints))
+    del keypoints
+    write_bytes(folder / f"points3D{suffix}", form.points_bytes(model.points, tracks))
 
 
 def _suffix(folder: Path) -> str | None:

@@ -30,6 +30,8 @@ _POINT3D = np.dtype(
     [("id", "<u8"), ("xyz", "<f8", (3,)), ("rgb", "u1", (3,)), ("error", "<f8"), ("length", "<u8")]
 )
 _TRACK = np.dtype([("image", "<u4"), ("index", "<u4")])
+# Number of records that are written at a time.
+_RECORDS = 1 << 14
 
 
 class _Reader:
@@ -192,5 +194,8 @@ def points_bytes(points: Points, tracks: Tracks) -> bytes:
     out = np.empty(table.nbytes + track.nbytes, np.uint8)
     for records, at in ((table, starts), (track, ends + _TRACK.itemsize * within)):
         size = records.dtype.itemsize
-        out[at[:, None] + np.arange(size)] = records.view(np.uint8).reshape(-1, size)
+        for first in range(0, len(records), _RECORDS):
+            some = slice(first, first + _RECORDS)
+            values = records[some].view(np.uint8).reshape(-1, size)
+            out[at[some, None] + np.arange(size)] = values
     return struct.pack("<Q", len(points)) + out.tobytes()

@@ -13,7 +13,7 @@ from pydantic import Field
 from pipeline.runtime.json_file import JsonFile, JsonObject, Vector3
 from pipeline.scene.georeference import GIVEN_UNIT, METHODS, Georeference, Method, Origin
 from pipeline.scene.views import View, scene_extent
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.arrays import GaussianSource
 
 AXES = (
     "right-handed, COLMAP's convention: in a camera at the identity, x is right, y is down and z "
@@ -80,7 +80,7 @@ class Frame(JsonFile, JsonObject):
 
 
 def describe_frame(
-    gaussians: Gaussians,
+    gaussians: GaussianSource,
     views: Sequence[View],
     up: NDArray[np.float64],
     render: RenderSettings,

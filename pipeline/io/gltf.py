@@ -9,17 +9,19 @@ from __future__ import annotations
 
 import json
 import struct
+from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
 from pipeline.io.splat_codec import logit, read_file, sigmoid, to_uint8
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import Array, GaussianArrays, GaussianSource
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.splats.init import SH_C0
 
@@ -35,7 +37,7 @@ _LEAST_BYTES = 32
 _OPACITY_MARGIN = 1e-6
 
 
-def write_gltf(path: Path, gaussians: Gaussians) -> None:
+def write_gltf(path: Path, gaussians: GaussianSource) -> None:
     """Write a .glb file atomically.
 
     Raises:
@@ -48,38 +50,27 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
             file=path,
             fix="change export.min_opacity to export more or fewer of the faint Gaussians",
         )
-    means, log_scales, quats, logits, sh = half_turn(gaussians).arrays().values()
-    opacity = sigmoid(logits)
-    rgba = np.concatenate([0.5 + SH_C0 * sh[:, 0], opacity[:, None]], 1)
-    norm = np.linalg.norm(quats, axis=1, keepdims=True)
-    columns: dict[str, NDArray[Any]] = {
-        "POSITION": means,
-        "COLOR_0": to_uint8(rgba * 255),
-        f"{_NAME}:ROTATION": np.where(norm > 0, quats / np.maximum(norm, 1e-30), (1, 0, 0, 0))[
-            :, [1, 2, 3, 0]
-        ],
-        f"{_NAME}:SCALE": np.exp(log_scales),
-        f"{_NAME}:OPACITY": opacity[:, None],
-    }
-    for k, name in enumerate(_COEFFICIENTS[: sh.shape[1]]):
-        columns[f"{_NAME}:{name}"] = sh[:, k]
+    columns = _columns(gaussians.sh_degree)
     accessors: list[dict[str, Any]] = []
-    parts: list[bytes] = []
-    for values in columns.values():
-        is_bytes = values.dtype == np.uint8
-        parts.append(np.asarray(values, "u1" if is_bytes else "<f4").tobytes())
+    for column in columns:
         accessors.append(
             {
                 "bufferView": len(accessors),
-                "componentType": 5121 if is_bytes else 5126,
+                "componentType": 5121 if column.is_bytes else 5126,
                 "count": count,
-                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[values.shape[1]],
+                "type": {1: "SCALAR", 3: "VEC3", 4: "VEC4"}[column.width],
             }
         )
-        if is_bytes:
+        if column.is_bytes:
             accessors[-1]["normalized"] = True
-    accessors[0] |= {"min": means.min(0).tolist(), "max": means.max(0).tolist()}
-    starts = np.cumsum([0, *map(len, parts)]).tolist()
+    bounds = [
+        np.stack([chunk.min(0), chunk.max(0)])
+        for chunk in (half_turned_means(means) for (means,) in gaussians.chunks("means"))
+    ]
+    low, high = np.min(bounds, 0)[0], np.max(bounds, 0)[1]
+    accessors[0] |= {"min": low.tolist(), "max": high.tolist()}
+    sizes = [count * column.width * (1 if column.is_bytes else 4) for column in columns]
+    starts = np.cumsum([0, *sizes]).tolist()
     extension = {
         "kernel": "ellipse",
         "colorSpace": "srgb_rec709_display",
@@ -87,7 +78,7 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
         "sortingMethod": "cameraDistance",
     }
     primitive = {
-        "attributes": {name: i for i, name in enumerate(columns)},
+        "attributes": {column.name: i for i, column in enumerate(columns)},
         "mode": 0,
         "extensions": {_NAME: extension},
     }
@@ -100,8 +91,8 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
         "meshes": [{"primitives": [primitive]}],
         "accessors": accessors,
         "bufferViews": [
-            {"buffer": 0, "byteOffset": start, "byteLength": len(part), "target": 34962}
-            for start, part in zip(starts, parts, strict=False)
+            {"buffer": 0, "byteOffset": start, "byteLength": length, "target": 34962}
+            for start, length in zip(starts, sizes, strict=False)
         ],
         "buffers": [{"byteLength": starts[-1]}],
     }
@@ -109,7 +100,50 @@ def write_gltf(path: Path, gaussians: Gaussians) -> None:
     text += b" " * (-len(text) % 4)
     size = _HEADER.size + 2 * _CHUNK.size + len(text) + starts[-1]
     head = _HEADER.pack(b"glTF", 2, size) + _CHUNK.pack(len(text), b"JSON") + text
-    write_bytes(path, b"".join([head, _CHUNK.pack(starts[-1], b"BIN\0"), *parts]))
+    body = (
+        np.asarray(column.values(*chunk), "u1" if column.is_bytes else "<f4").tobytes()
+        for column in columns
+        for chunk in gaussians.chunks(*column.arrays)
+    )
+    write_pieces(path, chain([head, _CHUNK.pack(starts[-1], b"BIN\0")], body))
+
+
+class _Column(NamedTuple):
+    """An attribute of the primitive: its width, and its values from chunks of arrays."""
+
+    name: str
+    width: int
+    arrays: tuple[str, ...]
+    values: Callable[..., NDArray[Any]]
+    is_bytes: bool = False
+
+
+def _columns(sh_degree: int) -> list[_Column]:
+    """The attributes, half-turned."""
+
+    def colour(sh: Array, logits: Array) -> NDArray[np.uint8]:
+        return to_uint8(np.concatenate([0.5 + SH_C0 * sh[:, 0], sigmoid(logits)[:, None]], 1) * 255)
+
+    def rotation(quats: Array) -> NDArray[Any]:
+        turned = half_turned_quats(quats)
+        norm = np.linalg.norm(turned, axis=1, keepdims=True)
+        unit = np.where(norm > 0, turned / np.maximum(norm, 1e-30), (1, 0, 0, 0))
+        return unit[:, [1, 2, 3, 0]]
+
+    def coefficient(k: int) -> Callable[[Array], Array]:
+        return lambda sh: -sh[:, k] if k % 2 else sh[:, k]
+
+    return [
+        _Column("POSITION", 3, ("means",), half_turned_means),
+        _Column("COLOR_0", 4, ("sh", "opacity_logits"), colour, is_bytes=True),
+        _Column(f"{_NAME}:ROTATION", 4, ("quats",), rotation),
+        _Column(f"{_NAME}:SCALE", 3, ("log_scales",), np.exp),
+        _Column(f"{_NAME}:OPACITY", 1, ("opacity_logits",), lambda x: sigmoid(x)[:, None]),
+        *(
+            _Column(f"{_NAME}:{name}", 3, ("sh",), coefficient(k))
+            for k, name in enumerate(_COEFFICIENTS[: (sh_degree + 1) ** 2])
+        ),
+    ]
 
 
 def read_gltf(path: Path) -> Gaussians:
@@ -278,19 +312,27 @@ def _values(document: _Document, body: memoryview, index: int) -> NDArray[np.flo
     return table.astype(np.float32)
 
 
-def half_turn(gaussians: Gaussians) -> Gaussians:
-    """The Gaussians rotated by 180 degrees about z; the inverse of itself.
+# The rotation by 180 degrees about z, the inverse of itself: x and y change sign, as do the
+# harmonics of odd order, which are the coefficients of odd index. Quaternions are multiplied by k.
 
-    x and y change sign, as do the harmonics of odd order, which are the coefficients of odd
-    index. Quaternions are multiplied by k.
-    """
-    signs = torch.ones(gaussians.sh.shape[1], 1)
+
+def half_turned_means(means: Array) -> Array:
+    return means * np.array([-1, -1, 1], np.float32)
+
+
+def half_turned_quats(quats: Array) -> Array:
+    w, x, y, z = quats.T
+    return np.stack([-z, -y, x, w], 1)
+
+
+def half_turned_sh(sh: Array) -> Array:
+    signs = np.ones((sh.shape[1], 1), np.float32)
     signs[1::2] = -1
-    w, x, y, z = gaussians.quats.unbind(1)
-    return Gaussians(
-        gaussians.means * torch.tensor([-1.0, -1.0, 1.0]),
-        gaussians.log_scales,
-        torch.stack([-z, -y, x, w], 1),
-        gaussians.opacity_logits,
-        gaussians.sh * signs,
-    )
+    return sh * signs
+
+
+def half_turn(gaussians: Gaussians) -> Gaussians:
+    """The Gaussians rotated by 180 degrees about z."""
+    means, log_scales, quats, logits, sh = gaussians.arrays().values()
+    turned = half_turned_means(means), log_scales, half_turned_quats(quats), logits
+    return Gaussians.sharing(GaussianArrays(*turned, half_turned_sh(sh)))

@@ -9,6 +9,8 @@ reorder properties, so they are read by name.
 
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
+from itertools import chain
 from pathlib import Path
 from typing import Any, BinaryIO
 
@@ -16,8 +18,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.ply_header import PlyHeader, read_header, wrong
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import NAMES, GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
 _POSITION = ("x", "y", "z")
@@ -28,24 +31,27 @@ _DC = tuple(f"f_dc_{i}" for i in range(3))
 _REQUIRED = (*_POSITION, *_DC, "opacity", *_SCALE, *_ROTATION)
 
 
-def write_splat_ply(path: Path, gaussians: Gaussians) -> None:
+def write_splat_ply(path: Path, gaussians: GaussianSource) -> None:
     """Write Gaussians in 3DGS's layout atomically: 62 floats each at SH degree 3, fewer at lower
     degrees."""
-    means, log_scales, quats, logits, sh = gaussians.arrays().values()
-    count, bands = sh.shape[:2]
-    rest = [f"f_rest_{i}" for i in range(3 * (bands - 1))]
+    rest = [f"f_rest_{i}" for i in range(3 * ((gaussians.sh_degree + 1) ** 2 - 1))]
     names = [*_POSITION, *_NORMAL, *_DC, *rest, "opacity", *_SCALE, *_ROTATION]
-    columns = (
-        means,
-        np.zeros((count, 3)),
-        sh[:, 0],
-        sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),
-        logits[:, None],
-        log_scales,
-        quats,
-    )
-    table = np.concatenate([np.asarray(c, "<f4") for c in columns], axis=1, dtype="<f4")
-    _write(path, count, [("float", name) for name in names], table.tobytes())
+
+    def rows() -> Iterator[bytes]:
+        for means, log_scales, quats, logits, sh in gaussians.chunks(*NAMES):
+            count = len(means)
+            columns = (
+                means,
+                np.zeros((count, 3)),
+                sh[:, 0],
+                sh[:, 1:].transpose(0, 2, 1).reshape(count, len(rest)),
+                logits[:, None],
+                log_scales,
+                quats,
+            )
+            yield np.concatenate(columns, axis=1, dtype="<f4").tobytes()
+
+    _write(path, len(gaussians), [("float", name) for name in names], rows())
 
 
 def write_points_ply(
@@ -76,13 +82,15 @@ def write_points_ply(
         for i, name in enumerate(names):
             table[name] = values[:, i]
     properties = [(kind, name) for kind, _, names, _ in columns for name in names]
-    _write(path, len(xyz), properties, table.tobytes())
+    _write(path, len(xyz), properties, [table.tobytes()])
 
 
-def _write(path: Path, count: int, properties: list[tuple[str, str]], body: bytes) -> None:
+def _write(
+    path: Path, count: int, properties: list[tuple[str, str]], body: Iterable[bytes]
+) -> None:
     lines = ["ply", "format binary_little_endian 1.0", f"element vertex {count}"]
     lines += [f"property {kind} {name}" for kind, name in properties]
-    write_bytes(path, "\n".join([*lines, "end_header", ""]).encode() + body)
+    write_pieces(path, chain(["\n".join([*lines, "end_header", ""]).encode()], body))
 
 
 def read_splat_ply(path: Path) -> Gaussians:

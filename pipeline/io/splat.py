@@ -8,12 +8,15 @@ README.md.
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import NAMES, Array, GaussianSource
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 
@@ -22,17 +25,20 @@ _ROW = np.dtype(
 )
 
 
-def write_splat(path: Path, gaussians: Gaussians) -> None:
+def write_splat(path: Path, gaussians: GaussianSource) -> None:
     """Write a .splat file atomically; colours are clamped to [0, 1]."""
-    means, log_scales, quats, logits, sh = gaussians.arrays().values()
+    write_pieces(path, (_rows(*chunk).tobytes() for chunk in gaussians.chunks(*NAMES)))
+
+
+def _rows(means: Array, log_scales: Array, quats: Array, logits: Array, sh: Array) -> NDArray[Any]:
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
-    table = np.zeros(len(gaussians), _ROW)
+    table = np.zeros(len(means), _ROW)
     table["mean"] = means
     table["scale"] = np.exp(log_scales)
     table["rgb"] = to_uint8((0.5 + SH_C0 * sh[:, 0]) * 255)
     table["alpha"] = to_uint8(sigmoid(logits) * 255)
     table["quat"] = to_uint8(quats / np.maximum(norm, 1e-12) * 128 + 128)
-    write_bytes(path, table.tobytes())
+    return table
 
 
 def read_splat(path: Path) -> Gaussians:

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
-
-import torch
 
 from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
@@ -14,6 +13,7 @@ from pipeline.io.ply import read_splat_ply, write_splat_ply
 from pipeline.io.splat import read_splat, write_splat
 from pipeline.io.spz import read_spz, write_spz
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
 _READERS: dict[str, Callable[[Path], Gaussians]] = {
@@ -23,7 +23,7 @@ _READERS: dict[str, Callable[[Path], Gaussians]] = {
     ".glb": read_gltf,
     ".npz": read_npz,
 }
-_WRITERS: dict[str, Callable[[Path, Gaussians], None]] = {
+_WRITERS: dict[str, Callable[[Path, GaussianSource], None]] = {
     ".ply": write_splat_ply,
     ".spz": write_spz,
     ".splat": write_splat,
@@ -53,7 +53,7 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     """
     gaussians = _by_suffix(_READERS, path)(path)
     finite = {
-        name: tensor.nan_to_num(nan=torch.nan, posinf=_LARGE, neginf=-_LARGE)
+        name: tensor.nan_to_num(nan=math.nan, posinf=_LARGE, neginf=-_LARGE)
         for name, tensor in gaussians.tensors().items()
         if name in ("log_scales", "opacity_logits")
     }
@@ -77,7 +77,7 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     return gaussians
 
 
-def write_gaussians(path: Path, gaussians: Gaussians) -> None:
+def write_gaussians(path: Path, gaussians: GaussianSource) -> None:
     """Write Gaussians atomically, in the format of the suffix.
 
     Raises:

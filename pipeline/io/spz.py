@@ -8,18 +8,22 @@ docs/reference/formats.md.
 
 from __future__ import annotations
 
-import gzip
 import struct
 import zlib
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
+from pipeline.splats.arrays import GaussianSource
 from pipeline.splats.gaussians import Gaussians
+
+Doubles = NDArray[np.float64]
 
 _MAGIC = 0x5053474E  # "NGSP"
 _HEADER = struct.Struct("<IIIBBBB")  # magic, version, count, SH degree, fraction bits, flags, 0
@@ -43,9 +47,9 @@ MAX_GAUSSIANS = 10_000_000
 _FIX = "write the file again as SPZ version 3, or get an intact copy of it"
 
 
-def write_spz(path: Path, gaussians: Gaussians, *, antialias: bool = False) -> None:
+def write_spz(path: Path, gaussians: GaussianSource, *, antialias: bool = False) -> None:
     """Write an SPZ file atomically; see ``encode_spz``."""
-    write_bytes(path, encode_spz(gaussians, antialias=antialias))
+    write_pieces(path, _compressed(_sections(gaussians, antialias)))
 
 
 def read_spz(path: Path) -> Gaussians:
@@ -57,7 +61,7 @@ def read_spz(path: Path) -> Gaussians:
     return decode_spz(read_file(path, "an SPZ file"), file=path)
 
 
-def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
+def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:
     """The bytes of an SPZ file, version 3; the same Gaussians always give the same bytes.
 
     Args:
@@ -67,37 +71,57 @@ def encode_spz(gaussians: Gaussians, *, antialias: bool = False) -> bytes:
     Raises:
         UserError: more than ``MAX_GAUSSIANS``.
     """
+    return b"".join(_compressed(_sections(gaussians, antialias)))
+
+
+def _compressed(pieces: Iterable[bytes]) -> Iterator[bytes]:
+    """One gzip stream, without a time."""
+    stream = zlib.compressobj(6, wbits=zlib.MAX_WBITS | 16)
+    for piece in pieces:
+        yield stream.compress(piece)
+    yield stream.flush()
+
+
+def _sections(gaussians: GaussianSource, antialias: bool) -> Iterator[bytes]:
+    """The header and the sections, chunk by chunk."""
     count = len(gaussians)
     if count > MAX_GAUSSIANS:
         raise UserError(
             f"an SPZ file can hold up to {MAX_GAUSSIANS} Gaussians, found {count}",
             fix="export fewer of the faint Gaussians (export.min_opacity), or write a PLY",
         )
-    means, log_scales, quats, logits, sh = (
-        array.astype(np.float64) for array in gaussians.arrays().values()
-    )
-    bits, shrink = _grid(means)
-    steps = np.rint(means * shrink * 2.0**bits).astype("<i4")
-    header = _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
-    sections = (
-        steps.reshape(-1, 1).view(np.uint8)[:, :3],
-        to_uint8(sigmoid(logits) * 255),
-        to_uint8(sh[:, 0] * _DC_STEPS + 127.5),
-        to_uint8((log_scales + np.log(shrink) + 10) * 16),
-        _pack_quats(quats),
-        to_uint8(sh[:, 1:] * 128 + 128),
-    )
-    return gzip.compress(header + b"".join(s.tobytes() for s in sections), 6, mtime=0)
+    bits = _fraction_bits(gaussians)
+
+    def section(encode: Callable[..., NDArray[np.uint8]], *names: str) -> Iterator[bytes]:
+        for chunk in gaussians.chunks(*names):
+            yield encode(*(values.astype(np.float64) for values in chunk)).tobytes()
+
+    def positions(means: Doubles) -> NDArray[np.uint8]:
+        steps = np.rint(means * _shrink(means, bits) * 2.0**bits).astype("<i4")
+        return steps.reshape(-1, 1).view(np.uint8)[:, :3]
+
+    def scales(means: Doubles, log_scales: Doubles) -> NDArray[np.uint8]:
+        return to_uint8((log_scales + np.log(_shrink(means, bits)) + 10) * 16)
+
+    yield _HEADER.pack(_MAGIC, 3, count, gaussians.sh_degree, bits, _ANTIALIASED * antialias, 0)
+    yield from section(positions, "means")
+    yield from section(lambda logits: to_uint8(sigmoid(logits) * 255), "opacity_logits")
+    yield from section(lambda sh: to_uint8(sh[:, 0] * _DC_STEPS + 127.5), "sh")
+    yield from section(scales, "means", "log_scales")
+    yield from section(_pack_quats, "quats")
+    yield from section(lambda sh: to_uint8(sh[:, 1:] * 128 + 128), "sh")
 
 
-def count_out_of_range(gaussians: Gaussians) -> int:
+def count_out_of_range(gaussians: GaussianSource) -> int:
     """The number of Gaussians whose largest scale is outside SPZ's range, or smaller than half a
     quantisation step of the positions."""
-    means, log_scales = (a.astype(np.float64) for a in list(gaussians.arrays().values())[:2])
-    bits, shrink = _grid(means)
-    longest = log_scales.max(axis=1, initial=-np.inf) + np.log(shrink[:, 0])
+    bits, count = _fraction_bits(gaussians), 0
     least = max(_LOG_SCALES[0], -(bits + 1) * np.log(2.0))
-    return int(((longest < least) | (longest > _LOG_SCALES[1])).sum())
+    for chunk in gaussians.chunks("means", "log_scales"):
+        means, log_scales = (values.astype(np.float64) for values in chunk)
+        longest = log_scales.max(axis=1, initial=-np.inf) + np.log(_shrink(means, bits)[:, 0])
+        count += int(((longest < least) | (longest > _LOG_SCALES[1])).sum())
+    return count
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
@@ -167,18 +191,29 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
     return Gaussians.from_arrays(arrays)
 
 
-def _grid(means: NDArray[np.float64]) -> tuple[int, NDArray[np.float64]]:
-    """The fixed-point format of the positions: the number of fractional bits, as many as the
-    scene's size allows; and (N, 1) factors of positions and scales, 1 except for outliers. Scaling
-    both leaves an outlier's appearance from the origin unchanged."""
-    distance = np.abs(means).max(axis=1, initial=0.0)
+def _fraction_bits(gaussians: GaussianSource) -> int:
+    """The number of fractional bits of the positions, as many as the scene's size allows."""
+    distance = np.zeros(len(gaussians))
+    start = 0
+    for (means,) in gaussians.chunks("means"):
+        distance[start : start + len(means)] = _distance(means)
+        start += len(means)
     reach = 0.0
-    if len(means):
+    if len(distance):
         reach = min(distance.max(), _OUTLIER_DISTANCE * float(np.median(distance)))
     integer_bits = int(np.ceil(np.log2(reach))) if reach > 0 else 0
-    bits = int(np.clip(23 - integer_bits, 0, _MAX_FRACTION_BITS))
+    return int(np.clip(23 - integer_bits, 0, _MAX_FRACTION_BITS))
+
+
+def _shrink(means: Doubles, bits: int) -> Doubles:
+    """(N, 1) factors of positions and scales, 1 except for outliers. Scaling both leaves an
+    outlier's appearance from the origin unchanged."""
     limit = (2**23 - 1) * 2.0**-bits
-    return bits, (limit / np.maximum(distance, limit))[:, None]
+    return np.asarray(limit / np.maximum(_distance(means), limit))[:, None]
+
+
+def _distance(means: NDArray[Any]) -> NDArray[Any]:
+    return np.asarray(np.abs(means).max(axis=1, initial=0.0))
 
 
 def _unpack_positions(fixed: NDArray[np.uint8]) -> NDArray[np.float64]:
@@ -188,7 +223,7 @@ def _unpack_positions(fixed: NDArray[np.uint8]) -> NDArray[np.float64]:
     return (padded.view("<i4")[:, :, 0] >> 8).astype(np.float64)
 
 
-def _pack_quats(quats: NDArray[np.float64]) -> NDArray[np.uint8]:
+def _pack_quats(quats: Doubles) -> NDArray[np.uint8]:
     """(N, 4) wxyz to (N, 4) bytes: 2 bits with the index of the largest component, then a sign bit
     and 9 bits of magnitude for each of the other three (in the order xyzw, highest bits first)."""
     norm = np.linalg.norm(quats, axis=1, keepdims=True)

@@ -5,14 +5,13 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.config.schema import Evaluate, Train
 from pipeline.metrics.evaluation import (
     EvaluatedModel,
     Evaluation,
@@ -21,18 +20,15 @@ from pipeline.metrics.evaluation import (
 )
 from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
 from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
+from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view
-from pipeline.render import BACKGROUNDS, Color, RasterOptions
-from pipeline.render.views import near_plane, render_rgb, to_bytes
+from pipeline.render.views import render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
-from pipeline.scene.views import View, scene_extent
+from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.cameras.fit_pose import fit_pose
 
-#: Number of training views that are rendered for ``train_psnr``.
-NUM_TRAINING_VIEWS = 8
 #: A mean PSNR of training views below this, in dB, indicates inconsistent photographs or poses.
 LOW_TRAIN_PSNR = 22.0
 #: Overfitting: the PSNR of training views exceeds that of test views by more than ``LARGE_GAP`` dB,
@@ -52,73 +48,6 @@ POSES_PROTOCOL = (
 POSES_OF_ALL = "from all photographs, test views included (as usual in the field)"
 POSES_OF_SPLIT = "poses are given; points are given or from the training photographs alone"
 Mask = NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Protocol:
-    """How the quality of a scene is measured.
-
-    Attributes:
-        views: the evaluated views: the test views, or all views if there are none.
-        training_views: an even sample of the training views; empty without test views.
-        every: every n-th view, sorted by name, is a test view; 0: there are none, or the scene's
-            own split lists them.
-        num_training: number of training views.
-        listed: whether the views are test views of the scene's own split.
-        background: RGB in [0, 1] behind renders and transparent photographs.
-        near: near plane of the renders, as in training; world units.
-        extent: radius of the scene, world units (``scene_extent``).
-    """
-
-    views: list[View]
-    training_views: list[View]
-    every: int
-    background: Color
-    near: float
-    extent: float
-    num_training: int
-    listed: bool
-
-    @property
-    def has_test_views(self) -> bool:
-        return self.every > 0 or self.listed
-
-    def options(self, train: Train, threads: int) -> RasterOptions:
-        """Options of the rasterizer: as in training, over ``background``."""
-        return RasterOptions(
-            sh_degree=train.sh_degree,
-            background=self.background,
-            antialias=train.antialias,
-            near=self.near,
-            threads=threads,
-        )
-
-
-def choose_protocol(views: Sequence[View], split: Split, train: Train) -> Protocol:
-    """The views to evaluate on (the test views; without any, all) and the background.
-
-    The background is that of training. If that is random (images with alpha), it is white, as is
-    usual for NeRF-synthetic scenes.
-    """
-    test = [view for view in views if view.is_test]
-    training = [view for view in views if not view.is_test]
-    picks = (
-        np.linspace(0, len(training) - 1, min(NUM_TRAINING_VIEWS, len(training)))
-        .round()
-        .astype(int)
-    )
-    extent = scene_extent(list(views))
-    listed = any(view.has_listed_split for view in test)
-    return Protocol(
-        test or list(views),
-        [training[i] for i in picks] if test else [],
-        split.test_every if test and not listed else 0,
-        BACKGROUNDS["white" if train.background in ("white", "random") else "black"],
-        near_plane(extent),
-        extent,
-        len(training),
-        listed,
-    )
 
 
 def evaluate_views(
@@ -159,6 +88,8 @@ def evaluate_views(
         pixels = load_view(view)
         photo = pixels.over(protocol.background)
         if train.refine_poses and view.is_test:
+            from pipeline.training.cameras.fit_pose import fit_pose
+
             gain, weight = gains.of(view.name), train.ssim_loss_weight
             view = fit_pose(
                 gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
@@ -176,11 +107,11 @@ def evaluate_views(
         image = with_exposure(rgb, view)
         name = f"{index:04d}.png"
         Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
-        a, b = image / 255.0, photo / 255.0
+        quality = psnr(image, photo, mask), ssim(image, photo, mask)
         record = ViewMetrics(
-            name=view.name, psnr=psnr(a, b, mask), ssim=ssim(a, b, mask), lpips=None, render=name
+            name=view.name, psnr=quality[0], ssim=quality[1], lpips=None, render=name
         )
-        return record, psnr(to_bytes(rgb) / 255.0, b, mask) if gains else None
+        return record, psnr(to_bytes(rgb), photo, mask) if gains else None
 
     def collect(future: Future[tuple[ViewMetrics, float | None]]) -> None:
         record, psnr_without_gains = future.result()
@@ -201,7 +132,7 @@ def evaluate_views(
                 continue
             pending.append(pool.submit(measure, index, rgb, photo, mask))
             if lpips is not None:
-                distances.append(lpips(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
+                distances.append(lpips(with_exposure(rgb, view), photo, mask))
             if len(pending) > threads:
                 collect(pending.popleft())
         while pending:
@@ -215,7 +146,7 @@ def evaluate_views(
     for view in protocol.training_views:
         rgb, photo, mask = render_and_load(view)
         if not _hides_all(mask):
-            training.append(psnr(with_exposure(rgb, view) / 255.0, photo / 255.0, mask))
+            training.append(psnr(with_exposure(rgb, view), photo, mask))
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")

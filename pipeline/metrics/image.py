@@ -5,12 +5,14 @@ visibility to structural similarity" (2004), with their constants K1 = 0.01, K2 
 11 x 11 Gaussian window of sigma 1.5. Implementations differ in the treatment of the border, which
 changes the second digit; ``SSIM_VARIANT`` describes the reported one.
 
-Images are (H, W, 3) in [0, 1]. All computations are in float64. A mask is (H, W); its non-zero
-pixels are measured.
+Images are (H, W, 3): floats in [0, 1], or uint8 where 255 represents 1. All computations are in
+float64, on bands of rows: only the map of the measure is held for the whole image. A mask is
+(H, W); its non-zero pixels are measured.
 """
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any, Literal
 
 import cv2
@@ -28,13 +30,15 @@ _RADIUS = 5
 _SIGMA = 1.5
 _C1 = 0.01**2
 _C2 = 0.03**2
+# Number of pixels that are measured at a time.
+_BAND_PIXELS = 1 << 15
 
 
 def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None = None) -> float:
     """Peak signal-to-noise ratio in dB, peak 1, over all channels of the unmasked pixels.
 
     Args:
-        image, reference: (H, W, 3), [0, 1].
+        image, reference: (H, W, 3).
         mask: (H, W) or None; zero pixels are excluded.
 
     Returns:
@@ -43,8 +47,10 @@ def psnr(image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
     Raises:
         UserError: no pixel is unmasked.
     """
-    image, reference, keep = _checked(image, reference, mask)
-    squared = (image - reference) ** 2
+    keep = _checked(image, reference, mask)
+    squared = np.empty(image.shape)
+    for rows in _bands(image):
+        squared[rows] = (_in_float64(image[rows]) - _in_float64(reference[rows])) ** 2
     error = float(np.mean(squared if keep is None else squared[keep]))
     return min(-10.0 * np.log10(error), PSNR_CAP) if error > 0.0 else PSNR_CAP
 
@@ -59,7 +65,7 @@ def ssim(
     """Mean structural similarity, averaged over pixels and channels.
 
     Args:
-        image, reference: (H, W, 3), [0, 1].
+        image, reference: (H, W, 3).
         mask: (H, W) or None. Masked pixels of the image are replaced by the reference's, so that
             they do not affect neighbouring windows, and are excluded from the mean.
         padding: "zero" pads both images with black, as 3DGS does (``SSIM_VARIANT``); "valid"
@@ -68,10 +74,16 @@ def ssim(
     Raises:
         UserError: no pixel is left to average, or a side is under 11 pixels with "valid".
     """
-    image, reference, keep = _checked(image, reference, mask)
-    if keep is not None:
-        image = np.where(keep[..., None], image, reference)
-    values = _ssim_map(image, reference)
+    keep = _checked(image, reference, mask)
+    values: NDArray[np.float64] = np.empty(image.shape)
+    for rows in _bands(image):
+        # The windows of the band's pixels reach beyond it.
+        first = max(rows.start - _RADIUS, 0)
+        reached = slice(first, rows.stop + _RADIUS)
+        x, y = _in_float64(image[reached]), _in_float64(reference[reached])
+        if keep is not None:
+            x = np.where(keep[reached, :, None], x, y)
+        values[rows] = _ssim_map(x, y)[rows.start - first : rows.stop - first]
     if padding == "valid":
         height, width = values.shape[:2]
         if min(height, width) <= 2 * _RADIUS:
@@ -107,17 +119,34 @@ def _blur(values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.asarray(blurred, np.float64).reshape(values.shape)
 
 
+def _bands(image: NDArray[Any]) -> Iterator[slice]:
+    """Bands of rows, each of about ``_BAND_PIXELS``."""
+    height, width = image.shape[:2]
+    step = max(_BAND_PIXELS // max(width, 1), 1)
+    for start in range(0, height, step):
+        yield slice(start, min(start + step, height))
+
+
+def _in_float64(image: NDArray[Any]) -> NDArray[np.float64]:
+    return image / 255.0 if image.dtype == np.uint8 else image.astype(np.float64)
+
+
 def _checked(
     image: NDArray[Any], reference: NDArray[Any], mask: NDArray[Any] | None
-) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.bool_] | None]:
+) -> NDArray[np.bool_] | None:
+    """The pixels that are measured; None for all.
+
+    Raises:
+        ValueError: shapes differ.
+        UserError: no pixel is unmasked.
+    """
     if image.shape != reference.shape or image.ndim != 3:
         raise ValueError(f"images of shapes {image.shape} and {reference.shape}")
-    keep = None
-    if mask is not None:
-        if mask.shape != image.shape[:2]:
-            raise ValueError(f"mask of shape {mask.shape} for images of shape {image.shape}")
-        keep = _not_empty(mask != 0)
-    return image.astype(np.float64), reference.astype(np.float64), keep
+    if mask is None:
+        return None
+    if mask.shape != image.shape[:2]:
+        raise ValueError(f"mask of shape {mask.shape} for images of shape {image.shape}")
+    return _not_empty(mask != 0)
 
 
 def _not_empty(keep: NDArray[np.bool_]) -> NDArray[np.bool_]:

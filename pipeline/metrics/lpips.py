@@ -129,10 +129,11 @@ def lpips_available(net: Net) -> tuple[Lpips | None, str]:
     Returns:
         ``(measure, "")``, or ``(None, reason)`` where a file is missing or not what it should
         be; the reason names the file and the folder it belongs into.
-        ``measure(image, reference, mask)`` takes (H, W, 3) in [0, 1] and a mask (H, W) or None,
-        and returns the distance (0 for identical pictures). Masked (zero) pixels of the image are
-        replaced by the reference's and each layer is averaged by how much of it is unmasked. It
-        raises UserError for pictures under ``MIN_SIDE`` pixels.
+        ``measure(image, reference, mask)`` takes (H, W, 3), floats in [0, 1] or uint8 where 255
+        represents 1, and a mask (H, W) or None, and returns the distance (0 for identical
+        pictures). Masked (zero) pixels of the image are replaced by the reference's and each layer
+        is averaged by how much of it is unmasked. It raises UserError for pictures under
+        ``MIN_SIDE`` pixels.
     """
     if net == "none":
         return None, "switched off"
@@ -173,7 +174,7 @@ def _load(file: Path) -> dict[str, torch.Tensor]:
 def _expect(tensor: torch.Tensor, name: str, shape: tuple[int, ...]) -> torch.Tensor:
     if tuple(tensor.shape) != shape:
         raise ValueError(f"{name} has shape {tuple(tensor.shape)}, expected {shape}")
-    return tensor.float()
+    return tensor.detach().float()
 
 
 def _backbone(
@@ -226,10 +227,11 @@ def _distance(
     # torch's convolutions round differently with the number of threads, so each image is
     # processed by a single thread.
     each = ThreadPoolExecutor(2, initializer=torch.set_num_threads, initargs=(1,))
+    taps = [_taps(network, weights, picture) for picture in (image, reference)]
     with _one_thread(), each as pool:
-        x, y = pool.map(lambda v: _taps(network, weights, v), (image, reference))
         total = 0.0
-        for a, b, head in zip(x, y, heads, strict=True):
+        for head in heads:
+            a, b = pool.map(next, taps)
             distance = F.conv2d((a - b) ** 2, head)[0, 0]
             share = F.adaptive_avg_pool2d(unmasked, (distance.shape[0], distance.shape[1]))[0, 0]
             d, s = (t.numpy().astype(np.float64) for t in (distance, share))
@@ -239,24 +241,23 @@ def _distance(
 
 def _taps(
     network: _Network, weights: list[tuple[torch.Tensor, torch.Tensor]], picture: NDArray[Any]
-) -> list[torch.Tensor]:
-    """Outputs of the layers that LPIPS compares, (1, C, h, w) each, normalised over channels."""
+) -> Iterator[torch.Tensor]:
+    """Outputs of the layers that LPIPS compares, (1, C, h, w) each, normalised over channels;
+    computed one by one, because those of all layers take a lot of memory."""
     import torch
     import torch.nn.functional as F
 
-    found = []
-    with torch.no_grad():
-        shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
-        x = torch.from_numpy(picture.astype(np.float32)).permute(2, 0, 1)[None]
-        x = (x - shift) / scale
-        for conv, (weight, bias) in zip(network.convs, weights, strict=True):
-            if conv.pool is not None:
-                x = F.max_pool2d(x, *conv.pool)
-            x = F.conv2d(x, weight, bias, stride=conv.stride, padding=conv.padding).relu_()
-            if conv.tap:
-                length = x.square().sum(dim=1, keepdim=True).sqrt()
-                found.append(x / (length + _EPSILON))
-    return found
+    shift, scale = (torch.tensor(v).view(1, 3, 1, 1) for v in (_SHIFT, _SCALE))
+    unit = picture / 255.0 if picture.dtype == np.uint8 else picture
+    x = torch.from_numpy(unit.astype(np.float32)).permute(2, 0, 1)[None]
+    x = (x - shift) / scale
+    for conv, (weight, bias) in zip(network.convs, weights, strict=True):
+        if conv.pool is not None:
+            x = F.max_pool2d(x, *conv.pool)
+        x = F.conv2d(x, weight, bias, stride=conv.stride, padding=conv.padding).relu_()
+        if conv.tap:
+            length = x.square().sum(dim=1, keepdim=True).sqrt()
+            yield x / (length + _EPSILON)
 
 
 @contextmanager

@@ -8,14 +8,16 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 
+from pipeline.config.schema import RENDERED_FORMATS
 from pipeline.plan import training_memory
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
 # What a cluster reserves is this many times the estimate.
 MARGIN = 1.25
-# Python with numpy and OpenCV or pycolmap; Python with torch, and with scipy besides.
-_PROGRAM, _TORCH, _TORCH_SCIPY = 140.0, 270.0, 340.0
+# Python with numpy and OpenCV or pycolmap; with numpy alone; with torch; with torch and the
+# rasterizer's kernels.
+_PROGRAM, _NUMPY, _TORCH, _RASTERIZER = 140.0, 70.0, 270.0, 290.0
 # Bytes per pixel of a photograph in one thread: decoded and reduced; scanned; undistorted;
 # developed by LibRaw. Bytes per pixel of SIFT's scale space.
 _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0, 195.0
@@ -23,10 +25,14 @@ _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0
 _VIEW_MAPS = 15.0
 # MB per photograph of features and matches, and of the mapper's model, for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
-# Bytes per Gaussian of rendering, and of writing all formats.
-_RENDERED, _WRITTEN = 1000.0, 2300.0
-# Bytes per pixel of a view of the measures of images.
-_MEASURED = 550.0
+# Bytes per Gaussian that is held; held and rendered; rendered with gradients.
+_HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
+# Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
+_IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
+# MB of the report's page with its parts, and of a mesh.
+_PAGE, _MESH = 110.0, 450.0
+# MB per photograph of a sparse model: read; read, with views; written; copied.
+_MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
 
 Estimate = Callable[[Plan, int], float]
 
@@ -70,8 +76,16 @@ def _gaussians(plan: Plan) -> float:
     return plan.config.train.density.max_gaussians * (1 + blocks) / 2 / 1e6
 
 
+def _with_model(plan: Plan) -> float:
+    """A program that copies the given poses with their points, where there are any."""
+    poses = plan.facts.given_poses
+    if poses is None or not poses.num_points:
+        return _PROGRAM
+    return max(_PROGRAM, _NUMPY + 10 + _MODEL_COPIED * _photos(plan))
+
+
 def _inspect(plan: Plan, threads: int) -> float:
-    return _PROGRAM + threads * _SCANNED * _pixels(plan)
+    return _with_model(plan) + threads * _SCANNED * _pixels(plan)
 
 
 def _decode(plan: Plan, threads: int) -> float:
@@ -94,7 +108,7 @@ def _per_photo(megabytes: float) -> Estimate:
 
 def _undistort(plan: Plan, threads: int) -> float:
     maps = _VIEW_MAPS * _pixels(plan) if plan.facts.panoramas else 0.0
-    return _PROGRAM + maps + threads * _UNDISTORTED * _pixels(plan)
+    return _with_model(plan) + maps + threads * _UNDISTORTED * _pixels(plan)
 
 
 def _init(plan: Plan, threads: int) -> float:
@@ -106,7 +120,8 @@ def _init(plan: Plan, threads: int) -> float:
 def _train(plan: Plan, threads: int) -> float:
     if plan.config.partition.blocks == 1:
         return plan.facts.training_memory_mb
-    return _TORCH + _WRITTEN * _gaussians(plan)
+    # The union of blocks holds one of them.
+    return _NUMPY + _HELD * plan.config.train.density.max_gaussians / 1e6
 
 
 def _coarse(plan: Plan, threads: int) -> float:
@@ -121,15 +136,26 @@ def _block(plan: Plan, threads: int) -> float:
 
 
 def _evaluate(plan: Plan, threads: int) -> float:
-    return _TORCH + _MEASURED * _view_pixels(plan) + _RENDERED * _gaussians(plan)
+    pixels = _view_pixels(plan)
+    measured = threads * (_BAND + _MEASURED * pixels)
+    drawn = _RENDERED * _gaussians(plan) + _IMAGE * pixels
+    return _RASTERIZER + _MODEL_VIEWS * _photos(plan) + drawn + measured
 
 
 def _coverage(plan: Plan, threads: int) -> float:
-    return _TORCH_SCIPY + _RENDERED * _gaussians(plan) + 0.4 * _photos(plan)
+    return _RASTERIZER + 25 + _MODEL_VIEWS * _photos(plan) + _RENDERED * _gaussians(plan)
 
 
 def _export(plan: Plan, threads: int) -> float:
-    return _TORCH + _WRITTEN * _gaussians(plan)
+    written = _NUMPY + _MODEL_WRITTEN * _photos(plan) + _HELD * _gaussians(plan)
+    rendered = RENDERED_FORMATS.intersection(plan.config.export.formats)
+    if not rendered:
+        return written
+    return max(written, _evaluate(plan, threads)) + _MESH * ("mesh" in rendered)
+
+
+def _report(plan: Plan, threads: int) -> float:
+    return _NUMPY + _PAGE + _MODEL_READ * _photos(plan) + _HELD * _gaussians(plan)
 
 
 _mapping = _per_photo(_MAPPING)
@@ -144,12 +170,12 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "undistort": _undistort,
     "init": _init,
     "coarse": _coarse,
-    "partition": lambda plan, threads: _TORCH + _RENDERED * _gaussians(plan),
+    "partition": lambda plan, threads: _TORCH + _PARTITIONED * _gaussians(plan),
     "block": _block,
     "polish": _block,
     "train": _train,
     "evaluate": _evaluate,
     "coverage": _coverage,
     "export": _export,
-    "report": lambda plan, threads: _TORCH + 40 + _WRITTEN * _gaussians(plan),
+    "report": _report,
 }

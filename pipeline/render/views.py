@@ -1,17 +1,20 @@
-"""Render scenes from views, for evaluation and display."""
+"""Render scenes from views, for evaluation and display. Importing this module does not import
+torch."""
 
 from __future__ import annotations
 
 from dataclasses import replace
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
-from pipeline.render import Backend, Forward, RasterCamera, RasterOptions, make_backend
+from pipeline.render import Forward, RasterCamera, RasterOptions
 from pipeline.scene.views import View, reduced_size
 from pipeline.splats.gaussians import Gaussians
+
+if TYPE_CHECKING:
+    from pipeline.render import Backend
 
 
 class Render(NamedTuple):
@@ -39,6 +42,8 @@ def near_plane(extent: float) -> float:
 
 def raster_camera(view: View, factor: int = 1) -> RasterCamera:
     """The rasterizer's camera of a view, downscaled by ``factor``."""
+    import torch
+
     width, height = reduced_size(view, factor)
     sx, sy = width / view.width, height / view.height
     crop, part_of = view.crop, None
@@ -86,6 +91,8 @@ def render_rgb(
 def _forward(
     gaussians: Gaussians, view: View, options: RasterOptions | None, backend: Backend | None
 ) -> Forward:
+    from pipeline.render import make_backend
+
     options = limit_sh_degree(options or RasterOptions(), gaussians)
     backend = backend or make_backend()
     return backend.forward(*gaussians.parameters(), raster_camera(view), options)
@@ -93,4 +100,6 @@ def _forward(
 
 def to_bytes(image: Any) -> NDArray[np.uint8]:
     """Convert floats in [0, 1] to uint8, rounded."""
-    return np.rint(np.clip(np.asarray(image), 0, 1) * 255).astype(np.uint8)
+    scaled = np.clip(np.asarray(image), 0, 1)
+    scaled *= 255
+    return np.rint(scaled, out=scaled).astype(np.uint8)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,10 +15,8 @@ from pipeline.plan.record import PlanRecord
 from pipeline.scene.blocks import Partition
 from pipeline.scene.normalization import IDENTITY, Normalization
 from pipeline.scene.views import View
+from pipeline.splats.arrays import GaussianArrays
 from pipeline.training.loop.curve import CurveRecord
-
-if TYPE_CHECKING:
-    from pipeline.splats.gaussians import Gaussians
 
 Rank = Literal["worst", "low", "median", "high", "best"]
 
@@ -59,7 +57,7 @@ class TrainedScene:
             refer to, to that of the views.
     """
 
-    gaussians: Gaussians
+    gaussians: GaussianArrays
     views: Sequence[View]
     orientations: Mapping[str, int]
     background: tuple[float, float, float]

@@ -5,12 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
+from pipeline.io.splat_codec import sigmoid
 from pipeline.io.spz import encode_spz
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.arrays import GaussianArrays, GaussianRows
 
 # Size of the sample from which the compressed size is estimated, and a safety factor.
 _SAMPLE = 20_000
@@ -26,7 +25,7 @@ class Packed:
     sh_degree: int
 
 
-def fit(gaussians: Gaussians, centres: NDArray[np.float64], max_bytes: int) -> Packed:
+def fit(gaussians: GaussianArrays, centres: NDArray[np.float64], max_bytes: int) -> Packed:
     """Compress Gaussians to at most about ``max_bytes``.
 
     Bands of spherical harmonics are dropped first, then the Gaussians of least prominence: at the
@@ -37,29 +36,34 @@ def fit(gaussians: Gaussians, centres: NDArray[np.float64], max_bytes: int) -> P
         centres: (C, 3) camera centres, world.
         max_bytes: size limit.
     """
-    sample = gaussians.select(torch.arange(0, len(gaussians), max(len(gaussians) // _SAMPLE, 1)))
+    step = max(len(gaussians) // _SAMPLE, 1)
+    sample, degree, number = np.arange(0, len(gaussians), step), gaussians.sh_degree, 0
     for degree in range(gaussians.sh_degree, -1, -1):
-        each = len(encode_spz(sample.with_sh_degree(degree))) / len(sample)
+        each = len(encode_spz(GaussianRows(gaussians, sample, degree))) / len(sample)
         number = max(int(max_bytes * _MARGIN / each), 0)
         if number >= len(gaussians):
             break
-    reduced = gaussians.with_sh_degree(degree)
-    if number < len(reduced):
-        rank = prominence(reduced, centres).argsort(descending=True, stable=True)
-        reduced = reduced.select(rank[:number].sort().values)
-    return Packed(encode_spz(reduced), len(reduced), degree)
+    rows = np.arange(len(gaussians))
+    if number < len(rows):
+        rank = np.argsort(-prominence(gaussians, centres), kind="stable")
+        rows = np.sort(rank[:number])
+    return Packed(encode_spz(GaussianRows(gaussians, rows, degree)), len(rows), degree)
 
 
-def prominence(gaussians: Gaussians, centres: NDArray[np.float64]) -> Tensor:
+def prominence(gaussians: GaussianArrays, centres: NDArray[np.float64]) -> NDArray[np.float32]:
     """(N,) opacity times the angle each Gaussian spans, as seen by the cameras.
 
     The angle is the square root of the product of the two longer axes and the mean of
     1 / distance^2.
     """
     # A sample of the cameras is enough.
-    some = torch.from_numpy(centres[:: max(len(centres) // 64, 1)]).float()
-    inverse = torch.zeros(len(gaussians))
-    for centre in some:
-        inverse += 1 / (gaussians.means - centre).square().sum(1).clamp(min=1e-12)
-    longer = gaussians.log_scales.sort(1).values[:, 1:].sum(1)
-    return gaussians.opacity_logits.sigmoid() * (longer.exp() * inverse / max(len(some), 1)).sqrt()
+    some = centres[:: max(len(centres) // 64, 1)].astype(np.float32)
+    found = [np.zeros(0, np.float32)]
+    for means, log_scales, logits in gaussians.chunks("means", "log_scales", "opacity_logits"):
+        inverse = np.zeros(len(means), np.float32)
+        for centre in some:
+            inverse += 1 / np.maximum(((means - centre) ** 2).sum(1), np.float32(1e-12))
+        longer = np.sort(log_scales, 1)[:, 1:].sum(1)
+        angle = np.sqrt(np.exp(longer) * inverse / max(len(some), 1))
+        found.append((sigmoid(logits) * angle).astype(np.float32))
+    return np.concatenate(found)

@@ -11,8 +11,8 @@ import numpy as np
 from PIL import Image
 
 from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
-from pipeline.metrics.evaluate import Protocol
 from pipeline.metrics.evaluation import Evaluation
+from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.data import (
@@ -34,7 +34,7 @@ from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.arrays import GaussianArrays
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.curve import TrainingCurve
 
@@ -58,7 +58,7 @@ class SceneResults:
     manifest: Manifest
     model: Reconstruction
     views: list[View]
-    gaussians: Gaussians
+    gaussians: GaussianArrays
     protocol: Protocol
     antialias: bool
 

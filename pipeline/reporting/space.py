@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import base64
 import json
-import math
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -87,16 +86,17 @@ def sized_for_spz(data: ReportData) -> ReportData:
     _, radius = _robust_box(data.points_xyz[finite], centres)
     if _SPZ_RADII[0] <= radius <= _SPZ_RADII[1]:
         return data
-    whole = scene.gaussians
-    gaussians = replace(
-        whole, means=whole.means / radius, log_scales=whole.log_scales - math.log(radius)
-    )
     views = []
     for view in scene.views:
         pose = view.world_to_camera.copy()
         pose[:3, 3] /= radius
         views.append(replace(view, world_to_camera=pose))
-    trained = replace(scene, gaussians=gaussians, views=views, near=scene.near / radius)
+    trained = replace(
+        scene,
+        gaussians=scene.gaussians.scaled(1 / radius),
+        views=views,
+        near=scene.near / radius,
+    )
     return replace(data, trained=trained, points_xyz=data.points_xyz / radius)
 
 

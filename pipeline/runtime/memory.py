@@ -1,6 +1,7 @@
 """Memory of this process."""
 
 import ctypes
+import re
 import resource
 import sys
 from pathlib import Path
@@ -10,9 +11,22 @@ _M_ARENA_MAX = -8  # malloc.h of glibc
 
 def peak_memory_mb() -> float:
     """Peak resident size in MiB, of this process or its largest finished child process."""
-    usages = [resource.getrusage(kind) for kind in (resource.RUSAGE_SELF, resource.RUSAGE_CHILDREN)]
+    return max(_own_peak_mb(), _max_rss_mb(resource.RUSAGE_CHILDREN))
+
+
+def _own_peak_mb() -> float:
+    # On Linux, ru_maxrss is at least the size of the process that started this one.
+    status = Path("/proc/self/status")
+    if status.exists():
+        found = re.search(r"^VmHWM:\s*(\d+) kB", status.read_text(), re.MULTILINE)
+        if found:
+            return int(found[1]) / 2**10
+    return _max_rss_mb(resource.RUSAGE_SELF)
+
+
+def _max_rss_mb(who: int) -> float:
     unit = 2**20 if sys.platform == "darwin" else 2**10  # ru_maxrss: bytes on macOS, KiB on Linux
-    return max(usage.ru_maxrss for usage in usages) / unit
+    return resource.getrusage(who).ru_maxrss / unit
 
 
 def release_free_memory() -> None:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from typing import ClassVar, Literal
+from typing import Any, ClassVar, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -34,12 +34,12 @@ class Box:
     lower: Array
     upper: Array
 
-    def along_axes(self, points: Array) -> Array:
+    def along_axes(self, points: NDArray[Any]) -> Array:
         """(N, 3) points of the world, along the box's axes."""
         # einsum, not a matrix product: BLAS may round differently with the number of threads.
         return np.einsum("ij,nj->ni", self.axes, np.asarray(points, np.float64))
 
-    def contains(self, points: Array) -> NDArray[np.bool_]:
+    def contains(self, points: NDArray[Any]) -> NDArray[np.bool_]:
         """(N,) whether each of (N, 3) points is in the box."""
         local = self.along_axes(points)
         return np.asarray(((local >= self.lower) & (local < self.upper)).all(1))

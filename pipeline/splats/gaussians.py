@@ -1,17 +1,19 @@
-"""The parameters of a scene's Gaussians, as tensors."""
+"""The parameters of a scene's Gaussians, as tensors. Importing this module does not import torch:
+the stages that write files handle ``arrays.GaussianArrays``."""
 
 from __future__ import annotations
 
-import math
-from collections.abc import Mapping
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import TYPE_CHECKING
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
-from torch import Tensor
 
-from pipeline.splats.init import InitGaussians
+from pipeline.splats.arrays import Array, GaussianArrays
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 
 @dataclass
@@ -38,15 +40,6 @@ class Gaussians:
     def __len__(self) -> int:
         return len(self.means)
 
-    def scaled(self, factor: float) -> Gaussians:
-        """The same Gaussians in a world whose coordinates are ``factor`` times as large; the
-        tensors that do not change are shared."""
-        if factor == 1:
-            return self
-        means = (self.means.double() * factor).float()
-        log_scales = (self.log_scales.double() + math.log(factor)).float()
-        return replace(self, means=means, log_scales=log_scales)
-
     @property
     def sh_degree(self) -> int:
         """Degree of the spherical harmonics."""
@@ -64,17 +57,30 @@ class Gaussians:
         """The tensors as numpy arrays that share their memory."""
         return {name: tensor.numpy() for name, tensor in self.tensors().items()}
 
+    def as_arrays(self) -> GaussianArrays:
+        """The same Gaussians in numpy arrays that share their memory."""
+        return GaussianArrays(**self.arrays())
+
+    def chunks(self, *names: str) -> Iterator[list[Array]]:
+        """See ``arrays.GaussianSource``."""
+        return self.as_arrays().chunks(*names)
+
     @staticmethod
-    def from_arrays(arrays: Mapping[str, NDArray] | InitGaussians) -> Gaussians:
+    def from_arrays(arrays: Mapping[str, NDArray] | GaussianArrays) -> Gaussians:
         """Gaussians with copies of numpy arrays, which are named as the fields."""
-        if isinstance(arrays, InitGaussians):
+        if isinstance(arrays, GaussianArrays):
             arrays = arrays.arrays()
-        return Gaussians(
-            *(
-                torch.from_numpy(np.array(arrays[field.name], np.float32, order="C"))
-                for field in fields(Gaussians)
-            )
+        copies = (
+            np.array(arrays[field.name], np.float32, order="C") for field in fields(Gaussians)
         )
+        return Gaussians.sharing(GaussianArrays(*copies))
+
+    @staticmethod
+    def sharing(arrays: GaussianArrays) -> Gaussians:
+        """Gaussians that share the memory of contiguous arrays."""
+        import torch
+
+        return Gaussians(*(torch.from_numpy(array) for array in arrays.arrays().values()))
 
     def select(self, which: Tensor) -> Gaussians:
         """Copies of the Gaussians selected by a boolean mask (N,) or int64 indices (M,)."""
@@ -97,6 +103,8 @@ class Gaussians:
 
 def concat(parts: list[Gaussians]) -> Gaussians:
     """Concatenate Gaussians of the same SH degree."""
+    import torch
+
     return Gaussians(
         *(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Gaussians))
     )
@@ -104,6 +112,8 @@ def concat(parts: list[Gaussians]) -> Gaussians:
 
 def resize_bands(sh: Tensor, degree: int) -> Tensor:
     """Truncate or zero-pad (N, K, 3) coefficients to (N, (degree + 1)^2, 3), contiguous."""
+    import torch
+
     bands = (degree + 1) ** 2
     if bands <= sh.shape[1]:
         return sh[:, :bands].contiguous()

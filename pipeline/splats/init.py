@@ -7,7 +7,7 @@ is the mean distance to its three nearest neighbours. Uses numpy and scipy, not 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +18,7 @@ from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View, scene_extent
+from pipeline.splats.arrays import GaussianArrays
 
 # The constant spherical harmonic, 1 / (2 sqrt(pi)): colour = 0.5 + SH_C0 * coefficient.
 SH_C0 = 0.28209479177387814
@@ -49,30 +50,16 @@ THINNING_SEED = 0
 
 
 @dataclass
-class InitGaussians:
-    """The arrays of ``pipeline.splats.gaussians.Gaussians``, in numpy.
+class InitGaussians(GaussianArrays):
+    """Initial Gaussians.
 
     Attributes:
-        means, log_scales: (N, 3) float32. quats: (N, 4) float32, wxyz. opacity_logits: (N,)
-            float32. sh: (N, K, 3) float32.
         num_dropped: number of points left out because they are not finite, too near or too far.
         num_thinned: number of points left out because there are more than ``Init.max_points``.
     """
 
-    means: NDArray[np.float32]
-    log_scales: NDArray[np.float32]
-    quats: NDArray[np.float32]
-    opacity_logits: NDArray[np.float32]
-    sh: NDArray[np.float32]
     num_dropped: int = 0
     num_thinned: int = 0
-
-    def __len__(self) -> int:
-        return len(self.means)
-
-    def arrays(self) -> dict[str, NDArray[np.float32]]:
-        """The five arrays by name."""
-        return {f.name: getattr(self, f.name) for f in fields(self)[:5]}
 
 
 def gaussians_from_points(

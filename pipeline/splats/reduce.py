@@ -2,28 +2,31 @@
 
 from __future__ import annotations
 
+import numpy as np
+
 from pipeline.runtime.errors import UserError
-from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.morton import in_morton_order
+from pipeline.splats.arrays import GaussianArrays, GaussianRows
+from pipeline.splats.z_order import z_order
 
 
 def reduce_gaussians(
-    gaussians: Gaussians, sh_degree: int, min_opacity: float, morton_order: bool
-) -> Gaussians:
+    gaussians: GaussianArrays, sh_degree: int, min_opacity: float, morton_order: bool
+) -> GaussianRows:
     """Remove SH bands above ``sh_degree`` and Gaussians with an opacity below ``min_opacity``, and
     optionally sort along a Z-order curve.
 
     Raises:
         UserError: no Gaussian is left.
     """
-    if sh_degree < gaussians.sh_degree:
-        gaussians = gaussians.with_sh_degree(sh_degree)
+    rows = np.arange(len(gaussians))
     if min_opacity > 0:
-        opaque = gaussians.opacity_logits.sigmoid() >= min_opacity
-        if not opaque.any():
+        opacity = 1 / (1 + np.exp(-gaussians.opacity_logits.astype(np.float64).clip(-100, 100)))
+        rows = np.flatnonzero(opacity >= min_opacity)
+        if not len(rows):
             raise UserError(
                 f"all {len(gaussians)} Gaussians have an opacity below {min_opacity}",
                 fix="lower min_opacity",
             )
-        gaussians = gaussians.select(opaque)
-    return in_morton_order(gaussians) if morton_order else gaussians
+    if morton_order:
+        rows = rows[z_order(gaussians.means[rows])]
+    return GaussianRows(gaussians, rows, min(sh_degree, gaussians.sh_degree))

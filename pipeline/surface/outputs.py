@@ -21,8 +21,6 @@ from pipeline.surface.mesh import build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
 from pipeline.surface.video import write_video
 
-RENDERED_FORMATS = frozenset(("renders", "depths", "mesh", "video"))
-
 #: Number of views from which the typical depth is measured.
 _DEPTH_VIEWS = 8
 

@@ -15,6 +15,7 @@ from stages.workflow import inputs
 if TYPE_CHECKING:
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.blocks.train import SceneInBlocks
+    from pipeline.training.blocks.union import Union
     from pipeline.training.loop.schedule import Part
 
 INPUTS = {
@@ -32,15 +33,18 @@ def read_partition(job: Job) -> Partition:
 
 def union_of(job: Job, role: str) -> Gaussians:
     """The Gaussians of all blocks, each without those outside of its box."""
-    from pipeline.io.npz import read_npz
-    from pipeline.training.blocks.union import inside, union
+    from pipeline.splats.arrays import collect
+    from pipeline.splats.gaussians import Gaussians
+
+    return Gaussians.sharing(collect(_union(job, role)))
+
+
+def _union(job: Job, role: str) -> Union:
+    from pipeline.training.blocks.union import Union
 
     partition = read_partition(job)
     numbers = range(1, len(partition.blocks) + 1)
-    return union(
-        inside(read_npz(job.inputs[f"{role}_{number}"] / "gaussians.npz"), partition, number)
-        for number in numbers
-    )
+    return Union([job.inputs[f"{role}_{i}"] / "gaussians.npz" for i in numbers], partition)
 
 
 def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None:
@@ -49,8 +53,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
     Args:
         read_gaussians: reads those of the whole scene.
     """
-    from pipeline.training.blocks.train import block_training
-    from pipeline.training.blocks.union import far_field, union
+    from pipeline.training.blocks.train import block_training, with_far_field
     from pipeline.training.scene import run_training
 
     trained = run_training(
@@ -65,8 +68,10 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
         inputs.training_run(job),
         part,
     )
-    far = far_field(read_gaussians(), read_partition(job), job.block)
-    inputs.write_trained(job, trained, union([trained.result.gaussians, far]))
+    gaussians = with_far_field(
+        trained.result.gaussians, read_gaussians(), read_partition(job), job.block
+    )
+    inputs.write_trained(job, trained, gaussians)
 
 
 def _scene(job: Job, read_gaussians: Callable[[], Gaussians]) -> SceneInBlocks:
@@ -95,7 +100,7 @@ def unite(job: Job) -> None:
     from pipeline.training.loop.counters import TrainCounters
     from pipeline.training.loop.curve import TrainingCurve
 
-    gaussians = union_of(job, "polish")
+    gaussians = _union(job, "polish")
     write_npz(job.out / "gaussians.npz", gaussians)
     coarse = job.inputs["coarse"]
     if has_model(coarse / "sparse" / "0"):

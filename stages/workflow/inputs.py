@@ -16,6 +16,7 @@ from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
 if TYPE_CHECKING:
+    from pipeline.splats.arrays import GaussianArrays
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.scene import TrainedScene, TrainingRun
 
@@ -126,6 +127,13 @@ def training_views(job: Job) -> list[View]:
             fix="check the photographs' names in the pose file, or set poses: ignore",
         )
     return found
+
+
+def trained_arrays(job: Job) -> GaussianArrays:
+    """The trained Gaussians, for stages that do not render."""
+    from pipeline.io.npz import read_gaussian_arrays
+
+    return read_gaussian_arrays(job.inputs["train"] / "gaussians.npz")
 
 
 def trained_gaussians(job: Job) -> Gaussians:

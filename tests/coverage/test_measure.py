@@ -11,7 +11,8 @@ from PIL import Image
 from pipeline.config.schema import Evaluate, Split, Train
 from pipeline.coverage.measure import WorldFrame, measure_coverage, spearman
 from pipeline.coverage.record import CoverageRecord
-from pipeline.metrics.evaluate import choose_protocol, evaluate_views
+from pipeline.metrics.evaluate import evaluate_views
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
 from tests.coverage.scenes import UP, camera, renderer, wall

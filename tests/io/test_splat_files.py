@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import math
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import torch
 
 from pipeline.io.splat_files import SUFFIXES, read_gaussians, write_gaussians
 from pipeline.runtime.errors import UserError
+from pipeline.splats import arrays
 from pipeline.splats.morton import in_morton_order
 from pipeline.splats.reduce import reduce_gaussians
 from tests.splats.samples import Within, sample
@@ -69,13 +74,41 @@ def test_nothing_to_render_is_an_error(tmp_path) -> None:
 
 def test_faint_gaussians_and_high_bands_are_left_out() -> None:
     gaussians = sample(100)
-    found = reduce_gaussians(gaussians, 1, 0.5, False)
-    kept = gaussians.opacity_logits >= 0
-    assert torch.equal(found.means, gaussians.means[kept])
-    assert torch.equal(found.sh, gaussians.sh[kept][:, :4])
-    assert reduce_gaussians(sample(10, 0), 3, 0, False).sh_degree == 0
+    [(means, sh)] = reduce_gaussians(gaussians.as_arrays(), 1, 0.5, False).chunks("means", "sh")
+    kept = (gaussians.opacity_logits >= 0).numpy()
+    assert np.array_equal(means, gaussians.means[kept])
+    assert np.array_equal(sh, gaussians.sh[kept][:, :4])
+    assert reduce_gaussians(sample(10, 0).as_arrays(), 3, 0, False).sh_degree == 0
     with pytest.raises(UserError, match="have an opacity below"):
-        reduce_gaussians(gaussians, 3, 1.0, False)
+        reduce_gaussians(gaussians.as_arrays(), 3, 1.0, False)
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_files_do_not_depend_on_the_size_of_chunks(tmp_path, monkeypatch, suffix, degree) -> None:
+    gaussians = sample(100)
+    gaussians.means[50] *= 1e4  # an outlier of SPZ
+    gaussians.quats[60] = 0
+    whole = reduce_gaussians(gaussians.as_arrays(), degree, 0.1, True)
+    write_gaussians(tmp_path / f"whole{suffix}", whole)
+    monkeypatch.setattr(arrays, "CHUNK", 7)
+    write_gaussians(tmp_path / f"chunks{suffix}", whole)
+    assert (tmp_path / f"chunks{suffix}").read_bytes() == (tmp_path / f"whole{suffix}").read_bytes()
+
+
+def test_gaussians_are_scaled_in_chunks(monkeypatch) -> None:
+    gaussians = sample(50).as_arrays()
+    monkeypatch.setattr(arrays, "CHUNK", 7)
+    found = gaussians.scaled(3.7)
+    assert np.array_equal(found.means, np.float32(gaussians.means.astype(np.float64) * 3.7))
+    log_scales = gaussians.log_scales.astype(np.float64) + math.log(3.7)
+    assert np.array_equal(found.log_scales, np.float32(log_scales))
+    assert found.sh is gaussians.sh and gaussians.scaled(1) is gaussians
+
+
+def test_formats_are_written_without_torch() -> None:
+    code = "import pipeline.export.write, sys; sys.exit('torch' in sys.modules)"
+    assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0
 
 
 def test_morton_order_is_a_permutation_with_neighbours_close_together() -> None:

@@ -7,12 +7,8 @@ import pytest
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
-from pipeline.metrics.evaluate import (
-    NUM_TRAINING_VIEWS,
-    choose_protocol,
-    diagnose,
-    evaluate_views,
-)
+from pipeline.metrics.evaluate import diagnose, evaluate_views
+from pipeline.metrics.protocol import NUM_TRAINING_VIEWS, choose_protocol
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
 from pipeline.scene.exposure import ExposureGains

@@ -134,3 +134,15 @@ def test_shapes_must_agree() -> None:
         psnr(image, reference[:-1])
     with pytest.raises(ValueError):
         ssim(image, reference, np.ones((3, 3), bool))
+
+
+@pytest.mark.parametrize("padding", ["zero", "valid"])
+@pytest.mark.parametrize("masked", [False, True])
+def test_measures_do_not_depend_on_the_bands(monkeypatch, masked: bool, padding) -> None:
+    image, reference = (np.rint(255 * values).astype(np.uint8) for values in pair(101, 57))
+    mask = np.random.default_rng(1).random(image.shape[:2]) > 0.3 if masked else None
+    whole = psnr(image / 255, reference / 255, mask), ssim(image, reference, mask, padding=padding)
+    for pixels in (1, 57 * 13):
+        monkeypatch.setattr("pipeline.metrics.image._BAND_PIXELS", pixels)
+        assert psnr(image, reference, mask) == whole[0]
+        assert ssim(image, reference, mask, padding=padding) == whole[1]

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Split, Train, Views
-from pipeline.metrics.evaluate import choose_protocol
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, load_views
 from stages.evaluate import decide

@@ -8,6 +8,7 @@ import pytest
 
 from pipeline.config.load import scene_config
 from pipeline.config.schema import Config
+from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.stage_memory import memory_mb
 from pipeline.plan.values import Plan
 from stages.workflow.registry import STAGES
@@ -21,12 +22,16 @@ class Scene(NamedTuple):
     size: tuple[int, int]
     view: tuple[int, int]
     gaussians: int
+    given_model: bool = False
 
 
 SOUTH_BUILDING = Scene(128, (1024, 768), (640, 480), 76_800)
-TOWN = Scene(125, (640, 427), (640, 427), 68_320)
+TOWN = Scene(125, (640, 427), (640, 427), 68_320, given_model=True)
 COLOSSEUM = Scene(35, (640, 360), (640, 360), 57_600)
 FOX = Scene(50, (720, 1280), (360, 640), 57_600)
+# A town whose Gaussians were divided into many.
+DENSE = Scene(60, (640, 427), (640, 427), 100_000)
+VAST = Scene(60, (640, 427), (640, 427), 1_000_000)
 LARGE = Scene(8, (3375, 6000), (360, 640), 20_000)  # fox, enlarged
 
 # Peak memory in MB with two threads and the preset fast, from run.json.
@@ -39,25 +44,38 @@ USED = {
         "undistort": 141,
         "init": 148,
         "train": 711,
-        "evaluate": 528,
-        "coverage": 482,
-        "export": 456,
-        "report": 465,
     },
     TOWN: {
+        "inspect": 153,
+        "undistort": 162,
+        "init": 147,
         "features": 217,
         "matches": 264,
         "sfm": 399,
-        "train": 678,
-        "evaluate": 499,
-        "coverage": 457,
-        "export": 438,
-        "report": 448,
+        "train": 711,
+        "evaluate": 401,
+        "coverage": 384,
+        "export": 139,
+        "report": 202,
     },
-    COLOSSEUM: {"matches": 179, "sfm": 264, "train": 545, "evaluate": 458, "export": 406},
+    COLOSSEUM: {"matches": 179, "sfm": 264, "train": 545},
     FOX: {"features": 470, "matches": 210, "sfm": 259, "train": 545},
     LARGE: {"inspect": 369, "features": 580, "undistort": 528},
+    DENSE: {"evaluate": 383, "coverage": 379, "export": 126, "report": 203, "partition": 344},
+    VAST: {"evaluate": 737, "coverage": 739, "export": 338, "report": 395, "partition": 979},
 }
+
+
+GIVEN = PoseSummary(
+    kind="colmap",
+    path="sparse/0",
+    num_images=125,
+    models=("SIMPLE_RADIAL",),
+    pinhole=False,
+    num_points=60_000,
+    tracked=1000,
+    centred=True,
+)
 
 
 def plan_of(scene: Scene, config: Config) -> Plan:
@@ -68,6 +86,7 @@ def plan_of(scene: Scene, config: Config) -> Plan:
             "photographs": scene.photographs,
             "sizes": {f"{scene.size[0]}x{scene.size[1]}": scene.photographs},
             "view_size": scene.view,
+            "given_poses": GIVEN if scene.given_model else None,
             "training_memory_mb": round(400 + 3.75e-6 * pixels + 2.5e-3 * scene.gaussians),
         }
     )

@@ -33,6 +33,7 @@ from pipeline.reporting.data import (
     TrainingRecord,
 )
 from pipeline.scene.views import View
+from pipeline.splats.arrays import GaussianArrays
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop.curve import CurveRecord
 from tests.plans import record_of
@@ -53,7 +54,7 @@ def ring(count: int = 5, *, width: int = 200, height: int = 150) -> list[View]:
     return views
 
 
-def gaussians(count: int = 400, *, degree: int = 3, seed: int = 0) -> Gaussians:
+def gaussians(count: int = 400, *, degree: int = 3, seed: int = 0) -> GaussianArrays:
     """Around the origin, of all sizes and opacities, their colours depending on the direction, few
     of them brighter than white: a browser cuts those off one by one, the rasterizer in the sum."""
     gen = torch.Generator().manual_seed(seed)
@@ -63,13 +64,14 @@ def gaussians(count: int = 400, *, degree: int = 3, seed: int = 0) -> Gaussians:
 
     sh = normal(count, (degree + 1) ** 2, 3) * 0.05
     sh[:, 0] += 0.3 * normal(count, 3)
-    return Gaussians(
+    made = Gaussians(
         normal(count, 3) * 0.6,
         normal(count, 3) * 0.5 - 3.3,
         normal(count, 4),
         normal(count) * 1.5 + 0.5,
         sh,
     )
+    return made.as_arrays()
 
 
 def trained(**changes) -> TrainedScene:

@@ -21,6 +21,7 @@ from pipeline.render import RasterOptions
 from pipeline.render.views import render_view
 from pipeline.reporting.page import write_report
 from pipeline.reporting.space import upright_camera
+from pipeline.splats.gaussians import Gaussians
 from tests.reporting.made import gaussians, report, trained
 from tests.tools import need_package
 
@@ -132,7 +133,7 @@ def test_the_viewer_renders_as_our_rasterizer(
         url = page.evaluate("camera => viewer.picture(camera)", upright_camera(view, 1))
         drawn = pixels(base64.b64decode(url.partition(",")[2]))
         options = RasterOptions(background=scene.background, antialias=antialias, near=scene.near)
-        ours = render_view(scene.gaussians, view, options).rgb
+        ours = render_view(Gaussians.sharing(scene.gaussians), view, options).rgb
         assert drawn.shape == ours.shape
         psnr = -10 * np.log10(np.mean((drawn / 255 - np.rint(ours * 255) / 255) ** 2))
         assert psnr >= 38

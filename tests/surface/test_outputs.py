@@ -14,7 +14,7 @@ from PIL import Image
 import pipeline.surface.path as path_module
 import pipeline.surface.video as video
 from pipeline.config.schema import Split, Train
-from pipeline.metrics.evaluate import choose_protocol
+from pipeline.metrics.protocol import choose_protocol
 from pipeline.splats.gaussians import Gaussians
 from pipeline.surface.depth import DepthMaps, RenderCache
 from pipeline.surface.outputs import write_rendered

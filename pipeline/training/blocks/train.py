@@ -20,7 +20,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
-from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options
 from pipeline.training.data.inputs import Inputs
@@ -134,6 +134,19 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
         seen_share=seen_share(initial.means.double().numpy(), views),
         open_layers=open_layers,
     )
+
+
+def with_far_field(
+    trained: Gaussians, scene: Gaussians, partition: Partition, number: int
+) -> Gaussians:
+    """The trained Gaussians of block ``number``, and those of the scene beyond its bounds that are
+    in the block's box, unchanged. All blocks see the far field behind their own Gaussians: none may
+    change it while others are trained."""
+    means = scene.means.numpy()
+    far = partition.box(number).contains(means) & ~partition.bounds.contains(means)
+    parts = [trained, scene.select(torch.from_numpy(np.flatnonzero(far)))]
+    degree = max(part.sh_degree for part in parts)
+    return concat([part.with_sh_degree(degree) for part in parts])
 
 
 def _overview(view: View) -> View:

@@ -1,33 +1,60 @@
-"""The union of trained blocks: each Gaussian is in exactly one."""
+"""The union of trained blocks: each Gaussian is in exactly one. Importing this module does not
+import torch."""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
-import torch
+from numpy.typing import NDArray
 
+from pipeline.io.npz import read_gaussian_arrays
 from pipeline.scene.blocks import Partition
-from pipeline.splats.gaussians import Gaussians, concat
+from pipeline.splats.arrays import Array, GaussianRows
 
 
-def far_field(scene: Gaussians, partition: Partition, number: int) -> Gaussians:
-    """The Gaussians of a scene beyond its bounds in the box of block ``number``. All blocks see
-    them behind their own: none may change them while others are trained."""
-    means = scene.means.numpy()
-    found = partition.box(number).contains(means) & ~partition.bounds.contains(means)
-    return scene.select(torch.from_numpy(np.flatnonzero(found)))
+class Union:
+    """All Gaussians of the blocks, of the highest SH degree among them.
+
+    A block comes without the Gaussians that its training left outside of its box: in the margin,
+    which other blocks train as well. Blocks are read when they are needed, one at a time
+    (``arrays.GaussianSource``).
+
+    Args:
+        files: of the blocks' Gaussians, by number.
+
+    Raises:
+        UserError: a file is missing, damaged, or not one of Gaussians.
+    """
+
+    def __init__(self, files: Sequence[Path], partition: Partition) -> None:
+        self._files = files
+        found = [_inside(file, partition, number) for number, file in enumerate(files, 1)]
+        self._rows = [rows for rows, _ in found]
+        self.sh_degree = max(degree for _, degree in found)
+
+    def __len__(self) -> int:
+        return sum(map(len, self._rows))
+
+    def chunks(self, *names: str) -> Iterator[list[Array]]:
+        """See ``arrays.GaussianSource``."""
+        for file, rows in zip(self._files, self._rows, strict=True):
+            yield from self._block(file, rows, names)
+
+    def _block(
+        self, file: Path, rows: NDArray[np.intp], names: Sequence[str]
+    ) -> Iterator[list[Array]]:
+        trained = read_gaussian_arrays(file)
+        missing = (self.sh_degree + 1) ** 2 - trained.sh.shape[1]
+        for chunk in GaussianRows(trained, rows, trained.sh_degree).chunks(*names):
+            yield [
+                np.pad(values, ((0, 0), (0, missing), (0, 0))) if name == "sh" else values
+                for name, values in zip(names, chunk, strict=True)
+            ]
 
 
-def inside(trained: Gaussians, partition: Partition, number: int) -> Gaussians:
-    """The Gaussians of block ``number`` without those that its training left outside of its box:
-    in the margin, which other blocks train as well."""
-    within = partition.box(number).contains(trained.means.numpy())
-    return trained.select(torch.from_numpy(np.flatnonzero(within)))
-
-
-def union(parts: Iterable[Gaussians]) -> Gaussians:
-    """All Gaussians, of the highest SH degree among the parts."""
-    found = list(parts)
-    degree = max(part.sh_degree for part in found)
-    return concat([part.with_sh_degree(degree) for part in found])
+def _inside(file: Path, partition: Partition, number: int) -> tuple[NDArray[np.intp], int]:
+    """The rows of a block's Gaussians inside of its box, and their SH degree."""
+    trained = read_gaussian_arrays(file)
+    return np.flatnonzero(partition.box(number).contains(trained.means)), trained.sh_degree

@@ -3,16 +3,20 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from pipeline.io.npz import write_npz
 from pipeline.render import RasterOptions, make_backend
 from pipeline.scene.blocks import Partition
+from pipeline.splats.arrays import collect
 from pipeline.splats.gaussians import concat
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.union import inside, union
+from pipeline.training.blocks.train import with_far_field
+from pipeline.training.blocks.union import Union
 from tests.training.blocks.conftest import NEAR, DividedScene, divide, moved
 from tests.training.conftest import ball
 
@@ -109,15 +113,37 @@ def test_margins_reach_beyond_inner_faces_alone(divided: DividedScene) -> None:
             assert (margin > 0) == (bound is not None)
 
 
-def test_the_union_of_regions_is_the_scene(divided: DividedScene) -> None:
+def test_the_union_of_regions_is_the_scene(divided: DividedScene, tmp_path: Path) -> None:
     """Each block is trained with its margin, and keeps its box."""
-    partition, gaussians = divided.partition, divided.gaussians
-    parts = []
+    partition, gaussians = divided.partition, divided.gaussians.with_sh_degree(1)
+    kept, files = [], []
     for number in (1, 2):
         region = partition.region(number).contains(gaussians.means.numpy())
         trained = gaussians.select(torch.from_numpy(np.flatnonzero(region)))
-        parts.append(inside(trained, partition, number))
-    joined = union(parts)
-    assert len(joined) == len(gaussians)
+        within = partition.box(number).contains(trained.means.numpy())
+        kept.append(trained.select(torch.from_numpy(within)))
+        files.append(tmp_path / f"{number}.npz")
+        # A block of a lower degree has zeros in the bands that it lacks.
+        write_npz(files[-1], trained.with_sh_degree(1 if number == 1 else 0))
+    kept[1].sh[:, 1:] = 0
+    joined = Union(files, partition)
+    assert len(joined) == len(gaussians) and joined.sh_degree == 1
     order = lambda means: means[np.lexsort(means.T)]  # noqa: E731
-    np.testing.assert_array_equal(order(joined.means.numpy()), order(gaussians.means.numpy()))
+    np.testing.assert_array_equal(order(collect(joined).means), order(gaussians.means.numpy()))
+    found, expected = collect(joined).arrays(), concat(kept).arrays()
+    for name, array in expected.items():
+        np.testing.assert_array_equal(found[name], array)
+    write_npz(tmp_path / "union.npz", joined)
+    write_npz(tmp_path / "expected.npz", concat(kept))
+    assert (tmp_path / "union.npz").read_bytes() == (tmp_path / "expected.npz").read_bytes()
+
+
+def test_the_far_field_of_a_block_stays_as_it_was(divided: DividedScene) -> None:
+    far = moved(ball(9, 3), 50.0)
+    scene, partition = concat([divided.gaussians, far]), divided.partition
+    trained = divided.gaussians.with_sh_degree(2)
+    parts = [with_far_field(trained, scene, partition, number) for number in (1, 2)]
+    assert [len(part) - len(trained) for part in parts] == [0, 9]
+    torch.testing.assert_close(parts[1].means[-9:], far.means)
+    torch.testing.assert_close(parts[1].with_sh_degree(1).sh[-9:], far.sh)
+    assert not partition.region(2).contains(far.means.numpy()).any()

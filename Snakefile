@@ -35,7 +35,7 @@ onerror:
 
 wildcard_constraints:
     scene=r"[^/]+",
-    block=r"[1-9][0-9]*",
+    job=r"[1-9][0-9]*",
 
 
 localrules:

@@ -101,9 +101,18 @@ class Job:
         return int(self.key["seed"])
 
     @property
-    def block(self) -> int:
-        """Number of the block; only for stages with a job for each."""
-        return int(self.key["block"])
+    def number(self) -> int:
+        """Number of the job, from 1; only for stages with several jobs."""
+        return int(self.key["job"])
+
+    @property
+    def of_jobs(self) -> int:
+        """Number of the stage's jobs; only for stages with several."""
+        return int(self.key["jobs"])
+
+    def cache_of(self, stage: str) -> Path:
+        """The ``shared_cache`` of another stage."""
+        return self.shared_cache.with_name(f"{stage}-cache")
 
     def section(self, model: type[S]) -> S:
         """The config section of type ``model``, with the options that the stage declares."""
@@ -144,8 +153,8 @@ class Request:
     """The arguments of a stage's command line.
 
     Attributes:
-        stage: name of the stage. That of its folder ``out`` has the number of the block besides,
-            if each block is a job.
+        stage: name of the stage. The name of its folder ``out`` ends with the number of the job if
+            the stage has several.
     """
 
     stage: str

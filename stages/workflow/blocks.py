@@ -58,7 +58,7 @@ def train(job: Job, scene: Gaussians, part: Part) -> None:
         scene,
         ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
         read_partition(job),
-        job.block,
+        job.number,
         job.section(Train),
         job.section(Experiments).train,
         part,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -21,6 +22,22 @@ def unless_posed(scan: Scan, reason: str, decisions: list[str]) -> StagePlan:
     if poses is None:
         return StagePlan(run=True, reason=reason, decisions=decisions)
     return StagePlan(run=False, reason=f"poses are given: {poses.label}")
+
+
+def if_several_jobs(
+    scan: Scan, settled: Settled, reason: str, *, scattered: bool = False
+) -> StagePlan:
+    """The plan of a stage that runs only if features and matches are computed in several jobs.
+
+    Args:
+        scattered: whether this stage is what has several jobs.
+    """
+    jobs = math.ceil(len(scan.planned) / int(settled.config.features.photos_per_job))
+    why = settled.why["features.photos_per_job"]
+    plan = unless_posed(scan, reason, [why] if scattered else [])
+    if plan.run and jobs == 1:
+        return StagePlan(run=False, reason=why)
+    return plan.model_copy(update={"jobs": jobs}) if plan.run and scattered else plan
 
 
 def if_blocks(settled: Settled, reason: str, *, scattered: bool = False) -> StagePlan:

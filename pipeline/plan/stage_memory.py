@@ -23,6 +23,9 @@ _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0
 _VIEW_MAPS = 15.0
 # MB per photograph of features and matches, and of the mapper's model, for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
+# Number of photographs whose features are in memory at a time while pairs are matched. MB per
+# photograph of the features that choose pairs, and of the list of pairs.
+_KEYPOINT_FILES, _LISTED = 200, 0.1
 # Bytes per Gaussian of rendering, and of writing all formats.
 _RENDERED, _WRITTEN = 1000.0, 2300.0
 # Bytes per pixel of a view of the measures of images.
@@ -84,12 +87,16 @@ def _features(plan: Plan, threads: int) -> float:
     return _PROGRAM + threads * (scale_space + _DECODED * _pixels(plan))
 
 
-def _per_photo(megabytes: float) -> Estimate:
-    def estimate(plan: Plan, threads: int) -> float:
-        share = plan.config.features.max_features / _FEATURES
-        return _PROGRAM + 25 + megabytes * share * _photos(plan)
+def _mapping(plan: Plan, threads: int) -> float:
+    share = plan.config.features.max_features / _FEATURES
+    return _PROGRAM + 25 + _MAPPING * share * _photos(plan)
 
-    return estimate
+
+def _matches(plan: Plan, threads: int) -> float:
+    """Keypoints and matches of a limited number of photographs are in memory at a time."""
+    share = plan.config.features.max_features / _FEATURES
+    in_memory = min(plan.photos_per_job, _KEYPOINT_FILES)
+    return _PROGRAM + 25 + _MATCHES * share * in_memory + _LISTED * _photos(plan)
 
 
 def _undistort(plan: Plan, threads: int) -> float:
@@ -132,13 +139,15 @@ def _export(plan: Plan, threads: int) -> float:
     return _TORCH + _WRITTEN * _gaussians(plan)
 
 
-_mapping = _per_photo(_MAPPING)
 _TRAINING = ("coarse", "block", "polish", "train")
 _ESTIMATES: Mapping[str, Estimate] = {
     "inspect": _inspect,
     "decode": _decode,
+    "extract": _features,
     "features": _features,
-    "matches": _per_photo(_MATCHES),
+    "pairs": _matches,
+    "match": _matches,
+    "matches": _matches,
     "sfm": _mapping,
     "refine": _mapping,
     "undistort": _undistort,

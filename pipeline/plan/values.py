@@ -110,5 +110,12 @@ class Plan(BaseModel):
     facts: SceneFacts
     folder: str = ""
 
+    @property
+    def photos_per_job(self) -> int:
+        """Number of photographs of a job of feature extraction."""
+        count = self.facts.photographs + self.facts.max_frames
+        wanted = self.config.features.photos_per_job
+        return count if wanted == "auto" else min(wanted, count)
+
     def runs(self, stage: str) -> bool:
         return self.stages[stage].run

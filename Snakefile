@@ -112,6 +112,8 @@ for spec in project.stages:
             stage=f"results/{{scene}}/{project.folder(spec)}/stage.json",
         log:
             f"results/{{scene}}/logs/{project.folder(spec)}.log",
+        group:
+            project.group(spec, workflow)
         threads: project.threads(workflow)
         resources:
             mem_mb=project.memory_mb(spec, workflow),

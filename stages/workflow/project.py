@@ -31,6 +31,7 @@ from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
     granted_cpus,
+    group_of,
     largest_node,
     wait_for_earlier_jobs,
     watch_jobs,
@@ -154,6 +155,16 @@ class SnakemakeProject:
             return wanted if node is None else min(wanted, node.cpus)
 
         return count
+
+    def group(self, spec: StageSpec, workflow: Any) -> Callable[[Any], str | None]:
+        """Group function: the group of jobs that a cluster runs as one, if there is a cluster."""
+
+        def name(wildcards: Any) -> str | None:
+            if not (workflow.remote_exec or workflow.non_local_exec):
+                return None
+            return group_of(spec.name, self._plan(wildcards.scene))
+
+        return name
 
     def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int, int], int]:
         """Resources function: memory in MB that the stage may use, and what a cluster's job needs

@@ -260,7 +260,7 @@ def resolve_pairs(
     count = len(photos)
 
     def descriptors() -> list[np.ndarray]:
-        keep = choose.RETRIEVAL_DESCRIPTORS
+        keep = choose.descriptors_per_photo(count)
         files = [keypoint_file(features, photo.name) for photo in photos]
         return [Keypoints.read(file).descriptors[:keep].copy() for file in files]
 

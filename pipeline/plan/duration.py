@@ -50,7 +50,7 @@ def _extract(plan: Plan) -> float:
 
 
 def _features(plan: Plan) -> float:
-    return _extract(plan) if _is_one_job(plan) else _gather(plan)
+    return _extract(plan) if plan.is_one_job else _gather(plan)
 
 
 def _match(plan: Plan) -> float:
@@ -62,12 +62,7 @@ def _match(plan: Plan) -> float:
 
 
 def _matches(plan: Plan) -> float:
-    return _match(plan) if _is_one_job(plan) else _gather(plan)
-
-
-def _is_one_job(plan: Plan) -> bool:
-    """Whether features and matches are computed in one job each."""
-    return plan.photos_per_job == _photos(plan)
+    return _match(plan) if plan.is_one_job else _gather(plan)
 
 
 def _gather(plan: Plan) -> float:

@@ -23,9 +23,9 @@ _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0
 _VIEW_MAPS = 15.0
 # MB per photograph of features and matches, and of the mapper's model, for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
-# Number of photographs whose features are in memory at a time while pairs are matched. MB per
-# photograph of the features that choose pairs, and of the list of pairs.
-_KEYPOINT_FILES, _LISTED = 200, 0.1
+# Number of photographs whose features are in memory at a time while pairs are matched; MB per
+# photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
+_KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
 # Bytes per Gaussian of rendering, and of writing all formats.
 _RENDERED, _WRITTEN = 1000.0, 2300.0
 # Bytes per pixel of a view of the measures of images.
@@ -92,11 +92,27 @@ def _mapping(plan: Plan, threads: int) -> float:
     return _PROGRAM + 25 + _MAPPING * share * _photos(plan)
 
 
+def _gathered_features(plan: Plan, threads: int) -> float:
+    return _features(plan, threads) if plan.is_one_job else _PROGRAM + 10
+
+
+def _pairs(plan: Plan, threads: int) -> float:
+    return _gathered_matches(plan) + _COMPARED
+
+
 def _matches(plan: Plan, threads: int) -> float:
+    return _match(plan, threads) if plan.is_one_job else _gathered_matches(plan)
+
+
+def _gathered_matches(plan: Plan) -> float:
+    return _PROGRAM + 25 + _LISTED * _photos(plan)
+
+
+def _match(plan: Plan, threads: int) -> float:
     """Keypoints and matches of a limited number of photographs are in memory at a time."""
     share = plan.config.features.max_features / _FEATURES
     in_memory = min(plan.photos_per_job, _KEYPOINT_FILES)
-    return _PROGRAM + 25 + _MATCHES * share * in_memory + _LISTED * _photos(plan)
+    return _gathered_matches(plan) + _MATCHES * share * in_memory
 
 
 def _undistort(plan: Plan, threads: int) -> float:
@@ -144,9 +160,9 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "inspect": _inspect,
     "decode": _decode,
     "extract": _features,
-    "features": _features,
-    "pairs": _matches,
-    "match": _matches,
+    "features": _gathered_features,
+    "pairs": _pairs,
+    "match": _match,
     "matches": _matches,
     "sfm": _mapping,
     "refine": _mapping,

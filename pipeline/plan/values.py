@@ -117,5 +117,10 @@ class Plan(BaseModel):
         wanted = self.config.features.photos_per_job
         return count if wanted == "auto" else min(wanted, count)
 
+    @property
+    def is_one_job(self) -> bool:
+        """Whether features and matches are computed in one job each."""
+        return self.photos_per_job == self.facts.photographs + self.facts.max_frames
+
     def runs(self, stage: str) -> bool:
         return self.stages[stage].run

@@ -28,7 +28,7 @@ RETRIEVAL_MIN_SCORE = 4
 # Number of photographs compared with one at a time: 300 x 300 distances each, 20 MB in all.
 RETRIEVAL_BATCH = 64
 # Number of scored pairs in memory, 24 bytes each, before all but the strongest are left out.
-MAX_SCORED_PAIRS = 1_000_000
+MAX_SCORED_PAIRS = 300_000
 DESCRIPTOR_SIZE = 128
 # Larger than the squared distance of any two descriptors (2 * 512^2), exact in float32.
 FAR = 2.0**22

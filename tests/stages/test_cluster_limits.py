@@ -158,6 +158,10 @@ def test_time_limits_grow_with_the_scene_and_the_steps(tmp_path):
     for stage in STAGES:
         assert duration.minutes(stage, many) >= duration.minutes(stage, few) >= 10
     assert duration.seconds("matches", many) > duration.seconds("matches", few)
+    divided = Config.model_validate({"features": {"photos_per_job": 10}})
+    chunks = make_plan(scan(tmp_path / "many", "many", divided, cache=None), divided, STAGES)
+    for stage, whole in (("extract", "features"), ("match", "matches")):
+        assert duration.seconds(stage, chunks) < duration.seconds(whole, many) / 2
     longer = Config.model_validate({"train": {"budget_minutes": 600}})
     plan = make_plan(scan(tmp_path / "few", "few", longer, cache=None), longer, STAGES)
     assert duration.minutes("train", plan) >= 4 * 600

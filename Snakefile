@@ -35,7 +35,7 @@ onerror:
 
 wildcard_constraints:
     scene=r"[^/]+",
-    block=r"[1-9][0-9]*",
+    job=r"[1-9][0-9]*",
 
 
 localrules:
@@ -112,6 +112,8 @@ for spec in project.stages:
             stage=f"results/{{scene}}/{project.folder(spec)}/stage.json",
         log:
             f"results/{{scene}}/logs/{project.folder(spec)}.log",
+        group:
+            project.group(spec, workflow)
         threads: project.threads(workflow)
         resources:
             mem_mb=project.memory_mb(spec, workflow),

@@ -344,6 +344,20 @@ MUTANTS: dict[str, Mutant] = {
         "adjusted poses in a world turned from the given one",
         ("tests/sfm/test_refine.py",),
     ),
+    "other_pairs": Mutant(
+        "pipeline/sfm/matching.py",
+        "(part / CHUNK_FILE, chunk(pairs, number, len(parts)))",
+        "(part / CHUNK_FILE, chunk(pairs[::-1], number, len(parts)))",
+        "matches of several jobs taken for those of other pairs",
+        ("tests/sfm/test_chunks.py",),
+    ),
+    "weak_pairs": Mutant(
+        "pipeline/sfm/pairs.py",
+        "-scored[:, 0])",
+        "scored[:, 0])",
+        "the least similar photographs are matched",
+        ("tests/sfm/test_pairs.py",),
+    ),
     "judge": Mutant(
         "pipeline/sfm/judge.py",
         "e.parallax < MIN_PARALLAX[level],",

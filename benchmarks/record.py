@@ -21,7 +21,10 @@ from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import EXIT_USER_ERROR
 
 # Stages that find the poses and make the training images.
-POSES = ("decode", "features", "matches", "sfm", "refine", "undistort")
+POSES = (
+    *("decode", "extract", "features", "pairs", "match", "matches", "sfm"),
+    *("refine", "undistort"),
+)
 PROTOCOL = ("num_views", "resolution", "split", "background", "exposure", "masks", "poses")
 # Of the same machine and build, wherever the run was.
 SAME = ("commit", "processor", "cores", "memory_mb", "instruction_set", "compiler", "threads")

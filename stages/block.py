@@ -17,7 +17,7 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return if_blocks(settled, "each block among coarse surroundings", per_block=True)
+    return if_blocks(settled, "each block among coarse surroundings", scattered=True)
 
 
 def work(job: Job) -> None:
@@ -36,5 +36,5 @@ SPEC = StageSpec(
     options=blocks.OPTIONS,
     packages=("torch", "numpy", "opencv-contrib-python-headless"),
     seeded=True,
-    per_block=True,
+    scattered=True,
 )

@@ -1,4 +1,5 @@
-"""SIFT keypoints and descriptors. Output: one ``.npz`` per photograph."""
+"""SIFT keypoints and descriptors of all photographs, extracted here or by the jobs of ``extract``.
+Output: one ``.npz`` per photograph."""
 
 from __future__ import annotations
 
@@ -26,18 +27,19 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.sfm.features import extract_features
+    from pipeline.runtime.counters import read_counters
+    from pipeline.sfm.features import extract_features, gather_features
 
-    report = extract_features(
-        inputs.read_manifest(job, "photos"),
-        job.section(Features),
-        job.out,
-        cache=job.shared_cache,
-        threads=job.threads,
-    )
+    manifest, config = inputs.read_manifest(job, "photos"), job.section(Features)
+    cache = job.shared_cache
+    if folders := inputs.of_jobs(job, "extract"):
+        parts = {folder: read_counters(folder, FeaturesCounters) for folder in folders}
+        report = gather_features(manifest, config, parts, job.out, cache=cache)
+    else:
+        report = extract_features(manifest, config, job.out, cache=cache, threads=job.threads)
+        # Not a counter: it depends on earlier runs.
+        job.timings["num_cached"] = report.num_cached
     job.record(report.counters, report.decisions, report.warnings)
-    # Not a counter: it depends on earlier runs.
-    job.timings["num_cached"] = report.num_cached
 
 
 SPEC = StageSpec(
@@ -45,7 +47,8 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=FeaturesCounters,
-    inputs={"photos": inputs.PHOTOS},
+    inputs={"photos": inputs.PHOTOS, "extract": ("extract",)},
+    optional=("extract",),
     options=("features",),
     packages=("opencv-contrib-python-headless", "pycolmap"),
 )

@@ -1,4 +1,5 @@
-"""Match and verify pairs of photographs. Output: ``database.db`` (COLMAP's)."""
+"""Matches and two-view geometries of all pairs of photographs, computed here or by the jobs of
+``match``. Outputs: ``database.db`` (COLMAP's) and ``keypoint_colors.npz``."""
 
 from __future__ import annotations
 
@@ -23,7 +24,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.sfm.matching import match_features
+    from pipeline.sfm.pair_list import PairList
 
+    parts = inputs.of_jobs(job, "match")
     report = match_features(
         inputs.read_manifest(job, "photos"),
         job.inputs["features"],
@@ -34,10 +37,13 @@ def work(job: Job) -> None:
         threads=job.threads,
         seed=job.seed,
         experiments=job.section(Experiments).matches,
+        chosen=PairList.read(job.inputs["pairs"]) if parts else None,
+        parts=parts,
     )
     job.record(report.counters, report.decisions, report.warnings)
-    # Not a counter: it depends on earlier runs.
-    job.timings["num_cached"] = report.num_cached
+    if not parts:
+        # Not a counter: it depends on earlier runs.
+        job.timings["num_cached"] = report.num_cached
 
 
 SPEC = StageSpec(
@@ -45,7 +51,13 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=MatchesCounters,
-    inputs={"photos": inputs.PHOTOS, "features": ("features",)},
+    inputs={
+        "photos": inputs.PHOTOS,
+        "features": ("features",),
+        "pairs": ("pairs",),
+        "match": ("match",),
+    },
+    optional=("pairs", "match"),
     options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
     packages=("pycolmap",),
     seeded=True,

@@ -35,11 +35,13 @@ FACTS = SceneFacts(
 
 
 BLOCK_STAGES = ("coarse", "partition", "block", "polish")
+CHUNK_STAGES = ("extract", "pairs", "match")
 
 
 def skipped(plan: Plan) -> list[str]:
-    """The stages that the plan leaves out, but for those of scenes in blocks."""
-    return [n for n, stage in plan.stages.items() if not stage.run and n not in BLOCK_STAGES]
+    """The stages that the plan leaves out, but for those of large scenes."""
+    of_large = (*BLOCK_STAGES, *CHUNK_STAGES)
+    return [n for n, stage in plan.stages.items() if not stage.run and n not in of_large]
 
 
 def make_plan(scan: Scan, config: Config, folder: str = "") -> Plan:

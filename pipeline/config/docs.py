@@ -50,7 +50,10 @@ _RECORDS = {
 COUNTERS = {
     "inspect": "pipeline.photos.counters:InspectCounters",
     "decode": "pipeline.photos.counters:DecodeCounters",
+    "extract": "pipeline.sfm.counters:FeaturesCounters",
     "features": "pipeline.sfm.counters:FeaturesCounters",
+    "pairs": "pipeline.sfm.counters:PairsCounters",
+    "match": "pipeline.sfm.counters:MatchCounters",
     "matches": "pipeline.sfm.counters:MatchesCounters",
     "refine": "pipeline.sfm.counters:RefineCounters",
     "sfm": "pipeline.sfm.counters:SfmCounters",

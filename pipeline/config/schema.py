@@ -118,6 +118,13 @@ class Features(Section):
     max_long_side_px: Pixels = Field(
         1600, description="Larger photographs are reduced to this length before extraction."
     )
+    photos_per_job: Literal["auto"] | Annotated[int, Field(gt=0), Unit("photographs")] = Field(
+        "auto",
+        description="Maximum number of photographs of a job of feature extraction; pairs are "
+        "matched in as many jobs. auto: one job for up to 500 photographs, else one for every 250. "
+        "Changes no result.",
+        json_schema_extra={"decides_result": False},
+    )
 
 
 class Matches(Section):

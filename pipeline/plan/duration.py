@@ -45,12 +45,28 @@ def _decode(plan: Plan) -> float:
     return _PROGRAM + 4 * plan.facts.linear + 0.1 * plan.facts.video_frames + _photos(plan)
 
 
-def _matches(plan: Plan) -> float:
+def _extract(plan: Plan) -> float:
+    return _PROGRAM + 1.5 * plan.photos_per_job
+
+
+def _features(plan: Plan) -> float:
+    return _extract(plan) if plan.is_one_job else _gather(plan)
+
+
+def _match(plan: Plan) -> float:
     count = _photos(plan)
     pairs = count * (count - 1) // 2
     if plan.config.matches.pairs != "exhaustive":
         pairs = min(pairs, NEIGHBOURS * count)
-    return _PROGRAM + 0.05 * pairs
+    return _PROGRAM + 0.05 * pairs * plan.photos_per_job / max(count, 1)
+
+
+def _matches(plan: Plan) -> float:
+    return _match(plan) if plan.is_one_job else _gather(plan)
+
+
+def _gather(plan: Plan) -> float:
+    return _PROGRAM + 0.1 * _photos(plan)
 
 
 def _train(plan: Plan) -> float:
@@ -79,7 +95,10 @@ def _block(plan: Plan) -> float:
 _ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
     "inspect": _per_photo(0.2),
     "decode": _decode,
-    "features": _per_photo(1.5),
+    "extract": _extract,
+    "features": _features,
+    "pairs": _per_photo(0.2),
+    "match": _match,
     "matches": _matches,
     "sfm": _per_photo(3.0),
     "refine": _per_photo(2.0),

@@ -18,7 +18,7 @@ _version = cache(version)
 _source_hash = cache(stage_source_hash)
 
 
-def stage_key(spec: StageSpec, plan: Plan, block: int | None = None) -> str:
+def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
     """The stage's key as a canonical JSON string.
 
     The key consists of the declared options as settled by the plan, a hash of the code that the
@@ -27,7 +27,7 @@ def stage_key(spec: StageSpec, plan: Plan, block: int | None = None) -> str:
     because Snakemake compares parameters as a set of ``repr(value)``, which would miss changes.
 
     Args:
-        block: number of the block, of a stage with a job for each.
+        job: number of the job, from 1. Only of stages with several jobs it is part of the key.
     """
     key: dict[str, Any] = {
         "stage": spec.name,
@@ -36,8 +36,8 @@ def stage_key(spec: StageSpec, plan: Plan, block: int | None = None) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
-    if block is not None:
-        key["block"] = block
+    if spec.scattered:
+        key |= {"job": job, "jobs": plan.stages[spec.name].jobs}
     if spec.shows_plan:
         key["plan"] = plan_record(plan).model_dump(mode="json")
     return canonical(key | spec.facts(plan))

@@ -65,15 +65,15 @@ def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
 
 
 def input_folders(spec: StageSpec, plan: Plan) -> dict[str, str]:
-    """Role of the stage's input -> folder in ``results/<scene>/``. An input with a folder for each
-    block has a role for each: with the number of the block."""
+    """Role of the stage's input -> folder in ``results/<scene>/``. A stage with several jobs
+    has a role for each: with the number of the job."""
     found = {}
     for role, stage in upstream(spec, plan).items():
         folders = plan.stages[stage].folders(stage)
         if len(folders) == 1:
             found[role] = folders[0]
         else:
-            found |= {f"{role}_{block}": name for block, name in enumerate(folders, 1)}
+            found |= {f"{role}_{job}": name for job, name in enumerate(folders, 1)}
     return found
 
 

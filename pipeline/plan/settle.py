@@ -35,6 +35,9 @@ FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
 # Scenes of more photographs are trained in blocks, one for so many.
 MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
+# Features and matches of more photographs are computed in several jobs, one for so many. A job of
+# 250 photographs takes minutes on two cores; to start one takes seconds.
+MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
@@ -69,11 +72,13 @@ def settle(scan: Scan, config: Config) -> Settled:
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
     blocks, blocks_reason = _blocks(scan, config)
+    photos_per_job, jobs_reason = _photos_per_job(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
     settled = _updated(
         config,
         {
             "inspect": {"image_folder": scan.image_folder},
+            "features": {"photos_per_job": photos_per_job},
             "matches": {"pairs": value["matches.pairs"]},
             "sfm": {
                 name: value[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")
@@ -94,6 +99,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     why = {path: reason for path, (_, reason) in chosen.items()}
     why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
     why["partition.blocks"] = blocks_reason
+    why["features.photos_per_job"] = jobs_reason
     return Settled(settled, why)
 
 
@@ -213,6 +219,18 @@ def _blocks(scan: Scan, config: Config) -> tuple[int, str]:
         return 1, ""
     blocks = math.ceil(count / PHOTOS_PER_BLOCK)
     return blocks, f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
+
+
+def _photos_per_job(scan: Scan, config: Config) -> tuple[int, str]:
+    """The maximum number of photographs of a job of extraction, which decides their number."""
+    wanted, count = config.features.photos_per_job, len(scan.planned)
+    size = PHOTOS_PER_JOB if count > MAX_PHOTOS_OF_ONE_JOB else max(count, 1)
+    if wanted != "auto":
+        size = wanted
+    jobs = math.ceil(count / size)
+    if jobs > 1:
+        return size, f"{jobs} jobs: one for every {size} of {count} photographs"
+    return size, "features and matches are one job each"
 
 
 def _masks(scan: Scan, config: Config) -> str:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Any
@@ -23,12 +24,32 @@ def unless_posed(scan: Scan, reason: str, decisions: list[str]) -> StagePlan:
     return StagePlan(run=False, reason=f"poses are given: {poses.label}")
 
 
-def if_blocks(settled: Settled, reason: str, *, per_block: bool = False) -> StagePlan:
-    """The plan of a stage that runs only if the scene is trained in blocks."""
+def if_several_jobs(
+    scan: Scan, settled: Settled, reason: str, *, scattered: bool = False
+) -> StagePlan:
+    """The plan of a stage that runs only if features and matches are computed in several jobs.
+
+    Args:
+        scattered: whether this stage is what has several jobs.
+    """
+    jobs = math.ceil(len(scan.planned) / int(settled.config.features.photos_per_job))
+    why = settled.why["features.photos_per_job"]
+    plan = unless_posed(scan, reason, [why] if scattered else [])
+    if plan.run and jobs == 1:
+        return StagePlan(run=False, reason=why)
+    return plan.model_copy(update={"jobs": jobs}) if plan.run and scattered else plan
+
+
+def if_blocks(settled: Settled, reason: str, *, scattered: bool = False) -> StagePlan:
+    """The plan of a stage that runs only if the scene is trained in blocks.
+
+    Args:
+        scattered: whether each block is a job.
+    """
     blocks = int(settled.config.partition.blocks)
     if blocks == 1:
         return StagePlan(run=False, reason="the scene is trained as one block")
-    return StagePlan(run=True, reason=reason, jobs=blocks if per_block else 1)
+    return StagePlan(run=True, reason=reason, jobs=blocks if scattered else 1)
 
 
 def _none(plan: Plan) -> dict[str, Any]:
@@ -56,7 +77,8 @@ class StageSpec:
             report.
         shows_plan: whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
         facts: facts that affect the result besides code, options, packages, seed and inputs.
-        per_block: whether each block of the scene is a job; its number is in ``Job.key["block"]``.
+        scattered: whether the stage has several jobs, as many as the plan says, each with a folder
+            and a log of its own. The key contains the number of the job and of all jobs.
         optional: roles that have no input if the plan runs none of their stages.
     """
 
@@ -71,7 +93,7 @@ class StageSpec:
     publishes: Mapping[str, str] = field(default_factory=dict)
     shows_plan: bool = False
     facts: Callable[[Plan], dict[str, Any]] = _none
-    per_block: bool = False
+    scattered: bool = False
     optional: tuple[str, ...] = ()
 
     @property

@@ -33,6 +33,9 @@ _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
+# Number of photographs whose features are in memory at a time while pairs are matched; MB per
+# photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
+_KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
 
 Estimate = Callable[[Plan, int], float]
 
@@ -98,12 +101,32 @@ def _features(plan: Plan, threads: int) -> float:
     return _PROGRAM + threads * (scale_space + _DECODED * _pixels(plan))
 
 
-def _per_photo(megabytes: float) -> Estimate:
-    def estimate(plan: Plan, threads: int) -> float:
-        share = plan.config.features.max_features / _FEATURES
-        return _PROGRAM + 25 + megabytes * share * _photos(plan)
+def _mapping(plan: Plan, threads: int) -> float:
+    share = plan.config.features.max_features / _FEATURES
+    return _PROGRAM + 25 + _MAPPING * share * _photos(plan)
 
-    return estimate
+
+def _gathered_features(plan: Plan, threads: int) -> float:
+    return _features(plan, threads) if plan.is_one_job else _PROGRAM + 10
+
+
+def _pairs(plan: Plan, threads: int) -> float:
+    return _gathered_matches(plan) + _COMPARED
+
+
+def _matches(plan: Plan, threads: int) -> float:
+    return _match(plan, threads) if plan.is_one_job else _gathered_matches(plan)
+
+
+def _gathered_matches(plan: Plan) -> float:
+    return _PROGRAM + 25 + _LISTED * _photos(plan)
+
+
+def _match(plan: Plan, threads: int) -> float:
+    """Keypoints and matches of a limited number of photographs are in memory at a time."""
+    share = plan.config.features.max_features / _FEATURES
+    in_memory = min(plan.photos_per_job, _KEYPOINT_FILES)
+    return _gathered_matches(plan) + _MATCHES * share * in_memory
 
 
 def _undistort(plan: Plan, threads: int) -> float:
@@ -158,13 +181,15 @@ def _report(plan: Plan, threads: int) -> float:
     return _NUMPY + _PAGE + _MODEL_READ * _photos(plan) + _HELD * _gaussians(plan)
 
 
-_mapping = _per_photo(_MAPPING)
 _TRAINING = ("coarse", "block", "polish", "train")
 _ESTIMATES: Mapping[str, Estimate] = {
     "inspect": _inspect,
     "decode": _decode,
-    "features": _features,
-    "matches": _per_photo(_MATCHES),
+    "extract": _features,
+    "features": _gathered_features,
+    "pairs": _pairs,
+    "match": _match,
+    "matches": _matches,
     "sfm": _mapping,
     "refine": _mapping,
     "undistort": _undistort,

@@ -18,17 +18,17 @@ class StagePlan(BaseModel):
     reason: str = Field(description="Why it runs, or why not.")
     decisions: list[str] = Field([], description="Values of its options, with the reasons.")
     inputs: list[str] = Field([], description="The stages whose output it reads.")
-    jobs: int = Field(1, description="Number of its jobs: one for each block of a scene in blocks.")
+    jobs: int = Field(1, description="Number of its jobs, which share its work.")
 
     def folders(self, stage: str) -> list[str]:
-        """Names of its folders in ``results/<scene>/``: the stage's, with the number of the block
-        if it has several jobs."""
+        """Names of its folders in ``results/<scene>/``: the stage's, with the number of the job if
+        it has several."""
         return job_folders(stage, self.jobs)
 
 
 def job_folders(stage: str, jobs: int) -> list[str]:
     """See ``StagePlan.folders``."""
-    return [stage] if jobs == 1 else [f"{stage}_{block}" for block in range(1, jobs + 1)]
+    return [stage] if jobs == 1 else [f"{stage}_{job}" for job in range(1, jobs + 1)]
 
 
 class SceneFacts(BaseModel):
@@ -109,6 +109,18 @@ class Plan(BaseModel):
     config: Config
     facts: SceneFacts
     folder: str = ""
+
+    @property
+    def photos_per_job(self) -> int:
+        """Number of photographs of a job of feature extraction."""
+        count = self.facts.photographs + self.facts.max_frames
+        wanted = self.config.features.photos_per_job
+        return count if wanted == "auto" else min(wanted, count)
+
+    @property
+    def is_one_job(self) -> bool:
+        """Whether features and matches are computed in one job each."""
+        return self.photos_per_job == self.facts.photographs + self.facts.max_frames
 
     def runs(self, stage: str) -> bool:
         return self.stages[stage].run

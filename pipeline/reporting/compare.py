@@ -32,7 +32,10 @@ QUALITY = (
     "centre_error_share",
 )
 # Stages whose times are compared.
-POSES = ("decode", "features", "matches", "sfm", "refine", "undistort")
+POSES = (
+    *("decode", "extract", "features", "pairs", "match", "matches", "sfm"),
+    *("refine", "undistort"),
+)
 WORK = (*POSES, "train")
 
 Row = dict[str, Any]
@@ -168,11 +171,11 @@ def repeated(first: Sequence[Row], second: Sequence[Row]) -> list[str]:
 
 
 def _wall(row: Row, stages: Sequence[str]) -> float:
-    return sum(row[f"{stage}_wall_s"] or 0.0 for stage in stages)
+    return sum(row.get(f"{stage}_wall_s") or 0.0 for stage in stages)
 
 
 def _cpu(row: Row, stages: Sequence[str]) -> float:
-    return sum(row[f"{stage}_cpu_s"] or 0.0 for stage in stages)
+    return sum(row.get(f"{stage}_cpu_s") or 0.0 for stage in stages)
 
 
 def _short(value: float, sign: str = "") -> str:

@@ -23,7 +23,7 @@ class StageStatus(JsonObject):
 
     skipped: bool = Field(description="Whether the plan leaves it out.")
     reason: str = Field(description="Why it is needed, or is not.")
-    jobs: int = Field(1, ge=1, description="Number of its jobs: one for each block of the scene.")
+    jobs: int = Field(1, ge=1, description="Number of its jobs, which share its work.")
 
 
 class Metrics(JsonFile, SceneQuality):

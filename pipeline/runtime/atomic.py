@@ -47,6 +47,15 @@ def write_json(path: Path, value: Any) -> None:
     write_text(path, json.dumps(value, indent=2, sort_keys=True, allow_nan=False) + "\n")
 
 
+def link_or_copy(source: str | Path, target: str | Path) -> None:
+    """Link a finished file of a stage to another place, or copy it where the file system has no
+    hard links. Safe because stages replace files instead of writing into them."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
 def replace_folder(source: Path, target: Path) -> None:
     """Rename folder ``source`` to ``target``, whose former content is removed."""
     old = target.with_name(f".{target.name}.old")

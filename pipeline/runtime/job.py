@@ -28,7 +28,7 @@ from typing import Any, TypeVar
 from pydantic import BaseModel, ValidationError
 
 from pipeline.runtime import targets
-from pipeline.runtime.atomic import replace_folder, write_bytes, write_json
+from pipeline.runtime.atomic import link_or_copy, replace_folder, write_bytes, write_json
 from pipeline.runtime.counters import NoCounters, StageCounters
 from pipeline.runtime.errors import (
     EXIT_INTERRUPTED,
@@ -101,9 +101,18 @@ class Job:
         return int(self.key["seed"])
 
     @property
-    def block(self) -> int:
-        """Number of the block; only for stages with a job for each."""
-        return int(self.key["block"])
+    def number(self) -> int:
+        """Number of the job, from 1; only for stages with several jobs."""
+        return int(self.key["job"])
+
+    @property
+    def of_jobs(self) -> int:
+        """Number of the stage's jobs; only for stages with several."""
+        return int(self.key["jobs"])
+
+    def cache_of(self, stage: str) -> Path:
+        """The ``shared_cache`` of another stage."""
+        return self.shared_cache.with_name(f"{stage}-cache")
 
     def section(self, model: type[S]) -> S:
         """The config section of type ``model``, with the options that the stage declares."""
@@ -144,8 +153,8 @@ class Request:
     """The arguments of a stage's command line.
 
     Attributes:
-        stage: name of the stage. That of its folder ``out`` has the number of the block besides,
-            if each block is a job.
+        stage: name of the stage. The name of its folder ``out`` ends with the number of the job if
+            the stage has several.
     """
 
     stage: str
@@ -303,11 +312,7 @@ def _finished(folder: Path, counters: type[StageCounters]) -> StageRecord | None
 def _reuse_other_run(
     request: Request, inputs: dict[str, str], counters: type[StageCounters], out: Path
 ) -> bool:
-    """Link the results of another run with the same key and inputs, if there is one.
-
-    Files are hard links if the file system supports them. This is safe, because stages replace
-    files instead of writing into them.
-    """
+    """Link the results of another run with the same key and inputs, if there is one."""
     required = identity(request.key, inputs)
     for hidden in sorted(request.out.parents[1].glob(f"*/{request.name}/{HIDDEN_STAGE}")):
         source = hidden.parent
@@ -319,7 +324,7 @@ def _reuse_other_run(
         except (UserError, OSError):
             continue
         with contextlib.suppress(OSError):  # The folder may just be replaced.
-            shutil.copytree(source, out, copy_function=_link, dirs_exist_ok=True)
+            shutil.copytree(source, out, copy_function=link_or_copy, dirs_exist_ok=True)
         if output_digests(out, request.threads) == record.outputs:
             reused = run.model_copy(update={"taken_from": source.parent.name})
             _write(out, record.model_copy(update={"scene": request.out.parent.name}), reused)
@@ -330,13 +335,6 @@ def _reuse_other_run(
         shutil.rmtree(out)
         out.mkdir()
     return False
-
-
-def _link(source: str, target: str) -> None:
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 def _recover(out: Path) -> None:

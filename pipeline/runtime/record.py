@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import re
 import shlex
 from collections.abc import Iterable, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -247,9 +248,10 @@ def changed(folder: Path) -> str:
 
 
 def rerun(folder: Path) -> str:
-    """The advice to rerun the stage with this folder."""
+    """The advice to rerun the stage with this folder, which may be that of one of its jobs."""
     target = shlex.quote(str(folder.parent / "metrics.json"))
+    stage = re.sub(r"_[0-9]+$", "", folder.name)
     return (
-        f"add --forcerun {folder.name} to the end of the snakemake command that you use, as in: "
-        f"snakemake --cores all {target} --forcerun {folder.name}"
+        f"add --forcerun {stage} to the end of the snakemake command that you use, as in: "
+        f"snakemake --cores all {target} --forcerun {stage}"
     )

@@ -19,6 +19,19 @@ class FeaturesCounters(StageCounters):
     counts: dict[str, int] = Field(description="Photograph's name to its number of keypoints.")
 
 
+class PairsCounters(StageCounters):
+    """Counters of the pairs stage."""
+
+    num_pairs: int = Field(ge=0, description="Number of pairs of photographs to match.")
+
+
+class MatchCounters(StageCounters):
+    """Counters of a job of the match stage."""
+
+    num_pairs: int = Field(ge=0, description="Number of pairs that the job matched.")
+    num_verified: int = Field(ge=0, description="Number of these with a two-view geometry.")
+
+
 class MatchesCounters(StageCounters):
     """Counters of the matches stage."""
 

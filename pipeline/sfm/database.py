@@ -11,7 +11,7 @@ import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
 from dataclasses import asdict, dataclass
@@ -29,6 +29,7 @@ from pipeline.scene.manifest import Manifest, Photo
 from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from pipeline.sfm.nearest import match_descriptors
+from pipeline.sfm.pair_cache import PairCache
 from pipeline.sfm.pairs import Pair
 
 # COLMAP's default focal length over the longer side without a prior (about 45 degrees).
@@ -45,7 +46,6 @@ MAX_TRIALS = 2000
 CACHED_KEYPOINT_FILES = 200
 # Number of pairs written to the cache at a time; an interrupted run loses at most these.
 BATCH_PAIRS = 256
-_PAIR_TABLES = ("matches", "two_view_geometries")
 
 
 @dataclass(frozen=True)
@@ -119,18 +119,20 @@ def build_database(
     settings: MatchingSettings,
     *,
     cache: Path | None = None,
+    matched: Iterable[tuple[Path, Sequence[Pair]]] = (),
     threads: int = 1,
 ) -> int:
     """Match and verify pairs and write the database to ``path``.
 
-    The file depends neither on ``threads`` nor on the content of the cache: pairs are computed
-    independently and written in order.
+    The file depends neither on ``threads`` nor on the content of the cache nor on what is already
+    ``matched``: pairs are computed independently and written in order.
 
     Args:
         images: (image id, name, camera id), sorted by id.
         features: folder of keypoint files.
         pairs: indices into ``images``, the smaller one first.
         cache: folder for results of pairs that outlives the call; None for a temporary one.
+        matched: files of ``match_pairs`` with their pairs, which are added to the cache.
 
     Returns:
         The number of pairs found in the cache.
@@ -140,16 +142,54 @@ def build_database(
         store = Path(folder) if cache is None else cache
         store.mkdir(parents=True, exist_ok=True)
         inputs = _MatchingInputs(cameras, images, features)
-        id_pairs = [(images[i][0], images[j][0]) for i, j in pairs]
-        keys = {pair: inputs.key(pair, settings) for pair in id_pairs}
-        with closing(_PairCache(store)) as results:
-            missing = [pair for pair in id_pairs if not results.has(keys[pair])]
-            _match_missing(inputs, missing, keys, settings, results, Path(folder), threads)
+        keys = inputs.keys(pairs, settings)
+        with closing(PairCache(store)) as results:
+            for file, part in matched:
+                results.add(file, inputs.keys(part, settings))
+            num_cached = _match_missing(inputs, keys, settings, results, Path(folder), threads)
             path.unlink(missing_ok=True)
             inputs.write(path)
             results.copy_to(path, keys)
             results.prune(set(keys.values()))
-    return len(id_pairs) - len(missing)
+    return num_cached
+
+
+def match_pairs(
+    path: Path,
+    cameras: Sequence[pycolmap.Camera],
+    images: Sequence[tuple[int, str, int]],
+    features: Path,
+    pairs: Sequence[Pair],
+    settings: MatchingSettings,
+    *,
+    cache: Path,
+    scratch: Path,
+    threads: int = 1,
+) -> tuple[int, int]:
+    """Match and verify some of a scene's pairs and write them to ``path``, a COLMAP database
+    without images. ``build_database`` adds them to the scene's database.
+
+    Args:
+        cache: as of ``build_database``; it is only read.
+        scratch: folder of the results until they are complete. A call that is repeated finds those
+            of a process that was killed.
+
+    Returns:
+        The numbers of pairs that were found in the cache, and of verified pairs.
+    """
+    for folder in (path.parent, scratch):
+        folder.mkdir(parents=True, exist_ok=True)
+    inputs = _MatchingInputs(cameras, images, features)
+    keys = inputs.keys(pairs, settings)
+    with closing(PairCache(scratch)) as results:
+        results.add_known(cache, keys.values())
+        num_cached = _match_missing(inputs, keys, settings, results, scratch, threads)
+        path.unlink(missing_ok=True)
+        pycolmap.Database.open(path).close()
+        results.copy_to(path, keys)
+    with pycolmap.Database.open(path) as database:
+        _, inliers = database.read_two_view_geometry_num_inliers()
+    return num_cached, sum(count > 0 for count in inliers)
 
 
 def verified_inliers(path: Path) -> dict[tuple[str, str], int]:
@@ -230,7 +270,7 @@ class _MatchingInputs:
         }
         self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
         self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
-        self._digest = {image_id: file_digest(file) for image_id, file in self._file.items()}
+        self._digest: dict[int, str] = {}
         self.keypoints = lru_cache(maxsize=CACHED_KEYPOINT_FILES)(self._read)
 
     def camera(self, image_id: int) -> pycolmap.Camera:
@@ -242,12 +282,19 @@ class _MatchingInputs:
         found = Keypoints.read(self._file[image_id])
         return found.xy.astype(np.float64), found.descriptors
 
-    def key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
+    def keys(self, pairs: Sequence[Pair], settings: MatchingSettings) -> dict[tuple[int, int], int]:
+        """Image ids of each pair, given by the indices of its images -> its cache key."""
+        ids = [(self._images[i][0], self._images[j][0]) for i, j in pairs]
+        return {pair: self._key(pair, settings) for pair in ids}
+
+    def _key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
         """Cache key of a pair: a hash of everything the result depends on, 63 bits (a positive
         SQLite integer)."""
         facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, asdict(settings)]
         for image_id in pair:
             c = self.camera(image_id)
+            if image_id not in self._digest:
+                self._digest[image_id] = file_digest(self._file[image_id])
             facts += [self._digest[image_id], c.model_name, c.width, c.height]
             facts += [c.params.tolist(), c.has_prior_focal_length]
         digest = hashlib.sha256(repr(facts).encode()).digest()
@@ -274,16 +321,20 @@ class _MatchingInputs:
 
 def _match_missing(
     inputs: _MatchingInputs,
-    missing: Sequence[tuple[int, int]],
     keys: Mapping[tuple[int, int], int],
     settings: MatchingSettings,
-    cache: _PairCache,
+    cache: PairCache,
     folder: Path,
     threads: int,
-) -> None:
-    """Match and verify pairs and add the results to the cache."""
+) -> int:
+    """Match and verify the pairs (image ids -> key) that the cache lacks and add them to it.
+
+    Returns:
+        The number of pairs that it has had already.
+    """
+    missing = [pair for pair, key in keys.items() if not cache.has(key)]
     if not missing:
-        return
+        return len(keys)
     progress = Progress("matching", len(missing), "pairs")
     # Threads suffice: matching and verification release the GIL.
     with ThreadPoolExecutor(max_workers=max(1, threads)) as pool:
@@ -298,6 +349,7 @@ def _match_missing(
                     database.write_two_view_geometry(first, second, geometry)
                     progress.advance()
             cache.add(path, {pair: keys[pair] for pair in batch})
+    return len(keys) - len(missing)
 
 
 def _match_pair(
@@ -319,85 +371,3 @@ def _match_pair(
     if len(geometry.inlier_matches) < settings.min_inliers:
         return matches, pycolmap.TwoViewGeometry()
     return matches, geometry
-
-
-class _PairCache:
-    """Cache of matches and two-view geometries: a COLMAP database whose ``pair_id`` is the cache
-    key of the pair."""
-
-    def __init__(self, folder: Path):
-        # The database schema may change with COLMAP's version.
-        path = folder / f"pairs-{pycolmap.__version__}.db"
-        for file in folder.glob("pairs-*.db"):
-            if file != path:
-                file.unlink()
-        try:
-            self._open(path)
-        except sqlite3.DatabaseError:
-            # Corrupt: the results can be computed again.
-            self._connection.close()
-            path.unlink()
-            self._open(path)
-
-    def _open(self, path: Path) -> None:
-        self._connection = sqlite3.connect(path)
-        if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
-            pycolmap.Database.open(path).close()
-        self._columns = {
-            table: [
-                row[1]
-                for row in self._connection.execute(f"PRAGMA table_info({table})")
-                if row[1] != "pair_id"
-            ]
-            for table in _PAIR_TABLES
-        }
-        rows = self._connection.execute("SELECT pair_id FROM two_view_geometries")
-        self._keys = {key for (key,) in rows}
-
-    def has(self, key: int) -> bool:
-        return key in self._keys
-
-    def add(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
-        """Add the pairs of the database at ``path`` (image ids -> key)."""
-        self._copy(path, [(pair_id, key) for pair_id, key in _by_pair_id(keys)], "other", "main")
-        self._keys |= set(keys.values())
-
-    def copy_to(self, path: Path, keys: Mapping[tuple[int, int], int]) -> None:
-        """Copy pairs (image ids -> key) to the database at ``path``, in order of pair ids."""
-        self._copy(path, [(key, pair_id) for pair_id, key in _by_pair_id(keys)], "main", "other")
-
-    def prune(self, used: set[int]) -> None:
-        """Remove the unused results if there are more of them than used ones."""
-        unused = self._keys - used
-        if len(unused) > len(used):
-            for table in _PAIR_TABLES:
-                self._connection.executemany(
-                    f"DELETE FROM {table} WHERE pair_id = ?", [(key,) for key in unused]
-                )
-            self._connection.commit()
-            self._connection.execute("VACUUM")
-
-    def close(self) -> None:
-        self._connection.close()
-
-    def _copy(self, path: Path, ids: list[tuple[int, int]], source: str, target: str) -> None:
-        """Copy rows, ``ids`` being (id in the source, id in the target), in order of target ids."""
-        run = self._connection.execute
-        run("ATTACH DATABASE ? AS other", (str(path),))
-        # Identical photographs have equal keys: neither column is unique.
-        run("CREATE TEMP TABLE renamed (old INTEGER, new INTEGER)")
-        self._connection.executemany("INSERT INTO renamed VALUES (?, ?)", ids)
-        for table in _PAIR_TABLES:
-            columns = ", ".join(self._columns[table])
-            run(
-                f"INSERT OR REPLACE INTO {target}.{table} (pair_id, {columns}) "
-                f"SELECT new, {columns} FROM renamed JOIN {source}.{table} ON pair_id = old "
-                "ORDER BY new"
-            )
-        run("DROP TABLE renamed")
-        self._connection.commit()
-        run("DETACH DATABASE other")
-
-
-def _by_pair_id(keys: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:
-    return sorted((pycolmap.image_pair_to_pair_id(*pair), key) for pair, key in keys.items())

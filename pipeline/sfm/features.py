@@ -6,6 +6,7 @@ import hashlib
 import json
 import shutil
 import tempfile
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -13,11 +14,13 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.config import schema
+from pipeline.runtime.atomic import link_or_copy
 from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.views import view_size
+from pipeline.sfm.chunks import chunk
 from pipeline.sfm.counters import FeaturesCounters
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
@@ -61,10 +64,45 @@ def extract_features(
     Raises:
         UserError: a photograph or mask cannot be read, or changed since it was inspected.
     """
+    report = extract_photos(manifest.photos, config, out, cache=cache, threads=threads)
+    _prune(cache, manifest, config)
+    return report
+
+
+def gather_features(
+    manifest: Manifest,
+    config: schema.Features,
+    parts: Mapping[Path, FeaturesCounters],
+    out: Path,
+    *,
+    cache: Path,
+) -> FeatureReport:
+    """Gather the keypoints of several jobs in ``out``: the same files and the same report as of
+    ``extract_features``.
+
+    Args:
+        parts: folder and counters of each job, in order.
+        cache: as of the jobs.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    counts: dict[str, int] = {}
+    for number, (part, counters) in enumerate(parts.items(), start=1):
+        counts |= counters.counts
+        for photo in chunk(manifest.photos, number, len(parts)):
+            link_or_copy(keypoint_file(part, photo.name), keypoint_file(out, photo.name))
+    _prune(cache, manifest, config)
+    return _report({photo.name: counts[photo.name] for photo in manifest.photos}, config)
+
+
+def extract_photos(
+    photos: Sequence[Photo], config: schema.Features, out: Path, *, cache: Path, threads: int
+) -> FeatureReport:
+    """``extract_features`` of some photographs, which removes no files from the cache. Several
+    processes may do so at the same time with the same cache."""
     out.mkdir(parents=True, exist_ok=True)
     cache.mkdir(parents=True, exist_ok=True)
-    keys = {photo.name: _cache_key(photo, config) for photo in manifest.photos}
-    absent = [p for p in manifest.photos if not (cache / f"{keys[p.name]}.npz").exists()]
+    keys = {photo.name: _cache_key(photo, config) for photo in photos}
+    absent = [p for p in photos if not (cache / f"{keys[p.name]}.npz").exists()]
     # One photograph of each key: identical photographs would write the same file concurrently.
     missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
@@ -78,14 +116,16 @@ def extract_features(
             progress,
         )
     counts = {}
-    for photo in manifest.photos:
+    for photo in photos:
         source = cache / f"{keys[photo.name]}.npz"
         target = keypoint_file(out, photo.name)
         # A copy, not a link: changes of a stage's output must not affect the cache.
         shutil.copyfile(source, target)
         counts[photo.name] = len(Keypoints.read(target))
-    _prune(cache, {f"{key}.npz" for key in keys.values()})
-    num_cached = len(manifest.photos) - len(absent)
+    return _report(counts, config, num_cached=len(photos) - len(absent))
+
+
+def _report(counts: dict[str, int], config: schema.Features, num_cached: int = 0) -> FeatureReport:
     median = int(np.median(list(counts.values()))) if counts else 0
     return FeatureReport(
         counters=FeaturesCounters(counts=counts),
@@ -108,13 +148,14 @@ def _cache_key(photo: Photo, config: schema.Features) -> str:
     facts = {
         "photo": photo.digest,
         "mask": photo.mask_digest,
-        "config": config.model_dump(mode="json"),
+        "config": config.model_dump(mode="json", exclude={"photos_per_job"}),
         "version": ALGORITHM_VERSION,
     }
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-def _prune(cache: Path, used: set[str]) -> None:
+def _prune(cache: Path, manifest: Manifest, config: schema.Features) -> None:
+    used = {f"{_cache_key(photo, config)}.npz" for photo in manifest.photos}
     unused = [file for file in cache.glob("*.npz") if file.name not in used]
     if len(unused) > len(used):
         for file in unused:
@@ -172,15 +213,15 @@ def _extract_colmap(
 
     batch = max(8, 4 * threads)
     for start in range(0, len(photos), batch):
-        chunk = photos[start : start + batch]
+        some = photos[start : start + batch]
         with tempfile.TemporaryDirectory(prefix="splatmake-sift-") as folder:
             pictures = {}
-            for index, photo in enumerate(chunk):
+            for index, photo in enumerate(some):
                 picture = sift.DetectionImage(photo, config.max_long_side_px)
                 sift.write_grey(picture, str(Path(folder) / f"{index:06d}.png"))
                 pictures[photo.name] = picture
             found = run_isolated(_colmap_sift, Path(folder), config.max_features, threads)
-            for index, photo in enumerate(chunk):
+            for index, photo in enumerate(some):
                 keypoints, descriptors = found[f"{index:06d}.png"]
                 picture = pictures[photo.name]
                 if picture.usable is not None:
@@ -195,7 +236,7 @@ def _extract_colmap(
                 picture.finish(table[:, :2], table[:, 2], table[:, 3], descriptors[largest]).write(
                     targets[photo.name]
                 )
-        progress.advance(len(chunk))
+        progress.advance(len(some))
 
 
 def _colmap_sift(

@@ -61,7 +61,7 @@ def set_initial_focals(
         side = max(camera.width, camera.height)
         inliers = {focal: _inliers(camera, focal * side, matches, seed) for focal in FOCALS}
         best = max(FOCALS, key=lambda focal: inliers[focal])
-        _set_focal(camera, best * side)
+        set_focal(camera, best * side)
         decisions.append(
             f"camera {camera.camera_id}: initial focal length {best:.2f} times the longer side, "
             f"with the most inliers in {len(matches)} pairs"
@@ -97,7 +97,7 @@ def _matches(
 def _inliers(camera: pycolmap.Camera, focal: float, matches: list[Match], seed: int) -> int:
     """Number of inliers of all pairs."""
     trial = with_prior(camera)
-    _set_focal(trial, focal)
+    set_focal(trial, focal)
     options = pycolmap.TwoViewGeometryOptions()
     options.ransac.random_seed = seed
     options.ransac.max_num_trials = MAX_TRIALS
@@ -111,7 +111,8 @@ def _inliers(camera: pycolmap.Camera, focal: float, matches: list[Match], seed: 
     return total
 
 
-def _set_focal(camera: pycolmap.Camera, focal: float) -> None:
+def set_focal(camera: pycolmap.Camera, focal: float) -> None:
+    """Set all focal lengths of a camera, pixels."""
     params = np.array(camera.params)
     params[list(camera.focal_length_idxs())] = focal
     camera.params = params.tolist()

@@ -5,7 +5,8 @@ Imports pycolmap and must not be imported in a process that uses torch (see ``is
 
 from __future__ import annotations
 
-import io
+import zipfile
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,22 +17,26 @@ from scipy.sparse.csgraph import connected_components
 
 from pipeline.config import schema
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
-from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm import pairs as choose
-from pipeline.sfm.counters import MatchesCounters
+from pipeline.sfm.chunks import chunk
+from pipeline.sfm.counters import MatchCounters, MatchesCounters
 from pipeline.sfm.database import (
     MatchingSettings,
     build_database,
+    match_pairs,
     plan_cameras,
     verified_inliers,
 )
-from pipeline.sfm.fisheye import set_initial_focals
+from pipeline.sfm.fisheye import is_uncalibrated, set_focal, set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
+from pipeline.sfm.pair_list import PairList
 from pipeline.sfm.quiet import quiet_colmap
 
 NAMES_SHOWN = 5
+# A COLMAP database with the results of the pairs of one of several jobs.
+CHUNK_FILE = "pairs.db"
 
 
 @dataclass(frozen=True)
@@ -49,6 +54,15 @@ class MatchReport:
     warnings: list[str]
 
 
+@dataclass(frozen=True)
+class ChunkReport:
+    """Result of a job that matches some of the pairs; attributes as of ``MatchReport``."""
+
+    counters: MatchCounters
+    num_cached: int
+    decisions: list[str]
+
+
 def match_features(
     manifest: Manifest,
     features: Path,
@@ -60,34 +74,51 @@ def match_features(
     cache: Path | None = None,
     threads: int = 1,
     experiments: MatchesExperiments = DEFAULT.matches,
+    chosen: PairList | None = None,
+    parts: Sequence[Path] = (),
 ) -> MatchReport:
     """Choose pairs, match them and verify their two-view geometry.
 
     Writes ``out/database.db`` (COLMAP database: cameras with their priors, images with ids from 1
     in order of names, keypoints, matches, two-view geometries) and ``out/keypoint_colors.npz``
-    (image id -> (F, 3) uint8). The files depend neither on ``threads`` nor on the cache.
+    (image id -> (F, 3) uint8). The files depend neither on ``threads`` nor on the cache, nor on the
+    number of jobs.
 
     Args:
         features: folder written by ``extract_features``.
         config: options; ``pairs`` must not be "auto".
         sharing: options of the sfm stage, of which the camera model and sharing are used.
         cache: folder for results of pairs that outlives the call.
+        chosen: result of ``choose_pairs``; None: the pairs are chosen.
+        parts: folders of the jobs that have matched them by ``match_chunk``, in order.
 
     Raises:
         UserError: no pair of photographs could be verified.
     """
     quiet_colmap()
     out.mkdir(parents=True, exist_ok=True)
-    photos = sorted(manifest.photos, key=lambda photo: photo.name)
-    names = [photo.name for photo in photos]
-    cameras, camera_of = plan_cameras(manifest, sharing)
-    images = [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
-    pairs, decision = resolve_pairs(manifest, features, config)
-    initial = set_initial_focals(cameras, images, features, pairs, experiments.max_ratio, seed)
-    settings = MatchingSettings(experiments.max_ratio, experiments.min_inliers, seed)
+    if chosen is None:
+        chosen = choose_pairs(
+            manifest, features, config, sharing, seed=seed, experiments=experiments
+        )
+    pairs = chosen.pairs
+    cameras, images = _cameras_and_images(manifest, sharing)
+    _set_focals(cameras, chosen.focals)
+    names = [name for _, name, _ in images]
     database = out / "database.db"
     num_cached = build_database(
-        database, cameras, images, features, pairs, settings, cache=cache, threads=threads
+        database,
+        cameras,
+        images,
+        features,
+        pairs,
+        _settings(experiments, seed),
+        cache=cache,
+        matched=[
+            (part / CHUNK_FILE, chunk(pairs, number, len(parts)))
+            for number, part in enumerate(parts, start=1)
+        ],
+        threads=threads,
     )
     _write_colors(out / "keypoint_colors.npz", features, names)
 
@@ -120,14 +151,100 @@ def match_features(
         counters=counters,
         num_cached=num_cached,
         decisions=[
-            decision,
-            *initial,
+            *chosen.decisions,
             f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
             f"{len(cameras)} camera(s) ({_models(cameras)}) for {len(names)} photographs, "
             f"{priors} with a focal length from EXIF",
         ],
         warnings=warnings,
     )
+
+
+def choose_pairs(
+    manifest: Manifest,
+    features: Path,
+    config: schema.Matches,
+    sharing: schema.Sfm,
+    *,
+    seed: int,
+    experiments: MatchesExperiments = DEFAULT.matches,
+) -> PairList:
+    """Choose the pairs to match, and initial focal lengths by the first of them where cameras need
+    one. Arguments: see ``match_features``."""
+    quiet_colmap()
+    pairs, decision = resolve_pairs(manifest, features, config)
+    cameras, images = _cameras_and_images(manifest, sharing)
+    uncalibrated = [camera for camera in cameras if is_uncalibrated(camera)]
+    initial = set_initial_focals(uncalibrated, images, features, pairs, experiments.max_ratio, seed)
+    return PairList(
+        pairs=pairs,
+        focals={camera.camera_id: float(camera.mean_focal_length()) for camera in uncalibrated},
+        decisions=[decision, *initial],
+    )
+
+
+def match_chunk(
+    manifest: Manifest,
+    features: Path,
+    chosen: PairList,
+    number: int,
+    jobs: int,
+    sharing: schema.Sfm,
+    out: Path,
+    *,
+    seed: int,
+    cache: Path,
+    scratch: Path,
+    threads: int = 1,
+    experiments: MatchesExperiments = DEFAULT.matches,
+) -> ChunkReport:
+    """Match and verify the pairs of one of several jobs. ``match_features`` gathers them.
+
+    Args:
+        number: of the job, from 1.
+        jobs: the number of all jobs.
+        cache: as of ``match_features``; it is only read.
+        scratch: folder that a later call with the same arguments finds if this one is killed.
+    """
+    quiet_colmap()
+    cameras, images = _cameras_and_images(manifest, sharing)
+    _set_focals(cameras, chosen.focals)
+    pairs = chunk(chosen.pairs, number, jobs)
+    num_cached, num_verified = match_pairs(
+        out / CHUNK_FILE,
+        cameras,
+        images,
+        features,
+        pairs,
+        _settings(experiments, seed),
+        cache=cache,
+        scratch=scratch,
+        threads=threads,
+    )
+    return ChunkReport(
+        MatchCounters(num_pairs=len(pairs), num_verified=num_verified),
+        num_cached,
+        [f"{num_verified} of {len(pairs)} pairs verified"],
+    )
+
+
+def _cameras_and_images(
+    manifest: Manifest, sharing: schema.Sfm
+) -> tuple[list[pycolmap.Camera], list[tuple[int, str, int]]]:
+    """The cameras, and (image id, name, camera id) in the order of names."""
+    cameras, camera_of = plan_cameras(manifest, sharing)
+    names = sorted(photo.name for photo in manifest.photos)
+    return cameras, [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
+
+
+def _set_focals(cameras: Sequence[pycolmap.Camera], focals: Mapping[int, float]) -> None:
+    for camera in cameras:
+        if camera.camera_id in focals:
+            set_focal(camera, focals[camera.camera_id])
+
+
+def _settings(experiments: MatchesExperiments, seed: int) -> MatchingSettings:
+    return MatchingSettings(experiments.max_ratio, experiments.min_inliers, seed)
 
 
 def _models(cameras: list[pycolmap.Camera]) -> str:
@@ -143,7 +260,7 @@ def resolve_pairs(
     count = len(photos)
 
     def descriptors() -> list[np.ndarray]:
-        keep = choose.RETRIEVAL_DESCRIPTORS
+        keep = choose.descriptors_per_photo(count)
         files = [keypoint_file(features, photo.name) for photo in photos]
         return [Keypoints.read(file).descriptors[:keep].copy() for file in files]
 
@@ -188,10 +305,10 @@ def _components(names: list[str], verified: list[tuple[str, str]]) -> tuple[list
 
 
 def _write_colors(path: Path, features: Path, names: list[str]) -> None:
-    colors = {
-        str(index): Keypoints.read(keypoint_file(features, name)).rgb
-        for index, name in enumerate(names, start=1)
-    }
-    buffer = io.BytesIO()
-    np.savez(buffer, **colors)  # type: ignore[arg-type]
-    write_bytes(path, buffer.getvalue())
+    """As by ``np.savez``, with the colours of one image in memory at a time."""
+    with zipfile.ZipFile(path, "w") as archive:
+        for index, name in enumerate(names, start=1):
+            colors = Keypoints.read(keypoint_file(features, name)).rgb
+            # By its name, a member gets a fixed date.
+            with archive.open(f"{index}.npy", "w", force_zip64=True) as member:
+                np.lib.format.write_array(member, colors)

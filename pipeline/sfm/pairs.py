@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,8 @@ from scipy.spatial.distance import cdist
 from pipeline.runtime.progress import Progress
 
 Pair = tuple[int, int]
+Descriptors = Sequence[NDArray[np.uint8]]
+"""For each photograph (F, 128), largest scale first."""
 
 # Retrieval compares the descriptors of the largest scales only.
 RETRIEVAL_DESCRIPTORS = 300
@@ -25,6 +27,8 @@ RETRIEVAL_MIN_DESCRIPTORS = 64
 RETRIEVAL_MIN_SCORE = 4
 # Number of photographs compared with one at a time: 300 x 300 distances each, 20 MB in all.
 RETRIEVAL_BATCH = 64
+# Number of scored pairs in memory, 24 bytes each, before all but the strongest are left out.
+MAX_SCORED_PAIRS = 300_000
 DESCRIPTOR_SIZE = 128
 # Larger than the squared distance of any two descriptors (2 * 512^2), exact in float32.
 FAR = 2.0**22
@@ -96,55 +100,58 @@ def proximity_pairs(
     )
 
 
-def retrieval_pairs(descriptors: Sequence[NDArray[np.uint8]], neighbours: int) -> list[Pair]:
+def retrieval_pairs(descriptors: Descriptors, neighbours: int) -> list[Pair]:
     """Each photograph with the ``neighbours`` most similar ones by ``retrieval_scores``, and the
-    pairs of the maximum spanning tree of the scores, which keep the view graph connected.
-
-    Args:
-        descriptors: for each photograph (F, 128) uint8, largest scale first.
-    """
-    score = retrieval_scores(descriptors)
-    return _unique([*_best(score, neighbours), *_spanning_tree(score)])
+    pairs of the maximum spanning tree of the scores, which keep the view graph connected."""
+    return _similar(descriptors, neighbours, tree=True)
 
 
-def loop_closure_pairs(descriptors: Sequence[NDArray[np.uint8]], overlap: int) -> list[Pair]:
+def loop_closure_pairs(descriptors: Descriptors, overlap: int) -> list[Pair]:
     """Each photograph with the most similar ones (by ``retrieval_scores``) that are more than
     ``overlap`` away in the sequence."""
-    score = retrieval_scores(descriptors)
-    index = np.arange(len(score))
-    score[np.abs(index[:, None] - index[None]) <= overlap] = 0
-    return _unique(_best(score, LOOP_CLOSURES))
+    return _similar(descriptors, LOOP_CLOSURES, overlap)
 
 
-def retrieval_scores(descriptors: Sequence[NDArray[np.uint8]]) -> NDArray[np.int64]:
-    """(N, N) symmetric number of mutual nearest neighbours that pass the ratio test among the
-    largest-scale descriptors of two photographs.
+def descriptors_per_photo(count: int) -> int:
+    """Number of descriptors that retrieval compares of each of ``count`` photographs."""
+    keep = RETRIEVAL_BUDGET // max(count, 1)
+    return max(RETRIEVAL_MIN_DESCRIPTORS, min(RETRIEVAL_DESCRIPTORS, keep))
+
+
+def retrieval_scores(descriptors: Descriptors) -> Iterator[tuple[int, int, NDArray[np.int64]]]:
+    """The number of mutual nearest neighbours that pass the ratio test among the largest-scale
+    descriptors of two photographs, for all pairs.
 
     Sums of products of bytes are exact in float32 (below 2^24), so the scores do not depend on the
     BLAS library or its threads.
+
+    Yields:
+        Photograph ``i``, a later photograph ``j``, and the scores of ``i`` with ``j``, ``j + 1``,
+        and so on.
     """
     count = len(descriptors)
-    keep = RETRIEVAL_BUDGET // max(count, 1)
-    keep = max(RETRIEVAL_MIN_DESCRIPTORS, min(RETRIEVAL_DESCRIPTORS, keep))
-    # Photographs with fewer descriptors are padded with ones that are never nearest.
-    table = np.zeros((count, keep, DESCRIPTOR_SIZE), np.float32)
-    norms = np.full((count, keep), FAR, np.float32)
-    for i, found in enumerate(descriptors):
-        table[i, : len(found[:keep])] = found[:keep]
-        norms[i, : len(found[:keep])] = (table[i, : len(found[:keep])] ** 2).sum(axis=1)
-    score = np.zeros((count, count), np.int64)
+    keep = descriptors_per_photo(count)
     progress = Progress("selecting pairs", count, "photographs")
-    for i in range(count):
-        own = min(len(descriptors[i]), keep)
-        for start in range(i + 1, count, RETRIEVAL_BATCH):
-            stop = min(start + RETRIEVAL_BATCH, count)
-            others = table[start:stop].reshape(-1, DESCRIPTOR_SIZE)
-            squared = -2 * (table[i, :own] @ others.T)
-            squared += norms[i, :own, None] + norms[start:stop].reshape(-1)
-            score[i, start:stop] = _mutual(squared.reshape(own, stop - start, keep))
-        score[i:, i] = score[i, i:]
-        progress.advance()
-    return score
+    for start in range(0, count, RETRIEVAL_BATCH):
+        stop = min(start + RETRIEVAL_BATCH, count)
+        # Photographs with fewer descriptors are padded with ones that are never nearest.
+        table = np.zeros((stop - start, keep, DESCRIPTOR_SIZE), np.float32)
+        norms = np.full((stop - start, keep), FAR, np.float32)
+        for row, found in enumerate(descriptors[start:stop]):
+            table[row, : len(found[:keep])] = found[:keep]
+            norms[row, : len(found[:keep])] = _norms(found[:keep].astype(np.float32))
+        for i in range(stop - 1):
+            own = descriptors[i][:keep].astype(np.float32)
+            first = max(i + 1, start)
+            others = table[first - start :].reshape(-1, DESCRIPTOR_SIZE)
+            squared = -2 * (own @ others.T)
+            squared += _norms(own)[:, None] + norms[first - start :].reshape(-1)
+            yield i, first, _mutual(squared.reshape(len(own), stop - first, keep))
+        progress.advance(stop - start)
+
+
+def _norms(descriptors: NDArray[np.float32]) -> NDArray[np.float32]:
+    return (descriptors**2).sum(axis=1)
 
 
 def _mutual(squared: NDArray[np.float32]) -> NDArray[np.int64]:
@@ -165,22 +172,49 @@ def _mutual(squared: NDArray[np.float32]) -> NDArray[np.int64]:
     return (mutual & accepted & (best < FAR / 2)).sum(axis=0)
 
 
-def _best(score: NDArray[np.int64], neighbours: int) -> list[Pair]:
-    """Each photograph with the ones of the highest scores."""
-    ranked = np.argsort(-score, axis=1, kind="stable")[:, :neighbours]
-    return [
-        (i, int(j))
-        for i, row in enumerate(ranked)
-        for j in row
-        if score[i, j] >= RETRIEVAL_MIN_SCORE
-    ]
+def _similar(
+    descriptors: Descriptors, neighbours: int, overlap: int = 0, *, tree: bool = False
+) -> list[Pair]:
+    """Each photograph with those of the highest scores that are more than ``overlap`` away, and the
+    pairs of the spanning tree. The memory is linear in the number of photographs."""
+    count = len(descriptors)
+    kept, found, num_found = np.zeros((0, 3), np.int64), [], 0
+    for i, first, scores in retrieval_scores(descriptors):
+        j = np.arange(first, first + len(scores))
+        accepted = (scores >= RETRIEVAL_MIN_SCORE) & (j - i > overlap)
+        j = j[accepted]
+        found.append(np.column_stack([scores[accepted], np.full(len(j), i), j]))
+        num_found += len(j)
+        if num_found > MAX_SCORED_PAIRS:
+            kept = _strongest(np.concatenate([kept, *found]), count, neighbours, tree=tree)
+            found, num_found = [], 0
+    kept = _strongest(np.concatenate([kept, *found]), count, neighbours, tree=tree)
+    return _unique(kept[:, 1:])
 
 
-def _spanning_tree(score: NDArray[np.int64]) -> list[Pair]:
-    # A minimum spanning tree of inverse scores; zero means no edge.
-    weight = np.where(score >= RETRIEVAL_MIN_SCORE, 1.0 / np.maximum(score, 1), 0.0)
-    tree = minimum_spanning_tree(csr_matrix(np.triu(weight))).tocoo()
-    return [(int(i), int(j)) for i, j in zip(tree.row, tree.col, strict=True)]
+def _strongest(
+    scored: NDArray[np.int64], count: int, neighbours: int, *, tree: bool
+) -> NDArray[np.int64]:
+    """The best pairs of each photograph, and those of the maximum spanning tree. They are among the
+    strongest of any part of the pairs that has them.
+
+    Args:
+        scored: (M, 3) scores and pairs.
+    """
+    # Of equal scores, the pairs of earlier photographs come first.
+    scored = scored[np.lexsort((scored[:, 2], scored[:, 1], -scored[:, 0]))]
+    ends = scored[:, 1:].ravel()
+    by_photo = np.argsort(ends, kind="stable")
+    photo = ends[by_photo]
+    rank = np.empty(len(ends), np.int64)
+    rank[by_photo] = np.arange(len(ends)) - np.searchsorted(photo, photo)
+    keep: NDArray[np.bool_] = np.any(rank.reshape(-1, 2) < neighbours, axis=1)
+    if tree:
+        # Weights are the positions from 1: zero means no edge.
+        position = np.arange(1, len(scored) + 1, dtype=np.float64)
+        edges = csr_matrix((position, (scored[:, 1], scored[:, 2])), shape=(count, count))
+        keep[minimum_spanning_tree(edges).data.astype(np.int64) - 1] = True
+    return scored[keep]
 
 
 def _unique(pairs: object) -> list[Pair]:

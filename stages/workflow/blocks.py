@@ -60,7 +60,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
         # Not a local variable here: what it is made from is not held during training.
         *block_training(
             _scene(job, read_gaussians),
-            job.block,
+            job.number,
             job.section(Train),
             job.section(Experiments).train,
             part,
@@ -69,7 +69,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
         part,
     )
     gaussians = with_far_field(
-        trained.result.gaussians, read_gaussians(), read_partition(job), job.block
+        trained.result.gaussians, read_gaussians(), read_partition(job), job.number
     )
     inputs.write_trained(job, trained, gaussians)
 

@@ -7,12 +7,24 @@ import re
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Sequence
+from collections.abc import AsyncIterator, Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any
 
+from pipeline.plan.values import Plan
+
+# Stages that are one submission of a scene, to save the time that each takes to start.
+GROUPS: Mapping[str, Sequence[str]] = {
+    "prepare": (
+        *("inspect", "decode", "features", "pairs", "matches", "sfm"),
+        *("refine", "undistort", "init"),
+    ),
+    "coarse": ("coarse", "partition"),
+    "train": ("train", "export"),
+    "finish": ("evaluate", "coverage", "report"),
+}
 # Cores that a stage asks for on a cluster whose nodes are unknown: few nodes have fewer.
 DEFAULT_CPUS = 8
 # Memory in MB that the two Snakemakes around a stage take in its job.
@@ -35,6 +47,31 @@ def granted_cpus() -> int | None:
     """The number of cores of the Slurm job that this process is in; None outside of a job."""
     value = os.environ.get("SLURM_CPUS_PER_TASK") or os.environ.get("SLURM_CPUS_ON_NODE", "")
     return int(value) if value.isdecimal() and "SLURM_JOB_ID" in os.environ else None
+
+
+def group_of(stage: str, plan: Plan) -> str | None:
+    """Name of the group of jobs that the stage's job is submitted with; None: it is one by itself.
+
+    A group is divided where jobs outside of it lie between its stages: otherwise it would depend on
+    itself.
+    """
+    name = next((name for name, stages in GROUPS.items() if stage in stages), None)
+    if name is None or plan.stages[stage].jobs > 1:
+        return None
+    divided = sum(plan.stages[source].jobs > 1 for source in _all_upstream(stage, plan))
+    return f"{name}_{divided}" if divided else name
+
+
+def _all_upstream(stage: str, plan: Plan) -> set[str]:
+    """The stages that a stage depends on, directly or not."""
+    found: set[str] = set()
+    queue = [stage]
+    while queue:
+        for source in plan.stages[queue.pop()].inputs:
+            if source not in found:
+                found.add(source)
+                queue.append(source)
+    return found
 
 
 @cache

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from pipeline.config.schema import Split, Views
@@ -31,6 +32,12 @@ TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
 # Options that rendering outside of training depends on.
 DRAWING_OPTIONS = ("train.sh_degree", "train.antialias", "train.background")
+
+
+def of_jobs(job: Job, role: str) -> list[Path]:
+    """The folders of the jobs of the stage with this role, in order; empty if it does not run."""
+    count = sum(name.startswith(f"{role}_") for name in job.inputs)
+    return [job.inputs[f"{role}_{number}"] for number in range(1, count + 1)]
 
 
 def read_manifest(job: Job, role: str) -> Manifest:

@@ -31,6 +31,7 @@ from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
     granted_cpus,
+    group_of,
     largest_node,
     wait_for_earlier_jobs,
     watch_jobs,
@@ -101,8 +102,8 @@ class SnakemakeProject:
         return STAGES.values()
 
     def folder(self, spec: StageSpec) -> str:
-        """The stage's folder in ``results/<scene>/``, with a wildcard if each block is a job."""
-        return f"{spec.name}_{{block}}" if spec.per_block else spec.name
+        """The stage's folder in ``results/<scene>/``, with a wildcard if it has several jobs."""
+        return f"{spec.name}_{{job}}" if spec.scattered else spec.name
 
     def packaged(self, file: str) -> str:
         """The absolute path of a file of the packages, which are not in the Snakefile's folder if
@@ -137,7 +138,7 @@ class SnakemakeProject:
     def key(self, spec: StageSpec) -> Callable[[Any], str]:
         """Params function: the stage's key."""
         return lambda wildcards: stage_key(
-            spec, self._plan(wildcards.scene), int(wildcards.block) if spec.per_block else None
+            spec, self._plan(wildcards.scene), int(wildcards.job) if spec.scattered else 1
         )
 
     def threads(self, workflow: Any) -> Callable[[Any], int]:
@@ -154,6 +155,16 @@ class SnakemakeProject:
             return wanted if node is None else min(wanted, node.cpus)
 
         return count
+
+    def group(self, spec: StageSpec, workflow: Any) -> Callable[[Any], str | None]:
+        """Group function: the group of jobs that a cluster runs as one, if there is a cluster."""
+
+        def name(wildcards: Any) -> str | None:
+            if not (workflow.remote_exec or workflow.non_local_exec):
+                return None
+            return group_of(spec.name, self._plan(wildcards.scene))
+
+        return name
 
     def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int, int], int]:
         """Resources function: memory in MB that the stage may use, and what a cluster's job needs
@@ -318,8 +329,8 @@ class SnakemakeProject:
         plan = self._make_plan(run.name)
         for stage in filter(plan.runs, plan.stages):
             folder, spec = RESULTS / run.name, STAGES[stage]
-            for block, name in enumerate(plan.stages[stage].folders(stage), 1):
-                key = stage_key(spec, plan, block if spec.per_block else None)
+            for job, name in enumerate(plan.stages[stage].folders(stage), 1):
+                key = stage_key(spec, plan, job)
                 if is_current(folder / name, key, self._inputs(spec, run.name)):
                     continue
                 log = folder / "logs" / f"{name}.log"

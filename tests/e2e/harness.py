@@ -12,6 +12,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections import Counter
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -35,7 +36,10 @@ OTHER_JOBS = ForkServer(
     *("pipeline.photos.undistort", "pipeline.splats.init", "pipeline.demo.write"),
 )
 TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
-OTHER_STAGES = ("inspect", "decode", "features", "matches", "sfm", "refine", "undistort", "init")
+OTHER_STAGES = (
+    *("inspect", "decode", "extract", "features", "pairs", "match", "matches", "sfm"),
+    *("refine", "undistort", "init"),
+)
 
 SOURCES = ("Snakefile", "pipeline", "stages", "profiles", "pyproject.toml")
 
@@ -174,6 +178,11 @@ def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) 
         r"^(?:local)?rule (\w+):\n(?: .*\n)*? +wildcards: scene=(\S+)$", done.stdout, re.M
     )
     return {rule for rule, of in jobs if of == scene}
+
+
+def started(done: subprocess.CompletedProcess[str]) -> Counter[str]:
+    """Rule -> number of its jobs that were started."""
+    return Counter(re.findall(r"^(?:local)?rule (\w+):", done.stdout, re.M))
 
 
 def start_and_kill(

@@ -10,7 +10,7 @@ import pytest
 from pipeline.config.schema import Config
 from pipeline.geometry.cube import panorama_face_side
 from pipeline.io.colmap import read_model, write_model
-from pipeline.plan.plan import describe
+from pipeline.plan.plan import describe, input_folders
 from pipeline.plan.scan import Scan, scan
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
@@ -20,7 +20,7 @@ from tests.io.test_llff import llff_row
 from tests.io.test_transforms import frame, write
 from tests.pictures import photos, picture
 from tests.plan.test_scan import write_dng, write_sparse
-from tests.plans import BLOCK_STAGES, make_plan, skipped
+from tests.plans import BLOCK_STAGES, CHUNK_STAGES, make_plan, skipped
 
 
 def look(folder: Path, **sections) -> Scan:
@@ -475,3 +475,31 @@ def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, block
     assert folders == (["polish"] if blocks == 1 else [f"polish_{i + 1}" for i in range(blocks)])
     chosen = make_plan(scan, Config.model_validate({"partition": {"blocks": 2}}))
     assert chosen.config.partition.blocks == 2 and chosen.stages["block"].jobs == 2
+
+
+@pytest.mark.parametrize("count, jobs", [(500, 1), (501, 3), (1000, 4)])
+def test_features_and_matches_of_many_photographs_are_several_jobs(tmp_path, count, jobs):
+    scan = many(tmp_path, count)
+    plan = make_plan(scan, Config())
+    assert all(plan.runs(stage) == (jobs > 1) for stage in CHUNK_STAGES)
+    for stage in ("extract", "match"):
+        folders = plan.stages[stage].folders(stage)
+        assert folders == ([stage] if jobs == 1 else [f"{stage}_{i + 1}" for i in range(jobs)])
+    assert len(plan.stages["features"].folders("features")) == 1
+    assert plan.stages["pairs"].jobs == 1
+    if jobs > 1:
+        why = f"{jobs} jobs: one for every 250 of {count} photographs"
+        assert plan.stages["extract"].decisions == plan.stages["match"].decisions == [why]
+        assert set(input_folders(STAGES["features"], plan)) == {
+            "photos",
+            *(f"extract_{i + 1}" for i in range(jobs)),
+        }
+    chosen = make_plan(scan, Config.model_validate({"features": {"photos_per_job": 100}}))
+    assert chosen.stages["match"].jobs == -(-count // 100)
+
+
+def test_given_poses_need_no_jobs_of_features(tmp_path):
+    scan = posed(tmp_path, tracks=20)
+    plan = plan_of(scan, features={"photos_per_job": 1})
+    assert not any(plan.runs(stage) for stage in CHUNK_STAGES)
+    assert "poses are given" in plan.stages["extract"].reason

@@ -107,6 +107,27 @@ def test_jobs_reserve_what_stages_take_and_at_most_half_more(scene: Scene) -> No
         assert used <= memory_mb(stage, plan, 2) <= 1.5 * used, stage
 
 
+def test_jobs_of_a_large_scene_reserve_what_they_take() -> None:
+    """The town of 300 photographs in three jobs, with two threads."""
+    town = Scene(300, (640, 427), (640, 427), 100_000)
+    plan = plan_of(town, Config.model_validate({"features": {"photos_per_job": 100}}))
+    used = {"extract": 211, "features": 141, "pairs": 237, "match": 243, "matches": 154}
+    for stage, megabytes in used.items():
+        assert megabytes <= memory_mb(stage, plan, 2) <= 1.6 * megabytes, stage
+
+
+def test_the_memory_of_matches_does_not_grow_with_large_scenes() -> None:
+    few, many = (
+        plan_of(Scene(count, (640, 427), (640, 427), 100_000), Config.model_validate(CHUNKS))
+        for count in (1000, 4000)
+    )
+    for stage in ("extract", "match"):
+        assert memory_mb(stage, many, 2) < 1.3 * memory_mb(stage, few, 2)
+
+
+CHUNKS = {"features": {"photos_per_job": 250}}
+
+
 def test_more_threads_and_larger_photographs_take_more() -> None:
     config = Config()
     for stage in ("inspect", "features", "undistort"):

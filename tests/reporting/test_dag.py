@@ -7,7 +7,7 @@ from pipeline.plan.plan import plan_record
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.dag import plan_svg
 from stages.workflow.registry import STAGES
-from tests.plans import full_plan
+from tests.plans import CHUNK_STAGES, full_plan
 
 SVG = "{http://www.w3.org/2000/svg}"
 
@@ -28,7 +28,8 @@ def drawn(found: PlanRecord) -> tuple[dict[str, tuple[float, float]], ET.Element
 
 
 def test_every_stage_has_a_box_inside_the_diagram():
-    for skipped in ((), ("decode",), ("decode", "features", "matches", "sfm", "undistort")):
+    estimation = ("features", "matches", "sfm", *CHUNK_STAGES)
+    for skipped in ((), ("decode",), ("decode", *estimation, "undistort")):
         boxes, root = drawn(plan(*skipped))
         assert list(boxes) == list(STAGES)
         assert len(set(boxes.values())) == len(boxes)

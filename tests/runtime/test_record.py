@@ -248,3 +248,8 @@ def test_a_garbled_record_is_read_or_refused_never_a_crash(tmp_path, counters, s
             read_record(file, model)
         except UserError as error:
             assert "stage.json: cannot be read" in str(error)
+
+
+def test_the_remedy_for_one_of_several_jobs_names_their_rule(tmp_path):
+    with pytest.raises(UserError, match=r"--forcerun match$"):
+        read_stage(tmp_path / "match_12")

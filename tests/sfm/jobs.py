@@ -52,6 +52,36 @@ def match(
     return flat(report)
 
 
+def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> dict[str, Any]:
+    """As ``match``, by ``count`` jobs besides."""
+    from pipeline.sfm.matching import choose_pairs, match_chunk, match_features
+
+    config, sfm = schema.Matches(pairs="exhaustive"), schema.Sfm()
+    chosen = choose_pairs(manifest, features, config, sfm, seed=0)
+    parts = [out.with_name(f"match_{number}") for number in range(1, count + 1)]
+    cache = out.with_name("cache")
+    pairs = cached = 0
+    for number, part in enumerate(parts, start=1):
+        scratch = out.with_name(f"scratch_{number}")
+        report = match_chunk(
+            *(manifest, features, chosen, number, count, sfm, part),
+            seed=0,
+            cache=cache,
+            scratch=scratch,
+            threads=2,
+        )
+        pairs, cached = pairs + report.counters.num_pairs, cached + report.num_cached
+    whole = match_features(
+        *(manifest, features, config, sfm, out),
+        seed=0,
+        cache=cache,
+        chosen=chosen,
+        parts=parts,
+    )
+    assert whole.num_cached == pairs == whole.counters.num_pairs, "nothing is left to match"
+    return flat(whole) | {"num_cached": cached}
+
+
 def reconstruct(
     manifest: Manifest, database: Path, config: schema.Sfm, out: Path, threads: int = 2
 ) -> dict[str, Any]:

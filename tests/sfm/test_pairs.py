@@ -21,6 +21,14 @@ def descriptors(rng, ids, noise=2.0):
     return np.clip(table[ids] + rng.normal(0, noise, (len(ids), 128)), 0, 255).astype(np.uint8)
 
 
+def scores(photographs):
+    """The symmetric matrix of all scores."""
+    table = np.zeros((len(photographs), len(photographs)), np.int64)
+    for i, first, row in choose.retrieval_scores(photographs):
+        table[i, first : first + len(row)] = row
+    return table + table.T
+
+
 @settings(max_examples=40, derandomize=True, deadline=None)
 @given(count=st.integers(0, 40), overlap=st.integers(1, 12))
 def test_sequential_pairs_contain_each_overlapping_pair_once(count, overlap):
@@ -61,8 +69,7 @@ def test_retrieval_pairs_share_points():
         descriptors(rng, rng.permutation(np.arange(start, start + 200)))
         for start in (0, 100, 1000, 1100)
     ]
-    score = choose.retrieval_scores(photographs)
-    assert (score == score.T).all()
+    score = scores(photographs)
     # Neighbours share 100 of 200 points; nothing else is shared.
     assert 90 <= score[0, 1] <= 100 and 90 <= score[2, 3] <= 100
     assert score[0, 2] < choose.RETRIEVAL_MIN_SCORE
@@ -73,7 +80,7 @@ def test_retrieval_scores_equal_plain_mutual_nearest_neighbours():
     rng = np.random.default_rng(1)
     counts = (40, 1, 0, 300, 75)
     photographs = [descriptors(rng, rng.integers(0, 60, n), noise=9.0) for n in counts]
-    score = choose.retrieval_scores(photographs)
+    score = scores(photographs)
     for i, first in enumerate(photographs):
         for j, second in enumerate(photographs[:i]):
             expected = 0
@@ -94,6 +101,40 @@ def test_the_spanning_tree_keeps_the_view_graph_connected():
     ids = [np.r_[0:100], np.r_[20:100, 500:520], np.r_[500:520, 600:680], np.r_[600:680, 700:720]]
     photographs = [descriptors(rng, i) for i in ids]
     assert choose.retrieval_pairs(photographs, 1) == [(0, 1), (1, 2), (2, 3)]
+
+
+def plain_pairs(score, neighbours, *, overlap=0, tree):
+    """The pairs by sorting all scores, and Kruskal's algorithm."""
+    count = len(score)
+    valid = [(i, j) for i, j in choose.exhaustive_pairs(count) if score[i, j] >= 4]
+    valid = [(i, j) for i, j in valid if j - i > overlap]
+    ordered = sorted(valid, key=lambda pair: (-score[pair], pair))
+    found = set()
+    for photo in range(count):
+        found |= set([pair for pair in ordered if photo in pair][:neighbours])
+    group = list(range(count))
+    for i, j in ordered if tree else ():
+        if group[i] != group[j]:
+            found.add((i, j))
+            group = [group[i] if g == group[j] else g for g in group]
+    return sorted(found)
+
+
+@pytest.mark.parametrize("limit", [1, 50, 10**6])
+@pytest.mark.parametrize("batch", [3, 64])
+def test_pairs_do_not_depend_on_how_many_scores_are_in_memory(monkeypatch, limit, batch):
+    monkeypatch.setattr(choose, "MAX_SCORED_PAIRS", limit)
+    monkeypatch.setattr(choose, "RETRIEVAL_BATCH", batch)
+    rng = np.random.default_rng(4)
+    # Two places without a photograph of both, but for one; equal scores are frequent.
+    starts = [*rng.integers(0, 60, 20), *rng.integers(500, 560, 20), 0]
+    ids = [np.r_[start : start + 40] for start in starts]
+    ids[-1] = np.r_[20:30, 520:530]
+    photographs = [descriptors(rng, i, noise=0.0) for i in ids]
+    score = scores(photographs)
+    assert choose.retrieval_pairs(photographs, 3) == plain_pairs(score, 3, tree=True)
+    closures = plain_pairs(score, choose.LOOP_CLOSURES, overlap=5, tree=False)
+    assert choose.loop_closure_pairs(photographs, 5) == closures
 
 
 def test_loop_closures_are_beyond_the_overlap():

@@ -129,21 +129,21 @@ class Runner:
         sources = input_folders(STAGES[stage], plan)
         folders = {role: root / name for role, name in sources.items()}
         names = plan.stages[stage].folders(stage)
-        for block, name in enumerate(names, 1):
-            self._run_job(plan, stage, block, root / name, folders, machine)
+        for number, name in enumerate(names, 1):
+            self._run_job(plan, stage, number, root / name, folders, machine)
         return [root / name for name in names]
 
     def _run_job(
         self,
         plan: Plan,
         stage: str,
-        block: int,
+        number: int,
         out: Path,
         folders: dict[str, Path],
         machine: Mapping[str, int],
     ) -> None:
         spec = STAGES[stage]
-        key = json.loads(stage_key(spec, plan, block if spec.per_block else None))
+        key = json.loads(stage_key(spec, plan, number))
         digests = {role: content_digest(folder) for role, folder in folders.items()}
         done = out, identity(key | machine, digests)
         if done not in self._done:

@@ -158,9 +158,37 @@ def test_time_limits_grow_with_the_scene_and_the_steps(tmp_path):
     for stage in STAGES:
         assert duration.minutes(stage, many) >= duration.minutes(stage, few) >= 10
     assert duration.seconds("matches", many) > duration.seconds("matches", few)
+    divided = Config.model_validate({"features": {"photos_per_job": 10}})
+    chunks = make_plan(scan(tmp_path / "many", "many", divided, cache=None), divided, STAGES)
+    for stage, whole in (("extract", "features"), ("match", "matches")):
+        assert duration.seconds(stage, chunks) < duration.seconds(whole, many) / 2
     longer = Config.model_validate({"train": {"budget_minutes": 600}})
     plan = make_plan(scan(tmp_path / "few", "few", longer, cache=None), longer, STAGES)
     assert duration.minutes("train", plan) >= 4 * 600
+
+
+def test_a_scene_is_three_submissions_and_one_for_each_job_of_divided_stages(tmp_path):
+    photos(tmp_path, 9)
+
+    def groups(**options: dict[str, int]) -> dict[str, str | None]:
+        config = Config.model_validate(options)
+        plan = make_plan(scan(tmp_path, "x", config, cache=None), config, STAGES)
+        return {stage: cluster.group_of(stage, plan) for stage in STAGES if plan.runs(stage)}
+
+    assert set(groups().values()) == {"prepare", "train", "finish"}
+    found = groups(features={"photos_per_job": 3}, partition={"blocks": 2})
+    assert [stage for stage, group in found.items() if group is None] == [
+        "extract",
+        "match",
+        "block",
+        "polish",
+    ]
+    # A group must not depend on jobs that depend on it.
+    assert found["inspect"] == "prepare"
+    assert found["features"] == found["pairs"] == "prepare_1"
+    assert found["matches"] == found["sfm"] == found["init"] == "prepare_2"
+    assert found["coarse"] == found["partition"] == "coarse_2"
+    assert found["train"] == found["export"] == "train_4"
 
 
 def test_sigterm_ends_at_once_or_where_the_work_allows_it():

@@ -1,0 +1,48 @@
+"""The pairs of photographs that the jobs of ``match`` share. Output: ``pairs.json``."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+from pipeline.config.experiments import Experiments
+from pipeline.config.schema import Matches, Sfm
+from pipeline.plan.stage import StageSpec, if_several_jobs
+from pipeline.plan.values import StagePlan
+from pipeline.runtime.job import Job
+from pipeline.sfm.counters import PairsCounters
+from stages.workflow import inputs
+
+if TYPE_CHECKING:
+    from pipeline.plan.scan import Scan
+    from pipeline.plan.settle import Settled
+
+
+def decide(scan: Scan, settled: Settled) -> StagePlan:
+    return if_several_jobs(scan, settled, "pairs that several jobs match")
+
+
+def work(job: Job) -> None:
+    from pipeline.sfm.matching import choose_pairs
+
+    chosen = choose_pairs(
+        inputs.read_manifest(job, "photos"),
+        job.inputs["features"],
+        job.section(Matches),
+        job.section(Sfm),
+        seed=job.seed,
+        experiments=job.section(Experiments).matches,
+    )
+    chosen.write(job.out)
+    job.record(PairsCounters(num_pairs=len(chosen.pairs)), chosen.decisions)
+
+
+SPEC = StageSpec(
+    name="pairs",
+    work=work,
+    decide=decide,
+    counters=PairsCounters,
+    inputs={"photos": inputs.PHOTOS, "features": ("features",)},
+    options=("matches", "sfm.camera_model", "sfm.share_cameras", "experiments.matches"),
+    packages=("pycolmap",),
+    seeded=True,
+)

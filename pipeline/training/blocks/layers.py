@@ -13,6 +13,7 @@ from torch import Tensor
 from pipeline.render import Backend, Color, Forward, RasterOptions
 from pipeline.render.views import raster_camera
 from pipeline.scene.blocks import BlockView, Box
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.surroundings import Surroundings
@@ -34,6 +35,7 @@ class BlockLayers:
         region: of the block, with its margin.
         background: behind the scene.
         options: as in training, without a background.
+        gains: of the views, by which renders are multiplied before they are compared.
         windows: of the views that the block is seen in, by name. Whole views ignore them: the block
             is trained on the windows themselves.
     """
@@ -43,6 +45,7 @@ class BlockLayers:
     background: Color
     options: RasterOptions
     backend: Backend
+    gains: ExposureGains = NO_GAINS
     windows: Mapping[str, BlockView] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock, compare=False)
 
@@ -61,10 +64,13 @@ class BlockLayers:
         if float(front.alpha.max()) >= MIN_FRONT:
             transmittance = _bytes(1 - front.alpha)
             around = replace(around, front=_bytes(front.color), transmittance=transmittance)
+        scene = around.compose(block.color, block.alpha)
+        if (gain := self.gains.of(view.name)) is not None:
+            scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(
             surroundings=around,
             used=(1 - front.alpha) * block.alpha > USED_SHARE,
-            coarse=_bytes(around.compose(block.color, block.alpha)),
+            coarse=_bytes(scene),
             background=self.background,
             ignored=self._ignored(view),
         )

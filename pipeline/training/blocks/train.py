@@ -90,7 +90,7 @@ def block_training(
 def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
     """The inputs of the training of block ``number``: its windows in the views that see it, and
     overviews."""
-    partition, read_gaussians = scene.partition, scene.read_gaussians
+    partition, gains, read_gaussians = scene.partition, scene.gains, scene.read_gaussians
     gaussians = read_gaussians()
     whole = scene_inputs(scene.views, scene.manifest, scene.model, gaussians, scene.gains, config)
     block = partition.blocks[number - 1]
@@ -116,6 +116,7 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
             BACKGROUNDS[background],
             replace(options, threads=threads),
             make_backend(),
+            gains,
             windows,
         )
 

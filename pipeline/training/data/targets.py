@@ -65,8 +65,8 @@ class Layers:
     Attributes:
         surroundings: the layers around the block.
         used: (H, W) bool, the pixels in which the block is trained.
-        coarse: (H, W, 3) uint8, the scene before training, which replaces the photograph in all
-            other pixels: other blocks explain them.
+        coarse: (H, W, 3) uint8, the scene before training with the view's exposure, which replaces
+            the photograph in all other pixels: other blocks explain them.
         background: behind the scene, and behind photographs with alpha.
         ignored: (H, W) bool, pixels that another view of the block shows; None if there are none.
     """

@@ -3,11 +3,14 @@ of autograd."""
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import pytest
 import torch
 
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import raster_camera
+from pipeline.scene.exposure import ExposureGains
 from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.data.surroundings import ALPHA_LOSS_WEIGHT, ALPHA_TOLERANCE, Surroundings
 from tests.training.blocks.conftest import NEAR, DividedScene
@@ -73,3 +76,16 @@ def test_layers_of_a_cropped_view_are_cropped_layers(divided: DividedScene) -> N
     cut = whole.coarse[16:96, 32:96].int()
     assert (cut - part.coarse.int()).abs().max() <= 1
     assert (whole.used[16:96, 32:96] ^ part.used).float().mean() < 0.01
+
+
+def test_pixels_of_other_blocks_have_the_exposure_of_their_view(divided: DividedScene) -> None:
+    """They are compared with renders that are multiplied by the view's gains."""
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    view, region = divided.views[1], divided.partition.box(1)
+    plain = BlockLayers(divided.gaussians, region, WHITE, options, make_backend())
+    gains = ExposureGains({view.name: (0.5, 0.25, 0.75)})
+    exposed = replace(plain, gains=gains)
+    factor = torch.tensor([0.5, 0.25, 0.75])
+    difference = exposed(view).coarse - plain(view).coarse * factor
+    assert difference.abs().max() <= 1
+    torch.testing.assert_close(exposed(view).surroundings.behind, plain(view).surroundings.behind)

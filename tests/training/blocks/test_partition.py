@@ -86,7 +86,12 @@ def test_overviews_are_not_trained_on_where_windows_are(divided: DividedScene) -
     windows = {shown.name: shown for shown in block.views}
     left, top, width, height = windows[view.name].window
     layers = BlockLayers(
-        divided.gaussians, divided.partition.region(1), (0, 0, 0), options, make_backend(), windows
+        divided.gaussians,
+        divided.partition.region(1),
+        (0, 0, 0),
+        options,
+        make_backend(),
+        windows=windows,
     )
     ignored = layers(view).ignored
     assert ignored is not None and ignored.sum() == width * height

@@ -29,9 +29,6 @@ from pipeline.training.density import make_strategy
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam
 
-# Memory of a pixel with the layers around a block, in pixels without.
-LAYERED_PIXELS = 3
-
 Warn = Callable[[str], None]
 
 
@@ -101,10 +98,11 @@ def load_scene(
 
 
 def choose_image_store(inputs: Inputs, config: Train, limit_mb: int | None) -> ImageStore:
-    """Memory if the views' pixels fit beside the Gaussians, else a file."""
-    pixels = sum(view.width * view.height for view in inputs.views)
+    """Memory if the views' pixels fit beside the Gaussians, else a file; always a file for a block,
+    of which there may be several at a time."""
     if inputs.open_layers is not None:
-        pixels *= LAYERED_PIXELS
+        return DiskStore()
+    pixels = sum(view.width * view.height for view in inputs.views)
     limit = min(machine_mb(), limit_mb or math.inf)
     fits = memory_mb(pixels, config.density.max_gaussians) <= limit
     return MemoryStore() if fits else DiskStore()

@@ -26,6 +26,10 @@ MAX_FACTOR = 4.0
 # large scenes: Adam's second moment is a mean over all steps, so that the step of a Gaussian that
 # is seen in a share p of them grows by 1 / sqrt(p).
 USUAL_SEEN_SHARE = 0.5
+# A part that begins in the middle of the schedule has no moments of Adam: in the first steps, each
+# parameter would move by its whole learning rate. Rates rise over so many steps, at most over this
+# share of the part.
+WARM_UP_STEPS, WARM_UP_SHARE = 50, 0.2
 # Learning rate of cameras in the last step over that in the first: as for the means in 3DGS.
 CAMERA_DECAY = 0.01
 
@@ -44,6 +48,12 @@ class Part:
     def of(self, steps: int) -> range:
         """The steps of a schedule of so many steps, counted from 0."""
         return range(round(self.begin * steps), max(1, round(self.end * steps)))
+
+
+def warm_up(part: range, step: int) -> float:
+    """Factor of the learning rates in a step of a part, counted from 1."""
+    steps = min(WARM_UP_STEPS, WARM_UP_SHARE * len(part)) if part.start else 0
+    return min(1.0, step / steps) if steps else 1.0
 
 
 WHOLE_RUN = Part()
@@ -104,15 +114,18 @@ class Schedule:
         pixels to fit."""
         return round(self.max_gaussians / math.sqrt(self.resolution_factor(step)))
 
-    def learning_rates(self, step: int, run_length: float, unit: float) -> Rates:
+    def learning_rates(
+        self, step: int, run_length: float, unit: float, warm_up: float = 1.0
+    ) -> Rates:
         """The learning rates of a step.
 
         Args:
+            warm_up: factor of all of them.
             run_length: number of optimiser steps of the whole run, or its estimate.
             unit: of the means' learning rate, world units; 1 for each Gaussian's own scales.
         """
         rates = self.experiments
-        run_factor = self.learning_rate_factor(run_length)
+        run_factor = self.learning_rate_factor(run_length) * warm_up
         factor = run_factor * self.decay_at(step)
         means = rates.means_learning_rate * self.means_decay_at(step)
         return Rates(

@@ -14,7 +14,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.training.data.targets import Target, usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.loop.clock import Clock
-from pipeline.training.loop.schedule import Schedule
+from pipeline.training.loop.schedule import Schedule, warm_up
 from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
 from pipeline.training.losses.alpha import alpha_gradient
@@ -43,7 +43,7 @@ class Trainer:
         self.scene, self.state, self.backend, self.threads = scene, state, backend, threads
         self.config, self.experiments = config, experiments
         self.schedule = Schedule.of(config, experiments, scene.inputs.seen_share)
-        self.clock = Clock(self.schedule.steps, config.budget_minutes, part)
+        self.part, self.clock = part, Clock(self.schedule.steps, config.budget_minutes, part)
         self.rate_unit = learning_rate_unit(scene.inputs, experiments)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))
         depths = scene.inputs.empty_depths
@@ -67,7 +67,9 @@ class Trainer:
         d_color, d_alpha = self.color_loss(rendered, target, index, background)
         d_alpha, d_depth = self.other_losses(rendered, target, index, d_alpha)
         run_length = self.clock.run_length(state)
-        rates = self.schedule.learning_rates(state.clock, run_length, self.rate_unit)
+        rates = self.schedule.learning_rates(
+            state.clock, run_length, self.rate_unit, warm_up(self.part, state.step)
+        )
         gradients = self.backend.backward(
             rendered,
             d_color,

@@ -22,6 +22,16 @@ QUEUE_SECONDS = 10.0
 # Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
 _JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
+# Variables in jobs of Slurm, Grid Engine, PBS and LSF: the job's number and its number of cores.
+_GRANTED = (
+    ("SLURM_JOB_ID", "SLURM_CPUS_PER_TASK"),
+    ("SLURM_JOB_ID", "SLURM_CPUS_ON_NODE"),
+    ("JOB_ID", "NSLOTS"),
+    ("PBS_JOBID", "NCPUS"),
+    ("PBS_JOBID", "PBS_NUM_PPN"),
+    ("LSB_JOBID", "LSB_DJOB_NUMPROC"),
+)
+
 
 @dataclass(frozen=True)
 class Node:
@@ -32,9 +42,12 @@ class Node:
 
 
 def granted_cpus() -> int | None:
-    """The number of cores of the Slurm job that this process is in; None outside of a job."""
-    value = os.environ.get("SLURM_CPUS_PER_TASK") or os.environ.get("SLURM_CPUS_ON_NODE", "")
-    return int(value) if value.isdecimal() and "SLURM_JOB_ID" in os.environ else None
+    """The number of cores of the cluster's job that this process is in; None outside of a job."""
+    for job, cpus in _GRANTED:
+        value = os.environ.get(cpus, "")
+        if job in os.environ and value.isdecimal():
+            return int(value)
+    return None
 
 
 @cache

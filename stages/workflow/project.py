@@ -149,7 +149,8 @@ class SnakemakeProject:
         a node; in a job those of the job."""
         limit = self._workflow.resource_settings.cores
         if self._workflow.remote_exec:
-            return int(granted_cpus() or limit)
+            # Snakemake gives the job all cores of the node.
+            return granted_cpus() or min(int(limit), DEFAULT_CPUS)
         if not self._workflow.non_local_exec:
             return int(self._workflow.cores)
         wanted, node = int(limit or DEFAULT_CPUS), largest_node()

@@ -133,6 +133,22 @@ def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
     assert cluster.granted_cpus() == 2
 
 
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"JOB_ID": "7", "NSLOTS": "3"},
+        {"PBS_JOBID": "7.host", "NCPUS": "3"},
+        {"PBS_JOBID": "7.host", "PBS_NUM_PPN": "3"},
+        {"LSB_JOBID": "7", "LSB_DJOB_NUMPROC": "3"},
+    ],
+)
+def test_the_cores_of_jobs_of_other_clusters(monkeypatch, variables):
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert cluster.granted_cpus() == 3
+
+
 def test_a_stage_gets_the_threads_and_the_memory_of_its_job(tmp_path, monkeypatch):
     """On a cluster without the memory of the Snakemakes around it."""
     requests = []

@@ -19,6 +19,9 @@ DEFAULT_CPUS = 8
 OVERHEAD_MB = 400
 # Seconds between two looks at the queue.
 QUEUE_SECONDS = 10.0
+# Seconds between two checks of jobs: at least so many, and this share of the time since a job has
+# started or ended, so that the wait for the check is short beside the job.
+SHORTEST_INTERVAL, INTERVAL_SHARE = 5.0, 0.1
 # Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
 _JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
 
@@ -48,6 +51,12 @@ def granted_cpus() -> int | None:
         if job in os.environ and value.isdecimal():
             return int(value)
     return None
+
+
+def granted_memory_mb() -> int | None:
+    """The memory of the Slurm job that this process is in; None outside of a job."""
+    value = os.environ.get("SLURM_MEM_PER_NODE", "")
+    return int(value) if value.isdecimal() and "SLURM_JOB_ID" in os.environ else None
 
 
 @cache
@@ -103,13 +112,15 @@ def earlier_jobs(folder: Path) -> Sequence[str]:
 
 
 def watch_jobs(executor: Any, seconds: float) -> None:
-    """Let an executor of Snakemake check its jobs at this interval at most, and each until it has
-    reported the job's end.
+    """Let an executor of Snakemake check its jobs at this interval at most, more often while they
+    are young, and each until it has reported the job's end.
 
     The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
     does not answer, as while the controller is started again: Snakemake would never end.
     """
     check, finished = executor.check_active_jobs, set()
+    known: set[int] = set()
+    changed = time.monotonic()
 
     def recording(report: Callable[..., None]) -> Callable[..., None]:
         def reported(job: Any, *args: Any, **options: Any) -> None:
@@ -119,6 +130,7 @@ def watch_jobs(executor: Any, seconds: float) -> None:
         return reported
 
     async def checked(active: Sequence[Any]) -> AsyncIterator[Any]:
+        nonlocal changed
         finished.clear()
         yielded = set()
         async for job in check(active):
@@ -127,7 +139,13 @@ def watch_jobs(executor: Any, seconds: float) -> None:
         for job in active:
             if id(job) not in yielded | finished:
                 yield job
-        due = min(seconds, executor.next_seconds_between_status_checks)
+        jobs, now = {id(job) for job in active}, time.monotonic()
+        if finished or not jobs <= known:
+            changed = now
+        known.clear()
+        known.update(jobs)
+        young = max(SHORTEST_INTERVAL, INTERVAL_SHARE * (now - changed))
+        due = min(seconds, young, executor.next_seconds_between_status_checks)
         executor.next_seconds_between_status_checks = due
 
     executor.report_job_success = recording(executor.report_job_success)

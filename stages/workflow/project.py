@@ -31,6 +31,7 @@ from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
     granted_cpus,
+    granted_memory_mb,
     largest_node,
     wait_for_earlier_jobs,
     watch_jobs,
@@ -158,13 +159,21 @@ class SnakemakeProject:
 
     def memory_mb(self, spec: StageSpec) -> Callable[[Any, int, int], int]:
         """Resources function: memory in MB that the stage may use, and what a cluster's job needs
-        besides. A job that is tried again gets more: the last may have been killed for memory."""
+        besides, but no more than a node has. A job that is tried again gets more: the last may have
+        been killed for memory."""
 
         def megabytes(wildcards: Any, threads: int, attempt: int) -> int:
             estimate = stage_memory.memory_mb(spec.name, self._plan(wildcards.scene), threads)
             needed = round(estimate * MORE_MEMORY ** (attempt - 1))
-            remote = self._workflow.remote_exec or self._workflow.non_local_exec
-            return needed + (OVERHEAD_MB if remote else 0)
+            if self._workflow.remote_exec:
+                most = granted_memory_mb()
+            elif self._workflow.non_local_exec:
+                node = largest_node()
+                most = None if node is None else node.memory_mb
+            else:
+                return needed
+            wanted = needed + OVERHEAD_MB
+            return wanted if most is None else min(wanted, most)
 
         return megabytes
 

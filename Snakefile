@@ -14,7 +14,7 @@ if os.path.exists("config/config.yaml"):
     configfile: "config/config.yaml"
 
 
-project = SnakemakeProject(config, workflow.basedir)
+project = SnakemakeProject(config, workflow)
 RUN = (
     "python -m stages {rule} --out {params.out:q} --key {params.key:q}"
     " --input {params.inputs:q} --publish {params.publish:q} --threads {threads}"
@@ -23,7 +23,7 @@ RUN = (
 
 
 onstart:
-    project.before_jobs(workflow)
+    project.before_jobs()
     # No limit on the rate of jobs: Snakemake's limiter uses a considerable share of a core after
     # some dozens of jobs.
     workflow.scheduler.job_rate_limiter = None
@@ -113,10 +113,10 @@ for spec in project.stages:
         log:
             f"results/{{scene}}/logs/{project.folder(spec)}.log",
         group:
-            project.group(spec, workflow)
-        threads: project.threads(workflow)
+            project.group(spec)
+        threads: project.threads
         resources:
-            mem_mb=project.memory_mb(spec, workflow),
+            mem_mb=project.memory_mb(spec),
             runtime=project.minutes(spec),
         params:
             out=subpath(output.stage, parent=True),

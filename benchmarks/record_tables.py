@@ -276,11 +276,13 @@ def slurm(records: Sequence[Stored]) -> str:
 
 
 def slurm_table(found: Sequence[SlurmResult]) -> str:
-    rows = [["scene", "nodes", "blocks", "jobs", "wall (s)", "a job runs (s)", "none runs (s)"]]
+    rows = [["scene", "nodes", "blocks", "jobs"]]
+    rows[0] += ["wall (s)", "a job runs (s)", "none runs (s)", "training of blocks (s)"]
     for r in found:
         times = (r.wall_s, r.busy_s, r.wall_s - r.busy_s)
         counts = (r.nodes, r.blocks, r.jobs)
-        rows.append([r.scene, *map(str, counts), *(f"{seconds:.0f}" for seconds in times)])
+        seconds = (*(f"{value:.0f}" for value in times), cell(r.blocks_s, ".0f"))
+        rows.append([r.scene, *map(str, counts), *seconds])
     return markdown.table(rows)
 
 

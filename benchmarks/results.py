@@ -327,6 +327,8 @@ class SlurmResult:
         jobs: number of submissions.
         wall_s: from the start of Snakemake to its end.
         busy_s: seconds in which at least one job runs.
+        blocks_s: from the start of the first job that trains or polishes a block to the end of the
+            last one; None if the scene is one block.
     """
 
     scene: str
@@ -335,3 +337,4 @@ class SlurmResult:
     jobs: int
     wall_s: float
     busy_s: float
+    blocks_s: float | None = None

@@ -1,5 +1,6 @@
 """``python -m benchmarks.slurm``: the demo scene on a Slurm cluster that is started on this
-machine (see ``benchmarks.slurm_cluster``), and the time in which none of its jobs runs.
+machine (see ``benchmarks.slurm_cluster``): the time in which none of its jobs runs, and the time
+that the training of blocks takes (``--blocks 4 --nodes 1 2``).
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ import sys
 import tempfile
 import time
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import datetime
 from pathlib import Path
 
@@ -43,12 +45,37 @@ def run(nodes: int, blocks: int, steps: int) -> SlurmResult:
             options = ("--workflow-profile", "profiles/slurm", "--config", *config)
             _python(project, "-m", "snakemake", TARGET, *options)
             wall = time.monotonic() - started
-            lines = cluster.run("squeue", "-h", "-t", "all", "-o", "%S %e").splitlines()
+            lines = cluster.run("squeue", "-h", "-t", "all", "-o", "%S|%e|%k").splitlines()
     finally:
         shutil.rmtree(folder, ignore_errors=True)
         shutil.rmtree(project, ignore_errors=True)
-    times = [tuple(map(_seconds, line.split())) for line in lines]
-    return SlurmResult("demo", nodes, blocks, len(times), wall, covered(times))
+    jobs = [JobTimes.parse(line) for line in lines]
+    for job in sorted(jobs):
+        print(f"{job.end - job.start:6.0f} s  {job.rule}", file=sys.stderr)
+    busy = covered([(job.start, job.end) for job in jobs])
+    return SlurmResult("demo", nodes, blocks, len(jobs), wall, busy, blocks_span(jobs))
+
+
+@dataclass(frozen=True, order=True)
+class JobTimes:
+    """Start and end of a job in seconds, and Snakemake's comment, which names its rule."""
+
+    start: float
+    end: float
+    rule: str
+
+    @classmethod
+    def parse(cls, line: str) -> JobTimes:
+        start, end, rule = line.split("|", 2)
+        return cls(_seconds(start), _seconds(end), rule)
+
+
+def blocks_span(jobs: Sequence[JobTimes]) -> float | None:
+    """Seconds from the start of the first job of a block to the end of the last one."""
+    found = [job for job in jobs if job.rule.startswith(("rule_block_", "rule_polish_"))]
+    if not found:
+        return None
+    return max(job.end for job in found) - min(job.start for job in found)
 
 
 def covered(intervals: Sequence[tuple[float, ...]]) -> float:

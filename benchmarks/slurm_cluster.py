@@ -16,7 +16,7 @@ import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 
 PROGRAMS = ("munged", "slurmctld", "slurmd", "sbatch", "squeue", "scontrol")
@@ -31,7 +31,7 @@ SlurmctldHost={host}(127.0.0.1)
 SlurmctldPort={port}
 CommunicationParameters=NoCtldInAddrAny,NoInAddrAny
 AuthType=auth/munge
-AuthInfo=socket={folder}/munge/socket
+AuthInfo=socket={folder}/munge/socket,cred_expire=20
 CryptoType=crypto/munge
 SlurmUser=root
 SlurmdUser=root
@@ -67,19 +67,29 @@ class Cluster:
     Attributes:
         folder: its configuration, state and logs.
         environment: variables with which Slurm's commands find it.
+        controllers: the running one's supervisor.
     """
 
     folder: Path
     environment: dict[str, str]
+    controllers: list[subprocess.Popen[bytes]] = field(default_factory=list)
 
     def run(self, *command: str, check: bool = True) -> str:
-        """Run a program of Slurm and return what it prints."""
-        done = subprocess.run(
-            command, env=self.environment, capture_output=True, text=True, check=False, timeout=60
-        )
-        if check and done.returncode:
-            raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
-        return done.stdout
+        """Run a program of Slurm and return what it prints.
+
+        Args:
+            check: run it again until it succeeds, for a minute: the controller may be starting.
+        """
+        end = time.monotonic() + 60
+        while True:
+            done = subprocess.run(
+                command, env=self.environment, capture_output=True, text=True, timeout=120
+            )
+            if not check or done.returncode == 0:
+                return done.stdout
+            if time.monotonic() > end:
+                raise RuntimeError(f"{' '.join(command)}: {done.stderr}")
+            time.sleep(0.5)
 
     def jobs(self) -> dict[str, str]:
         """Id -> state of the jobs that are pending or running."""
@@ -88,17 +98,28 @@ class Cluster:
 
     def start_controller(self) -> None:
         """Start the controller, and again if it crashes, as a service manager does: that of Slurm
-        22.05 sometimes does when a lost node returns."""
+        22.05 does if the job of a lost node is started earlier than Slurm would (``cred_expire``),
+        and asks for its nodes."""
         stopped = self.folder / "stopped"
         stopped.unlink(missing_ok=True)
-        loop = f"until [ -e {stopped} ]; do slurmctld -D; sleep 1; done"
-        subprocess.Popen(
-            ["sh", "-c", loop], env=self.environment, stderr=subprocess.DEVNULL, cwd=self.folder
+        loop = f"while [ -d {self.folder} -a ! -e {stopped} ]; do slurmctld -D; sleep 1; done"
+        command = ["sh", "-c", loop]
+        self.controllers.append(
+            subprocess.Popen(
+                command, env=self.environment, stderr=subprocess.DEVNULL, cwd=self.folder
+            )
         )
 
     def stop_controller(self) -> None:
         (self.folder / "stopped").touch()
-        _stop(self.folder / "slurmctld.pid")
+        while self.controllers:
+            # A controller that has just been started has not written its file yet.
+            _stop(self.folder / "slurmctld.pid")
+            try:
+                self.controllers[-1].wait(2)
+                self.controllers.pop()
+            except subprocess.TimeoutExpired:
+                continue
 
     def start_node(self, name: str) -> None:
         subprocess.run(["slurmd", "-N", name], env=self.environment, check=True)

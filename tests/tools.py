@@ -29,6 +29,7 @@ PACKAGES = {
     "objdump": "binutils",
     "qemu-aarch64": "qemu-user",
     "munged": "munge",
+    "setpriv": "util-linux",
     **dict.fromkeys(("slurmctld", "slurmd", "sbatch", "squeue", "scontrol"), "slurm-wlm"),
 }
 UNSUPPORTED = "not on this machine: "

@@ -16,7 +16,7 @@ from typing import TextIO
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Console
 
-_held: list[TextIO] = []
+_held: dict[Path, TextIO] = {}
 
 
 def lock_run(folder: Path) -> None:
@@ -26,29 +26,65 @@ def lock_run(folder: Path) -> None:
 
     Raises:
         UserError: another process has locked it.
+        PermissionError: this user may not write the lock's file, and no process has locked it.
     """
-    path = folder / ".scratch" / "run.lock"
+    path = _lock_file(folder)
     path.parent.mkdir(parents=True, exist_ok=True)
-    file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  (open until the process ends)
     try:
-        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        file.seek(0)
-        owner = file.read().strip() or "starting"
+        file = open(path, "a+", encoding="utf-8")  # noqa: SIM115  (open until the process ends)
+    except PermissionError:
+        check_not_locked(folder)
+        raise
+    try:
+        _lock(file, fcntl.LOCK_EX, folder)
+    except UserError:
         file.close()
-        what = f"another run is writing these results ({owner})"
-        fix = "wait until it has ended or end it, then run the same command again"
-        raise UserError(what, file=folder, fix=fix) from None
+        raise
     file.truncate(0)
-    file.write(f"{_user()} on {platform.node()}, process {os.getpid()}\n")
+    file.write(f"{user_name()} on {platform.node()}, process {os.getpid()}\n")
     file.flush()
-    _held.append(file)
+    _held[path.absolute()] = file
 
 
-def _user() -> str:
+def check_not_locked(folder: Path) -> None:
+    """Check that no other process has locked a run's folder of results, which this user need not be
+    allowed to write.
+
+    Raises:
+        UserError: another process has.
+    """
+    path = _lock_file(folder)
+    if path.absolute() in _held:
+        return
+    try:
+        file = open(path, encoding="utf-8")  # noqa: SIM115  (closed below)
+    except (FileNotFoundError, NotADirectoryError, PermissionError):
+        return
+    with file:
+        # Over NFS, an exclusive lock needs the permission to write.
+        _lock(file, fcntl.LOCK_SH, folder)
+
+
+def user_name() -> str:
+    """The name of this process's user; its number if it has no name, as in some containers."""
     with contextlib.suppress(OSError, KeyError):
         return getpass.getuser()
     return str(os.getuid())
+
+
+def _lock_file(folder: Path) -> Path:
+    return folder / ".scratch" / "run.lock"
+
+
+def _lock(file: TextIO, kind: int, folder: Path) -> None:
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        file.seek(0)
+        owner = file.read().strip() or "starting"
+        what = f"another run is writing these results ({owner})"
+        fix = "wait until it has ended or end it, then run the same command again"
+        raise UserError(what, file=folder, fix=fix) from None
 
 
 @contextmanager

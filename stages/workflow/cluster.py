@@ -31,8 +31,21 @@ DEFAULT_CPUS = 8
 OVERHEAD_MB = 400
 # Seconds between two looks at the queue.
 QUEUE_SECONDS = 10.0
+# Seconds between two checks of jobs: at least so many, and this share of the time since a job has
+# started or ended, so that the wait for the check is short beside the job.
+SHORTEST_INTERVAL, INTERVAL_SHARE = 5.0, 0.1
 # Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
 _JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
+
+# Variables in jobs of Slurm, Grid Engine, PBS and LSF: the job's number and its number of cores.
+_GRANTED = (
+    ("SLURM_JOB_ID", "SLURM_CPUS_PER_TASK"),
+    ("SLURM_JOB_ID", "SLURM_CPUS_ON_NODE"),
+    ("JOB_ID", "NSLOTS"),
+    ("PBS_JOBID", "NCPUS"),
+    ("PBS_JOBID", "PBS_NUM_PPN"),
+    ("LSB_JOBID", "LSB_DJOB_NUMPROC"),
+)
 
 
 @dataclass(frozen=True)
@@ -44,8 +57,17 @@ class Node:
 
 
 def granted_cpus() -> int | None:
-    """The number of cores of the Slurm job that this process is in; None outside of a job."""
-    value = os.environ.get("SLURM_CPUS_PER_TASK") or os.environ.get("SLURM_CPUS_ON_NODE", "")
+    """The number of cores of the cluster's job that this process is in; None outside of a job."""
+    for job, cpus in _GRANTED:
+        value = os.environ.get(cpus, "")
+        if job in os.environ and value.isdecimal():
+            return int(value)
+    return None
+
+
+def granted_memory_mb() -> int | None:
+    """The memory of the Slurm job that this process is in; None outside of a job."""
+    value = os.environ.get("SLURM_MEM_PER_NODE", "")
     return int(value) if value.isdecimal() and "SLURM_JOB_ID" in os.environ else None
 
 
@@ -127,13 +149,15 @@ def earlier_jobs(folder: Path) -> Sequence[str]:
 
 
 def watch_jobs(executor: Any, seconds: float) -> None:
-    """Let an executor of Snakemake check its jobs at this interval at most, and each until it has
-    reported the job's end.
+    """Let an executor of Snakemake check its jobs at this interval at most, more often while they
+    are young, and each until it has reported the job's end.
 
     The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
     does not answer, as while the controller is started again: Snakemake would never end.
     """
     check, finished = executor.check_active_jobs, set()
+    known: set[int] = set()
+    changed = time.monotonic()
 
     def recording(report: Callable[..., None]) -> Callable[..., None]:
         def reported(job: Any, *args: Any, **options: Any) -> None:
@@ -143,6 +167,7 @@ def watch_jobs(executor: Any, seconds: float) -> None:
         return reported
 
     async def checked(active: Sequence[Any]) -> AsyncIterator[Any]:
+        nonlocal changed
         finished.clear()
         yielded = set()
         async for job in check(active):
@@ -151,7 +176,13 @@ def watch_jobs(executor: Any, seconds: float) -> None:
         for job in active:
             if id(job) not in yielded | finished:
                 yield job
-        due = min(seconds, executor.next_seconds_between_status_checks)
+        jobs, now = {id(job) for job in active}, time.monotonic()
+        if finished or not jobs <= known:
+            changed = now
+        known.clear()
+        known.update(jobs)
+        young = max(SHORTEST_INTERVAL, INTERVAL_SHARE * (now - changed))
+        due = min(seconds, young, executor.next_seconds_between_status_checks)
         executor.next_seconds_between_status_checks = due
 
     executor.report_job_success = recording(executor.report_job_success)

@@ -24,13 +24,14 @@ from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
-from pipeline.runtime.lock import lock_run
+from pipeline.runtime.lock import check_not_locked, lock_run, user_name
 from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
     granted_cpus,
+    granted_memory_mb,
     group_of,
     largest_node,
     wait_for_earlier_jobs,
@@ -64,16 +65,20 @@ class SnakemakeProject:
 
     Args:
         raw: Snakemake's ``config``.
-        basedir: the folder of the Snakefile.
+        workflow: Snakemake's ``workflow``.
 
     Raises:
         UserError: the configuration is not valid, before any job starts.
     """
 
-    def __init__(self, raw: Mapping[str, Any], basedir: str):
+    def __init__(self, raw: Mapping[str, Any], workflow: Any):
         self._raw = dict(raw)
+        self._workflow = workflow
         self._started = time.time()
+        # Snakemake and packages end with a traceback if the user has no name.
+        os.environ.setdefault("LOGNAME", user_name())
         try:
+            _check_working_directory()
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
@@ -86,7 +91,7 @@ class SnakemakeProject:
         # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
-            filter(None, [basedir, os.environ.get("PYTHONPATH", "")])
+            filter(None, [workflow.basedir, os.environ.get("PYTHONPATH", "")])
         )
         os.environ["PATH"] = os.pathsep.join(
             [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
@@ -141,40 +146,45 @@ class SnakemakeProject:
             spec, self._plan(wildcards.scene), int(wildcards.job) if spec.scattered else 1
         )
 
-    def threads(self, workflow: Any) -> Callable[[Any], int]:
+    def threads(self, wildcards: Any) -> int:
         """Threads function: the cores of this machine that Snakemake may use; on a cluster those of
         a node; in a job those of the job."""
+        limit = self._workflow.resource_settings.cores
+        if self._workflow.remote_exec:
+            # Snakemake gives the job all cores of the node.
+            return granted_cpus() or min(int(limit), DEFAULT_CPUS)
+        if not self._workflow.non_local_exec:
+            return int(self._workflow.cores)
+        wanted, node = int(limit or DEFAULT_CPUS), largest_node()
+        return wanted if node is None else min(wanted, node.cpus)
 
-        def count(wildcards: Any) -> int:
-            limit = workflow.resource_settings.cores
-            if workflow.remote_exec:
-                return granted_cpus() or limit
-            if not workflow.non_local_exec:
-                return int(workflow.cores)
-            wanted, node = limit or DEFAULT_CPUS, largest_node()
-            return wanted if node is None else min(wanted, node.cpus)
-
-        return count
-
-    def group(self, spec: StageSpec, workflow: Any) -> Callable[[Any], str | None]:
+    def group(self, spec: StageSpec) -> Callable[[Any], str | None]:
         """Group function: the group of jobs that a cluster runs as one, if there is a cluster."""
 
         def name(wildcards: Any) -> str | None:
-            if not (workflow.remote_exec or workflow.non_local_exec):
+            if not (self._workflow.remote_exec or self._workflow.non_local_exec):
                 return None
             return group_of(spec.name, self._plan(wildcards.scene))
 
         return name
 
-    def memory_mb(self, spec: StageSpec, workflow: Any) -> Callable[[Any, int, int], int]:
+    def memory_mb(self, spec: StageSpec) -> Callable[[Any, int, int], int]:
         """Resources function: memory in MB that the stage may use, and what a cluster's job needs
-        besides. A job that is tried again gets more: the last may have been killed for memory."""
+        besides, but no more than a node has. A job that is tried again gets more: the last may have
+        been killed for memory."""
 
         def megabytes(wildcards: Any, threads: int, attempt: int) -> int:
             estimate = stage_memory.memory_mb(spec.name, self._plan(wildcards.scene), threads)
             needed = round(estimate * MORE_MEMORY ** (attempt - 1))
-            remote = workflow.remote_exec or workflow.non_local_exec
-            return needed + (OVERHEAD_MB if remote else 0)
+            if self._workflow.remote_exec:
+                most = granted_memory_mb()
+            elif self._workflow.non_local_exec:
+                node = largest_node()
+                most = None if node is None else node.memory_mb
+            else:
+                return needed
+            wanted = needed + OVERHEAD_MB
+            return wanted if most is None else min(wanted, most)
 
         return megabytes
 
@@ -195,9 +205,18 @@ class SnakemakeProject:
     def _plan(self, name: str) -> Plan:
         """The run's plan; a UserError ends Snakemake."""
         try:
+            # Before Snakemake's own lock, whose message does not name the other run, and before
+            # the permission to write is checked.
+            if self._writes_results():
+                check_not_locked(RESULTS / name)
             return self._make_plan(name)
         except UserError as error:
             _exit(error)
+
+    def _writes_results(self) -> bool:
+        """Whether this Snakemake runs jobs and is not itself in one."""
+        flow = self._workflow
+        return bool(flow.is_main_process and flow.executor_plugin and not flow.dryrun)
 
     def _scan_and_plan(self, name: str) -> Plan:
         self._check_results(name)
@@ -277,10 +296,11 @@ class SnakemakeProject:
 
     # --- clusters -------------------------------------------------------------------------
 
-    def before_jobs(self, workflow: Any) -> None:
+    def before_jobs(self) -> None:
         """Check that the jobs can write and that no other run does, and compile the native
         libraries before jobs are submitted: a compiler takes more memory than a job may use, and
         nodes may have none."""
+        workflow = self._workflow
         needed = list(workflow.dag.needrun_jobs())
         names = {getattr(job.wildcards, "scene", None) for job in needed}
         for name in sorted(filter(None, names)):
@@ -366,6 +386,16 @@ def _check_writable(folder: Path) -> None:
     if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
         fix = "make it writable, or run in another folder (snakemake --directory)"
         raise UserError("this folder of results cannot be written", file=folder, fix=fix)
+
+
+def _check_working_directory() -> None:
+    """Check that Snakemake can write its own files, which otherwise ends it with a traceback."""
+    own = Path(".snakemake").absolute()
+    folders = [own, *filter(Path.is_dir, own.iterdir())] if own.exists() else [own.parent]
+    for folder in folders:
+        if not os.access(folder, os.W_OK | os.X_OK):
+            fix = "make it writable, or run in another folder (snakemake --directory)"
+            raise UserError("Snakemake cannot write to this folder", file=folder, fix=fix)
 
 
 def _exit(error: UserError) -> NoReturn:

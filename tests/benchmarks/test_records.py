@@ -45,8 +45,8 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
     ),
     "slurm": (
         Record[SlurmResult],
-        SlurmResult("demo", nodes=2, blocks=1, jobs=3, wall_s=150.4, busy_s=110.0),
-        "| demo | 2 | 1 | 3 | 150 | 110 | 40 |",
+        SlurmResult("demo", 2, blocks=4, jobs=12, wall_s=150.4, busy_s=110.0, blocks_s=70.0),
+        "| demo | 2 | 4 | 12 | 150 | 110 | 40 | 70 |",
     ),
     "video": (
         Record[VideoFrames],

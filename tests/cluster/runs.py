@@ -15,12 +15,17 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from benchmarks.slurm_cluster import Cluster
-from tests.e2e.harness import TINY, copy_run, copy_sources, environment, make_project
+from tests.e2e.harness import TINY, copy_run, copy_sources, environment
 
 T = TypeVar("T")
 
-TARGET = "results/tiny/metrics.json"
-SLURM = ("--workflow-profile", "profiles/slurm")
+SCENE = "results/tiny/metrics.json"
+TRAINING = "results/tiny/train/stage.json"
+# The profile, with shorter intervals between two queries of the jobs' states.
+SLURM = (
+    *("--workflow-profile", "profiles/slurm"),
+    *("--slurm-init-seconds-before-status-checks", "1", "--seconds-between-status-checks", "2"),
+)
 # What follows the stages that make the poses.
 TRAINED = ("coarse", "partition", "train", "export", "evaluate", "coverage", "report")
 
@@ -39,7 +44,7 @@ def pause(step):
             Path("paused.new").rename("paused")
             Path("allocate").unlink()
             memory = bytes([1]) * (2 << 30)
-            time.sleep(60)
+            time.sleep(600)
         except FileNotFoundError:
             if not Path("pause").exists():
                 return
@@ -47,7 +52,7 @@ def pause(step):
 """
 
 
-def until(found: Callable[[], T], what: str, seconds: float = 240) -> T:
+def until(found: Callable[[], T], what: str, seconds: float = 600) -> T:
     """The first true value of ``found()``."""
     end = time.monotonic() + seconds
     while not (value := found()):
@@ -56,11 +61,20 @@ def until(found: Callable[[], T], what: str, seconds: float = 240) -> T:
     return value
 
 
-def project_that_pauses(folder: Path) -> Path:
-    """A copy of the project whose training saves a checkpoint after each step, and pauses at the
+def with_poses(finished: Path, folder: Path) -> Path:
+    """A copy of a finished project that has yet to train."""
+    copy_run(finished, folder)
+    for stage in TRAINED:
+        shutil.rmtree(folder / "results/tiny" / stage, ignore_errors=True)
+    (folder / SCENE).unlink()
+    return folder
+
+
+def that_pauses(project: Path) -> Path:
+    """Change a project so that its training saves a checkpoint after each step, and pauses at the
     step that the file ``pause`` names."""
-    copy_sources(make_project(folder))
-    loop = folder / "pipeline/training/loop"
+    copy_sources(project)
+    loop = project / "pipeline/training/loop"
     (loop / "pause.py").write_text(PAUSE)
     text = (loop / "session.py").read_text()
     advance = "        self.progress.advance("
@@ -70,16 +84,7 @@ def project_that_pauses(folder: Path) -> Path:
     first = "from pipeline.training.loop.state import"
     changed = changed.replace(first, f"from pipeline.training.loop.pause import pause\n{first}")
     (loop / "session.py").write_text(changed)
-    return folder
-
-
-def with_poses(finished: Path, folder: Path) -> Path:
-    """A copy of a finished project that has yet to train."""
-    copy_run(finished, folder)
-    for stage in TRAINED:
-        shutil.rmtree(folder / "results/tiny" / stage, ignore_errors=True)
-    (folder / TARGET).unlink()
-    return folder
+    return project
 
 
 class Running:
@@ -87,13 +92,13 @@ class Running:
 
     started: list[Running] = []  # noqa: RUF012  (of all projects)
 
-    def __init__(self, project: Path, *options: str, config: dict[str, Any] = TINY):
+    def __init__(self, project: Path, target: str, *options: str, config: dict[str, Any] = TINY):
         self.project = project
         self.file = project / f"snakemake-{len(Running.started)}.txt"
         values = [f"{name}={json.dumps(value)}" for name, value in config.items()]
         with self.file.open("w") as output:
             self.process = subprocess.Popen(
-                [sys.executable, "-m", "snakemake", TARGET, *options, "--config", *values],
+                [sys.executable, "-m", "snakemake", target, *options, "--config", *values],
                 cwd=project,
                 env=environment(project),
                 stdout=output,

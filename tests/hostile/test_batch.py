@@ -13,6 +13,10 @@ from pipeline.command.main import main
 from stages.workflow.project import SnakemakeProject
 from tests.pictures import photos
 
+# Snakemake's, in a dry run.
+WORKFLOW = SimpleNamespace(
+    basedir=str(Path(__file__).parents[2]), is_main_process=True, executor_plugin=None
+)
 NAMES = ("<x>", "{x}", "ab" * 20, "n" * 250, "a\nb", "\udcff")
 
 
@@ -26,7 +30,7 @@ def data(tmp_path, monkeypatch) -> Path:
 
 def runs(**config: object) -> tuple[list[str], dict[str, str]]:
     """The scenes that can be planned, and why the others cannot."""
-    project = SnakemakeProject(config, str(Path(__file__).parents[2]))
+    project = SnakemakeProject(config, WORKFLOW)
     found, left_out = project._batch
     planned = [run.scene for run in found if run not in left_out]
     assert {Path(file).parts[1] for file in project.every_run(None)} == set(planned)
@@ -106,12 +110,12 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"))
     batch = SimpleNamespace(wildcards=SimpleNamespace())
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
-    project = SnakemakeProject({}, str(Path(__file__).parents[2]))
-    jobs = SimpleNamespace(dag=dag, non_local_exec=False)
-    project.before_jobs(jobs)
+    flow = SimpleNamespace(**vars(WORKFLOW), dag=dag, non_local_exec=False)
+    project = SnakemakeProject({}, flow)
+    project.before_jobs()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "good")
     with pytest.raises(SystemExit):
-        project.before_jobs(jobs)
+        project.before_jobs()
     said = capfd.readouterr().err
     assert "results/good: this folder of results cannot be written" in said
 

@@ -8,6 +8,7 @@ import signal
 import sys
 import time
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -18,6 +19,8 @@ from pipeline.plan.scan import scan
 from pipeline.runtime import termination
 from stages import __main__ as main
 from stages.workflow import cluster
+from stages.workflow import project as project_module
+from stages.workflow.project import SnakemakeProject
 from stages.workflow.registry import STAGES
 from tests.pictures import photos
 
@@ -105,7 +108,7 @@ class Executor:
         self.next_seconds_between_status_checks += 10
 
 
-def test_jobs_without_a_status_stay_active_and_intervals_are_bounded():
+def test_jobs_without_a_status_stay_active():
     """An executor that forgets them would never report their end."""
     executor = Executor()
     cluster.watch_jobs(executor, 20)
@@ -116,9 +119,32 @@ def test_jobs_without_a_status_stay_active_and_intervals_are_bounded():
     active = asyncio.run(check("finished", "running", "unknown", "failed"))
     assert active == ["running", "unknown"]
     assert executor.ended == ["finished", "failed"]
-    assert executor.next_seconds_between_status_checks == 15
-    asyncio.run(check("running"))
-    assert executor.next_seconds_between_status_checks == 20
+
+
+def test_intervals_grow_with_the_age_of_the_jobs_and_are_bounded(monkeypatch):
+    """The executor's own interval grows by 10 s with each check."""
+    now = 1000.0
+    monkeypatch.setattr(cluster.time, "monotonic", lambda: now)
+    executor = Executor()
+    cluster.watch_jobs(executor, 15)
+
+    def interval_after(seconds: float, *jobs: str) -> float:
+        nonlocal now
+        now += seconds
+
+        async def check() -> None:
+            [job async for job in executor.check_active_jobs(jobs)]
+
+        asyncio.run(check())
+        return executor.next_seconds_between_status_checks
+
+    assert interval_after(5, "running") == 5
+    assert interval_after(5, "running") == 5
+    assert interval_after(75, "running") == 8
+    assert interval_after(1000, "running") == 15
+    assert interval_after(15, "running", "finished") == 5, "a job has ended"
+    assert interval_after(1000, "running") == 15
+    assert interval_after(15, "running", "unknown") == 5, "a job was submitted"
 
 
 def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
@@ -131,6 +157,60 @@ def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
     assert cluster.granted_cpus() == 16
     monkeypatch.setenv("SLURM_CPUS_PER_TASK", "2")
     assert cluster.granted_cpus() == 2
+
+
+def test_jobs_ask_for_no_more_than_a_node_has(tmp_path, monkeypatch):
+    """Slurm would refuse the third attempt of a large job, or never start it."""
+    monkeypatch.chdir(tmp_path)
+    for name in ("SLURM_JOB_ID", "SLURM_MEM_PER_NODE"):
+        monkeypatch.delenv(name, raising=False)
+    photos(tmp_path / "data" / "scene", 3)
+    flow = SimpleNamespace(
+        basedir=str(tmp_path),
+        is_main_process=True,
+        executor_plugin=None,
+        remote_exec=False,
+        non_local_exec=False,
+        cores=2,
+        resource_settings=SimpleNamespace(cores=16),
+    )
+    project = SnakemakeProject({}, flow)
+    scene = SimpleNamespace(scene="scene")
+    needed = project.memory_mb(STAGES["train"])
+
+    def wanted(attempt: int) -> int:
+        return needed(scene, 1, attempt)
+
+    local = wanted(1)
+    assert project.threads(scene) == 2
+    flow.non_local_exec = True
+    node = cluster.Node(4, local + cluster.OVERHEAD_MB + 1)
+    monkeypatch.setattr(project_module, "largest_node", lambda: node)
+    assert project.threads(scene) == 4
+    assert wanted(1) == local + cluster.OVERHEAD_MB
+    assert wanted(2) == wanted(3) == node.memory_mb
+    # In the job: what it was given.
+    flow.non_local_exec, flow.remote_exec = False, True
+    assert wanted(2) > node.memory_mb
+    monkeypatch.setenv("SLURM_JOB_ID", "7")
+    monkeypatch.setenv("SLURM_MEM_PER_NODE", str(node.memory_mb))
+    assert wanted(2) == node.memory_mb
+
+
+@pytest.mark.parametrize(
+    "variables",
+    [
+        {"JOB_ID": "7", "NSLOTS": "3"},
+        {"PBS_JOBID": "7.host", "NCPUS": "3"},
+        {"PBS_JOBID": "7.host", "PBS_NUM_PPN": "3"},
+        {"LSB_JOBID": "7", "LSB_DJOB_NUMPROC": "3"},
+    ],
+)
+def test_the_cores_of_jobs_of_other_clusters(monkeypatch, variables):
+    monkeypatch.delenv("SLURM_JOB_ID", raising=False)
+    for name, value in variables.items():
+        monkeypatch.setenv(name, value)
+    assert cluster.granted_cpus() == 3
 
 
 def test_a_stage_gets_the_threads_and_the_memory_of_its_job(tmp_path, monkeypatch):

@@ -1,12 +1,12 @@
-"""A short training of the whole scene on reduced images, before it is divided into blocks.
-Outputs: as of ``train``."""
+"""The first part of the training of a scene, before it is divided into blocks. Outputs: as of
+``train``."""
 
 from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Split, Train, Views
+from pipeline.config.schema import Train
 from pipeline.plan.stage import StageSpec, if_blocks
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -19,20 +19,18 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return if_blocks(settled, "a short training on reduced images: the surroundings of blocks")
+    return if_blocks(settled, "the first half of the training: the surroundings of blocks")
 
 
 def work(job: Job) -> None:
     from pipeline.io.npz import read_npz
-    from pipeline.scene.views import load_views
-    from pipeline.training.blocks.options import COARSE, coarse_options, coarse_views
+    from pipeline.training.blocks.options import COARSE, coarse_options
     from pipeline.training.scene import train_scene
 
-    manifest, model = inputs.read_manifest(job, "views"), inputs.input_model(job)
     trained = train_scene(
-        load_views(manifest, model, coarse_views(job.section(Views)), job.section(Split)),
-        manifest,
-        model,
+        inputs.input_views(job),
+        inputs.read_manifest(job, "views"),
+        inputs.input_model(job),
         read_npz(job.inputs["init"] / "gaussians.npz"),
         coarse_options(job.section(Train)),
         job.section(Experiments).train,

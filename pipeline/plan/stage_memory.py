@@ -147,14 +147,8 @@ def _train(plan: Plan, threads: int) -> float:
     return _NUMPY + _HELD * plan.config.train.density.max_gaussians / 1e6
 
 
-def _coarse(plan: Plan, threads: int) -> float:
-    """On images of half the size."""
-    gaussians = training_memory.memory_mb(0, plan.config.train.density.max_gaussians)
-    return gaussians + max(0, plan.facts.training_memory_mb - gaussians) / 4
-
-
-def _block(plan: Plan, threads: int) -> float:
-    """Images are read from disk where they do not fit."""
+def _part(plan: Plan, threads: int) -> float:
+    """A part of the training of a scene in blocks. Images that do not fit are read from disk."""
     return training_memory.memory_mb(0, plan.config.train.density.max_gaussians)
 
 
@@ -194,10 +188,10 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "refine": _mapping,
     "undistort": _undistort,
     "init": _init,
-    "coarse": _coarse,
+    "coarse": _part,
     "partition": lambda plan, threads: _TORCH + _PARTITIONED * _gaussians(plan),
-    "block": _block,
-    "polish": _block,
+    "block": _part,
+    "polish": _part,
     "train": _train,
     "evaluate": _evaluate,
     "coverage": _coverage,

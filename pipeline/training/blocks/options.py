@@ -1,33 +1,25 @@
 """The options of the parts of a training in blocks.
 
-A coarse run on reduced images gives every block its first Gaussians and its surroundings, and
-refines the cameras if that is configured. Then each block is trained twice.
+A coarse run gives every block its first Gaussians and its surroundings, and refines the cameras if
+that is configured. Then each block is trained twice.
 """
 
 from __future__ import annotations
 
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train, Views
+from pipeline.config.schema import Train
 from pipeline.scene.blocks import Block
 from pipeline.training.loop.schedule import Part, Schedule
 
-# The parts of a run's schedule: on the whole scene at reduced resolution, in blocks among the
-# coarse Gaussians, and in blocks among what the other blocks have become. Alternating over
-# subdomains that overlap is the Schwarz method of domain decomposition. The coarse part is long:
-# what it leaves wrong around a block, the block would correct with haze in front of it.
+# The parts of a run's schedule: on the whole scene, in blocks among the coarse Gaussians, and in
+# blocks among what the other blocks have become. Alternating over subdomains that overlap is the
+# Schwarz method of domain decomposition. The coarse part is long: what it leaves wrong around a
+# block, the block would correct with haze in front of it.
 COARSE, FIRST, SECOND = Part(0.0, 0.5), Part(0.5, 0.8), Part(0.8, 1.0)
-# Images of the coarse run are reduced by this factor, beside the schedule's own reduction.
-COARSE_IMAGE_FACTOR = 2
 # Overviews are trained on at 1 / this of their size.
 OVERVIEW_FACTOR = 4
 # View-dependent colours are left to the blocks.
 COARSE_SH_DEGREE = 1
-
-
-def coarse_views(views: Views) -> Views:
-    """The views of the coarse run."""
-    size = max(1, views.max_long_side_px // COARSE_IMAGE_FACTOR)
-    return views.model_copy(update={"max_long_side_px": size})
 
 
 def coarse_options(train: Train) -> Train:

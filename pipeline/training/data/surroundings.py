@@ -12,8 +12,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-# Without a loss on alpha, each of two blocks on a ray could leave a pixel to the other one.
-ALPHA_LOSS_WEIGHT, ALPHA_TOLERANCE = 1.0, 0.25
+# Larger changes of alpha are penalised. Otherwise a block would fade, since what is behind it often
+# has its colour, and each of two blocks on a ray could leave a pixel to the other one.
+ALPHA_LOSS_WEIGHT, FADE_TOLERANCE, GROWTH_TOLERANCE = 1.0, 0.02, 0.25
 
 
 @dataclass(frozen=True)
@@ -47,9 +48,9 @@ class Surroundings:
 
     def alpha_gradient(self, alpha: Tensor) -> Tensor:
         """(H, W) float32 gradient of ``ALPHA_LOSS_WEIGHT`` times the mean square of the part of
-        the change of the block's ``alpha`` (H, W) that exceeds ``ALPHA_TOLERANCE``."""
+        the change of the block's ``alpha`` (H, W) that exceeds the tolerances."""
         change = alpha - _unit(self.alpha)
-        beyond = change - change.clamp(-ALPHA_TOLERANCE, ALPHA_TOLERANCE)
+        beyond = change - change.clamp(-FADE_TOLERANCE, GROWTH_TOLERANCE)
         return beyond * (2 * ALPHA_LOSS_WEIGHT / beyond.numel())
 
     def gradients(self, d_image: Tensor) -> tuple[Tensor, Tensor]:

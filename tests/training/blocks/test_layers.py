@@ -12,7 +12,12 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import raster_camera
 from pipeline.scene.exposure import ExposureGains
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.data.surroundings import ALPHA_LOSS_WEIGHT, ALPHA_TOLERANCE, Surroundings
+from pipeline.training.data.surroundings import (
+    ALPHA_LOSS_WEIGHT,
+    FADE_TOLERANCE,
+    GROWTH_TOLERANCE,
+    Surroundings,
+)
 from tests.training.blocks.conftest import NEAR, DividedScene
 
 WHITE = (1.0, 1.0, 1.0)
@@ -60,9 +65,9 @@ def test_gradients_of_the_composition_are_those_of_autograd(front: bool) -> None
 def test_gradient_of_the_loss_on_alpha_is_that_of_autograd() -> None:
     around = random_surroundings(front=False)
     alpha = torch.rand(5, 7, requires_grad=True)
-    change = (alpha - around.alpha / 255).abs()
-    loss = ALPHA_LOSS_WEIGHT * (change - ALPHA_TOLERANCE).clamp(min=0).square().mean()
-    loss.backward()
+    change = alpha - around.alpha / 255
+    beyond = (change - GROWTH_TOLERANCE).clamp(min=0) + (-FADE_TOLERANCE - change).clamp(min=0)
+    (ALPHA_LOSS_WEIGHT * beyond.square().mean()).backward()
     torch.testing.assert_close(around.alpha_gradient(alpha.detach()), alpha.grad)
 
 

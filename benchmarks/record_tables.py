@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import statistics
 import textwrap
 from collections import Counter
@@ -22,6 +23,7 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    ScalingResult,
     SlurmResult,
     StabilityResult,
     StressResult,
@@ -247,6 +249,40 @@ def _pair(values: Sequence[float], form: str) -> str:
     return ", ".join(format(value, form) for value in values)
 
 
+def scaling(records: Sequence[Stored]) -> str:
+    return scaling_table(results(records, Record[ScalingResult]))
+
+
+def scaling_table(found: Sequence[ScalingResult]) -> str:
+    """A row for each stage: each run in a group of columns, and the growth of the CPU time."""
+    runs = list(dict.fromkeys(r.run for r in found))
+    by_key = {(r.stage, r.run): r for r in found}
+    heading = ["stage"]
+    for run in runs:
+        count = next(r.photographs for r in found if r.run == run)
+        heading += [f"{count} photographs: jobs", "CPU s", "largest job", "MB", "files, MB"]
+    rows = [[*heading, "CPU grows as N^"]]
+    for stage in dict.fromkeys(r.stage for r in found):
+        of_runs = [by_key.get((stage, run)) for run in runs]
+        row = [stage]
+        for r in of_runs:
+            row += (
+                ["-"] * 5
+                if r is None
+                else [
+                    *(str(r.jobs), f"{r.cpu_s:.0f}", f"{r.largest_cpu_s:.0f}"),
+                    *(f"{r.peak_rss_mb:.0f}", f"{r.output_mb:.0f}"),
+                ]
+            )
+        few, many = of_runs[0], of_runs[-1]
+        power = None
+        if few is not None and many is not None and many.photographs != few.photographs:
+            power = math.log(many.cpu_s / few.cpu_s)
+            power /= math.log(many.photographs / few.photographs)
+        rows.append([*row, cell(power, ".2f")])
+    return markdown.table(rows)
+
+
 def wide(records: Sequence[Stored]) -> str:
     return lenses(results(records, Record[WideResult]))
 
@@ -297,6 +333,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "page": page,
     "raster_stress": raster_stress,
     "blocks": blocks,
+    "scaling": scaling,
     "slurm": slurm,
     "video": video,
     "wide": wide,

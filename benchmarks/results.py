@@ -281,6 +281,30 @@ class BlocksResult:
         return self.seam_gradient[1] / self.seam_gradient[0]
 
 
+# ---- benchmarks.scaling ----
+
+
+@dataclass(frozen=True)
+class ScalingResult:
+    """A stage of a run, or stages that together do what one does in a small scene.
+
+    Attributes:
+        cpu_s: CPU seconds of all its jobs.
+        largest_cpu_s: of the job that takes most.
+        peak_rss_mb: largest memory of a job, MiB.
+        output_mb: size of the files that it leaves, MB.
+    """
+
+    run: str
+    photographs: int
+    stage: str
+    jobs: int
+    cpu_s: float
+    largest_cpu_s: float
+    peak_rss_mb: float
+    output_mb: float
+
+
 # ---- benchmarks.wide ----
 
 

@@ -37,6 +37,8 @@ GRADES: tuple[Grade, ...] = ("good", "weak", "failed")
 GROWTH_HEADING = [
     *("mapper", "views", "CPU s", "grows as N^", "MiB", "images", "rotation, deg", "centre, m"),
 ]
+# Number of photographs for which growth is extrapolated.
+EXTRAPOLATED = 100_000
 Stored = Mapping[str, Any]
 """A record as read from JSON."""
 
@@ -254,14 +256,15 @@ def scaling(records: Sequence[Stored]) -> str:
 
 
 def scaling_table(found: Sequence[ScalingResult]) -> str:
-    """A row for each stage: each run in a group of columns, and the growth of the CPU time."""
+    """A row for each stage: each run in a group of columns, the growth of the CPU time, and the CPU
+    time of ``EXTRAPOLATED`` photographs if it goes on like that."""
     runs = list(dict.fromkeys(r.run for r in found))
     by_key = {(r.stage, r.run): r for r in found}
     heading = ["stage"]
     for run in runs:
         count = next(r.photographs for r in found if r.run == run)
         heading += [f"{count} photographs: jobs", "CPU s", "largest job", "MB", "files, MB"]
-    rows = [[*heading, "CPU grows as N^"]]
+    rows = [[*heading, "CPU grows as N^", f"{EXTRAPOLATED:,} photographs: CPU h".replace(",", " ")]]
     for stage in dict.fromkeys(r.stage for r in found):
         of_runs = [by_key.get((stage, run)) for run in runs]
         row = [stage]
@@ -275,11 +278,12 @@ def scaling_table(found: Sequence[ScalingResult]) -> str:
                 ]
             )
         few, many = of_runs[0], of_runs[-1]
-        power = None
+        power = hours = None
         if few is not None and many is not None and many.photographs != few.photographs:
             power = math.log(many.cpu_s / few.cpu_s)
             power /= math.log(many.photographs / few.photographs)
-        rows.append([*row, cell(power, ".2f")])
+            hours = many.cpu_s * (EXTRAPOLATED / many.photographs) ** power / 3600
+        rows.append([*row, cell(power, ".2f"), cell(hours, ".0f")])
     return markdown.table(rows)
 
 

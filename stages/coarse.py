@@ -26,6 +26,7 @@ def work(job: Job) -> None:
     from pipeline.io.npz import read_npz
     from pipeline.training.blocks.options import COARSE, coarse_options
     from pipeline.training.scene import train_scene
+    from stages.workflow.training import training_run
 
     trained = train_scene(
         inputs.input_views(job),
@@ -34,7 +35,7 @@ def work(job: Job) -> None:
         read_npz(job.inputs["init"] / "gaussians.npz"),
         coarse_options(job.section(Train)),
         job.section(Experiments).train,
-        inputs.training_run(job),
+        training_run(job),
         COARSE,
     )
     inputs.write_trained(job, trained)

@@ -43,6 +43,7 @@ def work(job: Job) -> None:
 
     from pipeline.io.npz import read_npz
     from pipeline.training.scene import train_scene
+    from stages.workflow.training import training_run
 
     trained = train_scene(
         inputs.input_views(job),
@@ -51,7 +52,7 @@ def work(job: Job) -> None:
         read_npz(job.inputs["init"] / "gaussians.npz"),
         job.section(Train),
         job.section(Experiments).train,
-        inputs.training_run(job),
+        training_run(job),
     )
     inputs.write_trained(job, trained)
 

@@ -55,6 +55,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
     """
     from pipeline.training.blocks.train import block_training, with_far_field
     from pipeline.training.scene import run_training
+    from stages.workflow.training import training_run
 
     trained = run_training(
         # Not a local variable here: what it is made from is not held during training.
@@ -65,7 +66,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
             job.section(Experiments).train,
             part,
         ),
-        inputs.training_run(job),
+        training_run(job),
         part,
     )
     gaussians = with_far_field(

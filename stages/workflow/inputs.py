@@ -19,7 +19,7 @@ from pipeline.scene.views import View, load_views
 if TYPE_CHECKING:
     from pipeline.splats.arrays import GaussianArrays
     from pipeline.splats.gaussians import Gaussians
-    from pipeline.training.scene import TrainedScene, TrainingRun
+    from pipeline.training.scene import TrainedScene
 
 # The stages that can provide an input, the latest in the DAG first.
 PHOTOS = ("decode", "inspect")
@@ -82,19 +82,6 @@ def coarse_model(job: Job) -> Reconstruction:
 def coarse_views(job: Job) -> list[View]:
     """All views, with the cameras of ``coarse_model``."""
     return _views(job, coarse_model(job))
-
-
-def training_run(job: Job) -> TrainingRun:
-    """How the job's training runs."""
-    from pipeline.training.scene import TrainingRun
-
-    return TrainingRun(
-        seed=job.seed,
-        threads=job.threads,
-        memory_mb=job.memory_mb,
-        checkpoint_dir=job.scratch / "checkpoints",
-        logs=job.logs,
-    )
 
 
 def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:

@@ -21,6 +21,7 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    ScalingResult,
     SlurmResult,
     StabilityResult,
     StressResult,
@@ -37,11 +38,27 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
     "blocks": (
         Record[BlocksResult],
         BlocksResult(
-            *("town", 300, 4, (26.0, 27.125), (0.8, 0.85), (68_000, 90_400), (850.0, 480.0)),
-            *((60.0, 150.0), 41.0, 1.02),
+            scene="town",
+            photographs=300,
+            pixels="640x420",
+            test_views=38,
+            blocks=4,
+            psnr=(26.0, 27.125),
+            ssim=(0.8, 0.85),
+            gaussians=(68_000, 90_400),
+            training_rss_mb=(850.0, 480.0),
+            peak_rss_mb=(850.0, 500.0),
+            training_cpu_s=(60.0, 150.0),
+            largest_block_cpu_s=41.0,
+            seam_gradient=(1.25, 1.3),
         ),
-        "| town | 300 | 4 | 26.00 | 27.12 | 0.8000 | 0.8500 | 68k | 90k | 850 | 480 | 60 | 150 | "
-        "41 | 1.02 |",
+        "| town | 300 | 38, 640x420 | 1, 4 | 26.00, 27.12 | 0.8000, 0.8500 | 68k, 90k | 850, 480 | "
+        "850, 500 | 60, 150 | 41 | 1.250, 1.300 | 1.040 |",
+    ),
+    "scaling": (
+        Record[ScalingResult],
+        ScalingResult("town", 125, "features", 3, 60.4, 30.6, 210.0, 12.2),
+        "| features | 3 | 60 | 31 | 210 | 12 | - | - |",
     ),
     "slurm": (
         Record[SlurmResult],

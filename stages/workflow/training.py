@@ -1,0 +1,17 @@
+"""How the jobs of the stages that train run. Not in ``inputs``, which all stages import: their keys
+would change with the code of training."""
+
+from __future__ import annotations
+
+from pipeline.runtime.job import Job
+from pipeline.training.scene import TrainingRun
+
+
+def training_run(job: Job) -> TrainingRun:
+    return TrainingRun(
+        seed=job.seed,
+        threads=job.threads,
+        memory_mb=job.memory_mb,
+        checkpoint_dir=job.scratch / "checkpoints",
+        logs=job.logs,
+    )

@@ -17,7 +17,7 @@ from pipeline.runtime.memory import release_free_memory
 
 # Freed memory is returned to the system after so many images: those of a block differ in size, and
 # the heap would grow to several times the memory in use.
-IMAGES_PER_RELEASE = 32
+IMAGES_PER_RELEASE = 8
 
 Planes = tuple[Tensor | None, ...]
 """The tensors of one image, uint8 or bool; None for those that it does not have."""

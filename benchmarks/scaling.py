@@ -2,7 +2,8 @@
 
     python -m benchmarks.scaling results town125@grow125 town1000@grow1000
 
-Runs are finished folders of results, from few photographs to many.
+Runs are folders of results, from few photographs to many. Stages that have not finished are left
+out.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.record_tables import scaling_table
 from benchmarks.results import ScalingResult
 from pipeline.plan.record import read_plan
-from pipeline.runtime.record import read_run
+from pipeline.runtime.record import RUN, read_run
 
 # Stages that a scene of few photographs does in one job, with those of many.
 STEPS = {
@@ -26,7 +27,7 @@ STEPS = {
 
 
 def stage_results(folder: Path) -> list[ScalingResult]:
-    """Each stage of a finished run; those of ``STEPS`` together."""
+    """Each stage of a run; those of ``STEPS`` together. Without stages that have not finished."""
     plan = read_plan(folder)
     step_of = {stage: step for step, stages in STEPS.items() for stage in stages}
     found: dict[str, list[Path]] = {}
@@ -34,7 +35,9 @@ def stage_results(folder: Path) -> list[ScalingResult]:
         jobs = [folder / name for name in plan.stages[stage].folders(stage)]
         found.setdefault(step_of.get(stage, stage), []).extend(jobs)
     return [
-        _result(folder.name, plan.facts.photographs, step, jobs) for step, jobs in found.items()
+        _result(folder.name, plan.facts.photographs, step, jobs)
+        for step, jobs in found.items()
+        if all((job / RUN).exists() for job in jobs)
     ]
 
 

@@ -10,7 +10,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping
-from typing import Generic, TypeVar
+from dataclasses import replace
+from typing import Generic, Protocol, TypeVar
 
 import torch
 
@@ -27,7 +28,17 @@ from pipeline.render.types import (
     ShAdam,
 )
 
-Projected = TypeVar("Projected")
+
+
+class Projection(Protocol):
+    """What a backend's result of ``project`` has."""
+
+    @property
+    def radii(self) -> torch.Tensor:
+        """See ``Forward.radii``."""
+
+
+Projected = TypeVar("Projected", bound=Projection)
 Binned = TypeVar("Binned")
 
 
@@ -167,3 +178,15 @@ class Backend(ABC, Generic[Projected, Binned]):
         )
         checks.check_camera(camera, options.near)
         return self.blend(self.bin(self.project(parameters, camera, options)))
+
+    def visible(
+        self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
+    ) -> torch.Tensor:
+        """(N,) bool, the Gaussians that overlap the image. Arguments and errors: see ``forward``.
+
+        Without the others, the image has the same bits.
+        """
+        options = replace(options, sh_degree=0)
+        parameters = checks.parameters(*parameters, options.sh_degree)
+        checks.check_camera(camera, options.near)
+        return self.project(parameters, camera, options).radii > 0

@@ -43,6 +43,10 @@ class Projected:
     options: RasterOptions
     projection: reference.Projection
 
+    @property
+    def radii(self) -> torch.Tensor:
+        return self.projection.radii.float()
+
 
 @dataclass(frozen=True)
 class State:
@@ -90,7 +94,7 @@ class ReferenceBackend(Backend[Projected, Projected]):
         centres = projection.means2d.expand(camera.height * camera.width, -1, -1)
         image = reference.blend(replace(projection, means2d=centres), colors, camera, options)
         return Forward(
-            image.color.detach().float(), image.alpha.detach().float(), projection.radii.float(),
+            image.color.detach().float(), image.alpha.detach().float(), binned.radii,
             len(visible), projection.num_dropped, image.pairs,
             lambda: (image.depth.detach().float(), image.median_depth.float()),
             State(binned, centres, image),

@@ -56,6 +56,19 @@ def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> Non
     assert torch.equal(parts.color, backend.forward(*scene, CAMERA, OPTIONS).color)
 
 
+def test_without_the_gaussians_that_are_not_visible_the_image_has_the_same_bits(
+    backend: Backend, scene: Scene
+) -> None:
+    scene[0][::3, 2] -= 100.0
+    visible = backend.visible(scene, CAMERA, OPTIONS)
+    assert 0 < visible.sum() <= len(visible) * 2 / 3
+    some = backend.forward(*(tensor[visible] for tensor in scene), CAMERA, OPTIONS)
+    every = backend.forward(*scene, CAMERA, OPTIONS)
+    assert torch.equal(visible, every.radii > 0)
+    assert torch.equal(some.color, every.color)
+    assert torch.equal(some.alpha, every.alpha)
+
+
 @pytest.mark.parametrize("target", [torch.rand(22, 31, 3), torch.full((22, 31, 3), 90).byte()])
 def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -> None:
     rendered, mask = noise(22, 31, 3).sigmoid(), noise(22, 31) > 1

@@ -8,6 +8,7 @@ from threading import Lock
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render import Backend, Color, Forward, RasterOptions
@@ -54,12 +55,14 @@ class BlockLayers:
             return self._layers(view)
 
     def _layers(self, view: View) -> Layers:
-        means = self.coarse.means.numpy()
+        # Several times faster than to render all Gaussians in each layer.
+        visible = self._visible(view)
+        means = visible.means.numpy()
         own = self.region.contains(means)
         behind = self.region.hides(view.centre, means) & ~own
-        front = self._render(view, ~own & ~behind)
-        block = self._render(view, own)
-        back = self._render(view, behind, self.background)
+        front = self._render(visible, ~own & ~behind, view)
+        block = self._render(visible, own, view)
+        back = self._render(visible, behind, view, self.background)
         around = Surroundings(_bytes(back.color), _bytes(block.alpha))
         if float(front.alpha.max()) >= MIN_FRONT:
             transmittance = _bytes(1 - front.alpha)
@@ -84,8 +87,19 @@ class BlockLayers:
         ignored[top:bottom, left:right] = True
         return ignored
 
-    def _render(self, view: View, which: np.ndarray, background: Color | None = None) -> Forward:
-        chosen = self.coarse.select(torch.from_numpy(np.flatnonzero(which)))
+    def _visible(self, view: View) -> Gaussians:
+        """The Gaussians that the view shows."""
+        which = self.backend.visible(self.coarse.parameters(), raster_camera(view), self.options)
+        return self.coarse.select(which.nonzero()[:, 0])
+
+    def _render(
+        self,
+        gaussians: Gaussians,
+        which: NDArray[np.bool_],
+        view: View,
+        background: Color | None = None,
+    ) -> Forward:
+        chosen = gaussians.select(torch.from_numpy(np.flatnonzero(which)))
         options = replace(self.options, background=background)
         return self.backend.forward(*chosen.parameters(), raster_camera(view), options)
 

@@ -24,7 +24,7 @@ from pipeline.sfm.alignment import transform_model
 from pipeline.sfm.counters import RefineCounters
 from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap
-from pipeline.sfm.refine import Refined, adjust_points, bundle_adjust, refine
+from pipeline.sfm.refine import EXACT, EXACT_PX, Refined, adjust_points, bundle_adjust, refine
 
 # Numbers of the longest tracks of each image that cameras and poses are adjusted to, and that
 # decide which parameters are freed.
@@ -60,6 +60,8 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
     model = pycolmap.Reconstruction(sparse)
     model.update_point_3d_errors()
     before = float(model.compute_mean_reprojection_error())
+    if before < EXACT_PX:
+        return _unchanged(sparse, out, [EXACT], before)
     tracks = _tracks(model)
     anchors = [number for number, _ in tracks[:ANCHORS]]
     original = _positions(model, anchors)
@@ -71,12 +73,7 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
     )
     adjusted = _adjust_more_tracks(model, tracks, refined) if refined.freed else refined.model
     if not refined.freed or not _is_finite(adjusted):
-        out.mkdir(parents=True, exist_ok=True)
-        for file in colmap_files(sparse):
-            shutil.copy(file, out)
-        unchanged = [*refined.decisions, "known poses are unchanged"]
-        counters = RefineCounters(freed=False, error_before_px=before, error_px=before)
-        return KnownPosesReport(counters, unchanged)
+        return _unchanged(sparse, out, refined.decisions, before)
     _copy_parameters(model, adjusted)
     adjust_points(model, loss_px=LOSS_PX, done=adjusted.point3D_ids())
     _align(model, anchors, original)
@@ -88,6 +85,14 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
     )
     counters = RefineCounters(freed=True, error_before_px=before, error_px=after)
     return KnownPosesReport(counters, [*refined.decisions, decision])
+
+
+def _unchanged(sparse: Path, out: Path, decisions: list[str], error_px: float) -> KnownPosesReport:
+    out.mkdir(parents=True, exist_ok=True)
+    for file in colmap_files(sparse):
+        shutil.copy(file, out)
+    counters = RefineCounters(freed=False, error_before_px=error_px, error_px=error_px)
+    return KnownPosesReport(counters, [*decisions, "known poses are unchanged"])
 
 
 def _adjust_more_tracks(

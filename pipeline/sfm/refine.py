@@ -20,6 +20,7 @@ MIN_GAIN = 0.004
 MAX_SHIFT = 0.06
 # Below this RMS reprojection error the observations are projections by these cameras (synthetic).
 EXACT_PX = 0.01
+EXACT = "the tracks fit exactly: nothing is refined"
 FUNCTION_TOLERANCE = 1e-5
 
 
@@ -63,7 +64,7 @@ def refine(
     cost = bundle_adjust(best, inner_iterations=inner_iterations)
     # Ceres' cost is half of the sum of squares.
     if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
-        return Refined(best, False, set(), ["the tracks fit exactly: nothing is refined"])
+        return Refined(best, False, set(), [EXACT])
     decisions: list[str] = []
     freed, free_principal_points = False, set[int]()
     adjustable = {i for i, camera in model.cameras.items() if not camera.is_spherical()}

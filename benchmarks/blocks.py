@@ -46,7 +46,8 @@ def compare(results: Path, whole: str, divided: str) -> BlocksResult:
     one, many = map(read_metrics, folders)
     plan = read_plan(results / divided)
     return BlocksResult(
-        scene=whole.partition("@")[0],
+        run=whole,
+        seed=many.seed,
         pixels=one.protocol.resolution[0],
         photographs=one.registered_images or 0,
         test_views=one.protocol.num_views,

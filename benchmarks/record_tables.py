@@ -222,7 +222,7 @@ def video(records: Sequence[Stored]) -> str:
 def blocks(records: Sequence[Stored]) -> str:
     rows = [
         [
-            *("scene", "photographs", "test views, pixels", "blocks", "PSNR (dB)", "SSIM"),
+            *("run", "seed", "photographs", "test views, pixels", "blocks", "PSNR (dB)", "SSIM"),
             *(
                 "Gaussians",
                 "memory (MB): training",
@@ -236,7 +236,8 @@ def blocks(records: Sequence[Stored]) -> str:
     for r in results(records, Record[BlocksResult]):
         rows.append(
             [
-                *(r.scene, str(r.photographs), f"{r.test_views}, {r.pixels}", f"1, {r.blocks}"),
+                *(r.run, cell(r.seed, "d"), str(r.photographs)),
+                *(f"{r.test_views}, {r.pixels}", f"1, {r.blocks}"),
                 *(_pair(r.psnr, ".2f"), _pair(r.ssim, ".4f")),
                 ", ".join(f"{value / 1000:.0f}k" for value in r.gaussians),
                 *(_pair(r.training_rss_mb, ".0f"), _pair(r.peak_rss_mb, ".0f")),
@@ -263,17 +264,18 @@ def scaling_table(found: Sequence[ScalingResult]) -> str:
     heading = ["stage"]
     for run in runs:
         count = next(r.photographs for r in found if r.run == run)
-        heading += [f"{count} photographs: jobs", "CPU s", "largest job", "MB", "files, MB"]
+        heading += [f"{count} photographs: jobs", "CPU s", "a job", "largest", "MB", "files, MB"]
     rows = [[*heading, "CPU grows as N^", f"{EXTRAPOLATED:,} photographs: CPU h".replace(",", " ")]]
     for stage in dict.fromkeys(r.stage for r in found):
         of_runs = [by_key.get((stage, run)) for run in runs]
         row = [stage]
         for r in of_runs:
             row += (
-                ["-"] * 5
+                ["-"] * 6
                 if r is None
                 else [
-                    *(str(r.jobs), f"{r.cpu_s:.0f}", f"{r.largest_cpu_s:.0f}"),
+                    *(str(r.jobs), f"{r.cpu_s:.0f}", f"{r.cpu_s / r.jobs:.0f}"),
+                    f"{r.largest_cpu_s:.0f}",
                     *(f"{r.peak_rss_mb:.0f}", f"{r.output_mb:.0f}"),
                 ]
             )

@@ -249,6 +249,8 @@ class BlocksResult:
     """A scene as one block, and in blocks; pairs are in this order.
 
     Attributes:
+        run: name of the run as one block.
+        seed: of both.
         pixels: width and height of a view.
         psnr, ssim: of the test views.
         gaussians: numbers of trained Gaussians.
@@ -261,7 +263,8 @@ class BlocksResult:
             what the photographs show there.
     """
 
-    scene: str
+    run: str
+    seed: int | None
     photographs: int
     pixels: str
     test_views: int

@@ -3,13 +3,13 @@
     python -m benchmarks.scaling results town125@grow125 town1000@grow1000
 
 Runs are folders of results, from few photographs to many. Stages that have not finished are left
-out.
+out. ``--stages block polish`` lists these stages alone: how a block grows.
 """
 
 from __future__ import annotations
 
 import argparse
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from benchmarks.measured import add_record_options, measured, write_record
@@ -26,12 +26,18 @@ STEPS = {
 }
 
 
-def stage_results(folder: Path) -> list[ScalingResult]:
-    """Each stage of a run; those of ``STEPS`` together. Without stages that have not finished."""
+def stage_results(folder: Path, only: Collection[str] = ()) -> list[ScalingResult]:
+    """Each stage of a run, without stages that have not finished.
+
+    Args:
+        only: names of stages; if empty, all stages, those of ``STEPS`` together.
+    """
     plan = read_plan(folder)
-    step_of = {stage: step for step, stages in STEPS.items() for stage in stages}
+    step_of = {stage: step for step, stages in STEPS.items() for stage in stages if not only}
     found: dict[str, list[Path]] = {}
     for stage in filter(plan.runs, plan.order):
+        if only and stage not in only:
+            continue
         jobs = [folder / name for name in plan.stages[stage].folders(stage)]
         found.setdefault(step_of.get(stage, stage), []).extend(jobs)
     return [
@@ -60,9 +66,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.scaling", description=__doc__)
     parser.add_argument("results", type=Path, help="folder of results")
     parser.add_argument("runs", nargs="+", metavar="RUN", help="from few photographs to many")
+    parser.add_argument(
+        "--stages", nargs="+", default=[], metavar="STAGE", help="these stages alone"
+    )
     add_record_options(parser)
     options = parser.parse_args(arguments)
-    found = [result for run in options.runs for result in stage_results(options.results / run)]
+    found = [
+        result
+        for run in options.runs
+        for result in stage_results(options.results / run, options.stages)
+    ]
     print(scaling_table(found))
     if options.json is not None:
         write_record(options.json, measured("scaling", options.note, arguments), found)

@@ -29,7 +29,6 @@ from pipeline.render.types import (
 )
 
 
-
 class Projection(Protocol):
     """What a backend's result of ``project`` has."""
 

@@ -15,8 +15,8 @@ from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 # Smallest number of registered images of a model (2 for a scene of two photographs).
 MIN_MODEL_SIZE = 3
 
-# Incremental mapping of more photographs adjusts the whole model to part of its points only, as many
-# as constrain the poses: faster at the same accuracy after the final bundle adjustment.
+# With more photographs, incremental mapping adjusts the whole model to part of its points, as many
+# as constrain the poses: faster, and as accurate after the final bundle adjustment.
 MAX_ALL_POINTS = 200
 
 # Global mapping uses the longest tracks only: several times faster at the same accuracy.

@@ -57,6 +57,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
     from pipeline.training.scene import run_training
     from stages.workflow.training import training_run
 
+    run = training_run(job)
     trained = run_training(
         # Not a local variable here: what it is made from is not held during training.
         *block_training(
@@ -65,8 +66,9 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
             job.section(Train),
             job.section(Experiments).train,
             part,
+            run.seed,
         ),
-        training_run(job),
+        run,
         part,
     )
     gaussians = with_far_field(

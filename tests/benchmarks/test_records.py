@@ -38,7 +38,8 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
     "blocks": (
         Record[BlocksResult],
         BlocksResult(
-            scene="town",
+            run="town@fast",
+            seed=1,
             photographs=300,
             pixels="640x420",
             test_views=38,
@@ -52,13 +53,13 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
             largest_block_cpu_s=41.0,
             seam_gradient=(1.25, 1.3),
         ),
-        "| town | 300 | 38, 640x420 | 1, 4 | 26.00, 27.12 | 0.8000, 0.8500 | 68k, 90k | 850, 480 | "
-        "850, 500 | 60, 150 | 41 | 1.250, 1.300 | 1.040 |",
+        "| town@fast | 1 | 300 | 38, 640x420 | 1, 4 | 26.00, 27.12 | 0.8000, 0.8500 | 68k, 90k | "
+        "850, 480 | 850, 500 | 60, 150 | 41 | 1.250, 1.300 | 1.040 |",
     ),
     "scaling": (
         Record[ScalingResult],
         ScalingResult("town", 125, "features", 3, 60.4, 30.6, 210.0, 12.2),
-        "| features | 3 | 60 | 31 | 210 | 12 | - | - |",
+        "| features | 3 | 60 | 20 | 31 | 210 | 12 | - | - |",
     ),
     "slurm": (
         Record[SlurmResult],

@@ -63,8 +63,13 @@ def block_training(
     config: Train,
     experiments: TrainExperiments,
     part: Part,
+    seed: int,
 ) -> BlockTraining:
-    """What a part of the training of block ``number`` works on: the training views that see it.
+    """What a part of the training of block ``number`` works on: the training views that see it, or
+    as many of them as the part has steps.
+
+    Args:
+        seed: of the choice of views.
 
     Raises:
         UserError: no view sees the block.
@@ -84,6 +89,10 @@ def block_training(
         seen_share=inputs.seen_share,
         initial=len(inputs.initial),
     )
+    if options.budget_minutes is None:
+        # No other views are read, and no layers are rendered in them.
+        rng = np.random.Generator(np.random.PCG64([seed, number]))
+        inputs = inputs.sampled(len(part.of(options.steps)), rng)
     return BlockTraining(inputs, options, experiments)
 
 

@@ -62,3 +62,8 @@ class Inputs:
             depths=None if self.depths is None else [self.depths[index] for index in kept],
             empty_depths=None if self.empty_depths is None else self.empty_depths[kept],
         )
+
+    def sampled(self, views: int, rng: np.random.Generator) -> Inputs:
+        """The same with at most so many of the views, chosen at random."""
+        unused = rng.permutation(len(self.views))[views:]
+        return self.without(set(unused.tolist())) if len(unused) else self

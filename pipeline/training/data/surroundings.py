@@ -8,6 +8,7 @@ it or behind it, and the image of the whole scene is a composition of three laye
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import torch
 from torch import Tensor
@@ -41,10 +42,10 @@ class Surroundings:
             color: (H, W, 3) float32 of the block, without a background.
             alpha: (H, W) float32 of the block.
         """
-        image = color + (1 - alpha)[..., None] * _unit(self.behind)
-        if self.front is None or self.transmittance is None:
+        image = ((1 - alpha)[..., None] * self._behind).add_(color)
+        if self.front is None or self._passing is None:
             return image
-        return _unit(self.front) + _unit(self.transmittance)[..., None] * image
+        return image.mul_(self._passing).add_(_unit(self.front))
 
     def alpha_gradient(self, alpha: Tensor) -> Tensor:
         """(H, W) float32 gradient of ``ALPHA_LOSS_WEIGHT`` times the mean square of the part of
@@ -56,11 +57,19 @@ class Surroundings:
     def gradients(self, d_image: Tensor) -> tuple[Tensor, Tensor]:
         """Gradients with respect to ``color`` (H, W, 3) and ``alpha`` (H, W) of ``compose``, from
         the gradient with respect to its image (H, W, 3), float32."""
-        d_color = d_image
-        if self.transmittance is not None:
-            d_color = d_image * _unit(self.transmittance)[..., None]
-        return d_color, -(d_color * _unit(self.behind)).sum(-1)
+        d_color = d_image if self._passing is None else d_image * self._passing
+        return d_color, -(d_color * self._behind).sum(-1)
+
+    # Both are used twice in a training step.
+    @cached_property
+    def _behind(self) -> Tensor:
+        return _unit(self.behind)
+
+    @cached_property
+    def _passing(self) -> Tensor | None:
+        """(H, W, 1) transmittance of the front."""
+        return None if self.transmittance is None else _unit(self.transmittance)[..., None]
 
 
 def _unit(values: Tensor) -> Tensor:
-    return values.to(torch.float32) * (1 / 255)
+    return values.to(torch.float32).mul_(1 / 255)

@@ -26,6 +26,7 @@ from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStor
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.targets import Target, Targets
 from pipeline.training.density import make_strategy
+from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam
 
@@ -74,14 +75,18 @@ def load_scene(
     seed: int,
     threads: int,
     memory_mb: int | None,
+    part: Part,
     warn: Warn,
 ) -> TrainingScene:
     """Read the images of the views.
 
+    Args:
+        part: of the schedule.
+
     Raises:
         UserError: an image cannot be read, or the masks hide all views.
     """
-    store = choose_image_store(inputs, config, memory_mb)
+    store = choose_image_store(inputs, config, memory_mb, part)
     noise = experiments.salt_and_pepper_share
     release_free_memory()  # That the inputs were read with.
     layers = inputs.open_layers(threads) if inputs.open_layers else None
@@ -97,10 +102,12 @@ def load_scene(
     return TrainingScene(inputs, targets, gains, background, near)
 
 
-def choose_image_store(inputs: Inputs, config: Train, limit_mb: int | None) -> ImageStore:
-    """Memory if the views' pixels fit beside the Gaussians, else a file; always a file for a block,
-    of which there may be several at a time."""
-    if inputs.open_layers is not None:
+def choose_image_store(
+    inputs: Inputs, config: Train, limit_mb: int | None, part: Part = WHOLE_RUN
+) -> ImageStore:
+    """Memory if the views' pixels fit beside the Gaussians, else a file; always a file for a scene
+    in blocks, which are chosen to save memory."""
+    if part != WHOLE_RUN:
         return DiskStore()
     pixels = sum(view.width * view.height for view in inputs.views)
     limit = min(machine_mb(), limit_mb or math.inf)

@@ -80,7 +80,14 @@ def train(
     torch.set_num_threads(1)
     try:
         scene = load_scene(
-            inputs, config, experiments, seed=seed, threads=threads, memory_mb=memory_mb, warn=warn
+            inputs,
+            config,
+            experiments,
+            seed=seed,
+            threads=threads,
+            memory_mb=memory_mb,
+            part=part,
+            warn=warn,
         )
         steps = Schedule.of(config, experiments).steps
         span = part.of(steps)

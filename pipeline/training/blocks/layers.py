@@ -67,7 +67,9 @@ class BlockLayers:
         if float(front.alpha.max()) >= MIN_FRONT:
             transmittance = _bytes(1 - front.alpha)
             around = replace(around, front=_bytes(front.color), transmittance=transmittance)
-        scene = around.compose(block.color, block.alpha)
+        whole = self._render(visible, np.ones(len(visible), np.bool_), view, self.background)
+        scene = whole.color
+        around = around.corrected(scene - around.compose(block.color, block.alpha))
         if (gain := self.gains.of(view.name)) is not None:
             scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(

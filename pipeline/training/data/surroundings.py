@@ -2,12 +2,13 @@
 
 Blocks are convex. The other Gaussians on a ray that meets a block are therefore either in front of
 it or behind it, and the image of the whole scene is a composition of three layers (Porter and Duff
-1984): the front, the block, and what is behind it.
+1984): the front, the block, and what is behind it. Where extended Gaussians overlap across a face,
+layers are not exact: the error before training is known and corrected.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -28,12 +29,19 @@ class Surroundings:
         front: (H, W, 3) uint8, the scene in front of the block, multiplied by its alpha; None if
             nothing is.
         transmittance: (H, W) uint8 of the front, 255 where there is none; None if nothing is.
+        correction: (H, W, 3) int8, in 1/255: what the composition before training lacks of the
+            image of the whole scene; None: nothing.
     """
 
     behind: Tensor
     alpha: Tensor
     front: Tensor | None = None
     transmittance: Tensor | None = None
+    correction: Tensor | None = None
+
+    def corrected(self, error: Tensor) -> Surroundings:
+        """The layers with a correction of the composition by ``error`` (H, W, 3)."""
+        return replace(self, correction=(error * 255).round().clamp(-127, 127).to(torch.int8))
 
     def compose(self, color: Tensor, alpha: Tensor) -> Tensor:
         """(H, W, 3) float32 image of the whole scene.
@@ -43,9 +51,9 @@ class Surroundings:
             alpha: (H, W) float32 of the block.
         """
         image = ((1 - alpha)[..., None] * self._behind).add_(color)
-        if self.front is None or self._passing is None:
-            return image
-        return image.mul_(self._passing).add_(_unit(self.front))
+        if self.front is not None and self._passing is not None:
+            image.mul_(self._passing).add_(_unit(self.front))
+        return image if self.correction is None else image.add_(_unit(self.correction))
 
     def alpha_gradient(self, alpha: Tensor) -> Tensor:
         """(H, W) float32 gradient of ``ALPHA_LOSS_WEIGHT`` times the mean square of the part of

@@ -33,12 +33,14 @@ class Target:
         alpha: (H, W) uint8, 255 where ignored, or None if the view is opaque.
         ignored: (H, W) bool, True for ignored pixels, or None if there are none.
         surroundings: the layers around a block, or None if the whole scene is trained.
+        is_overview: of a block: the block is in the ignored pixels, and trained in another view.
     """
 
     rgb: Tensor
     alpha: Tensor | None
     ignored: Tensor | None
     surroundings: Surroundings | None = None
+    is_overview: bool = False
 
     def over(self, background: tuple[float, float, float]) -> Tensor:
         """The image over ``background`` (in [0, 1]): (H, W, 3), uint8 if the view is opaque, else
@@ -148,11 +150,12 @@ class _StoredTarget:
     """A target in an image store, with the facts that are needed without reading it."""
 
     def __init__(self, target: Target, store: ImageStore):
-        self.has_alpha = target.alpha is not None
+        self.has_alpha, self.is_overview = target.alpha is not None, target.is_overview
         self.hidden = target.ignored is not None and bool(target.ignored.all())
         planes: Planes = (target.rgb, target.alpha, target.ignored)
         if (around := target.surroundings) is not None:
             planes += (around.behind, around.alpha, around.front, around.transmittance)
+            planes += (around.correction,)
         self._read: Callable[[], Planes] = store.add(planes)
 
     def get(self) -> Target:
@@ -160,10 +163,10 @@ class _StoredTarget:
         assert rgb is not None
         if not layers:
             return Target(rgb, alpha, ignored)
-        behind, block_alpha, front, transmittance = layers
+        behind, block_alpha, *others = layers
         assert behind is not None and block_alpha is not None
-        around = Surroundings(behind, block_alpha, front, transmittance)
-        return Target(rgb, alpha, ignored, around)
+        around = Surroundings(behind, block_alpha, *others)
+        return Target(rgb, alpha, ignored, around, self.is_overview)
 
 
 def usable_factor(views: Sequence[View], factor: int) -> int:
@@ -200,10 +203,10 @@ def _among(target: Target, layers: Layers) -> Target:
     if target.alpha is not None:
         photograph = (photograph * 255).round().to(torch.uint8)
     rgb = torch.where(layers.used[..., None], photograph, layers.coarse)
-    ignored = target.ignored
+    ignored, is_overview = target.ignored, layers.ignored is not None
     if layers.ignored is not None:
         ignored = layers.ignored if ignored is None else ignored | layers.ignored
-    return Target(rgb, None, ignored, layers.surroundings)
+    return Target(rgb, None, ignored, layers.surroundings, is_overview)
 
 
 def _reduce(target: Target, factor: int) -> Target:

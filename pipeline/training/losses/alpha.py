@@ -30,8 +30,9 @@ def alpha_gradient(
 
 def mask_gradient(target: Target, weight: float) -> Tensor | None:
     """(H, W) float32 gradient of ``weight`` times the sum of alpha over ignored pixels, divided by
-    the number of the other pixels; None without ignored pixels or weight."""
-    if target.ignored is None or not weight:
+    the number of the other pixels; None without ignored pixels or weight, and for overviews of a
+    block, whose ignored pixels are not empty."""
+    if target.ignored is None or target.is_overview or not weight:
         return None
     counted = target.ignored.numel() - int(target.ignored.sum())
     return target.ignored * (weight / max(1, counted))

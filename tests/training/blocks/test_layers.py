@@ -24,21 +24,36 @@ WHITE = (1.0, 1.0, 1.0)
 
 
 @pytest.mark.parametrize("number", [1, 2])
-def test_layers_compose_to_the_whole_scene(divided: DividedScene, number: int) -> None:
+@pytest.mark.parametrize("corrected", [False, True])
+def test_layers_compose_to_the_whole_scene(
+    divided: DividedScene, number: int, corrected: bool
+) -> None:
+    backend = make_backend()
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
     region = divided.partition.box(number)
-    layers = BlockLayers(divided.gaussians, region, WHITE, options, make_backend())
-    whole = RasterOptions(sh_degree=1, near=NEAR, background=WHITE, threads=1)
+    layers = BlockLayers(divided.gaussians, region, WHITE, options, backend)
+    own = torch.from_numpy(region.contains(divided.gaussians.means.numpy()))
+    block_alone = divided.gaussians.select(own.nonzero()[:, 0])
     for view in divided.views:
-        expected = make_backend().forward(
-            *divided.gaussians.parameters(), raster_camera(view), whole
-        )
-        found = layers(view).coarse.float() / 255
-        # Layers are 8-bit. Gaussians across the face are in one layer, and blended in order of
-        # their centres in the whole scene.
-        error = (found - expected.color.clamp(0, 1)).abs()
-        assert error.mean() < 0.006
-        assert error.quantile(0.9) < 0.01
+        camera = raster_camera(view)
+        expected = backend.forward(
+            *divided.gaussians.parameters(), camera, replace(options, background=WHITE)
+        ).color
+        block = backend.forward(*block_alone.parameters(), camera, options)
+        found = layers(view)
+        around = found.surroundings
+        if not corrected:
+            around = replace(around, correction=None)
+        error = (around.compose(block.color, block.alpha) - expected).abs()
+        if corrected:
+            # Of 8 bits.
+            assert error.max() < 0.6 / 255
+            assert (found.coarse / 255 - expected.clamp(0, 1)).abs().max() < 0.6 / 255
+        else:
+            # Layers are 8-bit. Gaussians across the face are in one layer, and blended in order of
+            # their centres in the whole scene.
+            assert error.mean() < 0.006
+            assert error.quantile(0.9) < 0.01
 
 
 def random_surroundings(front: bool) -> Surroundings:
@@ -47,7 +62,8 @@ def random_surroundings(front: bool) -> Surroundings:
     behind, alpha = image(5, 7, 3), image(5, 7)
     if not front:
         return Surroundings(behind, alpha)
-    return Surroundings(behind, alpha, image(5, 7, 3), image(5, 7))
+    correction = torch.randint(-127, 128, (5, 7, 3), dtype=torch.int8)
+    return Surroundings(behind, alpha, image(5, 7, 3), image(5, 7), correction)
 
 
 @pytest.mark.parametrize("front", [False, True])

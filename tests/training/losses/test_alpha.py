@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -20,6 +21,8 @@ def test_the_mask_loss_is_relative_to_the_pixels_that_are_not_ignored(tmp_path: 
     masked = mask_gradient(target, 0.5)
     assert masked is not None and mask_gradient(target, 0.0) is None
     np.testing.assert_allclose(masked, (mask == 0) * 0.5 / (mask > 0).sum(), rtol=1e-6)
+    # What is in the ignored pixels of an overview is not empty: the block would fade.
+    assert mask_gradient(replace(target, is_overview=True), 0.5) is None
 
 
 def test_alpha_gradient_is_the_gradient_of_its_losses(tmp_path: Path) -> None:

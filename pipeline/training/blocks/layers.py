@@ -20,8 +20,9 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.surroundings import Surroundings
 from pipeline.training.data.targets import Layers
 
-# A pixel trains a block that explains at least this share of it, in front of all others.
-USED_SHARE = 0.02
+# A block is trained in the pixels of which it explains more than this share. In the others it keeps
+# the scene as it is: two blocks that corrected the same pixel would correct it twice.
+USED_SHARE = 0.5
 # Fronts of less alpha everywhere are left out.
 MIN_FRONT = 2 / 255
 

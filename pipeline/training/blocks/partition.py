@@ -27,13 +27,14 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
-from pipeline.training.blocks.layers import USED_SHARE
 from pipeline.training.data.targets import usable_factor
 
 Array = NDArray[np.float64]
 
 # Views are rendered at 1 / this of their size.
 IMAGE_FACTOR = 4
+# Windows contain the pixels of which the block explains more than this share.
+SHOWN_SHARE = 0.02
 # A view belongs to the blocks that explain at least this share of its pixels.
 MIN_VIEW_SHARE = 0.005
 # Windows are this much larger than the block in them, pixels of the view.
@@ -223,14 +224,15 @@ class _Views:
         """Add a view in which the block explains this share (h, w) of each reduced pixel, if it
         explains enough of them."""
         mean = float(share.mean(dtype=np.float64))
-        used = share > USED_SHARE
+        shown = share > SHOWN_SHARE
         enter, leave = self.region.crossed(rays.origin, rays.directions)
         through = enter.clip(0) < np.minimum(leave, rays.depth)
-        if mean >= MIN_VIEW_SHARE and used.any():
-            left, top, width, height = window = _window(used, view)
+        if mean >= MIN_VIEW_SHARE and shown.any():
+            left, top, width, height = window = _window(shown, view)
             size = view.width, view.height
-            shown = BlockView(name=view.name, window=window, size=size, share=round(mean, 6))
-            self.views.append(shown)
+            self.views.append(
+                BlockView(name=view.name, window=window, size=size, share=round(mean, 6))
+            )
             self.pixels.append(mean * view.width * view.height)
             within = (rays.x >= left) & (rays.x < left + width)
             through &= ~(within & (rays.y >= top) & (rays.y < top + height))
@@ -341,17 +343,16 @@ def _shares(
     return shares, found.median_depth.numpy()
 
 
-def _window(used: NDArray[np.bool_], view: View) -> tuple[int, int, int, int]:
-    """Left, top, width and height, pixels of the view, around the used pixels of a reduced
-    image."""
-    left, width = _span(np.any(used, 0), view.width)
-    top, height = _span(np.any(used, 1), view.height)
+def _window(shown: NDArray[np.bool_], view: View) -> tuple[int, int, int, int]:
+    """Left, top, width and height, pixels of the view, around these pixels of a reduced image."""
+    left, width = _span(np.any(shown, 0), view.width)
+    top, height = _span(np.any(shown, 1), view.height)
     return left, top, width, height
 
 
-def _span(used: Any, size: int) -> tuple[int, int]:
-    found = np.flatnonzero(used)
-    scale = size / len(used)
+def _span(shown: Any, size: int) -> tuple[int, int]:
+    found = np.flatnonzero(shown)
+    scale = size / len(shown)
     begin = int(found[0] * scale) - WINDOW_MARGIN
     end = int(np.ceil((found[-1] + 1) * scale)) + WINDOW_MARGIN
     length = min(size, -(-(end - begin) // WINDOW_UNIT) * WINDOW_UNIT)

@@ -9,7 +9,6 @@ import math
 from collections.abc import Callable, Mapping
 
 from pipeline.config.schema import RENDERED_FORMATS
-from pipeline.plan import training_memory
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
@@ -29,6 +28,8 @@ _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
 _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
 # Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
+# A part of the training of a scene in blocks: bytes per pixel of a view, and per Gaussian.
+_PART_IMAGE, _PART_GAUSSIAN = 300.0, 900.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
@@ -148,8 +149,9 @@ def _train(plan: Plan, threads: int) -> float:
 
 
 def _part(plan: Plan, threads: int) -> float:
-    """A part of the training of a scene in blocks. Images that do not fit are read from disk."""
-    return training_memory.memory_mb(0, plan.config.train.density.max_gaussians)
+    """A part of the training of a scene in blocks. Images are read from disk."""
+    trained = _PART_GAUSSIAN * plan.config.train.density.max_gaussians / 1e6
+    return _RASTERIZER + _PART_IMAGE * _view_pixels(plan) + trained
 
 
 def _evaluate(plan: Plan, threads: int) -> float:

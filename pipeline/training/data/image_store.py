@@ -20,7 +20,7 @@ from pipeline.runtime.memory import release_free_memory
 IMAGES_PER_RELEASE = 8
 
 Planes = tuple[Tensor | None, ...]
-"""The tensors of one image, uint8 or bool; None for those that it does not have."""
+"""The tensors of one image, of 8 bits or bool; None for those that it does not have."""
 
 
 class ImageStore(Protocol):

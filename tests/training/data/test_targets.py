@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import fields, replace
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +15,8 @@ from pipeline.render import RasterOptions, forward
 from pipeline.render.views import raster_camera
 from pipeline.scene.views import View, reduced_size
 from pipeline.training.data.image_store import DiskStore, MemoryStore
-from pipeline.training.data.targets import Targets, usable_factor
+from pipeline.training.data.surroundings import Surroundings
+from pipeline.training.data.targets import Layers, Targets, usable_factor
 from tests.training.conftest import TinyScene
 
 
@@ -128,3 +129,25 @@ def test_a_disk_store_reads_copies_and_leaves_no_file(
     assert first[0] is not None and second[0] is not None and first[1] is None
     assert torch.equal(first[0], second[0]) and first[0].data_ptr() != second[0].data_ptr()
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("store", [MemoryStore, DiskStore])
+def test_the_layers_around_a_block_are_stored_with_its_pixels(
+    tmp_path: Path, store: type[MemoryStore] | type[DiskStore]
+) -> None:
+    view = view_of(tmp_path / "a.png", np.full((8, 10, 3), 200, np.uint8))
+    plane = torch.arange(80, dtype=torch.uint8).reshape(8, 10)
+    image = plane[..., None].repeat(1, 1, 3)
+    around = Surroundings(image, plane, image + 1, plane + 1, image.to(torch.int8) - 90)
+    used, window = plane > 40, plane < 10
+
+    def layers(_: View) -> Layers:
+        return Layers(around, used, image, (0.0, 0.0, 0.0), window)
+
+    target = Targets([view], threads=1, store=store(), layers=layers).get(0, 1)
+    assert target.is_overview and target.surroundings is not None
+    assert target.ignored is not None and torch.equal(target.ignored, window)
+    assert torch.equal(target.rgb, torch.where(used[..., None], 200, image))
+    for field in fields(Surroundings):
+        found, expected = getattr(target.surroundings, field.name), getattr(around, field.name)
+        assert torch.equal(found, expected) and found.dtype == expected.dtype

@@ -115,6 +115,10 @@ class Block(JsonObject):
         "parts are trained on at reduced size, so that nothing appears in them."
     )
 
+    def window_of(self, view: str) -> BlockView | None:
+        """The view with this name; None if the block has none."""
+        return next((shown for shown in self.views if shown.name == view), None)
+
     @property
     def pixels(self) -> int:
         """Number of pixels of all windows."""
@@ -146,6 +150,12 @@ class Partition(JsonFile, JsonObject):
         lower = [-np.inf if bound is None else bound for bound in block.lower]
         upper = [np.inf if bound is None else bound for bound in block.upper]
         return Box(np.array(self.axes), np.array(lower), np.array(upper))
+
+    def scene_boxes(self, number: int) -> tuple[Box, list[Box]]:
+        """The box of block ``number`` within the scene's bounds, and those of all others."""
+        bounds = np.array(self.lower), np.array(self.upper)
+        boxes = [self.box(each).clipped(*bounds) for each in range(1, len(self.blocks) + 1)]
+        return boxes.pop(number - 1), boxes
 
     def region(self, number: int) -> Box:
         """The box of block ``number`` with its margin, within the scene's bounds: where its

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
@@ -12,17 +11,16 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.render import Backend, Color, Forward, RasterOptions
+from pipeline.render.contributions import in_grey
 from pipeline.render.views import raster_camera
-from pipeline.scene.blocks import BlockView, Box
+from pipeline.scene.blocks import Partition
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.blocks.shares import IMAGE_FACTOR, SHOWN_SHARE, explained_shares
 from pipeline.training.data.surroundings import Surroundings
-from pipeline.training.data.targets import Layers
+from pipeline.training.data.targets import Layers, usable_factor
 
-# A block is trained in the pixels of which it explains more than this share. In the others it keeps
-# the scene as it is: two blocks that corrected the same pixel would correct it twice.
-USED_SHARE = 0.5
 # Fronts of less alpha everywhere are left out.
 MIN_FRONT = 2 / 255
 
@@ -34,21 +32,19 @@ class BlockLayers:
 
     Attributes:
         coarse: the Gaussians of the whole scene before the blocks are trained.
-        region: of the block, with its margin.
+        partition, number: the block.
         background: behind the scene.
         options: as in training, without a background.
         gains: of the views, by which renders are multiplied before they are compared.
-        windows: of the views that the block is seen in, by name. Whole views ignore them: the block
-            is trained on the windows themselves.
     """
 
     coarse: Gaussians
-    region: Box
+    partition: Partition
+    number: int
     background: Color
     options: RasterOptions
     backend: Backend
     gains: ExposureGains = NO_GAINS
-    windows: Mapping[str, BlockView] = field(default_factory=dict)
     _lock: Lock = field(default_factory=Lock, compare=False)
 
     def __call__(self, view: View) -> Layers:
@@ -58,9 +54,9 @@ class BlockLayers:
     def _layers(self, view: View) -> Layers:
         # Several times faster than to render all Gaussians in each layer.
         visible = self._visible(view)
-        means = visible.means.numpy()
-        own = self.region.contains(means)
-        behind = self.region.hides(view.centre, means) & ~own
+        means, region = visible.means.numpy(), self.partition.region(self.number)
+        own = region.contains(means)
+        behind = region.hides(view.centre, means) & ~own
         front = self._render(visible, ~own & ~behind, view)
         block = self._render(visible, own, view)
         back = self._render(visible, behind, view, self.background)
@@ -75,14 +71,33 @@ class BlockLayers:
             scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(
             surroundings=around,
-            used=(1 - front.alpha) * block.alpha > USED_SHARE,
+            used=self._used(visible, view),
             coarse=_bytes(scene),
             background=self.background,
             ignored=self._ignored(view),
         )
 
+    def _used(self, gaussians: Gaussians, view: View) -> Tensor:
+        """(H, W) bool, the pixels that the block explains more of than any other block. Two blocks
+        that corrected the same pixel would correct it twice."""
+        factor = usable_factor([view], IMAGE_FACTOR)
+        means = gaussians.means.numpy()
+        box, others = self.partition.scene_boxes(self.number)
+        boxes = [each.contains(means) for each in (box, *others)]
+        options = replace(self.options, sh_degree=0)
+        (own, *rest), _ = explained_shares(
+            in_grey(gaussians), boxes, raster_camera(view, factor), options, self.backend
+        )
+        used = (own > SHOWN_SHARE) & (own > np.maximum.reduce(rest, initial=0.0))
+        rows, columns = (
+            np.arange(size) * reduced // size
+            for size, reduced in zip((view.height, view.width), used.shape, strict=True)
+        )
+        return torch.from_numpy(used[rows[:, None], columns])
+
     def _ignored(self, view: View) -> Tensor | None:
-        shown = self.windows.get(view.name)
+        """The window of a whole view: the block is trained on the window itself."""
+        shown = self.partition.blocks[self.number - 1].window_of(view.name)
         if shown is None or view.crop is not None:
             return None
         ignored = torch.zeros(view.height, view.width, dtype=torch.bool)

@@ -14,27 +14,22 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
-import torch
 from numpy.typing import NDArray
 
 from pipeline.config.schema import Train
 from pipeline.plan.budget import TRAINING_PIXELS_PER_GAUSSIAN
-from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
+from pipeline.render import Backend, RasterOptions, make_backend
 from pipeline.render.contributions import contributions, in_grey
 from pipeline.render.views import near_plane, raster_camera
 from pipeline.scene.blocks import Block, BlockView, Box, Partition, bounds_of
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
-from pipeline.splats.init import SH_C0
+from pipeline.training.blocks.shares import IMAGE_FACTOR, SHOWN_SHARE, explained_shares
 from pipeline.training.data.targets import usable_factor
 
 Array = NDArray[np.float64]
 
-# Views are rendered at 1 / this of their size.
-IMAGE_FACTOR = 4
-# Windows contain the pixels of which the block explains more than this share.
-SHOWN_SHARE = 0.02
 # A view belongs to the blocks that explain at least this share of its pixels.
 MIN_VIEW_SHARE = 0.005
 # Windows are this much larger than the block in them, pixels of the view.
@@ -165,11 +160,10 @@ def make_partition(
     regions = [box.contains(coarse.means.numpy()) for box in boxes]
     shares = [_Views(box) for box in boxes]
     for view, camera in zip(views, cameras, strict=True):
-        for start in range(0, len(cells), 3):
-            maps, depth = _shares(grey, regions[start : start + 3], camera, raster, backend)
-            rays = _Rays.of(view, depth)
-            for found, share in zip(shares[start : start + 3], maps, strict=False):
-                found.add(view, share, rays)
+        maps, depth = explained_shares(grey, regions, camera, raster, backend)
+        rays = _Rays.of(view, depth)
+        for found, share in zip(shares, maps, strict=True):
+            found.add(view, share, rays)
     return Partition(
         axes=tuple(map(tuple, options.axes.tolist())),
         lower=tuple(bounds[0].tolist()),
@@ -323,24 +317,6 @@ def _quantile(values: Array, weight: Array, share: float) -> float:
     total = np.cumsum(weight[order])
     at = int(np.searchsorted(total, share * total[-1]))
     return float(values[order[min(at, len(order) - 1)]])
-
-
-def _shares(
-    grey: Gaussians,
-    regions: Sequence[NDArray[np.bool_]],
-    camera: RasterCamera,
-    options: RasterOptions,
-    backend: Backend,
-) -> tuple[list[NDArray[np.float32]], NDArray[np.float32]]:
-    """(h, w) share of each pixel that the Gaussians of each of up to three regions explain: the
-    regions are colour channels. And (h, w) the median depth."""
-    white = 0.5 / SH_C0
-    sh = torch.full((len(grey), 1, 3), -white)
-    for channel, region in enumerate(regions):
-        sh[torch.from_numpy(region), 0, channel] = white
-    found = backend.forward(*replace(grey, sh=sh).parameters(), camera, options)
-    shares = [found.color[..., channel].numpy() for channel in range(len(regions))]
-    return shares, found.median_depth.numpy()
 
 
 def _window(shown: NDArray[np.bool_], view: View) -> tuple[int, int, int, int]:

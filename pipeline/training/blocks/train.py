@@ -121,12 +121,12 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
     def open_layers(threads: int) -> BlockLayers:
         return BlockLayers(
             read_gaussians(),
-            region,
+            partition,
+            number,
             BACKGROUNDS[background],
             replace(options, threads=threads),
             make_backend(),
             gains,
-            windows,
         )
 
     return Inputs(

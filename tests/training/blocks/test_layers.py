@@ -30,8 +30,8 @@ def test_layers_compose_to_the_whole_scene(
 ) -> None:
     backend = make_backend()
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
-    region = divided.partition.box(number)
-    layers = BlockLayers(divided.gaussians, region, WHITE, options, backend)
+    region = divided.partition.region(number)
+    layers = BlockLayers(divided.gaussians, divided.partition, number, WHITE, options, backend)
     own = torch.from_numpy(region.contains(divided.gaussians.means.numpy()))
     block_alone = divided.gaussians.select(own.nonzero()[:, 0])
     for view in divided.views:
@@ -89,21 +89,20 @@ def test_gradient_of_the_loss_on_alpha_is_that_of_autograd() -> None:
 
 def test_layers_of_a_cropped_view_are_cropped_layers(divided: DividedScene) -> None:
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
-    layers = BlockLayers(
-        divided.gaussians, divided.partition.box(1), WHITE, options, make_backend()
-    )
+    layers = BlockLayers(divided.gaussians, divided.partition, 1, WHITE, options, make_backend())
     view = divided.views[1]
     whole, part = layers(view), layers(view.cropped(32, 16, 64, 80))
     cut = whole.coarse[16:96, 32:96].int()
     assert (cut - part.coarse.int()).abs().max() <= 1
-    assert (whole.used[16:96, 32:96] ^ part.used).float().mean() < 0.01
+    # Of 4 x 4 pixels each, with rounding where two blocks explain as much.
+    assert (whole.used[16:96, 32:96] ^ part.used).float().mean() < 0.02
 
 
 def test_pixels_of_other_blocks_have_the_exposure_of_their_view(divided: DividedScene) -> None:
     """They are compared with renders that are multiplied by the view's gains."""
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
-    view, region = divided.views[1], divided.partition.box(1)
-    plain = BlockLayers(divided.gaussians, region, WHITE, options, make_backend())
+    view, backend = divided.views[1], make_backend()
+    plain = BlockLayers(divided.gaussians, divided.partition, 1, WHITE, options, backend)
     gains = ExposureGains({view.name: (0.5, 0.25, 0.75)})
     exposed = replace(plain, gains=gains)
     factor = torch.tensor([0.5, 0.25, 0.75])

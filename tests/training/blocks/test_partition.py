@@ -47,8 +47,9 @@ def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedSce
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
     views = {view.name: view for view in divided.views}
     for number, block in enumerate(divided.partition.blocks, 1):
-        region = divided.partition.region(number)
-        layers = BlockLayers(divided.gaussians, region, (0, 0, 0), options, make_backend())
+        layers = BlockLayers(
+            divided.gaussians, divided.partition, number, (0, 0, 0), options, make_backend()
+        )
         assert block.views
         for shown in block.views:
             left, top, width, height = shown.window
@@ -86,12 +87,7 @@ def test_overviews_are_not_trained_on_where_windows_are(divided: DividedScene) -
     windows = {shown.name: shown for shown in block.views}
     left, top, width, height = windows[view.name].window
     layers = BlockLayers(
-        divided.gaussians,
-        divided.partition.region(1),
-        (0, 0, 0),
-        options,
-        make_backend(),
-        windows=windows,
+        divided.gaussians, divided.partition, 1, (0, 0, 0), options, make_backend()
     )
     ignored = layers(view).ignored
     assert ignored is not None and ignored.sum() == width * height

@@ -83,7 +83,8 @@ class BlockLayers:
         factor = usable_factor([view], IMAGE_FACTOR)
         means = gaussians.means.numpy()
         box, others = self.partition.scene_boxes(self.number)
-        boxes = [each.contains(means) for each in (box, *others)]
+        boxes = [box.contains(means)]
+        boxes += [inside for each in others if (inside := each.contains(means)).any()]
         options = replace(self.options, sh_degree=0)
         (own, *rest), _ = explained_shares(
             in_grey(gaussians), boxes, raster_camera(view, factor), options, self.backend

@@ -29,7 +29,7 @@ _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
 # Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # A part of the training of a scene in blocks: bytes per pixel of a view, and per Gaussian.
-_PART_IMAGE, _PART_GAUSSIAN = 300.0, 900.0
+_PART_IMAGE, _PART_GAUSSIAN = 400.0, 900.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.

@@ -116,6 +116,20 @@ def test_jobs_of_a_large_scene_reserve_what_they_take() -> None:
         assert megabytes <= memory_mb(stage, plan, 2) <= 1.6 * megabytes, stage
 
 
+def test_jobs_of_a_scene_in_blocks_reserve_what_they_take() -> None:
+    """Aerial photographs and a town in four blocks, with two threads: the coarse run, and the
+    largest block of each round."""
+    aerial, town = (75, (4000, 3000)), (300, (640, 427))
+    for (count, size), view, gaussians, used in (
+        (aerial, (800, 600), 240_000, {"coarse": 621, "block": 678, "polish": 706}),
+        (aerial, (640, 480), 76_800, {"coarse": 397, "block": 547, "polish": 572}),
+        (town, (640, 427), 68_320, {"coarse": 441, "block": 501, "polish": 524}),
+    ):
+        plan = plan_of(Scene(count, size, view, gaussians), Config())
+        for stage, megabytes in used.items():
+            assert megabytes <= memory_mb(stage, plan, 2) <= 1.6 * megabytes, stage
+
+
 def test_the_memory_of_matches_does_not_grow_with_large_scenes() -> None:
     few, many = (
         plan_of(Scene(count, (640, 427), (640, 427), 100_000), Config.model_validate(CHUNKS))

@@ -10,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Backend, Color, Forward, RasterOptions
+from pipeline.render import Backend, Color, RasterOptions
 from pipeline.render.contributions import in_grey
 from pipeline.render.views import raster_camera
 from pipeline.scene.blocks import Partition
@@ -57,16 +57,15 @@ class BlockLayers:
         means, region = visible.means.numpy(), self.partition.region(self.number)
         own = region.contains(means)
         behind = region.hides(view.centre, means) & ~own
-        front = self._render(visible, ~own & ~behind, view)
-        block = self._render(visible, own, view)
-        back = self._render(visible, behind, view, self.background)
-        around = Surroundings(_bytes(back.color), _bytes(block.alpha))
-        if float(front.alpha.max()) >= MIN_FRONT:
-            transmittance = _bytes(1 - front.alpha)
-            around = replace(around, front=_bytes(front.color), transmittance=transmittance)
-        whole = self._render(visible, np.ones(len(visible), np.bool_), view, self.background)
-        scene = whole.color
-        around = around.corrected(scene - around.compose(block.color, block.alpha))
+        front, front_alpha = self._render(visible, ~own & ~behind, view)
+        block, block_alpha = self._render(visible, own, view)
+        back, _ = self._render(visible, behind, view, self.background)
+        around = Surroundings(_bytes(back), _bytes(block_alpha))
+        if float(front_alpha.max()) >= MIN_FRONT:
+            transmittance = _bytes(1 - front_alpha)
+            around = replace(around, front=_bytes(front), transmittance=transmittance)
+        scene, _ = self._render(visible, None, view, self.background)
+        around = around.corrected(scene - around.compose(block, block_alpha))
         if (gain := self.gains.of(view.name)) is not None:
             scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(
@@ -114,13 +113,16 @@ class BlockLayers:
     def _render(
         self,
         gaussians: Gaussians,
-        which: NDArray[np.bool_],
+        which: NDArray[np.bool_] | None,
         view: View,
         background: Color | None = None,
-    ) -> Forward:
-        chosen = gaussians.select(torch.from_numpy(np.flatnonzero(which)))
+    ) -> tuple[Tensor, Tensor]:
+        """(H, W, 3) colour and (H, W) alpha of some of the Gaussians, or of all."""
+        if which is not None:
+            gaussians = gaussians.select(torch.from_numpy(np.flatnonzero(which)))
         options = replace(self.options, background=background)
-        return self.backend.forward(*chosen.parameters(), raster_camera(view), options)
+        found = self.backend.forward(*gaussians.parameters(), raster_camera(view), options)
+        return found.color, found.alpha
 
 
 def _bytes(values: Tensor) -> Tensor:

@@ -52,8 +52,8 @@ class Surroundings:
         """
         image = ((1 - alpha)[..., None] * self._behind).add_(color)
         if self.front is not None and self._passing is not None:
-            image.mul_(self._passing).add_(_unit(self.front))
-        return image if self.correction is None else image.add_(_unit(self.correction))
+            image.mul_(self._passing).add_(self.front, alpha=1 / 255)
+        return image if self.correction is None else image.add_(self.correction, alpha=1 / 255)
 
     def alpha_gradient(self, alpha: Tensor) -> Tensor:
         """(H, W) float32 gradient of ``ALPHA_LOSS_WEIGHT`` times the mean square of the part of

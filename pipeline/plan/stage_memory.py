@@ -28,8 +28,9 @@ _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
 _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
 # Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
-# A part of the training of a scene in blocks: bytes per pixel of a view, and per Gaussian.
-_PART_IMAGE, _PART_GAUSSIAN = 400.0, 900.0
+# Training of a scene in blocks: bytes per pixel of a view, in the coarse run and with the layers
+# around a block; bytes per Gaussian.
+_COARSE_IMAGE, _BLOCK_IMAGE, _PART_GAUSSIAN = 150.0, 400.0, 900.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
@@ -148,10 +149,10 @@ def _train(plan: Plan, threads: int) -> float:
     return _NUMPY + _HELD * plan.config.train.density.max_gaussians / 1e6
 
 
-def _part(plan: Plan, threads: int) -> float:
+def _part(plan: Plan, image: float) -> float:
     """A part of the training of a scene in blocks. Images are read from disk."""
     trained = _PART_GAUSSIAN * plan.config.train.density.max_gaussians / 1e6
-    return _RASTERIZER + _PART_IMAGE * _view_pixels(plan) + trained
+    return _RASTERIZER + image * _view_pixels(plan) + trained
 
 
 def _evaluate(plan: Plan, threads: int) -> float:
@@ -190,10 +191,10 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "refine": _mapping,
     "undistort": _undistort,
     "init": _init,
-    "coarse": _part,
+    "coarse": lambda plan, threads: _part(plan, _COARSE_IMAGE),
     "partition": lambda plan, threads: _TORCH + _PARTITIONED * _gaussians(plan),
-    "block": _part,
-    "polish": _part,
+    "block": lambda plan, threads: _part(plan, _BLOCK_IMAGE),
+    "polish": lambda plan, threads: _part(plan, _BLOCK_IMAGE),
     "train": _train,
     "evaluate": _evaluate,
     "coverage": _coverage,

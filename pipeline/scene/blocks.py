@@ -116,7 +116,7 @@ class Block(JsonObject):
     )
 
     def window_of(self, view: str) -> BlockView | None:
-        """The view with this name; None if the block has none."""
+        """Its view with this name; None if the block is not seen in it."""
         return next((shown for shown in self.views if shown.name == view), None)
 
     @property

@@ -88,6 +88,7 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
 
 
 def _unchanged(sparse: Path, out: Path, decisions: list[str], error_px: float) -> KnownPosesReport:
+    """Copy the input files."""
     out.mkdir(parents=True, exist_ok=True)
     for file in colmap_files(sparse):
         shutil.copy(file, out)

@@ -17,7 +17,7 @@ MIN_MODEL_SIZE = 3
 
 # With more photographs, incremental mapping adjusts the whole model to part of its points, as many
 # as constrain the poses: faster, and as accurate after the final bundle adjustment.
-MAX_ALL_POINTS = 200
+MAX_PHOTOS_WITH_ALL_POINTS = 200
 
 # Global mapping uses the longest tracks only: several times faster at the same accuracy.
 GLOBAL_TRACKS_PER_VIEW = 300
@@ -76,7 +76,7 @@ def _map_incremental(
     )
     # Two-view tracks nearly double the number of points, from which Gaussians are initialised.
     options.triangulation.ignore_two_view_tracks = False
-    options.mapper.ba_global_ignore_redundant_points3D = total > MAX_ALL_POINTS
+    options.mapper.ba_global_ignore_redundant_points3D = total > MAX_PHOTOS_WITH_ALL_POINTS
     progress = Progress("mapping", total, "photographs")
 
     def registered() -> None:

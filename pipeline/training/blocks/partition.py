@@ -160,8 +160,8 @@ def make_partition(
     regions = [box.contains(coarse.means.numpy()) for box in boxes]
     shares = [_Views(box) for box in boxes]
     for view, camera in zip(views, cameras, strict=True):
-        maps, depth = explained_shares(grey, regions, camera, raster, backend)
-        rays = _Rays.of(view, depth)
+        maps, rendered = explained_shares(grey, regions, camera, raster, backend)
+        rays = _Rays.of(view, rendered.median_depth.numpy())
         for found, share in zip(shares, maps, strict=True):
             found.add(view, share, rays)
     return Partition(

@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.render import Backend, RasterCamera, RasterOptions
+from pipeline.render import Backend, Forward, RasterCamera, RasterOptions
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
 
@@ -27,9 +27,9 @@ def explained_shares(
     camera: RasterCamera,
     options: RasterOptions,
     backend: Backend,
-) -> tuple[Shares, NDArray[np.float32]]:
+) -> tuple[Shares, Forward]:
     """(h, w) share of each pixel that the Gaussians of each region explain, in front of all others;
-    and the (h, w) median depth, camera z.
+    and a render of all Gaussians, for its depths.
 
     Args:
         grey: all Gaussians, of SH degree 0.
@@ -46,6 +46,4 @@ def explained_shares(
             sh[torch.from_numpy(region), 0, channel] = white
         found = backend.forward(*replace(grey, sh=sh).parameters(), camera, options)
         shares += [found.color[..., channel].numpy() for channel in range(len(some))]
-        if start == 0:
-            depth = found.median_depth.numpy()
-    return shares, depth
+    return shares, found

@@ -103,7 +103,7 @@ def load_scene(
 
 
 def choose_image_store(
-    inputs: Inputs, config: Train, limit_mb: int | None, part: Part = WHOLE_RUN
+    inputs: Inputs, config: Train, limit_mb: int | None, part: Part
 ) -> ImageStore:
     """Memory if the views' pixels fit beside the Gaussians, else a file; always a file for a scene
     in blocks, which are chosen to save memory."""

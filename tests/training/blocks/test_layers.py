@@ -94,8 +94,31 @@ def test_layers_of_a_cropped_view_are_cropped_layers(divided: DividedScene) -> N
     whole, part = layers(view), layers(view.cropped(32, 16, 64, 80))
     cut = whole.coarse[16:96, 32:96].int()
     assert (cut - part.coarse.int()).abs().max() <= 1
-    # Of 4 x 4 pixels each, with rounding where two blocks explain as much.
-    assert (whole.used[16:96, 32:96] ^ part.used).float().mean() < 0.02
+
+
+def test_pixels_that_train_a_block_are_the_same_in_a_cropped_view(divided: DividedScene) -> None:
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    layers = BlockLayers(divided.gaussians, divided.partition, 1, WHITE, options, make_backend())
+    for view in divided.views:
+        # As large as the view needs for the same reduced size.
+        whole, part = layers(view).used, layers(view.cropped(16, 0, 128, 128)).used
+        assert torch.equal(whole[:, 16:144], part)
+
+
+def test_each_pixel_trains_at_most_one_block(divided: DividedScene) -> None:
+    """Two blocks that corrected the same pixel would correct it twice."""
+    options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
+    first, second = (
+        BlockLayers(divided.gaussians, divided.partition, number, WHITE, options, make_backend())
+        for number in (1, 2)
+    )
+    for view in divided.views:
+        used, other = first(view), second(view)
+        assert used.used.any() and other.used.any()
+        assert not (used.used & other.used).any()
+        # Both regions have the pixels at the face, and one of them is trained there.
+        seen = (used.surroundings.alpha > 200) | (other.surroundings.alpha > 200)
+        assert (used.used | other.used)[seen].float().mean() > 0.95
 
 
 def test_pixels_of_other_blocks_have_the_exposure_of_their_view(divided: DividedScene) -> None:

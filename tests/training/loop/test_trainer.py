@@ -25,7 +25,7 @@ from pipeline.training.data.image_store import DiskStore, MemoryStore
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import metrics_log, session, setup
 from pipeline.training.loop.result import TrainResult
-from pipeline.training.loop.schedule import Part
+from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.train import train
 from tests.training.conftest import HEIGHT, WIDTH, Options, TinyScene, tiny_config
 
@@ -106,8 +106,8 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
 def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
     config = tiny_config(coarse_share=0.3)
     inputs = Inputs(scene.views, scene.initial, scene.extent)
-    assert isinstance(setup.choose_image_store(inputs, config.train, None), MemoryStore)
-    assert isinstance(setup.choose_image_store(inputs, config.train, 1), DiskStore)
+    assert isinstance(setup.choose_image_store(inputs, config.train, None, WHOLE_RUN), MemoryStore)
+    assert isinstance(setup.choose_image_store(inputs, config.train, 1, WHOLE_RUN), DiskStore)
     in_blocks = setup.choose_image_store(inputs, config.train, None, Part(0.0, 0.5))
     assert isinstance(in_blocks, DiskStore)
     little = run(scene, tmp_path / "b", config, memory_mb=1)

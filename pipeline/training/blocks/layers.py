@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field, replace
 from threading import Lock
 
+import cv2
 import numpy as np
 import torch
 from numpy.typing import NDArray
@@ -70,30 +71,28 @@ class BlockLayers:
             scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(
             surroundings=around,
-            used=self._used(visible, view),
+            weight=self._weight(visible, view),
             coarse=_bytes(scene),
             background=self.background,
             ignored=self._ignored(view),
         )
 
-    def _used(self, gaussians: Gaussians, view: View) -> Tensor:
-        """(H, W) bool, the pixels that the block explains more of than any other block. Two blocks
-        that corrected the same pixel would correct it twice."""
+    def _weight(self, gaussians: Gaussians, view: View) -> Tensor:
+        """(H, W) float32, what the block explains of each pixel, of all that blocks explain. Two
+        blocks that corrected the same error of a pixel would correct it twice."""
         factor = usable_factor([view], IMAGE_FACTOR)
         means = gaussians.means.numpy()
         box, others = self.partition.scene_boxes(self.number)
         boxes = [box.contains(means)]
         boxes += [inside for each in others if (inside := each.contains(means)).any()]
         options = replace(self.options, sh_degree=0)
-        (own, *rest), _ = explained_shares(
+        shares, _ = explained_shares(
             in_grey(gaussians), boxes, raster_camera(view, factor), options, self.backend
         )
-        used = (own > SHOWN_SHARE) & (own > np.maximum.reduce(rest, initial=0.0))
-        rows, columns = (
-            np.arange(size) * reduced // size
-            for size, reduced in zip((view.height, view.width), used.shape, strict=True)
-        )
-        return torch.from_numpy(used[rows[:, None], columns])
+        own, total = shares[0], np.sum(shares, axis=0)
+        weight = np.where(own > SHOWN_SHARE, own / np.maximum(total, SHOWN_SHARE), 0)
+        size = view.width, view.height
+        return torch.from_numpy(cv2.resize(weight, size, interpolation=cv2.INTER_LINEAR))
 
     def _ignored(self, view: View) -> Tensor | None:
         """The window of a whole view: the block is trained on the window itself."""

@@ -66,15 +66,15 @@ class Layers:
 
     Attributes:
         surroundings: the layers around the block.
-        used: (H, W) bool, the pixels in which the block is trained.
-        coarse: (H, W, 3) uint8, the scene before training with the view's exposure, which replaces
-            the photograph in all other pixels: other blocks explain them.
+        weight: (H, W) float32, the part of the scene's error that the block is to correct; other
+            blocks correct the rest.
+        coarse: (H, W, 3) uint8, the scene before training with the view's exposure.
         background: behind the scene, and behind photographs with alpha.
         ignored: (H, W) bool, pixels that another view of the block shows; None if there are none.
     """
 
     surroundings: Surroundings
-    used: Tensor
+    weight: Tensor
     coarse: Tensor
     background: tuple[float, float, float]
     ignored: Tensor | None = None
@@ -201,8 +201,9 @@ def _target(pixels: ViewPixels) -> Target:
 def _among(target: Target, layers: Layers) -> Target:
     photograph = target.over(layers.background)
     if target.alpha is not None:
-        photograph = (photograph * 255).round().to(torch.uint8)
-    rgb = torch.where(layers.used[..., None], photograph, layers.coarse)
+        photograph = photograph * 255
+    rgb = torch.lerp(layers.coarse.float(), photograph.float(), layers.weight[..., None])
+    rgb = rgb.round().to(torch.uint8)
     ignored, is_overview = target.ignored, layers.ignored is not None
     if layers.ignored is not None:
         ignored = layers.ignored if ignored is None else ignored | layers.ignored

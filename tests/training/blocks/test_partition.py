@@ -53,10 +53,10 @@ def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedSce
         assert block.views
         for shown in block.views:
             left, top, width, height = shown.window
-            used = layers(views[shown.name]).used
-            outside = used.clone()
-            outside[top : top + height, left : left + width] = False
-            assert outside.sum() <= 0.01 * used.sum()
+            weight = layers(views[shown.name]).weight
+            outside = weight.clone()
+            outside[top : top + height, left : left + width] = 0
+            assert outside.sum() <= 0.01 * weight.sum()
 
 
 def test_a_view_without_the_block_is_not_among_its_views(divided: DividedScene) -> None:

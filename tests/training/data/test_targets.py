@@ -139,15 +139,16 @@ def test_the_layers_around_a_block_are_stored_with_its_pixels(
     plane = torch.arange(80, dtype=torch.uint8).reshape(8, 10)
     image = plane[..., None].repeat(1, 1, 3)
     around = Surroundings(image, plane, image + 1, plane + 1, image.to(torch.int8) - 90)
-    used, window = plane > 40, plane < 10
+    weight, window = plane / 100, plane < 10
 
     def layers(_: View) -> Layers:
-        return Layers(around, used, image, (0.0, 0.0, 0.0), window)
+        return Layers(around, weight, image, (0.0, 0.0, 0.0), window)
 
     target = Targets([view], threads=1, store=store(), layers=layers).get(0, 1)
     assert target.is_overview and target.surroundings is not None
     assert target.ignored is not None and torch.equal(target.ignored, window)
-    assert torch.equal(target.rgb, torch.where(used[..., None], 200, image))
+    expected_rgb = image + weight[..., None] * (200 - image.float())
+    assert (target.rgb - expected_rgb).abs().max() <= 0.5
     for field in fields(Surroundings):
         found, expected = getattr(target.surroundings, field.name), getattr(around, field.name)
         assert torch.equal(found, expected) and found.dtype == expected.dtype

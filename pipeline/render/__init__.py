@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.render.types import (
     BACKGROUNDS,
+    AlphaChangeLoss,
     CameraGradients,
     Color,
     DenseAdam,
@@ -25,6 +26,8 @@ from pipeline.render.types import (
     RasterOptions,
     RenderOutput,
     ShAdam,
+    Subset,
+    Surroundings,
 )
 
 if TYPE_CHECKING:
@@ -41,6 +44,7 @@ if TYPE_CHECKING:
 
 __all__ = [
     "BACKGROUNDS",
+    "AlphaChangeLoss",
     "Backend",
     "CameraGradients",
     "Color",
@@ -53,6 +57,8 @@ __all__ = [
     "RasterOptions",
     "RenderOutput",
     "ShAdam",
+    "Subset",
+    "Surroundings",
     "adam_step",
     "backward",
     "forward",

@@ -9,8 +9,7 @@ To add a backend, derive a class from ``Backend`` and add it to ``pipeline.rende
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
 import torch
@@ -18,6 +17,7 @@ import torch
 from pipeline.render import checks
 from pipeline.render.checks import Parameters
 from pipeline.render.types import (
+    AlphaChangeLoss,
     DenseAdam,
     Forward,
     FrameAdam,
@@ -26,6 +26,8 @@ from pipeline.render.types import (
     RasterCamera,
     RasterOptions,
     ShAdam,
+    Subset,
+    Surroundings,
 )
 
 
@@ -58,6 +60,10 @@ class Backend(ABC, Generic[Projected, Binned]):
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
         """Project Gaussians to 2D Gaussians on the image plane and evaluate their colours."""
+
+    @abstractmethod
+    def subset_of(self, projected: Projected, subset: Subset) -> Projected:
+        """The projection of a subset of the Gaussians, whose indices stay the same."""
 
     @abstractmethod
     def bin(self, projected: Projected) -> Binned:
@@ -121,6 +127,33 @@ class Backend(ABC, Generic[Projected, Binned]):
         """
 
     @abstractmethod
+    def compose(
+        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
+    ) -> torch.Tensor:
+        """(H, W, 3) float32 image of a scene, of which one part is rendered:
+
+            C = F + T (C_p + (1 - alpha_p) B) + correction
+
+        with the front's colour F and transmittance T, and what is behind, B.
+
+        Args:
+            color: (H, W, 3) float32, C_p without a background.
+            alpha: (H, W) float32, alpha_p.
+        """
+
+    @abstractmethod
+    def compose_backward(
+        self,
+        around: Surroundings,
+        alpha: torch.Tensor,
+        d_image: torch.Tensor,
+        loss: AlphaChangeLoss,
+        threads: int = 0,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        """Gradients with respect to ``color`` (H, W, 3) and ``alpha`` (H, W) of ``compose``, from
+        the gradient on its image (H, W, 3) float32, and of the loss on alpha."""
+
+    @abstractmethod
     def adam_step(
         self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
     ) -> None:
@@ -178,14 +211,21 @@ class Backend(ABC, Generic[Projected, Binned]):
         checks.check_camera(camera, options.near)
         return self.blend(self.bin(self.project(parameters, camera, options)))
 
-    def visible(
-        self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
-    ) -> torch.Tensor:
-        """(N,) bool, the Gaussians that overlap the image. Arguments and errors: see ``forward``.
+    def forward_subsets(
+        self,
+        parameters: Parameters,
+        camera: RasterCamera,
+        options: RasterOptions,
+        subsets: Callable[[torch.Tensor], Iterable[Subset]],
+    ) -> Iterator[Forward]:
+        """Render subsets of the Gaussians, each without the others; all are projected once. Images
+        have the same bits as of these Gaussians alone. Errors: see ``forward``.
 
-        Without the others, the image has the same bits.
+        Args:
+            subsets: given (N,) bool, the Gaussians that overlap the image, those to render.
         """
-        options = replace(options, sh_degree=0)
         parameters = checks.parameters(*parameters, options.sh_degree)
         checks.check_camera(camera, options.near)
-        return self.project(parameters, camera, options).radii > 0
+        projected = self.project(parameters, camera, options)
+        for subset in subsets(projected.radii > 0):
+            yield self.blend(self.bin(self.subset_of(projected, subset)))

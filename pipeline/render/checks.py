@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import torch
 
-from pipeline.render.types import DenseAdam, FrameAdam, RasterCamera, ShAdam
+from pipeline.render.types import DenseAdam, FrameAdam, RasterCamera, ShAdam, Surroundings
 
 MAX_IMAGE_SIDE = 1 << 16
 
@@ -101,6 +101,33 @@ def images(
             )
         mask = mask.contiguous().view(torch.uint8)
     return rendered, target, mask
+
+
+def layers(
+    around: Surroundings, color: torch.Tensor, alpha: torch.Tensor
+) -> tuple[torch.Tensor, torch.Tensor]:
+    """(H, W, 3) and (H, W) images of a part of a scene that fit its surroundings, checked."""
+    color = checked("color", color, (None, None, 3))
+    height, width = color.shape[:2]
+    expected = {
+        "behind": (torch.uint8, (height, width, 3)),
+        "alpha": (torch.uint8, (height, width)),
+        "front": (torch.uint8, (height, width, 3)),
+        "transmittance": (torch.uint8, (height, width)),
+        "correction": (torch.int8, (height, width, 3)),
+    }
+    for name, (dtype, shape) in expected.items():
+        plane = getattr(around, name)
+        if plane is None and name not in ("behind", "alpha"):
+            continue
+        if plane.dtype != dtype or plane.shape != shape or not plane.is_contiguous():
+            raise ValueError(
+                f"{name}: expected contiguous {dtype} {shape}, found {plane.dtype} "
+                f"{tuple(plane.shape)}"
+            )
+    if (around.front is None) != (around.transmittance is None):
+        raise ValueError("front and transmittance: expected both or neither")
+    return color, checked("alpha", alpha, (height, width))
 
 
 def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:

@@ -19,12 +19,14 @@ import torch
 import torch.nn.functional as F
 
 from pipeline.render.types import (
+    AlphaChangeLoss,
     DenseAdam,
     FrameAdam,
     RasterCamera,
     RasterOptions,
     RenderOutput,
     ShAdam,
+    Surroundings,
 )
 
 # The same constants as in cpu/csrc/constants.h, which has their reasons.
@@ -399,6 +401,23 @@ def l1_ssim(
     error = ((d.abs() + l2_weight * d * d) * valid.unsqueeze(-1)).sum() / count
     ssim = (ssim_map * valid.unsqueeze(-1)).sum() / count
     return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
+
+
+def compose(around: Surroundings, color: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+    """(H, W, 3) image of a scene, of which one part is rendered; see ``Backend.compose``."""
+    image = color + (1 - alpha)[..., None] * around.behind / 255
+    if around.front is not None and around.transmittance is not None:
+        image = image * around.transmittance[..., None] / 255 + around.front / 255
+    return image if around.correction is None else image + around.correction / 255
+
+
+def alpha_change_loss(
+    around: Surroundings, alpha: torch.Tensor, loss: AlphaChangeLoss
+) -> torch.Tensor:
+    """See ``AlphaChangeLoss``."""
+    change = alpha - around.alpha.to(alpha.dtype) / 255
+    beyond = (change - loss.growth).clamp(min=0) + (-loss.fade - change).clamp(min=0)
+    return loss.weight * beyond.square().mean()
 
 
 def adam_step(param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam) -> None:

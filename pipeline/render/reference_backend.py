@@ -13,6 +13,7 @@ from pipeline.render import checks, reference
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.types import (
+    AlphaChangeLoss,
     CameraGradients,
     DenseAdam,
     Forward,
@@ -22,6 +23,8 @@ from pipeline.render.types import (
     RasterCamera,
     RasterOptions,
     ShAdam,
+    Subset,
+    Surroundings,
 )
 
 
@@ -76,6 +79,21 @@ class ReferenceBackend(Backend[Projected, Projected]):
             means, log_scales, quats, opacity_logits, sh, perturbed, options
         )
         return Projected(parameters, leaves, change, perturbed, options, projection)
+
+    def subset_of(self, projected: Projected, subset: Subset) -> Projected:
+        whole = projected.projection
+        rows = subset.which[whole.index]
+        projection = reference.Projection(
+            index=whole.index[rows],
+            means2d=whole.means2d[rows],
+            conics=whole.conics[rows],
+            depths=whole.depths[rows],
+            opacities=whole.opacities[rows],
+            radii=torch.where(subset.which, whole.radii, 0.0),
+            num_dropped=whole.num_dropped,
+        )
+        options = replace(projected.options, background=subset.background)
+        return replace(projected, projection=projection, options=options)
 
     def bin(self, projected: Projected) -> Projected:
         return projected
@@ -159,6 +177,29 @@ class ReferenceBackend(Backend[Projected, Projected]):
         return LossResult(
             float(loss.detach()), float(error.detach()), float(ssim.detach()), grad.float()
         )
+
+    def compose(
+        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
+    ) -> torch.Tensor:
+        color, alpha = checks.layers(around, color, alpha)
+        return reference.compose(around, color.double(), alpha.double()).float()
+
+    def compose_backward(
+        self,
+        around: Surroundings,
+        alpha: torch.Tensor,
+        d_image: torch.Tensor,
+        loss: AlphaChangeLoss,
+        threads: int = 0,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        d_image, alpha = checks.layers(around, d_image, alpha)
+        # The composition is linear in the colour.
+        color = torch.zeros(d_image.shape, dtype=torch.float64, requires_grad=True)
+        change = alpha.double().requires_grad_()
+        total = (reference.compose(around, color, change) * d_image).sum()
+        (total + reference.alpha_change_loss(around, change, loss)).backward()
+        assert color.grad is not None and change.grad is not None
+        return color.grad.float(), change.grad.float()
 
     def adam_step(
         self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0

@@ -87,6 +87,51 @@ class RasterOptions:
 
 
 @dataclass(frozen=True)
+class Surroundings:
+    """What a view shows around a part of a scene, as images. The image of the whole scene is a
+    composition of three layers (Porter and Duff 1984): the front, the part, and what is behind it.
+
+    Attributes:
+        behind: (H, W, 3) uint8, the scene behind the part over the background.
+        alpha: (H, W) uint8 of the part before training.
+        front: (H, W, 3) uint8, the scene in front of the part, multiplied by its alpha; None if
+            nothing is.
+        transmittance: (H, W) uint8 of the front, 255 where there is none; None if nothing is.
+        correction: (H, W, 3) int8, in 1/255: what the composition before training lacks of the
+            image of the whole scene; None: nothing.
+    """
+
+    behind: torch.Tensor
+    alpha: torch.Tensor
+    front: torch.Tensor | None = None
+    transmittance: torch.Tensor | None = None
+    correction: torch.Tensor | None = None
+
+
+@dataclass(frozen=True)
+class AlphaChangeLoss:
+    """``weight`` times the mean square of the part of the change of alpha that exceeds the
+    tolerances ``fade`` (of a decrease) and ``growth``."""
+
+    weight: float
+    fade: float
+    growth: float
+
+
+@dataclass(frozen=True)
+class Subset:
+    """Some of N Gaussians, to be rendered without the others.
+
+    Attributes:
+        which: (N,) bool.
+        background: see ``RasterOptions``.
+    """
+
+    which: torch.Tensor
+    background: Color | None = None
+
+
+@dataclass(frozen=True)
 class Forward:
     """A rendered view, with the state that ``backward`` needs. Do not write to its tensors.
 

@@ -20,6 +20,8 @@ Array = NDArray[np.float64]
 Bound = float | None
 Bounds = tuple[Bound, Bound, Bound]
 
+_POINTS_AT_ONCE = 1 << 15
+
 
 @dataclass(frozen=True)
 class Box:
@@ -65,9 +67,15 @@ class Box:
         """(N,) whether each of (N, 3) points outside of the box is farther from ``origin`` (3,)
         than the point of the box that is nearest to it: what surrounds it is behind the box, where
         they overlap in an image."""
-        start, local = self.along_axes(origin[None]), self.along_axes(points)
-        nearest = np.clip(local, self.lower, self.upper)
-        return np.asarray(((nearest - start) ** 2).sum(1) < ((local - start) ** 2).sum(1))
+        start = self.along_axes(origin[None])
+        hidden = np.empty(len(points), bool)
+        # A part at a time, for less memory.
+        for first in range(0, len(points), _POINTS_AT_ONCE):
+            rows = slice(first, first + _POINTS_AT_ONCE)
+            local = self.along_axes(points[rows])
+            nearest = np.clip(local, self.lower, self.upper)
+            hidden[rows] = ((nearest - start) ** 2).sum(1) < ((local - start) ** 2).sum(1)
+        return hidden
 
 
 class BlockView(JsonObject):
@@ -151,11 +159,10 @@ class Partition(JsonFile, JsonObject):
         upper = [np.inf if bound is None else bound for bound in block.upper]
         return Box(np.array(self.axes), np.array(lower), np.array(upper))
 
-    def scene_boxes(self, number: int) -> tuple[Box, list[Box]]:
-        """The box of block ``number`` within the scene's bounds, and those of all others."""
-        bounds = np.array(self.lower), np.array(self.upper)
-        boxes = [self.box(each).clipped(*bounds) for each in range(1, len(self.blocks) + 1)]
-        return boxes.pop(number - 1), boxes
+    def kept(self, number: int) -> Box:
+        """The box of block ``number`` within the scene's bounds: where its Gaussians stay in the
+        union of the blocks."""
+        return self.box(number).clipped(np.array(self.lower), np.array(self.upper))
 
     def region(self, number: int) -> Box:
         """The box of block ``number`` with its margin, within the scene's bounds: where its

@@ -8,7 +8,17 @@ from dataclasses import replace
 import pytest
 import torch
 
-from pipeline.render import Backend, DenseAdam, FrameAdam, RasterOptions, ShAdam, make_backend
+from pipeline.render import (
+    AlphaChangeLoss,
+    Backend,
+    DenseAdam,
+    FrameAdam,
+    RasterOptions,
+    ShAdam,
+    Subset,
+    Surroundings,
+    make_backend,
+)
 from pipeline.render.registry import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
 
@@ -56,17 +66,27 @@ def test_forward_is_project_bin_and_blend(backend: Backend, scene: Scene) -> Non
     assert torch.equal(parts.color, backend.forward(*scene, CAMERA, OPTIONS).color)
 
 
-def test_without_the_gaussians_that_are_not_visible_the_image_has_the_same_bits(
-    backend: Backend, scene: Scene
-) -> None:
+def test_a_subset_has_the_image_of_its_gaussians_alone(backend: Backend, scene: Scene) -> None:
+    """To the bit, and without the Gaussians that are not visible."""
     scene[0][::3, 2] -= 100.0
-    visible = backend.visible(scene, CAMERA, OPTIONS)
+    some = torch.arange(len(scene[0])) % 2 == 0
+    background = (0.25, 0.5, 0.75)
+    visible = torch.zeros(len(some), dtype=torch.bool)
+
+    def subsets(seen: torch.Tensor) -> list[Subset]:
+        visible.copy_(seen)
+        return [Subset(seen & some), Subset(seen, background)]
+
+    part, every = backend.forward_subsets(scene, CAMERA, OPTIONS, subsets)
     assert 0 < visible.sum() <= len(visible) * 2 / 3
-    some = backend.forward(*(tensor[visible] for tensor in scene), CAMERA, OPTIONS)
-    every = backend.forward(*scene, CAMERA, OPTIONS)
-    assert torch.equal(visible, every.radii > 0)
-    assert torch.equal(some.color, every.color)
-    assert torch.equal(some.alpha, every.alpha)
+    for found, which, behind in ((part, some, None), (every, visible, background)):
+        options = replace(OPTIONS, background=behind)
+        alone = backend.forward(*(tensor[which] for tensor in scene), CAMERA, options)
+        assert torch.equal(found.color, alone.color)
+        assert torch.equal(found.alpha, alone.alpha)
+        assert torch.equal(found.radii[which], alone.radii)
+        assert not found.radii[~which].any()
+        assert found.num_visible == alone.num_visible
 
 
 @pytest.mark.parametrize("target", [torch.rand(22, 31, 3), torch.full((22, 31, 3), 90).byte()])
@@ -78,6 +98,44 @@ def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -
     assert found.loss == pytest.approx(expected.loss, rel=1e-5)
     assert found.grad.dtype == torch.float32
     assert relative(found.grad, expected.grad) < 1e-5
+
+
+@pytest.mark.parametrize("front", [False, True])
+@pytest.mark.parametrize("correction", [False, True])
+def test_the_composition_equals_the_reference(
+    backend: Backend, front: bool, correction: bool
+) -> None:
+    """And its gradients, with that of the loss on alpha."""
+    torch.manual_seed(0)
+    image = lambda *size: torch.randint(0, 256, size, dtype=torch.uint8)  # noqa: E731
+    around = Surroundings(
+        image(22, 31, 3),
+        image(22, 31),
+        image(22, 31, 3) if front else None,
+        image(22, 31) if front else None,
+        torch.randint(-127, 128, (22, 31, 3), dtype=torch.int8) if correction else None,
+    )
+    color, alpha, d = torch.rand(22, 31, 3), torch.rand(22, 31), noise(22, 31, 3)
+    # Less than the gradients through the image, but not negligible.
+    loss = AlphaChangeLoss(weight=50.0, fade=0.1, growth=0.25)
+    images, gradients = [], []
+    for each in (backend, REFERENCE):
+        images.append(each.compose(around, color, alpha))
+        gradients.append(each.compose_backward(around, alpha, d, loss))
+    assert images[0].dtype == torch.float32
+    assert torch.allclose(*images, atol=2e-6)
+    for found, expected in zip(*gradients, strict=True):
+        assert torch.allclose(found, expected, atol=2e-6)
+    without = REFERENCE.compose_backward(around, alpha, d, replace(loss, weight=0.0))[1]
+    assert (gradients[1][1] - without).abs().max() > 0.01
+    with pytest.raises(ValueError, match="behind: expected contiguous"):
+        backend.compose(replace(around, behind=image(21, 31, 3)), color, alpha)
+
+
+def test_the_composition_without_front_is_a_background() -> None:
+    around = Surroundings(torch.full((2, 3, 3), 255, dtype=torch.uint8), torch.zeros(2, 3).byte())
+    image = REFERENCE.compose(around, torch.full((2, 3, 3), 0.25), torch.full((2, 3), 0.75))
+    assert torch.equal(image, torch.full((2, 3, 3), 0.5))
 
 
 def copies(*tensors: torch.Tensor) -> list[torch.Tensor]:

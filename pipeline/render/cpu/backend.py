@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -13,6 +13,7 @@ from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.cpu import build
 from pipeline.render.types import (
+    AlphaChangeLoss,
     CameraGradients,
     DenseAdam,
     Forward,
@@ -22,6 +23,8 @@ from pipeline.render.types import (
     RasterCamera,
     RasterOptions,
     ShAdam,
+    Subset,
+    Surroundings,
 )
 from pipeline.runtime.errors import UserError
 
@@ -105,6 +108,11 @@ class CpuBackend(Backend[Projected, Binned]):
         )  # fmt: skip
         return Projected(parameters, view, size, options, *found)
 
+    def subset_of(self, projected: Projected, subset: Subset) -> Projected:
+        radii = torch.where(subset.which, projected.radii, 0.0)
+        options = replace(projected.options, background=subset.background)
+        return replace(projected, radii=radii, options=options, num_visible=int((radii > 0).sum()))
+
     def bin(self, projected: Projected) -> Binned:
         p = projected
         entries, tile_begin, slots, fits = _ops().bin(
@@ -184,6 +192,29 @@ class CpuBackend(Backend[Projected, Binned]):
     ) -> LossResult:
         images = checks.images(rendered, target, mask)
         return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
+
+    def compose(
+        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
+    ) -> torch.Tensor:
+        color, alpha = checks.layers(around, color, alpha)
+        return _ops().compose(
+            around.behind, around.alpha, around.front, around.transmittance, around.correction,
+            color, alpha, _threads(threads),
+        )  # fmt: skip
+
+    def compose_backward(
+        self,
+        around: Surroundings,
+        alpha: torch.Tensor,
+        d_image: torch.Tensor,
+        loss: AlphaChangeLoss,
+        threads: int = 0,
+    ) -> tuple[torch.Tensor, torch.Tensor]:
+        d_image, alpha = checks.layers(around, d_image, alpha)
+        return _ops().compose_backward(
+            around.behind, around.alpha, around.front, around.transmittance, alpha, d_image,
+            loss.weight, loss.fade, loss.growth, _threads(threads),
+        )  # fmt: skip
 
     def adam_step(
         self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0

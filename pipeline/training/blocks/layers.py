@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from threading import Lock
 
 import cv2
@@ -11,15 +13,14 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Backend, Color, RasterOptions
+from pipeline.render import Backend, Color, RasterOptions, Subset, Surroundings
 from pipeline.render.contributions import in_grey
 from pipeline.render.views import raster_camera
-from pipeline.scene.blocks import Partition
+from pipeline.scene.blocks import Box, Partition
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.blocks.shares import IMAGE_FACTOR, SHOWN_SHARE, explained_shares
-from pipeline.training.data.surroundings import Surroundings
 from pipeline.training.data.targets import Layers, usable_factor
 
 # Fronts of less alpha everywhere are left out.
@@ -34,6 +35,7 @@ class BlockLayers:
     Attributes:
         coarse: the Gaussians of the whole scene before the blocks are trained.
         partition, number: the block.
+        corrects: what explains the part of an error that the block is to correct.
         background: behind the scene.
         options: as in training, without a background.
         gains: of the views, by which renders are multiplied before they are compared.
@@ -42,6 +44,7 @@ class BlockLayers:
     coarse: Gaussians
     partition: Partition
     number: int
+    corrects: Box
     background: Color
     options: RasterOptions
     backend: Backend
@@ -53,44 +56,53 @@ class BlockLayers:
             return self._layers(view)
 
     def _layers(self, view: View) -> Layers:
-        # Several times faster than to render all Gaussians in each layer.
-        visible = self._visible(view)
-        means, region = visible.means.numpy(), self.partition.region(self.number)
-        own = region.contains(means)
-        behind = region.hides(view.centre, means) & ~own
-        front, front_alpha = self._render(visible, ~own & ~behind, view)
-        block, block_alpha = self._render(visible, own, view)
-        back, _ = self._render(visible, behind, view, self.background)
+        def layers(visible: Tensor) -> Iterator[Subset]:
+            around = visible & ~self._own
+            behind = around & self._hidden(around, view)
+            yield Subset(around & ~behind)
+            yield Subset(visible & self._own)
+            yield Subset(behind, self.background)
+            yield Subset(visible, self.background)
+
+        rendered = self.backend.forward_subsets(
+            self.coarse.parameters(), raster_camera(view), self.options, layers
+        )
+        # Without what else was rendered with each image.
+        images = [(found.color, found.alpha) for found in rendered]
+        (front, front_alpha), (block, block_alpha), (back, _), (scene, _) = images
         around = Surroundings(_bytes(back), _bytes(block_alpha))
         if float(front_alpha.max()) >= MIN_FRONT:
             transmittance = _bytes(1 - front_alpha)
             around = replace(around, front=_bytes(front), transmittance=transmittance)
-        scene, _ = self._render(visible, None, view, self.background)
-        around = around.corrected(scene - around.compose(block, block_alpha))
+        error = scene - self.backend.compose(around, block, block_alpha, self.options.threads)
+        correction = (error * 255).round().clamp(-127, 127).to(torch.int8)
         if (gain := self.gains.of(view.name)) is not None:
             scene = scene * torch.tensor(gain, dtype=torch.float32)
         return Layers(
-            surroundings=around,
-            weight=self._weight(visible, view),
+            surroundings=replace(around, correction=correction),
+            weight=self._weight(view),
             coarse=_bytes(scene),
             background=self.background,
             ignored=self._ignored(view),
         )
 
-    def _weight(self, gaussians: Gaussians, view: View) -> Tensor:
-        """(H, W) float32, what the block explains of each pixel, of all that blocks explain. Two
+    def _hidden(self, which: Tensor, view: View) -> Tensor:
+        """(N,) bool, those of some of the Gaussians, outside of the region, that are behind it."""
+        rows = which.nonzero()[:, 0]
+        means = self.coarse.means[rows].numpy()
+        hidden = torch.zeros_like(which)
+        hidden[rows] = torch.from_numpy(self._region.hides(view.centre, means))
+        return hidden
+
+    def _weight(self, view: View) -> Tensor:
+        """(H, W) float32, what ``corrects`` explains of each pixel, of all that blocks explain: two
         blocks that corrected the same error of a pixel would correct it twice."""
         factor = usable_factor([view], IMAGE_FACTOR)
-        means = gaussians.means.numpy()
-        box, others = self.partition.scene_boxes(self.number)
-        boxes = [box.contains(means)]
-        boxes += [inside for each in others if (inside := each.contains(means)).any()]
         options = replace(self.options, sh_degree=0)
-        shares, _ = explained_shares(
-            in_grey(gaussians), boxes, raster_camera(view, factor), options, self.backend
+        (own, blocks), _ = explained_shares(
+            self._grey, self._explaining, raster_camera(view, factor), options, self.backend
         )
-        own, total = shares[0], np.sum(shares, axis=0)
-        weight = np.where(own > SHOWN_SHARE, own / np.maximum(total, SHOWN_SHARE), 0)
+        weight = np.where(own > SHOWN_SHARE, own / np.maximum(blocks, SHOWN_SHARE), 0)
         size = view.width, view.height
         return torch.from_numpy(cv2.resize(weight, size, interpolation=cv2.INTER_LINEAR))
 
@@ -104,24 +116,24 @@ class BlockLayers:
         ignored[top:bottom, left:right] = True
         return ignored
 
-    def _visible(self, view: View) -> Gaussians:
-        """The Gaussians that the view shows."""
-        which = self.backend.visible(self.coarse.parameters(), raster_camera(view), self.options)
-        return self.coarse.select(which.nonzero()[:, 0])
+    @cached_property
+    def _region(self) -> Box:
+        return self.partition.region(self.number)
 
-    def _render(
-        self,
-        gaussians: Gaussians,
-        which: NDArray[np.bool_] | None,
-        view: View,
-        background: Color | None = None,
-    ) -> tuple[Tensor, Tensor]:
-        """(H, W, 3) colour and (H, W) alpha of some of the Gaussians, or of all."""
-        if which is not None:
-            gaussians = gaussians.select(torch.from_numpy(np.flatnonzero(which)))
-        options = replace(self.options, background=background)
-        found = self.backend.forward(*gaussians.parameters(), raster_camera(view), options)
-        return found.color, found.alpha
+    @cached_property
+    def _own(self) -> Tensor:
+        """(N,) bool, the Gaussians of the region."""
+        return torch.from_numpy(self._region.contains(self.coarse.means.numpy()))
+
+    @cached_property
+    def _explaining(self) -> list[NDArray[np.bool_]]:
+        """The Gaussians of ``corrects``, and of all blocks."""
+        means = self.coarse.means.numpy()
+        return [box.contains(means) for box in (self.corrects, self.partition.bounds)]
+
+    @cached_property
+    def _grey(self) -> Gaussians:
+        return in_grey(self.coarse)
 
 
 def _bytes(values: Tensor) -> Tensor:

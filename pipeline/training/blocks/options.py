@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.scene.blocks import Block
+from pipeline.scene.blocks import Block, Box, Partition
 from pipeline.training.loop.schedule import Part, Schedule
 
 # The parts of a run's schedule: on the whole scene, in blocks among the coarse Gaussians, and in
@@ -20,6 +20,17 @@ COARSE, FIRST, SECOND = Part(0.0, 0.5), Part(0.5, 0.8), Part(0.8, 1.0)
 OVERVIEW_FACTOR = 4
 # View-dependent colours are left to the blocks.
 COARSE_SH_DEGREE = 1
+
+
+def corrected_box(partition: Partition, number: int, part: Part) -> Box:
+    """What explains the part of an error that block ``number`` is to correct.
+
+    What a block changes beyond its faces is lost in the union. In the first part it changes much,
+    and corrects only as much as it keeps, so that errors remain where blocks meet. In the second,
+    changes are small: each block corrects all that its region explains, and two blocks that correct
+    the same error at a face each keep their part of it.
+    """
+    return partition.region(number) if part == SECOND else partition.kept(number)
 
 
 def coarse_options(train: Train) -> Train:

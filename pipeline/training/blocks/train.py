@@ -22,7 +22,7 @@ from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options
+from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options, corrected_box
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.data.targets import usable_factor
@@ -79,7 +79,7 @@ def block_training(
     if not block.views or not block.gaussians:
         raise UserError(f"no training view sees block {number}", fix="lower partition.blocks")
     share = block.pixels / max(1, sum(other.pixels for other in partition.blocks))
-    inputs = block_inputs(scene, number, config)
+    inputs = block_inputs(scene, number, config, part)
     options, experiments = block_options(
         config,
         experiments,
@@ -96,9 +96,9 @@ def block_training(
     return BlockTraining(inputs, options, experiments)
 
 
-def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
-    """The inputs of the training of block ``number``: its windows in the views that see it, and
-    overviews."""
+def block_inputs(scene: SceneInBlocks, number: int, config: Train, part: Part) -> Inputs:
+    """The inputs of a part of the training of block ``number``: its windows in the views that see
+    it, and overviews."""
     partition, gains, read_gaussians = scene.partition, scene.gains, scene.read_gaussians
     gaussians = read_gaussians()
     whole = scene_inputs(scene.views, scene.manifest, scene.model, gaussians, scene.gains, config)
@@ -123,6 +123,7 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train) -> Inputs:
             read_gaussians(),
             partition,
             number,
+            corrected_box(partition, number, part),
             BACKGROUNDS[background],
             replace(options, threads=threads),
             make_backend(),

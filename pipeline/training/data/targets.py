@@ -15,10 +15,10 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from pipeline.photos.load import ViewPixels, load_view, resize_area
+from pipeline.render import Surroundings
 from pipeline.runtime.progress import track
 from pipeline.scene.views import View
 from pipeline.training.data.image_store import ImageStore, MemoryStore, Planes
-from pipeline.training.data.surroundings import Surroundings
 
 # Shorter side, pixels, below which SSIM's windows of 11 pixels mostly cover borders.
 MIN_SHORT_SIDE = 64

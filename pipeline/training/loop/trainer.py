@@ -17,7 +17,7 @@ from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.schedule import Schedule, warm_up
 from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
-from pipeline.training.losses.alpha import alpha_gradient
+from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS, alpha_gradient
 from pipeline.training.losses.depth import depth_gradients
 
 # PSNR is computed in some of the steps only: it takes a pass over the image.
@@ -97,7 +97,7 @@ class Trainer:
         gain = None if self.scene.gains is None else self.scene.gains[index]
         color = rendered.color
         if around is not None:
-            color = around.compose(color, rendered.alpha)
+            color = self.backend.compose(around, color, rendered.alpha, self.threads)
         if gain is not None:
             color = color * gain
         loss = self.backend.l1_ssim(
@@ -117,8 +117,9 @@ class Trainer:
         d_color = loss.grad if gain is None else loss.grad * gain
         if around is None:
             return d_color, None
-        d_color, d_alpha = around.gradients(d_color)
-        return d_color, d_alpha + around.alpha_gradient(rendered.alpha)
+        return self.backend.compose_backward(
+            around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads
+        )
 
     def other_losses(
         self, rendered: Forward, target: Target, index: int, by_color: Tensor | None

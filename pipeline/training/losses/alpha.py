@@ -1,11 +1,17 @@
-"""Losses on the rendered alpha: at masked pixels, and of photographs with an alpha channel."""
+"""Losses on the rendered alpha: at masked pixels, of photographs with an alpha channel, and of a
+block among its surroundings."""
 
 from __future__ import annotations
 
 import torch
 from torch import Tensor
 
+from pipeline.render import AlphaChangeLoss
 from pipeline.training.data.targets import Target
+
+# Without it a block would fade, since what is behind it often has its colour, and each of two
+# blocks on a ray could leave a pixel to the other one.
+BLOCK_ALPHA_LOSS = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
 
 
 def alpha_gradient(

@@ -9,13 +9,15 @@ import pytest
 import torch
 
 from pipeline.render import RasterOptions, make_backend
-from pipeline.scene.blocks import Partition
+from pipeline.scene.blocks import Box, Partition
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians, concat
+from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.partition import PartitionOptions, make_partition
 from tests.training.conftest import NUM_VIEWS, ball, camera_at
 
 NEAR = 0.033
+WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,17 @@ def divide(gaussians: Gaussians, views: list[View], blocks: int, threads: int = 
     size = views[0].width * views[0].height
     options = PartitionOptions(blocks, np.eye(3), 1000, size, 40, 100, raster)
     return make_partition(gaussians, views, options, make_backend())
+
+
+def layers_of(
+    gaussians: Gaussians,
+    partition: Partition,
+    number: int,
+    options: RasterOptions,
+    corrects: Box | None = None,
+) -> BlockLayers:
+    box = corrects or partition.kept(number)
+    return BlockLayers(gaussians, partition, number, box, WHITE, options, make_backend())
 
 
 @pytest.fixture(scope="session")

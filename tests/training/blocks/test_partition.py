@@ -10,14 +10,13 @@ import pytest
 import torch
 
 from pipeline.io.npz import write_npz
-from pipeline.render import RasterOptions, make_backend
+from pipeline.render import RasterOptions
 from pipeline.scene.blocks import Partition
 from pipeline.splats.arrays import collect
 from pipeline.splats.gaussians import concat
-from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.train import with_far_field
 from pipeline.training.blocks.union import Union
-from tests.training.blocks.conftest import NEAR, DividedScene, divide, moved
+from tests.training.blocks.conftest import NEAR, DividedScene, divide, layers_of, moved
 from tests.training.conftest import ball
 
 
@@ -46,10 +45,10 @@ def test_blocks_explain_similar_numbers_of_pixels(divided: DividedScene) -> None
 def test_windows_hold_the_pixels_in_which_a_block_is_trained(divided: DividedScene) -> None:
     options = RasterOptions(sh_degree=1, near=NEAR, threads=1)
     views = {view.name: view for view in divided.views}
-    for number, block in enumerate(divided.partition.blocks, 1):
-        layers = BlockLayers(
-            divided.gaussians, divided.partition, number, (0, 0, 0), options, make_backend()
-        )
+    partition = divided.partition
+    for number, block in enumerate(partition.blocks, 1):
+        box = partition.region(number)
+        layers = layers_of(divided.gaussians, partition, number, options, box)
         assert block.views
         for shown in block.views:
             left, top, width, height = shown.window
@@ -86,9 +85,7 @@ def test_overviews_are_not_trained_on_where_windows_are(divided: DividedScene) -
     block, view = divided.partition.blocks[0], divided.views[1]
     windows = {shown.name: shown for shown in block.views}
     left, top, width, height = windows[view.name].window
-    layers = BlockLayers(
-        divided.gaussians, divided.partition, 1, (0, 0, 0), options, make_backend()
-    )
+    layers = layers_of(divided.gaussians, divided.partition, 1, options)
     ignored = layers(view).ignored
     assert ignored is not None and ignored.sum() == width * height
     assert ignored[top : top + height, left : left + width].all()

@@ -11,11 +11,10 @@ import torch
 from PIL import Image
 
 from pipeline.photos.load import resize_area
-from pipeline.render import RasterOptions, forward
+from pipeline.render import RasterOptions, Surroundings, forward
 from pipeline.render.views import raster_camera
 from pipeline.scene.views import View, reduced_size
 from pipeline.training.data.image_store import DiskStore, MemoryStore
-from pipeline.training.data.surroundings import Surroundings
 from pipeline.training.data.targets import Layers, Targets, usable_factor
 from tests.training.conftest import TinyScene
 

@@ -15,6 +15,7 @@
 #include "loss.h"
 #include "memory.h"
 #include "project.h"
+#include "surroundings.h"
 
 namespace {
 
@@ -209,6 +210,43 @@ std::tuple<double, double, double, Tensor> l1_ssim(const Tensor& rendered, const
     return {values.loss, values.error, values.ssim, grad};
 }
 
+splat::Surroundings surroundings_from(const Tensor& behind, const Tensor& alpha,
+                                      const OptionalTensor& front,
+                                      const OptionalTensor& transmittance,
+                                      const OptionalTensor& correction) {
+    const auto bytes = [](const OptionalTensor& t) {
+        return t ? t->const_data_ptr<uint8_t>() : nullptr;
+    };
+    return {alpha.numel(),        bytes(behind),
+            bytes(alpha),         bytes(front),
+            bytes(transmittance), correction ? correction->const_data_ptr<int8_t>() : nullptr};
+}
+
+// (H, W, 3) image
+Tensor compose(const Tensor& behind, const Tensor& old_alpha, OptionalTensor front,
+               OptionalTensor transmittance, OptionalTensor correction, const Tensor& color,
+               const Tensor& alpha, int64_t threads) {
+    Tensor image = new_floats({alpha.size(0), alpha.size(1), 3});
+    splat::compose(surroundings_from(behind, old_alpha, front, transmittance, correction),
+                   floats(color), floats(alpha), int(threads), mutable_floats(image));
+    return image;
+}
+
+// (H, W, 3) and (H, W) gradients of color and alpha
+std::tuple<Tensor, Tensor> compose_backward(const Tensor& behind, const Tensor& old_alpha,
+                                            OptionalTensor front, OptionalTensor transmittance,
+                                            const Tensor& alpha, const Tensor& d_image,
+                                            double weight, double fade, double growth,
+                                            int64_t threads) {
+    Tensor d_color = new_floats({alpha.size(0), alpha.size(1), 3});
+    Tensor d_alpha = new_floats({alpha.size(0), alpha.size(1)});
+    splat::compose_backward(surroundings_from(behind, old_alpha, front, transmittance, {}),
+                            floats(alpha), floats(d_image),
+                            {float(weight), float(fade), float(growth)}, int(threads),
+                            mutable_floats(d_color), mutable_floats(d_alpha));
+    return {d_color, d_alpha};
+}
+
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
                const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
                double beta2, double eps, int64_t threads) {
@@ -270,6 +308,13 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, float "
         "l2_weight, int threads) -> (float, float, float, Tensor)");
     m.def(
+        "compose(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
+        "Tensor? correction, Tensor color, Tensor alpha, int threads) -> Tensor");
+    m.def(
+        "compose_backward(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
+        "Tensor alpha, Tensor d_image, float weight, float fade, float growth, int threads) -> "
+        "(Tensor, Tensor)");
+    m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
         "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
     m.def(
@@ -287,6 +332,8 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("blend_backward", TORCH_BOX(&blend_backward));
     m.impl("project_backward", TORCH_BOX(&project_backward));
     m.impl("l1_ssim", TORCH_BOX(&l1_ssim));
+    m.impl("compose", TORCH_BOX(&compose));
+    m.impl("compose_backward", TORCH_BOX(&compose_backward));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }

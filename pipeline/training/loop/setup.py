@@ -130,7 +130,8 @@ def initial_state(
     degree of spherical harmonics is that of the initial Gaussians."""
     inputs = scene.inputs
     rng = np.random.Generator(np.random.PCG64(seed))
-    gaussians = (inputs.initial if start else inputs.initial.with_sh_degree(0)).clone()
+    gaussians = inputs.initial if start else inputs.initial.with_sh_degree(0)
+    # A copy: the initial Gaussians stay as they are.
     gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
     density = make_strategy(
         config.density, experiments, steps=steps, scale=inputs.size, extent=inputs.extent

@@ -11,6 +11,7 @@ from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.render import BACKGROUNDS, Backend, Color, Forward, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.memory import release_free_memory
 from pipeline.training.data.targets import Target, usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.loop.clock import Clock
@@ -157,15 +158,20 @@ class Trainer:
             prune=floaters > 0,
         )
         state.gaussians = update.gaussians
-        if update.changes is not None:
-            state.counters.changes.add(update.changes)
+        changes, opacity_reset = update.changes, update.opacity_reset
+        del update  # Or its Gaussians would be in memory beside those in another order.
+        if changes is not None:
+            state.counters.changes.add(changes)
+            # Arrays of another size leave gaps.
+            release_free_memory()
             state.reorder()
+            release_free_memory()
             if not len(state.gaussians):
                 raise UserError(
                     f"no Gaussian is left at step {state.step}: all became transparent",
                     fix="check the poses and the masks; init.method: points may help",
                 )
-        state.counters.opacity_resets += update.opacity_reset
+        state.counters.opacity_resets += opacity_reset
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
 
     def fade_floaters(self, steps: range, run_length: float) -> int:

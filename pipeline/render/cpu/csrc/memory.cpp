@@ -13,15 +13,49 @@ namespace splat {
 namespace {
 
 constexpr size_t kHugePage = size_t(2) << 20, kLine = 64;
+// The peak of use is that of this many blocks taken, or twice as many: some dozens of steps.
+constexpr size_t kPeriod = 1024;
 
 struct Block {
     void* memory;
     size_t size;
-
-    std::align_val_t alignment() const {
-        return std::align_val_t(size < kHugePage ? kLine : kHugePage);
-    }
 };
+
+#if defined(__linux__)
+// Pages of their own: on the heap, large blocks that are freed leave gaps, which smaller ones
+// split.
+void* new_pages(size_t size) {
+    const size_t mapped = size + kHugePage;
+    void* const found =
+        mmap(nullptr, mapped, PROT_READ | PROT_WRITE, MAP_PRIVATE | MAP_ANONYMOUS, -1, 0);
+    if (found == MAP_FAILED) throw std::bad_alloc();
+    char* const first = static_cast<char*>(found);
+    const size_t before = (kHugePage - reinterpret_cast<uintptr_t>(first) % kHugePage) % kHugePage;
+    if (before) munmap(first, before);
+    if (before < kHugePage) munmap(first + before + size, kHugePage - before);
+#if defined(MADV_HUGEPAGE)
+    madvise(first + before, size, MADV_HUGEPAGE);
+#endif
+    return first + before;
+}
+#endif
+
+Block new_block(size_t size) {
+#if defined(__linux__)
+    if (size >= kHugePage) return {new_pages(size), size};
+#endif
+    return {::operator new(size, std::align_val_t(kLine)), size};
+}
+
+void free_block(const Block& block) {
+#if defined(__linux__)
+    if (block.size >= kHugePage) {
+        munmap(block.memory, block.size);
+        return;
+    }
+#endif
+    ::operator delete(block.memory, std::align_val_t(kLine));
+}
 
 class Pool {
   public:
@@ -41,9 +75,13 @@ class Pool {
             free_.erase(free_.begin() + best);
             unused_ -= block.size;
         } else {
-            block = fresh(size);
+            block = new_block(size);
         }
         used_ += block.size;
+        if (++taken_ % kPeriod == 0) {
+            earlier_most_ = most_used_;
+            most_used_ = 0;
+        }
         most_used_ = used_ > most_used_ ? used_ : most_used_;
         sizes_[block.memory] = block.size;
         return block.memory;
@@ -57,27 +95,19 @@ class Pool {
         unused_ += found->second;
         sizes_.erase(found);
         // Least recently freed blocks are released first: their sizes are no longer in use.
-        while (used_ + unused_ > most_used_ + most_used_ / 2) {
+        const size_t most = most_used_ > earlier_most_ ? most_used_ : earlier_most_;
+        while (used_ + unused_ > most + most / 2) {
             unused_ -= free_.front().size;
-            ::operator delete(free_.front().memory, free_.front().alignment());
+            free_block(free_.front());
             free_.erase(free_.begin());
         }
     }
 
   private:
-    static Block fresh(size_t size) {
-        Block block = {nullptr, size};
-        block.memory = ::operator new(size, block.alignment());
-#if defined(MADV_HUGEPAGE)
-        if (size >= kHugePage) madvise(block.memory, size, MADV_HUGEPAGE);
-#endif
-        return block;
-    }
-
     std::mutex mutex_;
     std::vector<Block> free_;                  // least recently freed first
     std::unordered_map<void*, size_t> sizes_;  // of the blocks in use
-    size_t used_ = 0, unused_ = 0, most_used_ = 0;
+    size_t used_ = 0, unused_ = 0, most_used_ = 0, earlier_most_ = 0, taken_ = 0;
 };
 
 // Never destroyed: tensors may be freed after static objects.

@@ -114,7 +114,7 @@ for spec in project.stages:
             f"results/{{scene}}/logs/{project.folder(spec)}.log",
         group:
             project.group(spec)
-        threads: project.threads
+        threads: project.threads(spec)
         resources:
             mem_mb=project.memory_mb(spec),
             runtime=project.minutes(spec),

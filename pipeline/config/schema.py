@@ -361,7 +361,15 @@ class Partition(Section):
 
     blocks: Literal["auto"] | Count = Field(
         "auto",
-        description="Number of blocks. auto: 1 for up to 1000 photographs, else one for every 250.",
+        description="Number of blocks. auto: 1 for up to 1000 photographs, else one for every 250; "
+        "more where `memory_mb` requires it.",
+    )
+    memory_mb: Annotated[int, Field(gt=0), Unit("MB")] | None = Field(
+        None,
+        description="Memory that a job may use. A scene whose training would need more is divided "
+        "into blocks, and jobs that would need more for several photographs at a time run fewer "
+        "threads. null: no limit.",
+        json_schema_extra={"decides_result": False},
     )
 
 

@@ -15,9 +15,11 @@ from typing import Any
 
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
-from pipeline.plan.budget import gaussian_budget
+from pipeline.plan.budget import gaussian_budget, typical_view
 from pipeline.plan.panoramas import check_panorama_sizes
 from pipeline.plan.scan import Scan
+from pipeline.plan.training_memory import MEMORY_MARGIN, blocks_in, coarse_mb, memory_mb
+from pipeline.runtime.errors import UserError
 
 # Up to this many photographs (780 pairs), all pairs are matched. For more, retrieval takes a
 # fraction of the time.
@@ -60,7 +62,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     """Settle the options for a scene.
 
     Raises:
-        UserError: ``train.memory_mb`` is too small.
+        UserError: ``train.memory_mb`` or ``partition.memory_mb`` is too small.
     """
     chosen = {
         "matches.pairs": _pairs(scan, config),
@@ -71,9 +73,9 @@ def settle(scan: Scan, config: Config) -> Settled:
         "train.depth_loss_weight": _depth_loss_weight(scan, config),
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
-    blocks, blocks_reason = _blocks(scan, config)
     photos_per_job, jobs_reason = _photos_per_job(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
+    blocks, blocks_reason = _blocks(scan, config, budget)
     settled = _updated(
         config,
         {
@@ -210,15 +212,33 @@ def _background(scan: Scan, config: Config) -> Choice:
     return "black", f"black background: {few}"
 
 
-def _blocks(scan: Scan, config: Config) -> tuple[int, str]:
-    """The number of blocks of the scene."""
-    wanted, count = config.partition.blocks, len(scan.planned)
+def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
+    """The number of blocks of the scene, of at most so many Gaussians.
+
+    Raises:
+        UserError: ``partition.memory_mb`` is not enough for any number.
+    """
+    wanted, count, limit = config.partition.blocks, len(scan.planned), config.partition.memory_mb
     if wanted != "auto":
         return wanted, f"{wanted} blocks, as configured" if wanted > 1 else ""
-    if count <= MAX_PHOTOS_OF_ONE_BLOCK:
-        return 1, ""
-    blocks = math.ceil(count / PHOTOS_PER_BLOCK)
-    return blocks, f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
+    blocks, reason = 1, ""
+    if count > MAX_PHOTOS_OF_ONE_BLOCK:
+        blocks = math.ceil(count / PHOTOS_PER_BLOCK)
+        reason = f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
+    if limit is None or (blocks == 1 and MEMORY_MARGIN * memory_mb(0, gaussians) <= limit):
+        return blocks, reason
+    width, height = typical_view(scan, config)
+    needed = blocks_in(limit / MEMORY_MARGIN, width * height, gaussians)
+    if needed is None:
+        least = MEMORY_MARGIN * coarse_mb(width * height, gaussians)
+        raise UserError(
+            f"partition.memory_mb is {limit}; {gaussians} Gaussians need at least "
+            f"{math.ceil(least)} MB in any number of blocks",
+            fix="increase it, or lower train.density.max_gaussians",
+        )
+    if needed > blocks:
+        return needed, f"{needed} blocks, which fit into {limit} MB of memory each"
+    return blocks, reason
 
 
 def _photos_per_job(scan: Scan, config: Config) -> tuple[int, str]:

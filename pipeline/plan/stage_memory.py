@@ -9,11 +9,10 @@ import math
 from collections.abc import Callable, Mapping
 
 from pipeline.config.schema import RENDERED_FORMATS
+from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
-# What a cluster reserves is this many times the estimate.
-MARGIN = 1.25
 # Python with numpy and OpenCV or pycolmap; with numpy alone; with torch; with torch and the
 # rasterizer's kernels.
 _PROGRAM, _NUMPY, _TORCH, _RASTERIZER = 140.0, 70.0, 270.0, 290.0
@@ -28,9 +27,6 @@ _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
 _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
 # Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
-# Training of a scene in blocks: bytes per pixel of a view, in the coarse run and with the layers
-# around a block; bytes per Gaussian.
-_COARSE_IMAGE, _BLOCK_IMAGE, _PART_GAUSSIAN = 150.0, 400.0, 900.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
@@ -43,12 +39,26 @@ Estimate = Callable[[Plan, int], float]
 
 
 def memory_mb(stage: str, plan: Plan, threads: int) -> int:
-    """Memory in MB that the stage's job may use: what is configured for training, else the
-    estimate with a margin."""
+    """Memory in MB that the stage's job may use: what is configured, else the estimate with a
+    margin."""
     limit = plan.config.train.memory_mb
     if limit is not None and stage in _TRAINING:
         return limit
-    return math.ceil(MARGIN * _ESTIMATES[stage](plan, threads))
+    needed, most = _needed(stage, plan, threads), plan.config.partition.memory_mb
+    return needed if most is None else min(needed, most)
+
+
+def threads_within(stage: str, plan: Plan, threads: int) -> int:
+    """The number of threads, at most ``threads``, for which ``partition.memory_mb`` is enough."""
+    most = plan.config.partition.memory_mb
+    if most is None:
+        return threads
+    fitting = (n for n in range(threads, 1, -1) if _needed(stage, plan, n) <= most)
+    return next(fitting, 1)
+
+
+def _needed(stage: str, plan: Plan, threads: int) -> int:
+    return math.ceil(MEMORY_MARGIN * _ESTIMATES[stage](plan, threads))
 
 
 def _largest(plan: Plan) -> tuple[int, int]:
@@ -149,10 +159,14 @@ def _train(plan: Plan, threads: int) -> float:
     return _NUMPY + _HELD * plan.config.train.density.max_gaussians / 1e6
 
 
-def _part(plan: Plan, image: float) -> float:
-    """A part of the training of a scene in blocks. Images are read from disk."""
-    trained = _PART_GAUSSIAN * plan.config.train.density.max_gaussians / 1e6
-    return _RASTERIZER + image * _view_pixels(plan) + trained
+def _trained(plan: Plan) -> tuple[int, int]:
+    """Pixels of a view, and the maximum number of Gaussians of the scene."""
+    width, height = plan.facts.view_size
+    return width * height, plan.config.train.density.max_gaussians
+
+
+def _block(plan: Plan, threads: int) -> float:
+    return block_mb(*_trained(plan), int(plan.config.partition.blocks))
 
 
 def _evaluate(plan: Plan, threads: int) -> float:
@@ -191,10 +205,10 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "refine": _mapping,
     "undistort": _undistort,
     "init": _init,
-    "coarse": lambda plan, threads: _part(plan, _COARSE_IMAGE),
+    "coarse": lambda plan, threads: coarse_mb(*_trained(plan)),
     "partition": lambda plan, threads: _TORCH + _PARTITIONED * _gaussians(plan),
-    "block": lambda plan, threads: _part(plan, _BLOCK_IMAGE),
-    "polish": lambda plan, threads: _part(plan, _BLOCK_IMAGE),
+    "block": _block,
+    "polish": _block,
     "train": _train,
     "evaluate": _evaluate,
     "coverage": _coverage,

@@ -10,6 +10,15 @@ PROGRAM_MB = 400
 GAUSSIAN_BYTES = 2500
 #: 8-bit RGB, and a quarter more for reduced copies.
 PIXEL_BYTES = 1.25 * 3
+#: A process that trains a part of a scene in blocks; images are on disk. Bytes per pixel of a view:
+#: of the coarse run; with the layers around a block. Bytes per Gaussian: of the whole scene in the
+#: coarse run; of the whole scene while layers are rendered; of a block, whose region extends beyond
+#: its box.
+PART_MB = 290
+COARSE_PIXEL_BYTES, BLOCK_PIXEL_BYTES = 150, 240
+COARSE_GAUSSIAN_BYTES, SCENE_GAUSSIAN_BYTES, BLOCK_GAUSSIAN_BYTES = 900, 450, 2200
+#: A job may use this many times its estimate.
+MEMORY_MARGIN = 1.25
 #: The share of the machine's memory that is left to other programs.
 OTHERS_SHARE = 0.25
 
@@ -33,3 +42,30 @@ def gaussians_in(megabytes: int, pixels: int) -> int:
 def machine_mb() -> int:
     """The memory in MB that training may use on this machine if ``train.memory_mb`` is not set."""
     return round(usable_memory() / 1e6 * (1 - OTHERS_SHARE))
+
+
+def coarse_mb(pixels: int, gaussians: int) -> float:
+    """Estimated peak memory of the coarse run of a scene in blocks, MB.
+
+    Args:
+        pixels: of a view.
+        gaussians: maximum number of Gaussians of the scene.
+    """
+    return PART_MB + (COARSE_PIXEL_BYTES * pixels + COARSE_GAUSSIAN_BYTES * gaussians) / 1e6
+
+
+def block_mb(pixels: int, gaussians: int, blocks: int) -> float:
+    """Estimated peak memory of the training of one of ``blocks`` blocks, MB; see ``coarse_mb``."""
+    held = max(SCENE_GAUSSIAN_BYTES, BLOCK_GAUSSIAN_BYTES / blocks)
+    return PART_MB + (BLOCK_PIXEL_BYTES * pixels + held * gaussians) / 1e6
+
+
+def blocks_in(megabytes: float, pixels: int, gaussians: int) -> int | None:
+    """The smallest number of blocks, 2 or more, that are trained in this memory; None if no number
+    is enough."""
+    if max(coarse_mb(pixels, gaussians), block_mb(pixels, gaussians, gaussians)) > megabytes:
+        return None
+    blocks = 2
+    while block_mb(pixels, gaussians, blocks) > megabytes:
+        blocks += 1
+    return blocks

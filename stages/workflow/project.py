@@ -146,9 +146,14 @@ class SnakemakeProject:
             spec, self._plan(wildcards.scene), int(wildcards.job) if spec.scattered else 1
         )
 
-    def threads(self, wildcards: Any) -> int:
+    def threads(self, spec: StageSpec) -> Callable[[Any], int]:
         """Threads function: the cores of this machine that Snakemake may use; on a cluster those of
-        a node; in a job those of the job."""
+        a node; in a job those of the job. Fewer where the memory is limited."""
+        return lambda wildcards: stage_memory.threads_within(
+            spec.name, self._plan(wildcards.scene), self._cores()
+        )
+
+    def _cores(self) -> int:
         limit = self._workflow.resource_settings.cores
         if self._workflow.remote_exec:
             # Snakemake gives the job all cores of the node.

@@ -10,6 +10,7 @@ import pytest
 from pipeline.config.schema import Config
 from pipeline.geometry.cube import panorama_face_side
 from pipeline.io.colmap import read_model, write_model
+from pipeline.plan import stage_memory
 from pipeline.plan.plan import describe, input_folders
 from pipeline.plan.scan import Scan, scan
 from pipeline.plan.values import Plan
@@ -475,6 +476,35 @@ def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, block
     assert folders == (["polish"] if blocks == 1 else [f"polish_{i + 1}" for i in range(blocks)])
     chosen = make_plan(scan, Config.model_validate({"partition": {"blocks": 2}}))
     assert chosen.config.partition.blocks == 2 and chosen.stages["block"].jobs == 2
+
+
+def test_a_scene_is_divided_until_its_training_fits(tmp_path):
+    size = {"width": lambda i: 800, "height": lambda i: 500}
+    scan = many(tmp_path, 200, **size)
+    train = {"density": {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}}
+
+    def planned(megabytes: int | None) -> Plan:
+        options = {"train": train, "partition": {"memory_mb": megabytes}}
+        return make_plan(scan, Config.model_validate(options))
+
+    assert planned(None).config.partition.blocks == 1
+    whole, divided = planned(3625), planned(3624)
+    assert whole.config.partition.blocks == 1
+    assert divided.config.partition.blocks == 2
+    assert divided.config.train.density.max_gaussians == 1_000_000
+    least = planned(1563)
+    assert least.config.partition.blocks == 3
+    assert "3 blocks, which fit into 1563 MB of memory each" in least.stages["partition"].reason
+    for plan, limit in ((divided, 3624), (least, 1563)):
+        for stage in ("coarse", "block", "polish"):
+            assert stage_memory.memory_mb(stage, plan, 1) <= limit
+    with pytest.raises(UserError, match=r"memory_mb is 1562; 1000000 Gaussians need at least 1563"):
+        planned(1562)
+    # More blocks than memory requires, for the number of photographs.
+    many_photos = make_plan(
+        many(tmp_path / "many", 1001), Config.model_validate({"partition": {"memory_mb": 4000}})
+    )
+    assert many_photos.config.partition.blocks == 5
 
 
 @pytest.mark.parametrize("count, jobs", [(500, 1), (501, 3), (1000, 4)])

@@ -9,7 +9,7 @@ import pytest
 from pipeline.config.load import scene_config
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
-from pipeline.plan.stage_memory import memory_mb
+from pipeline.plan.stage_memory import memory_mb, threads_within
 from pipeline.plan.values import Plan
 from stages.workflow.registry import STAGES
 from tests.plans import FACTS
@@ -78,7 +78,7 @@ GIVEN = PoseSummary(
 )
 
 
-def plan_of(scene: Scene, config: Config) -> Plan:
+def plan_of(scene: Scene, config: Config, blocks: int = 1) -> Plan:
     width, height = scene.view
     pixels = scene.photographs * width * height
     facts = FACTS.model_copy(
@@ -94,7 +94,7 @@ def plan_of(scene: Scene, config: Config) -> Plan:
     settled = config.model_copy(
         update={
             "train": config.train.model_copy(update={"density": density}),
-            "partition": config.partition.model_copy(update={"blocks": 1}),
+            "partition": config.partition.model_copy(update={"blocks": blocks}),
         }
     )
     return Plan(scene="x", stages={}, warnings=[], config=settled, facts=facts)
@@ -121,11 +121,11 @@ def test_jobs_of_a_scene_in_blocks_reserve_what_they_take() -> None:
     largest block of each round."""
     aerial, town = (75, (4000, 3000)), (300, (640, 427))
     for (count, size), view, gaussians, used in (
-        (aerial, (800, 600), 240_000, {"coarse": 621, "block": 678, "polish": 706}),
-        (aerial, (640, 480), 76_800, {"coarse": 397, "block": 547, "polish": 572}),
-        (town, (640, 427), 68_320, {"coarse": 441, "block": 501, "polish": 524}),
+        (aerial, (800, 600), 240_000, {"coarse": 621, "block": 580, "polish": 600}),
+        (aerial, (640, 480), 76_800, {"coarse": 397, "block": 411, "polish": 411}),
+        (town, (640, 427), 68_320, {"coarse": 456, "block": 408, "polish": 408}),
     ):
-        plan = plan_of(Scene(count, size, view, gaussians), Config())
+        plan = plan_of(Scene(count, size, view, gaussians), Config(), blocks=4)
         for stage, megabytes in used.items():
             assert megabytes <= memory_mb(stage, plan, 2) <= 1.5 * megabytes, stage
 
@@ -151,6 +151,22 @@ def test_more_threads_and_larger_photographs_take_more() -> None:
         assert memory_mb(stage, plan_of(LARGE, config), 2) > memory_mb(
             stage, plan_of(FOX, config), 2
         )
+
+
+def test_a_limit_of_memory_limits_threads_and_requests() -> None:
+    config = Config.model_validate({"partition": {"memory_mb": 700}})
+    free, limited = plan_of(LARGE, Config()), plan_of(LARGE, config)
+    for stage in STAGES:
+        assert threads_within(stage, free, 8) == 8
+        threads = threads_within(stage, limited, 8)
+        assert memory_mb(stage, limited, 8) <= 700
+        if threads > 1:
+            assert memory_mb(stage, free, threads) <= 700
+        if threads < 8:
+            assert memory_mb(stage, free, threads + 1) > 700
+    assert 1 < threads_within("undistort", limited, 8) < 8
+    # One photograph needs more, and the job gets what is allowed.
+    assert threads_within("features", limited, 8) == 1
 
 
 def test_every_stage_has_an_estimate_and_training_its_limit() -> None:

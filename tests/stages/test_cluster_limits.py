@@ -182,11 +182,11 @@ def test_jobs_ask_for_no_more_than_a_node_has(tmp_path, monkeypatch):
         return needed(scene, 1, attempt)
 
     local = wanted(1)
-    assert project.threads(scene) == 2
+    assert project.threads(STAGES["train"])(scene) == 2
     flow.non_local_exec = True
     node = cluster.Node(4, local + cluster.OVERHEAD_MB + 1)
     monkeypatch.setattr(project_module, "largest_node", lambda: node)
-    assert project.threads(scene) == 4
+    assert project.threads(STAGES["train"])(scene) == 4
     assert wanted(1) == local + cluster.OVERHEAD_MB
     assert wanted(2) == wanted(3) == node.memory_mb
     # In the job: what it was given.

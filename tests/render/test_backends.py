@@ -100,21 +100,29 @@ def test_the_loss_equals_the_reference(backend: Backend, target: torch.Tensor) -
     assert relative(found.grad, expected.grad) < 1e-5
 
 
+def random_surroundings(height: int, width: int, front: bool, correction: bool) -> Surroundings:
+    torch.manual_seed(0)
+
+    def plane(*channels: int) -> torch.Tensor:
+        return torch.randint(0, 256, (height, width, *channels), dtype=torch.uint8)
+
+    signed = torch.randint(-127, 128, (height, width, 3), dtype=torch.int8)
+    return Surroundings(
+        plane(3),
+        plane(),
+        plane(3) if front else None,
+        plane() if front else None,
+        signed if correction else None,
+    )
+
+
 @pytest.mark.parametrize("front", [False, True])
 @pytest.mark.parametrize("correction", [False, True])
 def test_the_composition_equals_the_reference(
     backend: Backend, front: bool, correction: bool
 ) -> None:
     """And its gradients, with that of the loss on alpha."""
-    torch.manual_seed(0)
-    image = lambda *size: torch.randint(0, 256, size, dtype=torch.uint8)  # noqa: E731
-    around = Surroundings(
-        image(22, 31, 3),
-        image(22, 31),
-        image(22, 31, 3) if front else None,
-        image(22, 31) if front else None,
-        torch.randint(-127, 128, (22, 31, 3), dtype=torch.int8) if correction else None,
-    )
+    around = random_surroundings(22, 31, front, correction)
     color, alpha, d = torch.rand(22, 31, 3), torch.rand(22, 31), noise(22, 31, 3)
     # Less than the gradients through the image, but not negligible.
     loss = AlphaChangeLoss(weight=50.0, fade=0.1, growth=0.25)
@@ -129,7 +137,21 @@ def test_the_composition_equals_the_reference(
     without = REFERENCE.compose_backward(around, alpha, d, replace(loss, weight=0.0))[1]
     assert (gradients[1][1] - without).abs().max() > 0.01
     with pytest.raises(ValueError, match="behind: expected contiguous"):
-        backend.compose(replace(around, behind=image(21, 31, 3)), color, alpha)
+        backend.compose(replace(around, behind=around.behind[1:]), color, alpha)
+
+
+def test_the_composition_has_the_same_bits_at_any_number_of_threads(backend: Backend) -> None:
+    around = random_surroundings(70, 101, front=True, correction=True)
+    color, alpha, d = torch.rand(70, 101, 3), torch.rand(70, 101), noise(70, 101, 3)
+    loss = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
+    one, three = (
+        (
+            backend.compose(around, color, alpha, threads),
+            *backend.compose_backward(around, alpha, d, loss, threads),
+        )
+        for threads in (1, 3)
+    )
+    assert all(map(torch.equal, one, three))
 
 
 def test_the_composition_without_front_is_a_background() -> None:

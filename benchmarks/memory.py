@@ -74,7 +74,9 @@ def main() -> int:
     parser.add_argument("--views", type=int, default=200)
     parser.add_argument("--size", type=int, nargs=2, default=[1600, 1067], metavar=("W", "H"))
     parser.add_argument("--steps", type=int, default=40)
-    parser.add_argument("--memory-mb", type=int, help="train.memory_mb: images are read from disk")
+    parser.add_argument(
+        "--memory-mb", type=int, help="partition.memory_mb: images are read from disk"
+    )
     parser.add_argument("--threads", type=int, default=usable_cores())
     add_record_options(parser)
     args = parser.parse_args()

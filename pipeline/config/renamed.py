@@ -11,6 +11,7 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "init.num_random": ("experiments.init.num_random",),
     "init.opacity": ("experiments.init.opacity",),
     "train.sh_interval": ("experiments.train.sh_degree_interval",),
+    "train.memory_mb": ("partition.memory_mb",),
     "train.ssim_weight": ("train.ssim_loss_weight",),
     "train.square_weight": ("experiments.train.squared_error_loss_weight",),
     "train.coarse_until": ("experiments.train.coarse_share",),

@@ -303,13 +303,6 @@ class Train(Section):
         description="Train for this time instead of a number of steps. The number of steps depends "
         "on the machine and its load, so that results of two runs differ.",
     )
-    memory_mb: Annotated[int, Field(gt=0), Unit("MB")] | None = Field(
-        None,
-        description="Maximum memory of training: limits the number of Gaussians; images that do "
-        "not fit are read from disk. null: images are read from disk if training would take over "
-        "three quarters of the memory of the machine or container, which changes no result.",
-        json_schema_extra={"decides_result": False},
-    )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the spherical harmonics.")
     background: Literal["auto", "black", "white", "random"] = Field(
         "auto",
@@ -367,8 +360,10 @@ class Partition(Section):
     memory_mb: Annotated[int, Field(gt=0), Unit("MB")] | None = Field(
         None,
         description="Memory that a job may use. A scene whose training would need more is divided "
-        "into blocks, and jobs that would need more for several photographs at a time run fewer "
-        "threads. null: no limit.",
+        "into blocks, or, with `blocks: 1`, gets fewer Gaussians. Training images that do not fit "
+        "are read from disk, and jobs that process several photographs at a time run fewer "
+        "threads, which changes no result. null: no limit, but images are read from disk if "
+        "training would take over three quarters of the memory of the machine or container.",
         json_schema_extra={"decides_result": False},
     )
 

@@ -28,10 +28,11 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     """The maximum number of Gaussians, and the sentence that gives the reason.
 
     The smallest of the bounds by the size of a view, by the training pixels, by
-    ``train.budget_minutes``, by ``train.memory_mb`` and ``density.max_gaussians``.
+    ``train.budget_minutes``, by ``density.max_gaussians`` and, for one block,
+    ``partition.memory_mb``.
 
     Raises:
-        UserError: ``train.memory_mb`` is too small.
+        UserError: ``partition.memory_mb`` is too small.
     """
     density = config.train.density
     typical = _typical(scan, config)
@@ -62,26 +63,27 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
 
 
 def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:
-    """The number of Gaussians that fit into ``train.memory_mb`` and the reason; None if ``wanted``
-    fit. Photographs count nothing, since those that do not fit are read from disk."""
-    limit = config.train.memory_mb
-    if limit is None or memory_mb(0, wanted) <= limit:
+    """The number of Gaussians that fit into ``partition.memory_mb`` as one block and the reason;
+    None if ``wanted`` fit, or may be divided. Photographs count nothing, since those that do not
+    fit are read from disk."""
+    limit = config.partition.memory_mb
+    if limit is None or config.partition.blocks != 1 or memory_mb(0, wanted) <= limit:
         return None
     budget = gaussians_in(limit, 0)
     if budget < min(MIN_GAUSSIANS, wanted):
         least = memory_mb(0, min(MIN_GAUSSIANS, wanted))
         raise UserError(
-            f"train.memory_mb: {limit} MB is not enough for training; at least {least} are needed",
-            fix="increase or remove train.memory_mb",
+            f"partition.memory_mb: {limit} MB are not enough for training; {least} are needed",
+            fix="increase or remove it",
         )
     return budget, f"at most {budget} Gaussians: as many as fit into {limit} MB of memory"
 
 
 def training_memory_mb(scan: Scan, config: Config) -> int:
-    """Estimated peak memory of training in MB, at most ``train.memory_mb``: photographs that do
+    """Estimated peak memory of training in MB, at most ``partition.memory_mb``: photographs that do
     not fit are read from disk."""
     needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
-    return min(needed, config.train.memory_mb or needed)
+    return min(needed, config.partition.memory_mb or needed)
 
 
 def _pixels(scan: Scan, config: Config) -> int:
@@ -165,7 +167,7 @@ def length_line(config: Config) -> str:
 
 def memory_line(scan: Scan, config: Config) -> str:
     """The plan's sentence about ``training_memory_mb``."""
-    limit = config.train.memory_mb
+    limit = config.partition.memory_mb
     needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
     if limit is None or needed <= limit:
         return f"about {needed / 1000:.1f} GB of memory"

@@ -62,7 +62,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     """Settle the options for a scene.
 
     Raises:
-        UserError: ``train.memory_mb`` or ``partition.memory_mb`` is too small.
+        UserError: ``partition.memory_mb`` is too small.
     """
     chosen = {
         "matches.pairs": _pairs(scan, config),

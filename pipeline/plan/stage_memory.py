@@ -41,9 +41,6 @@ Estimate = Callable[[Plan, int], float]
 def memory_mb(stage: str, plan: Plan, threads: int) -> int:
     """Memory in MB that the stage's job may use: what is configured, else the estimate with a
     margin."""
-    limit = plan.config.train.memory_mb
-    if limit is not None and stage in _TRAINING:
-        return limit
     needed, most = _needed(stage, plan, threads), plan.config.partition.memory_mb
     return needed if most is None else min(needed, most)
 
@@ -192,7 +189,6 @@ def _report(plan: Plan, threads: int) -> float:
     return _NUMPY + _PAGE + _MODEL_READ * _photos(plan) + _HELD * _gaussians(plan)
 
 
-_TRAINING = ("coarse", "block", "polish", "train")
 _ESTIMATES: Mapping[str, Estimate] = {
     "inspect": _inspect,
     "decode": _decode,

@@ -40,7 +40,7 @@ def gaussians_in(megabytes: int, pixels: int) -> int:
 
 
 def machine_mb() -> int:
-    """The memory in MB that training may use on this machine if ``train.memory_mb`` is not set."""
+    """The memory in MB that training may use without ``partition.memory_mb``."""
     return round(usable_memory() / 1e6 * (1 - OTHERS_SHARE))
 
 

@@ -446,8 +446,8 @@ def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gauss
     density = {"max_gaussians": 1_000_000, "pixels_per_gaussian": 0.1}
 
     def planned(megabytes: int) -> Plan:
-        train = {"memory_mb": megabytes, "density": density}
-        return make_plan(scan, Config.model_validate({"train": train}))
+        options = {"partition": {"blocks": 1, "memory_mb": megabytes}}
+        return make_plan(scan, Config.model_validate(options | {"train": {"density": density}}))
 
     roomy, tight, small = planned(3200), planned(3199), planned(1400)
     assert "about 3.2 GB of memory" in roomy.stages["train"].decisions
@@ -462,7 +462,7 @@ def test_a_memory_limit_sends_photographs_to_disk_and_limits_the_number_of_gauss
         3199,
         1400,
     ]
-    with pytest.raises(UserError, match=r"train.memory_mb: 449 MB .* at least 450 are needed"):
+    with pytest.raises(UserError, match=r"partition.memory_mb: 449 MB .* 450 are needed"):
         planned(449)
 
 

@@ -17,7 +17,7 @@ from pipeline.runtime.section import read_section
 from stages.workflow.registry import STAGES
 from tests.plans import full_plan
 
-NOT_IN_KEYS = ("train.memory_mb", "features.photos_per_job")
+NOT_IN_KEYS = ("partition.memory_mb", "features.photos_per_job")
 
 
 def differing(one: Plan, two: Plan) -> set[str]:

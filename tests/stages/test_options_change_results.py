@@ -280,8 +280,8 @@ def test_any_other_value_of_a_rate_or_weight_changes_the_result(outputs, data):
 def test_options_that_no_stage_declares_change_no_output(outputs):
     """Nor does the number of threads."""
     assert {path for path in option_paths() if not declaring(path)} == {"preset"}
-    assert "train.memory_mb" not in set(option_paths())
-    other = with_option(with_option(POSED, "preset", "high"), "train.memory_mb", 100_000)
+    assert "partition.memory_mb" not in set(option_paths())
+    other = with_option(with_option(POSED, "preset", "high"), "partition.memory_mb", 100_000)
     for stage in ("train", "evaluate", "coverage", "export"):
         expected = outputs("base", "photos", POSED, stage)
         assert expected

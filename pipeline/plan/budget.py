@@ -9,7 +9,7 @@ from typing import NamedTuple
 from pipeline.config.schema import Config
 from pipeline.geometry.cube import ROTATIONS, panorama_face_side
 from pipeline.plan.scan import Scan
-from pipeline.plan.training_memory import gaussians_in, memory_mb
+from pipeline.plan.training_memory import gaussians_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import view_size
 
@@ -166,8 +166,13 @@ def length_line(config: Config) -> str:
 
 
 def memory_line(scan: Scan, config: Config) -> str:
-    """The plan's sentence about ``training_memory_mb``."""
-    limit = config.partition.memory_mb
+    """The plan's sentence about the memory of training."""
+    limit, blocks = config.partition.memory_mb, config.partition.blocks
+    if blocks not in ("auto", 1):
+        width, height = typical_view(scan, config)
+        gaussians = config.train.density.max_gaussians
+        largest = in_blocks_mb(width * height, gaussians, int(blocks))
+        return f"about {largest / 1000:.1f} GB of memory in the largest job"
     needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
     if limit is None or needed <= limit:
         return f"about {needed / 1000:.1f} GB of memory"

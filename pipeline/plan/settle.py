@@ -18,7 +18,7 @@ from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget, typical_view
 from pipeline.plan.panoramas import check_panorama_sizes
 from pipeline.plan.scan import Scan
-from pipeline.plan.training_memory import MEMORY_MARGIN, blocks_in, coarse_mb, memory_mb
+from pipeline.plan.training_memory import MEMORY_MARGIN, blocks_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
 
 # Up to this many photographs (780 pairs), all pairs are matched. For more, retrieval takes a
@@ -216,28 +216,30 @@ def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
     """The number of blocks of the scene, of at most so many Gaussians.
 
     Raises:
-        UserError: ``partition.memory_mb`` is not enough for any number.
+        UserError: ``partition.memory_mb`` is not enough for this number, or for any.
     """
     wanted, count, limit = config.partition.blocks, len(scan.planned), config.partition.memory_mb
-    if wanted != "auto":
-        return wanted, f"{wanted} blocks, as configured" if wanted > 1 else ""
     blocks, reason = 1, ""
-    if count > MAX_PHOTOS_OF_ONE_BLOCK:
+    if wanted != "auto":
+        blocks, reason = wanted, f"{wanted} blocks, as configured" if wanted > 1 else ""
+    elif count > MAX_PHOTOS_OF_ONE_BLOCK:
         blocks = math.ceil(count / PHOTOS_PER_BLOCK)
         reason = f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
-    if limit is None or (blocks == 1 and MEMORY_MARGIN * memory_mb(0, gaussians) <= limit):
+    # With one block as configured, the number of Gaussians is what fits.
+    one_fits = wanted == 1 or MEMORY_MARGIN * memory_mb(0, gaussians) <= (limit or math.inf)
+    if limit is None or (blocks == 1 and one_fits):
         return blocks, reason
     width, height = typical_view(scan, config)
-    needed = blocks_in(limit / MEMORY_MARGIN, width * height, gaussians)
-    if needed is None:
-        least = MEMORY_MARGIN * coarse_mb(width * height, gaussians)
+    size = width * height, gaussians
+    if wanted == "auto" and (needed := blocks_in(limit / MEMORY_MARGIN, *size)) > blocks:
+        blocks, reason = needed, f"{needed} blocks, which fit into {limit} MB of memory each"
+    if (least := math.ceil(MEMORY_MARGIN * in_blocks_mb(*size, blocks))) > limit:
+        number = "any number of" if wanted == "auto" else wanted
         raise UserError(
-            f"partition.memory_mb is {limit}; {gaussians} Gaussians need at least "
-            f"{math.ceil(least)} MB in any number of blocks",
+            f"partition.memory_mb: {limit} MB are not enough to train {gaussians} Gaussians in "
+            f"{number} blocks; {least} are needed",
             fix="increase it, or lower train.density.max_gaussians",
         )
-    if needed > blocks:
-        return needed, f"{needed} blocks, which fit into {limit} MB of memory each"
     return blocks, reason
 
 

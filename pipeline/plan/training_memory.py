@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 from pipeline.runtime.machine import usable_memory
 
 #: The Python process with torch.
@@ -60,12 +62,15 @@ def block_mb(pixels: int, gaussians: int, blocks: int) -> float:
     return PART_MB + (BLOCK_PIXEL_BYTES * pixels + held * gaussians) / 1e6
 
 
-def blocks_in(megabytes: float, pixels: int, gaussians: int) -> int | None:
-    """The smallest number of blocks, 2 or more, that are trained in this memory; None if no number
-    is enough."""
-    if max(coarse_mb(pixels, gaussians), block_mb(pixels, gaussians, gaussians)) > megabytes:
-        return None
-    blocks = 2
-    while block_mb(pixels, gaussians, blocks) > megabytes:
-        blocks += 1
-    return blocks
+def in_blocks_mb(pixels: int, gaussians: int, blocks: int) -> float:
+    """Estimated peak memory of the largest job that trains a scene in blocks, MB."""
+    return max(coarse_mb(pixels, gaussians), block_mb(pixels, gaussians, blocks))
+
+
+def blocks_in(megabytes: float, pixels: int, gaussians: int) -> int:
+    """The smallest number of blocks, 2 or more, that are trained in this memory; if no number is
+    enough, one that takes least."""
+    # More take no less memory.
+    most = math.ceil(BLOCK_GAUSSIAN_BYTES / SCENE_GAUSSIAN_BYTES)
+    fitting = (n for n in range(2, most + 1) if in_blocks_mb(pixels, gaussians, n) <= megabytes)
+    return next(fitting, most)

@@ -498,8 +498,13 @@ def test_a_scene_is_divided_until_its_training_fits(tmp_path):
     for plan, limit in ((divided, 3624), (least, 1563)):
         for stage in ("coarse", "block", "polish"):
             assert stage_memory.memory_mb(stage, plan, 1) <= limit
-    with pytest.raises(UserError, match=r"memory_mb is 1562; 1000000 Gaussians need at least 1563"):
+    with pytest.raises(
+        UserError, match=r"1562 MB are not enough .* in any number of blocks; 1563 are needed"
+    ):
         planned(1562)
+    options = {"train": train, "partition": {"blocks": 2, "memory_mb": 1800}}
+    with pytest.raises(UserError, match=r"1800 MB are not enough .* in 2 blocks; \d+ are needed"):
+        make_plan(scan, Config.model_validate(options))
     # More blocks than memory requires, for the number of photographs.
     many_photos = make_plan(
         many(tmp_path / "many", 1001), Config.model_validate({"partition": {"memory_mb": 4000}})

@@ -13,7 +13,8 @@ namespace splat {
 namespace {
 
 constexpr size_t kHugePage = size_t(2) << 20, kLine = 64;
-// The peak of use is that of this many blocks taken, or twice as many: some dozens of steps.
+// Unused memory is limited by the peak of use over the last one or two periods of so many
+// allocations, which are some dozens of steps.
 constexpr size_t kPeriod = 1024;
 
 struct Block {

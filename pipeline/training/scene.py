@@ -283,7 +283,7 @@ def _describe(result: TrainResult, num_views: int, config: Train, part: Part, no
     if unseen := result.counters["unseen"]:
         notes.decisions.append(f"{unseen} Gaussians that no training view sees were removed")
     if floaters := result.counters["floaters"]:
-        notes.decisions.append(f"{floaters} floaters close to a single camera were removed")
+        notes.decisions.append(f"{floaters} floaters close to cameras were removed")
 
 
 def too_few_epochs(steps: int, views: int, seconds: float, minutes: float | None) -> str | None:

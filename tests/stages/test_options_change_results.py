@@ -186,7 +186,7 @@ CONDITIONAL = {
     "sfm.max_attempts": "a first model that is not good",
     "sfm.georeference": "photographs with GPS, or gcp_list.txt",
     "train.density.pixels_per_gaussian": "views of more than 40 000 pixels",
-    "train.density.remove_floaters": "at least 50 epochs, and floaters",
+    "train.density.remove_floaters": "floaters near cameras",
 }
 """Options without an effect on these scenes, and what they need to have one."""
 

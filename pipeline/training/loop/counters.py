@@ -57,5 +57,6 @@ class TrainCounters(StageCounters):
     )
     floaters: int = Field(
         ge=0,
-        description="Number of Gaussians removed because they were close to a single camera.",
+        description="Number of Gaussians removed because they were close to a single camera, "
+        "or between neighbouring cameras.",
     )

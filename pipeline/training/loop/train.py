@@ -114,6 +114,7 @@ def train(
         # With a limit of gradients per pixel, Gaussians that are seen may have none.
         if not experiments.gradients_per_pixel:
             state.drop_unseen(len(scene.views))
+        trainer.clear_camera_path()
         # Of a block, overviews see nothing where others are in front of it.
         if state.counters.blind_steps and inputs.open_layers is None:
             warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")

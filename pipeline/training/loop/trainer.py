@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import torch
 from torch import Tensor
 
 from pipeline.config.experiments import TrainExperiments
@@ -13,6 +14,7 @@ from pipeline.render import BACKGROUNDS, Backend, Color, Forward, RasterCamera, 
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import release_free_memory
 from pipeline.training.data.targets import Target, usable_factor
+from pipeline.training.density.camera_path import on_camera_path
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.schedule import Schedule, warm_up
@@ -178,16 +180,45 @@ class Trainer:
         """The number of floaters, made transparent if their removal is due."""
         if self.floaters is None or not self.floaters.is_due(steps, run_length):
             return 0
-        factor = usable_factor(self.scene.views, IMAGE_FACTOR)
-        cameras = [self.camera(index, factor) for index in range(len(self.scene.views))]
-        options = RasterOptions(
-            antialias=self.config.antialias, near=self.scene.near, threads=self.threads
-        )
+        cameras, factor = self.reduced_cameras()
         found = self.floaters.fade(
-            self.state.gaussians, cameras, options, pixel=factor**2, backend=self.backend
+            self.state.gaussians,
+            cameras,
+            self.geometry_options(),
+            pixel=factor**2,
+            backend=self.backend,
         )
         self.state.counters.floaters += found
         return found
+
+    def clear_camera_path(self) -> None:
+        """At the end, remove the Gaussians that hide views from between the cameras."""
+        if self.floaters is None:
+            return
+        found = on_camera_path(
+            self.state.gaussians,
+            self.reduced_cameras()[0],
+            self.floaters.depths,
+            self.geometry_options(),
+            self.backend,
+        )
+        if not found.all():
+            self.state.counters.floaters += int(found.sum())
+            self.state.gaussians = self.state.gaussians.select(torch.nonzero(~found)[:, 0])
+
+    def reduced_cameras(self) -> tuple[list[RasterCamera], int]:
+        """The refined cameras of all views at a reduced size, and the factor of it."""
+        factor = usable_factor(self.scene.views, IMAGE_FACTOR)
+        return [self.camera(index, factor) for index in range(len(self.scene.views))], factor
+
+    def geometry_options(self) -> RasterOptions:
+        """Without colour and background."""
+        return RasterOptions(
+            sh_degree=0,
+            antialias=self.config.antialias,
+            near=self.scene.near,
+            threads=self.threads,
+        )
 
     def options(self, background: Color) -> RasterOptions:
         return RasterOptions(

@@ -51,6 +51,7 @@ $(VENV)/watch $(VENV)/dev $(VENV)/test $(VENV)/docs $(VENV)/slurm: $(VENV)/produ
 extension: $(VENV)/product
 	@$(BIN)/python -m pipeline.render.cpu.build
 	@$(BIN)/python -m pipeline.sfm.nearest
+	@$(BIN)/python -m pipeline.mvs.patchmatch
 
 setup: extension $(VENV)/watch
 

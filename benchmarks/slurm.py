@@ -22,6 +22,7 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.record_tables import slurm_table
 from benchmarks.results import SlurmResult
 from benchmarks.slurm_cluster import missing_programs, running
+from pipeline.runtime.native import MODULES
 
 ROOT = Path(__file__).parents[1]
 TARGET = "results/demo/metrics.json"
@@ -39,7 +40,7 @@ def run(nodes: int, blocks: int, steps: int) -> SlurmResult:
         config += [f"partition={json.dumps({'blocks': blocks})}"] if blocks > 1 else []
         with running(folder, nodes) as cluster:
             # Compiled before the clock starts, as on a cluster that has run a scene before.
-            for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
+            for module in MODULES:
                 _python(project, "-m", module, "--target", "all")
             started = time.monotonic()
             options = ("--workflow-profile", "profiles/slurm", "--config", *config)

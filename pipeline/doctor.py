@@ -136,10 +136,11 @@ def _compilers() -> list[Finding]:
 
 
 def _libraries() -> list[Finding]:
-    """The native libraries. The modules that declare them do not import torch; the matcher's
-    imports numpy."""
+    """The native libraries. The modules that declare them do not import torch; the others
+    import numpy."""
     found = []
-    for topic, declared in (("rasterizer", _rasterizer), ("matcher", _matcher)):
+    libraries = (("rasterizer", _rasterizer), ("matcher", _matcher), ("stereo", _stereo))
+    for topic, declared in libraries:
         try:
             found += [Finding(topic, _describe(library)) for library in declared()]
         except UserError as error:
@@ -174,6 +175,12 @@ def _rasterizer() -> Sequence[native.NativeLibrary]:
 
 def _matcher() -> Sequence[native.NativeLibrary]:
     from pipeline.sfm.nearest import LIBRARY
+
+    return [LIBRARY]
+
+
+def _stereo() -> Sequence[native.NativeLibrary]:
+    from pipeline.mvs.patchmatch import LIBRARY
 
     return [LIBRARY]
 

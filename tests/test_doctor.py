@@ -59,7 +59,7 @@ def test_no_compiler_and_no_library_is_an_error_with_a_remedy(bare, tmp_path, ca
     shown = json.loads(capsys.readouterr().out)
     missing = [f for f in shown["findings"] if f["state"] == "missing"]
     assert not shown["ready"]
-    assert [finding["topic"] for finding in missing] == ["rasterizer", "matcher"]
+    assert [finding["topic"] for finding in missing] == ["rasterizer", "matcher", "stereo"]
     assert all("install g++" in finding["fix"] for finding in missing)
 
 

@@ -1,6 +1,6 @@
 """``python -m pipeline.command.kernels FOLDER``: make the native libraries of a wheel.
 
-Compiles both libraries for all instruction-set targets of this architecture, unless they are
+Compiles the libraries for all instruction-set targets of this architecture, unless they are
 cached, and copies them into the folder.
 """
 
@@ -10,6 +10,7 @@ import shutil
 import sys
 from pathlib import Path
 
+from pipeline.mvs import patchmatch
 from pipeline.render.libraries import native_libraries
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.native import build_targets
@@ -20,7 +21,7 @@ def main(folder: Path) -> int:
     try:
         built = [
             item
-            for library in (*native_libraries(), nearest.LIBRARY)
+            for library in (*native_libraries(), nearest.LIBRARY, patchmatch.LIBRARY)
             for item in build_targets(library, ["all"])
         ]
     except UserError as error:

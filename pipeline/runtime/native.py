@@ -34,6 +34,9 @@ RECORD = "library.json"
 # In order of preference if $CXX is not set. On macOS, g++ is clang.
 COMPILERS = ("c++", "clang++") if sys.platform == "darwin" else ("g++", "clang++")
 
+# Modules whose command line builds a library.
+MODULES = ("pipeline.render.cpu.build", "pipeline.sfm.nearest", "pipeline.mvs.patchmatch")
+
 _used: dict[str, Built] = {}
 
 

@@ -32,6 +32,7 @@ NEUTRAL = (
 NATIVE = {
     "pipeline.render": "pipeline/render/cpu/csrc",
     "pipeline.sfm.nearest": "pipeline/sfm/csrc",
+    "pipeline.mvs.patchmatch": "pipeline/mvs/csrc",
 }
 
 # Cache: module -> digest of its file, names that it imports, hash of its syntax tree. Parsing all

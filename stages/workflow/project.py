@@ -25,6 +25,7 @@ from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.lock import check_not_locked, lock_run, user_name
+from pipeline.runtime.native import MODULES
 from pipeline.runtime.record import canonical, file_digest, is_current
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.cluster import (
@@ -321,7 +322,7 @@ class SnakemakeProject:
             for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
                 watch_jobs(executor, interval)
             wait_for_earlier_jobs(Path.cwd())
-            for module in ("pipeline.render.cpu.build", "pipeline.sfm.nearest"):
+            for module in MODULES:
                 command = [sys.executable, "-m", module, "--target", "all"]
                 subprocess.run(command, check=False, stdout=sys.stderr)
 

@@ -1,0 +1,1 @@
+"""Multi-view stereo: depth maps of the views and a fused point cloud."""

@@ -2,8 +2,8 @@
 
 Outputs: Gaussians (``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``); sparse points
 (``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP; ``transforms.json``);
-``frame.json`` with axes, unit and up direction. On demand ``renders/``, ``depths/``, ``mesh.ply``
-and ``.glb``, ``video`` and ``path.json``.
+``frame.json`` with axes, unit and up direction. On demand ``dense_points.ply``, ``dense_maps/``,
+``renders/``, ``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
 """
 
 from __future__ import annotations
@@ -49,6 +49,7 @@ def work(job: Job) -> None:
         georeference=inputs.georeference(job),
         given=Unrounded.read(job.inputs["inspect"]),
         folder=job.inputs["train"].parent / job.stage,
+        dense=job.inputs.get("dense"),
     )
     report = export_scene(
         job.out,
@@ -67,7 +68,8 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=ExportCounters,
-    inputs=inputs.TRAINED | {"inspect": ("inspect",)},
+    inputs=inputs.TRAINED | {"inspect": ("inspect",), "dense": ("dense",)},
+    optional=("dense",),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -1,5 +1,5 @@
-"""The initial Gaussians, from the scene's point cloud, from sparse points or random. Output:
-``gaussians.npz``."""
+"""The initial Gaussians, from fused depth maps, the scene's point cloud, sparse points or random.
+Output: ``gaussians.npz``."""
 
 from __future__ import annotations
 
@@ -16,9 +16,13 @@ from stages.workflow import inputs
 
 if TYPE_CHECKING:
     from pipeline.io.posefiles import GivenPoses
+    from pipeline.mvs.initial import SurfacePoints
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.scene.views import View
 
+# Methods that use the point cloud of the scene folder.
+CLOUD_METHODS = ("auto", "points")
 EXPERIMENTS = ("experiments.init", "experiments.matches")
 
 
@@ -27,6 +31,13 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     if config.method == "random":
         count = settled.config.experiments.init.num_random
         return StagePlan(run=True, reason=f"{count} random Gaussians")
+    if config.method == "dense":
+        limit = f"{config.max_points:,}"
+        reason = f"Gaussians from the fused depth maps, subsampled to at most {limit} points"
+        decisions = []
+        if scan.cloud is not None:
+            decisions.append(f"init.method: points would use {scan.cloud.text}")
+        return StagePlan(run=True, reason=reason, decisions=decisions)
     if scan.cloud is not None:
         return _from_cloud(scan.cloud, scan.poses, config.max_points)
     if scan.poses is None:
@@ -53,19 +64,22 @@ def work(job: Job) -> None:
     from pipeline.io.colmap import read_model
     from pipeline.photos.cloud import NOT_PLACED, placed_points
     from pipeline.sfm.triangulation import triangulate
-    from pipeline.splats.first import first_gaussians
+    from pipeline.splats.first import InitPoints, first_gaussians
 
     config, experiments = job.section(Init), job.section(Experiments)
     training = inputs.training_views(job)
     points = inputs.input_model(job).points
-    extra, source = {}, "points"
-    cloud = read_cloud(job.inputs["inspect"]) if config.method != "random" else None
+    extra, source, normals = {}, "points", None
+    dense = _dense_points(job, training, config) if config.method == "dense" else None
+    cloud = read_cloud(job.inputs["inspect"]) if config.method in CLOUD_METHODS else None
     placed = None
     if cloud is not None:
         placed = placed_points(cloud, inputs.georeference(job), training, config)
         if placed is None:
             job.warn(NOT_PLACED)
-    if placed is not None:
+    if dense is not None:
+        points, normals, source = dense.points, dense.normals, "the depth maps"
+    elif placed is not None:
         points, source = placed, "the point cloud"
     elif config.method != "random" and len(points) == 0:
         job.decide("the given poses have no points: points are triangulated")
@@ -87,9 +101,27 @@ def work(job: Job) -> None:
         job.add_messages(report.decisions, report.warnings)
         points = read_model(triangulated / "sparse" / "0").points
         extra = {"triangulated_points": len(points)}
-    first = first_gaussians(points, training, config, experiments.init, job.seed, source)
+    first = first_gaussians(
+        InitPoints(points, source, normals), training, config, experiments.init, job.seed
+    )
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
+
+
+def _dense_points(job: Job, training: list[View], config: Init) -> SurfacePoints | None:
+    """Points of the fused depth maps; None, with a warning, if there are too few."""
+    from pipeline.mvs.initial import surface_points
+    from pipeline.mvs.maps import read_dense_cloud
+    from pipeline.splats.first import MIN_POINTS
+
+    cloud = read_dense_cloud(job.inputs["dense"])
+    if len(cloud) < MIN_POINTS:
+        job.warn(
+            f"the depth maps have only {len(cloud)} points in common: Gaussians are initialised "
+            "from the sparse points"
+        )
+        return None
+    return surface_points(cloud, training, config.max_points)
 
 
 SPEC = StageSpec(
@@ -102,7 +134,9 @@ SPEC = StageSpec(
         "model": inputs.MODEL,
         "poses": inputs.POSES,
         "inspect": ("inspect",),
+        "dense": ("dense",),
     },
+    optional=("dense",),
     options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,

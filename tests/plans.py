@@ -39,9 +39,9 @@ CHUNK_STAGES = ("extract", "pairs", "match")
 
 
 def skipped(plan: Plan) -> list[str]:
-    """The stages that the plan leaves out, but for those of large scenes."""
-    of_large = (*BLOCK_STAGES, *CHUNK_STAGES)
-    return [n for n, stage in plan.stages.items() if not stage.run and n not in of_large]
+    """The stages that the plan leaves out, but for those of large scenes and on demand."""
+    rare = (*BLOCK_STAGES, *CHUNK_STAGES, "dense")
+    return [n for n, stage in plan.stages.items() if not stage.run and n not in rare]
 
 
 def make_plan(scan: Scan, config: Config, folder: str = "") -> Plan:

@@ -9,6 +9,7 @@ from typing import get_args
 
 import numpy as np
 import pytest
+import tifffile
 from PIL import Image
 
 from pipeline.config.schema import RENDERED_FORMATS, Config, ExportFormat
@@ -21,6 +22,7 @@ from pipeline.io.npz import write_npz
 from pipeline.io.recorded import digest_of
 from pipeline.io.splat_files import read_gaussians
 from pipeline.io.transforms import read_frames, read_transforms
+from pipeline.mvs.maps import DenseCloud, DenseMap, write_dense_cloud, write_map
 from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
@@ -62,6 +64,13 @@ def scene(tmp_path: Path) -> Path:
     Manifest(scene="NAME", photos=tuple(photos)).write(scene / "undistort" / "images.json")
     (scene / "train").mkdir()
     write_npz(scene / "train" / "gaussians.npz", sample(50))
+    up = np.array([[0.0, 0.0, 1.0]], np.float32)
+    cloud = DenseCloud(np.array([[0, 1, 2]], np.float32), up, np.array([[1, 2, 3]], np.uint8))
+    write_dense_cloud(scene / "dense", cloud)
+    depth = np.full((60, 90), 2.0, np.float32)
+    normals = np.broadcast_to(-up[0], (60, 90, 3)).astype(np.float32)
+    for i in range(1, 8):  # p0 and p8 are test views
+        write_map(scene / "dense", f"p{i}.png", DenseMap(depth, normals, depth / 2))
     return scene
 
 
@@ -77,7 +86,7 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
         scene="NAME",
         key={"seed": 0, "config": config},
         inputs={role: scene / "undistort" for role in ("views", "model", "poses", "inspect")}
-        | {"train": scene / "train"},
+        | {"train": scene / "train", "dense": scene / "dense"},
         out=out,
         scratch=out.parent,
         shared_cache=out.parent,
@@ -106,7 +115,11 @@ def test_every_format_the_schema_offers_is_written(scene):
         model = read_model(out / folder)
         assert len(model.images) == 9 and len(model.points) == 1
     assert (out / "sparse_text" / "cameras.txt").is_file()
-    assert b"element vertex 1\n" in (out / "points.ply").read_bytes()[:100]
+    for name in ("points.ply", "dense_points.ply"):
+        assert b"element vertex 1\n" in (out / name).read_bytes()[:100]
+    assert b"property float nx" in (out / "dense_points.ply").read_bytes()
+    maps = sorted(path.name for path in (out / "dense_maps").iterdir())
+    assert maps == [f"p{i}.tiff" for i in range(1, 8)]
 
 
 GIVEN = Normalization(0.001, np.array([4e6, 5e5, 300.0]))
@@ -124,13 +137,20 @@ def far_scene(scene: Path) -> Path:
 
 
 def test_cameras_and_points_are_exported_in_the_given_world(far_scene):
-    out, _ = export(far_scene, formats=["colmap", "transforms", "points", "ply"])
+    formats = ["colmap", "transforms", "points", "ply", "dense_points", "dense_maps"]
+    out, _ = export(far_scene, formats=formats)
     local = read_model(far_scene / "undistort" / "sparse" / "0")
     expected = GIVEN.model_to_given(local).by_name()
     for found in (read_model(out / "sparse" / "0"), read_cameras_without_origin(out)):
         for image in found.images.values():
             truth = next(v for k, v in expected.items() if image.name.endswith(k))
             np.testing.assert_allclose(image.centre, truth.centre, rtol=1e-12)
+    depth = tifffile.imread(out / "dense_maps" / "p1.tiff")
+    assert depth.dtype == np.float32 and depth.shape == (60, 90)
+    np.testing.assert_allclose(depth, 2000.0, rtol=1e-5)  # in the given unit
+    dense = (out / "dense_points.ply").read_bytes().split(b"end_header\n")[1]
+    expected_xyz = GIVEN.to_given(np.array([0.0, 1.0, 2.0]))
+    np.testing.assert_allclose(np.frombuffer(dense[:24], "<f8"), expected_xyz, rtol=1e-12)
     header, body = (out / "points.ply").read_bytes().split(b"end_header\n")
     assert b"property double x" in header
     xyz = np.frombuffer(body[:24], "<f8")

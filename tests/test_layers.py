@@ -13,19 +13,8 @@ import pytest
 
 ROOT = Path(__file__).parents[1]
 ROOMS = (
-    *(
-        "runtime",
-        "config",
-        "geometry",
-        "scene",
-        "splats",
-        "io",
-        "plan",
-        "photos",
-        "sfm",
-        "mvs",
-        "render",
-    ),
+    *("runtime", "config", "geometry", "scene", "splats", "io", "plan", "photos", "sfm", "mvs"),
+    "render",
     *("training.data", "training.losses", "training.optimisers", "training.cameras"),
     *("training.density", "training.checkpoints", "training.loop", "training.scene"),
     "training.blocks",

@@ -58,6 +58,7 @@ COUNTERS = {
     "refine": "pipeline.sfm.counters:RefineCounters",
     "sfm": "pipeline.sfm.counters:SfmCounters",
     "undistort": "pipeline.photos.counters:UndistortCounters",
+    "dense": "pipeline.mvs.counters:DenseCounters",
     "init": "pipeline.splats.counters:InitCounters",
     "coarse": "pipeline.training.loop.counters:TrainCounters",
     "partition": "pipeline.training.blocks.counters:PartitionCounters",

@@ -215,10 +215,11 @@ class Undistort(Section):
 class Init(Section):
     """The initial Gaussians."""
 
-    method: Literal["auto", "points", "random"] = Field(
+    method: Literal["auto", "points", "random", "dense"] = Field(
         "auto",
-        description="auto: from the sparse points, which are triangulated if the given poses have "
-        "none.",
+        description="points: from the sparse points, which are triangulated if the given poses "
+        "have none, or from a point cloud of the scene; dense: from depth maps that multi-view "
+        "stereo estimates; auto: points.",
     )
     max_points: Annotated[int, Field(gt=0), Unit("points")] = Field(
         200_000,
@@ -386,11 +387,15 @@ ExportFormat = Literal[
     "colmap",
     "colmap_text",
     "transforms",
+    "dense_points",
+    "dense_maps",
     "renders",
     "depths",
     "mesh",
     "video",
 ]
+# Formats that need multi-view stereo.
+DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
 # Formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -403,8 +408,10 @@ class Export(Section):
         description="Gaussians: ply (3DGS's layout, exact), spz (a sixth of the size), splat "
         "(without SH), gltf (.glb with KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
-        "(nerfstudio's transforms.json). Rendered from every view: renders (PNG), depths (float "
-        "TIFF), mesh (PLY and GLB), video (along a camera path).",
+        "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
+        "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Rendered from "
+        "every view: renders (PNG), depths (float TIFF), mesh (PLY and GLB), video (along a camera "
+        "path).",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")

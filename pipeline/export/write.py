@@ -6,10 +6,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
 from pipeline.export.counters import ExportCounters
 from pipeline.io.colmap import write_model
+from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
@@ -17,6 +20,8 @@ from pipeline.io.splat import write_splat
 from pipeline.io.spz import count_out_of_range, write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
+from pipeline.mvs.maps import read_dense_cloud, read_map
+from pipeline.photos.naming import rename
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
@@ -46,6 +51,7 @@ class ExportScene:
         georeference: frame of the poses; None for given poses in their own world.
         given: the given poses before rounding; empty for estimated ones.
         folder: final folder of the exported files.
+        dense: folder of the dense stage, None if it did not run.
     """
 
     trained: GaussianArrays
@@ -56,6 +62,7 @@ class ExportScene:
     georeference: Georeference | None
     given: Unrounded
     folder: Path
+    dense: Path | None = None
 
     @property
     def normalization(self) -> Normalization:
@@ -82,6 +89,7 @@ class _Files:
         model, views: those of ``scene`` in the given world: formats in double precision.
         antialias: whether the Gaussians were trained with opacity compensation.
         points: name of the file of points, None without one.
+        normalization: from the given world to the scene's.
     """
 
     scene: ExportScene
@@ -90,6 +98,7 @@ class _Files:
     views: list[View]
     antialias: bool
     points: str | None
+    normalization: Normalization
 
     @property
     def moved(self) -> bool:
@@ -99,6 +108,25 @@ class _Files:
     def write_points(self, path: Path) -> None:
         points = self.model.points
         write_points_ply(path, points.xyz, points.rgb, double=self.moved)
+
+    def write_dense_points(self, path: Path) -> None:
+        cloud = read_dense_cloud(self.dense_folder)
+        xyz = self.normalization.to_given(cloud.xyz.astype(np.float64))
+        write_points_ply(path, xyz, cloud.rgb, cloud.normals, double=self.moved)
+
+    def write_dense_maps(self, path: Path) -> None:
+        names = rename({view.name: ".tiff" for view in self.views})
+        for view in self.views:
+            if not view.is_test:
+                depth = read_map(self.dense_folder, view.name).depth
+                depth = depth / np.float32(self.normalization.scale)
+                write_depth_tiff(path / names[view.name], depth)
+
+    @property
+    def dense_folder(self) -> Path:
+        if self.scene.dense is None:
+            raise ValueError("expected the output of stage dense for the configured formats")
+        return self.scene.dense
 
 
 # Format -> name of the file or folder, and its writer.
@@ -114,9 +142,11 @@ WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
         "transforms.json",
         lambda path, f: write_transforms(path, f.views, f.scene.folder, points=f.points),
     ),
+    "dense_points": ("dense_points.ply", lambda path, f: f.write_dense_points(path)),
+    "dense_maps": ("dense_maps", lambda path, f: f.write_dense_maps(path)),
 }
 # Formats in double precision, whose coordinates are those of the given world.
-_GIVEN_WORLD = ("points", "colmap", "colmap_text", "transforms")
+_GIVEN_WORLD = ("points", "colmap", "colmap_text", "transforms", "dense_points")
 
 
 def export_scene(
@@ -132,13 +162,13 @@ def export_scene(
     model = scene.given.model_to_given(scene.model, scene.normalization)
     poses = {name: image.world_to_camera for name, image in model.by_name().items()}
     views = [replace(view, world_to_camera=poses[view.name]) for view in scene.views]
-    scene = _in_given_unit(scene)
+    normalization, scene = scene.normalization, _in_given_unit(scene)
     gaussians = reduce_gaussians(
         scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
     )
     has_points = "points" in config.formats and len(scene.model.points) > 0
     points = WRITERS["points"][0] if has_points else None
-    files = _Files(scene, gaussians, model, views, train.antialias, points)
+    files = _Files(scene, gaussians, model, views, train.antialias, points, normalization)
     written = []
     for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]

@@ -46,7 +46,7 @@ class StereoOptions:
     levels: tuple[Level, ...] = (
         Level(4, iterations=6, num_random=8, first_step=2.0),
         Level(2, iterations=3, num_random=0, first_step=1.0),
-        Level(1, iterations=3, num_random=0, first_step=0.5),
+        Level(1, iterations=2, num_random=0, first_step=0.5),
     )
     min_side: int = 24
     cost: CostOptions = field(default_factory=CostOptions)

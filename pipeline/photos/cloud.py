@@ -72,21 +72,19 @@ def points_of_cloud(
     Args:
         xyz: (N, 3) the cloud's points in the world of the views.
     """
-    seen = np.flatnonzero(_in_frustums(xyz, views))
-    chosen = seen[thinned(xyz[seen], max_points, 1 / _resolution(xyz[seen], views))]
+    chosen = sampled(xyz, views, max_points)
     xyz, rgb = xyz[chosen], cloud.rgb[chosen].copy()
     missing = ~cloud.coloured[chosen]
     if missing.any():
         rgb[missing] = _colours(xyz, views)[missing]
-    count = len(xyz)
-    return Points(
-        xyz,
-        rgb,
-        np.full(count, -1.0),
-        np.zeros(count + 1, np.int64),
-        np.zeros(0, np.int64),
-        np.zeros((0, 2)),
-    )
+    return Points.without_tracks(xyz, rgb)
+
+
+def sampled(xyz: NDArray[np.float64], views: Sequence[View], max_points: int) -> NDArray[np.intp]:
+    """Sorted indices of at most ``max_points`` of the points (N, 3) that are in the frustum of a
+    view, one a voxel; voxels are smaller where views see more detail."""
+    seen = np.flatnonzero(_in_frustums(xyz, views))
+    return seen[thinned(xyz[seen], max_points, 1 / _resolution(xyz[seen], views))]
 
 
 def _in_frustums(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.bool_]:

@@ -83,6 +83,11 @@ def _steps(plan: Plan) -> float:
     return train.steps * step if train.budget_minutes is None else 60 * train.budget_minutes
 
 
+def _dense(plan: Plan) -> float:
+    width, height = plan.facts.view_size
+    return _PROGRAM + 1.2e-5 * width * height * _photos(plan)
+
+
 def _coarse(plan: Plan) -> float:
     return _PROGRAM + 0.2 * _photos(plan) + _steps(plan)
 
@@ -103,6 +108,7 @@ _ESTIMATES: Mapping[str, Callable[[Plan], float]] = {
     "sfm": _per_photo(3.0),
     "refine": _per_photo(2.0),
     "undistort": _per_photo(0.5),
+    "dense": _dense,
     "init": _per_photo(1.0),
     "coarse": _coarse,
     "partition": _per_photo(1.0),

@@ -11,7 +11,7 @@ import posixpath
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Literal
 
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
@@ -40,6 +40,9 @@ MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
 # Features and matches of more photographs are computed in several jobs, one for so many. A job of
 # 250 photographs takes minutes on two cores; to start one takes seconds.
 MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
+
+# What ``init.method: auto`` chooses.
+AUTO_INIT_METHOD: Literal["points", "dense"] = "points"
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
@@ -86,7 +89,7 @@ def settle(scan: Scan, config: Config) -> Settled:
                 name: value[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")
             },
             "init": {
-                "method": "points" if config.init.method == "auto" else config.init.method,
+                "method": AUTO_INIT_METHOD if config.init.method == "auto" else config.init.method,
                 "max_points": min(config.init.max_points, max(1, budget // 2)),
                 "points_file": scan.cloud.path if scan.cloud else "none",
             },

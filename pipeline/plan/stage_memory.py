@@ -31,6 +31,11 @@ _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
+# Bytes per pixel of multi-view stereo: of a view in a thread, and of the views that are cached.
+_STEREO, _CACHED_VIEWS = 300.0, 170.0
+# Points of the fused cloud, share of the pixels and maximum in millions; bytes of a point; memory
+# of thinning, relative to that of the cloud.
+_FUSED_SHARE, _MAX_FUSED, _FUSED, _THINNED = 0.3, 5.0, 30.0, 4.0
 # Number of photographs whose features are in memory at a time while pairs are matched; MB per
 # photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
 _KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
@@ -143,9 +148,24 @@ def _undistort(plan: Plan, threads: int) -> float:
     return _with_model(plan) + maps + threads * _UNDISTORTED * _pixels(plan)
 
 
+def _dense(plan: Plan, threads: int) -> float:
+    views = (threads * _STEREO + _CACHED_VIEWS) * _view_pixels(plan) + threads * _DECODED * _pixels(
+        plan
+    )
+    return _PROGRAM + _MODEL_READ * _photos(plan) + views + _fused_cloud(plan)
+
+
+def _fused_cloud(plan: Plan) -> float:
+    """Parts and whole of the fused cloud, which has about a fifth of the views' pixels."""
+    points = min(_FUSED_SHARE * _photos(plan) * _view_pixels(plan), _MAX_FUSED)
+    return 2 * _FUSED * points
+
+
 def _init(plan: Plan, threads: int) -> float:
     poses = plan.facts.given_poses
     triangulated = poses is not None and not poses.num_points
+    if plan.config.init.method == "dense":
+        return _PROGRAM + 10 + _THINNED * _fused_cloud(plan)
     return max(_features(plan, threads), _mapping(plan, threads)) if triangulated else _PROGRAM + 10
 
 
@@ -200,6 +220,7 @@ _ESTIMATES: Mapping[str, Estimate] = {
     "sfm": _mapping,
     "refine": _mapping,
     "undistort": _undistort,
+    "dense": _dense,
     "init": _init,
     "coarse": lambda plan, threads: coarse_mb(*_trained(plan)),
     "partition": lambda plan, threads: _TORCH + _PARTITIONED * _gaussians(plan),

@@ -66,15 +66,21 @@ class Points:
     track_xy: NDArray[np.float64]
 
     @staticmethod
-    def empty() -> Points:
+    def without_tracks(xyz: NDArray[np.float64], rgb: NDArray[np.uint8]) -> Points:
+        """Points of unknown error, without observations."""
+        count = len(xyz)
         return Points(
-            np.zeros((0, 3)),
-            np.zeros((0, 3), np.uint8),
-            np.zeros(0),
-            np.zeros(1, np.int64),
+            xyz,
+            rgb,
+            np.full(count, -1.0),
+            np.zeros(count + 1, np.int64),
             np.zeros(0, np.int64),
             np.zeros((0, 2)),
         )
+
+    @staticmethod
+    def empty() -> Points:
+        return Points.without_tracks(np.zeros((0, 3)), np.zeros((0, 3), np.uint8))
 
     def __len__(self) -> int:
         return len(self.xyz)

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.experiments import InitExperiments
 from pipeline.config.schema import Init
@@ -19,6 +20,20 @@ MIN_POINTS = 100
 
 
 @dataclass(frozen=True)
+class InitPoints:
+    """The points that Gaussians are initialised from.
+
+    Attributes:
+        source: what they are, for messages.
+        normals: (P, 3) unit normals of the surface, None if unknown.
+    """
+
+    points: Points
+    source: str = "points"
+    normals: NDArray[np.float64] | None = None
+
+
+@dataclass(frozen=True)
 class FirstGaussians:
     """Initial Gaussians, with the counters, decisions and warnings of the init stage."""
 
@@ -29,21 +44,20 @@ class FirstGaussians:
 
 
 def first_gaussians(
-    points: Points,
+    init: InitPoints,
     training: Sequence[View],
     config: Init,
     experiments: InitExperiments,
     seed: int,
-    source: str = "points",
 ) -> FirstGaussians:
-    """Initialise Gaussians from the sparse ``points``, or at random if ``config.method`` is
+    """Initialise Gaussians from points, or at random if ``config.method`` is
     "random" or there are fewer than ``MIN_POINTS``.
 
     Args:
         training: the training views, for random initialisation and the scale of the scene.
         seed: of random initialisation.
-        source: what ``points`` are, for messages.
     """
+    points, source = init.points, init.source
     method, warnings = config.method, []
     if method != "random" and len(points) < MIN_POINTS:
         warnings = [f"only {len(points)} sparse points: Gaussians are initialised at random"]
@@ -52,7 +66,7 @@ def first_gaussians(
         first = gaussians_random(list(training), 0, seed, experiments)
     else:
         centres = np.array([view.centre for view in training])
-        first = gaussians_from_points(points, centres, config, 0, experiments)
+        first = gaussians_from_points(points, centres, config, 0, experiments, init.normals)
     source = "random positions" if method == "random" else source
     counters = InitCounters(
         num_gaussians=len(first),

@@ -27,6 +27,8 @@ SH_C0 = 0.28209479177387814
 NEIGHBOURS = 3
 # Number of neighbours, with the point itself, that determine the surface normal.
 NORMAL_NEIGHBOURS = 12
+# Thickness of Gaussians with a known normal, relative to their other axes.
+FLATNESS = 0.3
 # Axes of Gaussians point into the half space of this direction. No plane that contains simple
 # directions is orthogonal to it.
 SIGN_DIRECTION = np.array([1.0, 0.7548, 0.5698])
@@ -68,13 +70,16 @@ def gaussians_from_points(
     config: Init,
     sh_degree: int,
     experiments: InitExperiments = DEFAULT.init,
+    normals: NDArray[np.float64] | None = None,
 ) -> InitGaussians:
-    """Initialise one Gaussian at each sparse point.
+    """Initialise one Gaussian at each point.
 
-    The first axis of each Gaussian is the normal of the surface through its neighbours.
+    The first axis of each Gaussian is the normal of the surface: with known normals, Gaussians are
+    flat along it; otherwise it is that of the surface through the neighbours.
 
     Args:
         camera_centres: (C, 3) float64 in world coordinates.
+        normals: (P, 3) unit normals in the world, None if unknown.
 
     Raises:
         UserError: no point is usable.
@@ -109,7 +114,10 @@ def gaussians_from_points(
     )
     colour = points.rgb[chosen].astype(np.float64) / 255.0
     result = _isotropic(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
-    if len(xyz) > NEIGHBOURS:
+    if normals is not None:
+        result.quats[:] = _rotations_to(normals[chosen])
+        result.log_scales[:, 0] += np.float32(np.log(FLATNESS))
+    elif len(xyz) > NEIGHBOURS:
         result.quats[:] = _normal_rotations(xyz, neighbours)
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
     return result
@@ -210,6 +218,20 @@ def _normal_rotations(
     axes *= np.where(np.einsum("nij,i->nj", axes, SIGN_DIRECTION) < 0, -1.0, 1.0)[:, None, :]
     axes[:, :, 0] *= np.sign(np.linalg.det(axes))[:, None]
     return rotation_to_quat(axes)
+
+
+def _rotations_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(N, 4) quaternions (wxyz) whose first axis is the normal (N, 3).
+
+    The other axes are orthonormal (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
+    """
+    x, y, z = normals.T
+    sign = np.where(z < 0, -1.0, 1.0)
+    a = -1.0 / (sign + z)
+    b = x * y * a
+    second = np.column_stack([1.0 + sign * x * x * a, sign * b, -sign * x])
+    third = np.column_stack([b, sign + y * y * a, -y])
+    return rotation_to_quat(np.stack([normals, second, third], axis=2))
 
 
 def _clamp(spacing: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArray[np.float64]:

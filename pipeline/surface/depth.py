@@ -8,10 +8,10 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import tifffile
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.io.depth_tiff import write_depth_tiff
 from pipeline.photos.load import load_view
 from pipeline.photos.naming import rename
 from pipeline.render import RasterOptions
@@ -132,9 +132,5 @@ def write_depths(folder: Path, renders: RenderCache) -> None:
     names = rename({view.name: ".tiff" for view in renders.views})
     for rendered in renders:
         for kind in ("median", "expected"):
-            buffer = io.BytesIO()
-            # Without metadata: libtiff warns about the order of the description tag.
-            tifffile.imwrite(
-                buffer, np.asarray(getattr(rendered, kind)), compression="zlib", metadata=None
-            )
-            write_bytes(folder / kind / names[rendered.view.name], buffer.getvalue())
+            path = folder / kind / names[rendered.view.name]
+            write_depth_tiff(path, getattr(rendered, kind))

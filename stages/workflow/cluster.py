@@ -19,7 +19,7 @@ from pipeline.plan.values import Plan
 GROUPS: Mapping[str, Sequence[str]] = {
     "prepare": (
         *("inspect", "decode", "features", "pairs", "matches", "sfm"),
-        *("refine", "undistort", "init"),
+        *("refine", "undistort", "dense", "init"),
     ),
     "coarse": ("coarse", "partition"),
     "train": ("train", "export"),

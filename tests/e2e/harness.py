@@ -38,7 +38,7 @@ OTHER_JOBS = ForkServer(
 TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
 OTHER_STAGES = (
     *("inspect", "decode", "extract", "features", "pairs", "match", "matches", "sfm"),
-    *("refine", "undistort", "init"),
+    *("refine", "undistort", "dense", "init"),
 )
 
 SOURCES = ("Snakefile", "pipeline", "stages", "profiles", "pyproject.toml")

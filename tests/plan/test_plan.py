@@ -172,6 +172,31 @@ def test_options_are_settled(tmp_path):
     assert (config.init.method, config.train.background) == ("points", "black")
 
 
+@pytest.mark.parametrize(
+    ("sections", "reason"),
+    [
+        ({"init": {"method": "dense"}}, "init.method: dense"),
+        ({"export": {"formats": ["ply", "dense_maps"]}}, "export.formats: dense_maps"),
+    ],
+)
+def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason):
+    photos(tmp_path / "images", 3)
+    plan = plan_of(tmp_path)
+    assert not plan.runs("dense") and "init: points" in plan.stages["dense"].reason
+    assert "dense" not in plan.stages["init"].inputs
+    plan = plan_of(tmp_path, **sections)
+    assert plan.runs("dense") and reason in plan.stages["dense"].reason
+    assert "dense" in plan.stages["init"].inputs and "dense" in plan.stages["export"].inputs
+
+
+def test_dense_initialisation_does_not_use_the_scenes_cloud(tmp_path):
+    names = [path.name for path in photos(tmp_path / "images", 3)]
+    write_sparse(tmp_path / "sparse" / "0", names, (64, 48))
+    (tmp_path / "points.xyz").write_text("0 0 0\n1 1 1\n")
+    init = plan_of(tmp_path, init={"method": "dense"}).stages["init"]
+    assert "fused depth maps" in init.reason and "init.method: points" in init.decisions[0]
+
+
 def images(folder: Path) -> None:
     photos(folder / "images", 2)
 

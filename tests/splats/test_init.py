@@ -14,6 +14,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.init import (
+    FLATNESS,
     MAX_ANGLE,
     SH_C0,
     InitGaussians,
@@ -180,3 +181,18 @@ def test_rounding_turns_no_gaussian():
     first = gaussians_from_points(points_at(xyz), CENTRES, Init(), 0)
     there = gaussians_from_points(points_at(xyz * 1000 * 0.001), CENTRES, Init(), 0)
     np.testing.assert_allclose(there.quats, first.quats, atol=1e-6)
+
+
+def test_gaussians_are_flat_along_known_normals():
+    rng = np.random.default_rng(2)
+    xyz = rng.uniform(-1, 1, (50, 3))
+    normals = rng.normal(size=(50, 3))
+    normals[:3] = np.diag([1.0, 1.0, -1.0])
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    found = gaussians_from_points(points_at(xyz), CENTRES, Init(max_points=30), 0, normals=normals)
+    assert_valid(found)
+    nearest = ((xyz[:, None] - found.means[None]) ** 2).sum(-1).argmin(0)
+    axes = quat_to_rotation(found.quats.astype(np.float64))
+    np.testing.assert_allclose(axes[:, :, 0], normals[nearest], atol=1e-5)
+    thickness = np.exp(found.log_scales[:, 0] - found.log_scales[:, 1])
+    np.testing.assert_allclose(thickness, FLATNESS, rtol=1e-5)

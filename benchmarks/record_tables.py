@@ -18,6 +18,7 @@ from benchmarks.measured import Record, Result
 from benchmarks.results import (
     BlocksResult,
     CoverageResult,
+    DenseResult,
     GrowthResult,
     JudgeResult,
     MemoryResult,
@@ -84,6 +85,23 @@ def mesh(records: Sequence[Stored]) -> str:
                     f"{region.completeness:.1%}",
                 ]
             )
+    return markdown.table(rows)
+
+
+def dense(records: Sequence[Stored]) -> str:
+    return dense_table(results(records, Record[DenseResult]))
+
+
+def dense_table(found: Sequence[DenseResult]) -> str:
+    rows = [["scene", "photographs", "median error", "below 0.5, 1, 2 %", "with a depth"]]
+    rows[0] += ["of these below 0.5, 1, 2 %", "points", "CPU s a photograph"]
+    rows[0] += ["instruction set", "peak (MB)"]
+    for r in found:
+        shares = [", ".join(f"{share:.1%}" for share in s) for s in (r.within, r.within_known)]
+        cells = [r.scene, f"{r.photographs}, {r.pixels}", f"{r.median_error:.3%}", shares[0]]
+        cells += [f"{r.completeness:.1%}", shares[1], f"{r.points / 1e6:.2f}M"]
+        cells += [f"{r.cpu_s_per_photograph:.2f}", r.instruction_set, f"{r.peak_mb:.0f}"]
+        rows.append(cells)
     return markdown.table(rows)
 
 
@@ -330,6 +348,7 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
 
 TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "mesh": mesh,
+    "dense": dense,
     "coverage": coverage,
     "memory": memory,
     "sfm": sfm,

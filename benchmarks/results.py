@@ -46,6 +46,38 @@ class MeshResult:
     room: Accuracy
 
 
+# ---- benchmarks.dense ----
+
+
+@dataclass(frozen=True)
+class DenseResult:
+    """Depth maps of a scene; shares are of its textured pixels.
+
+    Attributes:
+        pixels: size of the views.
+        median_error: median relative error of the pixels with a depth.
+        within: share with a relative error below 0.5 %, 1 % and 2 %.
+        completeness: share with a depth.
+        within_known: as ``within``, of the pixels with a depth.
+        points: number of points of the fused cloud.
+        instruction_set: of the kernel.
+        cpu_s_per_photograph: of all passes.
+        peak_mb: peak memory of the process, MiB.
+    """
+
+    scene: str
+    photographs: int
+    pixels: str
+    median_error: float
+    within: list[float]
+    completeness: float
+    within_known: list[float]
+    points: int
+    instruction_set: str
+    cpu_s_per_photograph: float
+    peak_mb: float
+
+
 # ---- benchmarks.coverage ----
 
 Place = list[float]

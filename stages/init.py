@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from pipeline.mvs.initial import SurfacePoints
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
+    from pipeline.scene.reconstruction import Points
     from pipeline.scene.views import View
 
 # Methods that use the point cloud of the scene folder.
@@ -70,7 +71,7 @@ def work(job: Job) -> None:
     training = inputs.training_views(job)
     points = inputs.input_model(job).points
     extra, source, normals = {}, "points", None
-    dense = _dense_points(job, training, config) if config.method == "dense" else None
+    dense = _dense_points(job, points, training, config) if config.method == "dense" else None
     cloud = read_cloud(job.inputs["inspect"]) if config.method in CLOUD_METHODS else None
     placed = None
     if cloud is not None:
@@ -108,7 +109,9 @@ def work(job: Job) -> None:
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
 
 
-def _dense_points(job: Job, training: list[View], config: Init) -> SurfacePoints | None:
+def _dense_points(
+    job: Job, sparse: Points, training: list[View], config: Init
+) -> SurfacePoints | None:
     """Points of the fused depth maps; None, with a warning, if there are too few."""
     from pipeline.mvs.initial import surface_points
     from pipeline.mvs.maps import read_dense_cloud
@@ -121,7 +124,9 @@ def _dense_points(job: Job, training: list[View], config: Init) -> SurfacePoints
             "from the sparse points"
         )
         return None
-    return surface_points(cloud, training, config.max_points)
+    found = surface_points(cloud, sparse, training, config.max_points)
+    job.decide(f"{found.num_sparse} sparse points fill holes of the depth maps")
+    return found
 
 
 SPEC = StageSpec(

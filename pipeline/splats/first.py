@@ -25,7 +25,7 @@ class InitPoints:
 
     Attributes:
         source: what they are, for messages.
-        normals: (P, 3) unit normals of the surface, None if unknown.
+        normals: see ``gaussians_from_points``.
     """
 
     points: Points

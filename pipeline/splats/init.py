@@ -79,7 +79,7 @@ def gaussians_from_points(
 
     Args:
         camera_centres: (C, 3) float64 in world coordinates.
-        normals: (P, 3) unit normals in the world, None if unknown.
+        normals: (P, 3) unit normals in the world, NaN where unknown; None if all are.
 
     Raises:
         UserError: no point is usable.
@@ -114,11 +114,12 @@ def gaussians_from_points(
     )
     colour = points.rgb[chosen].astype(np.float64) / 255.0
     result = _isotropic(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
-    if normals is not None:
-        result.quats[:] = _rotations_to(normals[chosen])
-        result.log_scales[:, 0] += np.float32(np.log(FLATNESS))
-    elif len(xyz) > NEIGHBOURS:
+    if len(xyz) > NEIGHBOURS:
         result.quats[:] = _normal_rotations(xyz, neighbours)
+    if normals is not None:
+        known = np.isfinite(normals[chosen]).all(1)
+        result.quats[known] = _rotations_to(normals[chosen[known]])
+        result.log_scales[known, 0] += np.float32(np.log(FLATNESS))
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
     return result
 

@@ -16,6 +16,7 @@ from benchmarks.results import (
     Accuracy,
     BlocksResult,
     CoverageResult,
+    DenseResult,
     GrowthResult,
     JudgeResult,
     MemoryResult,
@@ -84,6 +85,15 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
             room=Accuracy(10.0, 0.002, 0.01, 0.9),
         ),
         "| foreground | 2.5 | 20.0 | 90k | 2.5 | 10.0 | 95.0% |",
+    ),
+    "dense": (
+        Record[DenseResult],
+        DenseResult(
+            *("town", 40, "640x427", 0.0004, [0.8, 0.85, 0.9], 0.92, [0.9, 0.95, 0.99]),
+            *(1_930_000, "x86-64-v3", 1.8, 500.0),
+        ),
+        "| town | 40, 640x427 | 0.040% | 80.0%, 85.0%, 90.0% | 92.0% | 90.0%, 95.0%, 99.0% "
+        "| 1.93M | 1.80 | x86-64-v3 | 500 |",
     ),
     "coverage": (
         Record[CoverageResult],

@@ -110,13 +110,17 @@ def test_the_cloud_has_at_most_so_many_points(result, tmp_path):
     assert 500 < len(read_dense_cloud(tmp_path / "out")) <= 1000
 
 
-def test_initial_points_are_thinned_with_their_normals(result):
-    views, _, folder, _ = result
+def test_initial_points_are_thinned_with_their_normals_and_holes_are_filled(result):
+    views, model, folder, _ = result
     cloud = read_dense_cloud(folder / "out")
-    found = surface_points(cloud, views, 300)
-    assert 200 < len(found.points) <= 300
-    assert found.normals.shape == (len(found.points), 3)
-    np.testing.assert_allclose(np.linalg.norm(found.normals, axis=1), 1, atol=1e-5)
+    far = np.array([[0.0, 0.0, 9.0], [np.nan, 0, 0]])
+    sparse = model_of(views, np.concatenate([model.points.xyz, far])).points
+    found = surface_points(cloud, sparse, views, 300)
+    count = len(found.points) - found.num_sparse
+    assert 200 < count <= 300 and found.num_sparse < 15
+    np.testing.assert_allclose(np.linalg.norm(found.normals[:count], axis=1), 1, atol=1e-5)
+    assert np.isnan(found.normals[count:]).all()
+    assert (found.points.xyz[-1] == far[0]).all()
 
 
 def test_a_missing_photograph_is_a_user_error(result, tmp_path):

@@ -24,7 +24,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         users.insert(0, "init.method: dense")
     if users:
         return StagePlan(run=True, reason=f"depth maps for {', '.join(users)}")
-    reason = f"neither init.method nor export.formats needs depth maps (init: {config.init.method})"
+    reason = f"init.method: {config.init.method} and the export formats need no depth maps"
     return StagePlan(run=False, reason=reason)
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from pipeline.mvs.consistency import FilterOptions, PlaneMap, compare
 from pipeline.mvs.maps import DenseCloud, DenseMap
+from pipeline.mvs.patchmatch import relative_pose
 from pipeline.scene.views import View
 
 # Pixels with less confidence are not fused.
@@ -104,8 +105,8 @@ def _finer_by(
     Rounded to steps of 0.1 %, so that rounding errors do not order views with equal resolution.
     """
     local = _rays(view, xy) / inverse_depth[:, None]
-    relative = other.world_to_camera @ np.linalg.inv(view.world_to_camera)
-    z = np.einsum("j,nj->n", relative[2, :3], local) + relative[2, 3]
+    rotation, translation = relative_pose(view, other)
+    z = np.einsum("j,nj->n", rotation[2], local) + translation[2]
     focal = np.sqrt(other.fx * other.fy / (view.fx * view.fy))
     ratio = focal / (np.maximum(z, 1e-12) * inverse_depth)
     return np.rint(1000 * np.log(np.maximum(ratio, 1e-12)))

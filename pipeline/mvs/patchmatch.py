@@ -168,19 +168,24 @@ def matching_cost(
     return costs
 
 
+def relative_pose(view: View, other: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """(3, 3) R and (3,) t: the point X of the view's camera is R X + t in the other's."""
+    rotation = other.world_to_camera[:3, :3] @ view.world_to_camera[:3, :3].T
+    return rotation, other.world_to_camera[:3, 3] - rotation @ view.world_to_camera[:3, 3]
+
+
 def relative_projection(
     reference: View, source: View
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """(3, 3) K_s R K_r^-1 and (3,) K_s t: the pixel (x, y) of the reference with inverse depth w is
     at the homogeneous pixel ``rotation @ (x, y, 1) + translation * w`` of the source."""
-    relative = source.world_to_camera @ np.linalg.inv(reference.world_to_camera)
-    rotation = intrinsics(source) @ relative[:3, :3] @ np.linalg.inv(intrinsics(reference))
-    return rotation, intrinsics(source) @ relative[:3, 3]
-
-
-def intrinsics(view: View) -> NDArray[np.float64]:
-    """(3, 3) float64 pinhole matrix K of a view."""
-    return np.array([[view.fx, 0.0, view.cx], [0.0, view.fy, view.cy], [0.0, 0.0, 1.0]])
+    rotation, translation = relative_pose(reference, source)
+    fx, fy = reference.fx, reference.fy
+    inverse = np.array(
+        [[1 / fx, 0.0, -reference.cx / fx], [0.0, 1 / fy, -reference.cy / fy], [0.0, 0.0, 1.0]]
+    )
+    matrix = np.array([[source.fx, 0.0, source.cx], [0.0, source.fy, source.cy], [0.0, 0.0, 1.0]])
+    return matrix @ rotation @ inverse, matrix @ translation
 
 
 def pixel_step(reference: View, sources: Sequence[View], depth: float) -> float:

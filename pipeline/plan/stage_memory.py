@@ -33,9 +33,9 @@ _PAGE, _MESH = 110.0, 450.0
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
 # Bytes per pixel of multi-view stereo: of a view in a thread, and of the views that are cached.
 _STEREO, _CACHED_VIEWS = 300.0, 170.0
-# Points of the fused cloud, share of the pixels and maximum in millions; bytes of a point; memory
-# of thinning, relative to that of the cloud.
-_FUSED_SHARE, _MAX_FUSED, _FUSED, _THINNED = 0.3, 5.0, 30.0, 4.0
+# Points of the fused cloud: share of the pixels, and maximum in millions. Bytes of a point, and of
+# one of the sample that is thinned.
+_FUSED_SHARE, _MAX_FUSED, _FUSED, _SAMPLED = 0.25, 5.0, 30.0, 150.0
 # Number of photographs whose features are in memory at a time while pairs are matched; MB per
 # photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
 _KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
@@ -149,23 +149,23 @@ def _undistort(plan: Plan, threads: int) -> float:
 
 
 def _dense(plan: Plan, threads: int) -> float:
-    views = (threads * _STEREO + _CACHED_VIEWS) * _view_pixels(plan) + threads * _DECODED * _pixels(
-        plan
-    )
-    return _PROGRAM + _MODEL_READ * _photos(plan) + views + _fused_cloud(plan)
+    views = (threads * _STEREO + _CACHED_VIEWS) * _view_pixels(plan)
+    views += threads * _DECODED * _pixels(plan)
+    # Parts of the cloud and the whole.
+    return _PROGRAM + _MODEL_READ * _photos(plan) + views + 2 * _FUSED * _fused_points(plan)
 
 
-def _fused_cloud(plan: Plan) -> float:
-    """Parts and whole of the fused cloud, which has about a fifth of the views' pixels."""
-    points = min(_FUSED_SHARE * _photos(plan) * _view_pixels(plan), _MAX_FUSED)
-    return 2 * _FUSED * points
+def _fused_points(plan: Plan) -> float:
+    """Points of the fused cloud, millions."""
+    return min(_FUSED_SHARE * _photos(plan) * _view_pixels(plan), _MAX_FUSED)
 
 
 def _init(plan: Plan, threads: int) -> float:
     poses = plan.facts.given_poses
     triangulated = poses is not None and not poses.num_points
     if plan.config.init.method == "dense":
-        return _PROGRAM + 10 + _THINNED * _fused_cloud(plan)
+        sample = min(5 * plan.config.init.max_points / 1e6, _fused_points(plan))
+        return _PROGRAM + 10 + _FUSED * _fused_points(plan) + _SAMPLED * sample
     return max(_features(plan, threads), _mapping(plan, threads)) if triangulated else _PROGRAM + 10
 
 

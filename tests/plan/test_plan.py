@@ -182,7 +182,7 @@ def test_options_are_settled(tmp_path):
 def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason):
     photos(tmp_path / "images", 3)
     plan = plan_of(tmp_path)
-    assert not plan.runs("dense") and "init: points" in plan.stages["dense"].reason
+    assert not plan.runs("dense") and "init.method: points" in plan.stages["dense"].reason
     assert "dense" not in plan.stages["init"].inputs
     plan = plan_of(tmp_path, **sections)
     assert plan.runs("dense") and reason in plan.stages["dense"].reason

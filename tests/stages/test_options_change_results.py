@@ -61,6 +61,7 @@ DARK = under(poses="keep", experiments__train__sh0_learning_rate=1.0)
 LARGE = under(poses="keep", views__max_long_side_px=200)
 FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_gaussians=320)
 BLOCKS = under(poses="keep", partition__blocks=2)
+DENSE = under(poses="keep", init__method="dense", export__formats=["dense_points", "dense_maps"])
 MESH = under(poses="keep", export__formats=["mesh"])
 
 _T, _G, _M = "experiments.train", "experiments.train.gradient", "experiments.train.mcmc"
@@ -287,6 +288,27 @@ def test_options_that_no_stage_declares_change_no_output(outputs):
         assert expected
         found = outputs("machine", "photos", other, stage, threads=2, memory_mb=1)
         assert found == expected
+
+
+def test_depth_maps_have_the_same_bits_at_any_number_of_threads(outputs):
+    """And neither a run's seed nor the options of later stages change them."""
+    expected = outputs("dense", "photos", DENSE, "dense")
+    names = [name for name in expected if name.startswith("maps/")]
+    assert "points.npz" in expected and names
+    assert outputs("dense", "photos", DENSE, "dense", threads=2) == expected
+    other = with_option(with_option(DENSE, "seed", 1), "train.steps", 41)
+    assert outputs("dense-other", "photos", other, "dense") == expected
+    exported = outputs("dense", "photos", DENSE, "export")
+    assert "dense_points.ply" in exported
+    assert sum(name.startswith("dense_maps/") for name in exported) == len(names)
+
+
+@pytest.mark.parametrize(
+    ("path", "value"), [("views.max_long_side_px", 48), ("split.test_every", 5)]
+)
+def test_options_of_depth_maps_change_them(outputs, path, value):
+    expected = outputs("dense", "photos", DENSE, "dense")
+    assert outputs("dense-other", "photos", with_option(DENSE, path, value), "dense") != expected
 
 
 def test_a_scene_in_blocks_has_the_same_bits_at_any_number_of_threads(outputs):

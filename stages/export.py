@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Export, Split, Train, Views
+from pipeline.config.schema import DENSE_FORMATS, Export, Split, Train, Views
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -69,7 +69,7 @@ SPEC = StageSpec(
     decide=decide,
     counters=ExportCounters,
     inputs=inputs.TRAINED | {"inspect": ("inspect",), "dense": ("dense",)},
-    optional=("dense",),
+    only_if={"dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats)},
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -141,7 +141,7 @@ SPEC = StageSpec(
         "inspect": ("inspect",),
         "dense": ("dense",),
     },
-    optional=("dense",),
+    only_if={"dense": lambda config: config.init.method == "dense"},
     options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,

@@ -56,7 +56,9 @@ def full_plan(config: Config, scene: str = "fox", skipped: tuple[str, ...] = ())
             run=name in running,
             reason=f"why {name} <&",
             decisions=["so"],
-            inputs=sorted(set(plans._upstream(spec, running).values())) if name in running else [],
+            inputs=sorted(set(plans._upstream(spec, running, config).values()))
+            if name in running
+            else [],
         )
         for name, spec in STAGES.items()
     }

@@ -37,7 +37,7 @@ def make_plan(
     decided = {name: spec.decide(scan, settled) for name, spec in stages.items()}
     running = {name for name, stage in decided.items() if stage.run}
     for name in running:
-        sources = sorted(set(_upstream(stages[name], running).values()))
+        sources = sorted(set(_upstream(stages[name], running, settled.config).values()))
         decided[name] = decided[name].model_copy(update={"inputs": sources})
     hints = panorama_hints(scan.maybe_panoramas, config) if scan.poses is None else []
     return Plan(
@@ -52,12 +52,15 @@ def make_plan(
 
 def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:
     """Role of the stage's input -> the stage that provides it, according to the plan."""
-    return _upstream(spec, {name for name, stage in plan.stages.items() if stage.run})
+    running = {name for name, stage in plan.stages.items() if stage.run}
+    return _upstream(spec, running, plan.config)
 
 
-def _upstream(spec: StageSpec, running: Collection[str]) -> dict[str, str]:
+def _upstream(spec: StageSpec, running: Collection[str], config: Config) -> dict[str, str]:
     found = {}
     for role, candidates in spec.inputs.items():
+        if role in spec.only_if and not spec.only_if[role](config):
+            continue
         providers = [name for name in candidates if name in running]
         if providers or role not in spec.optional:
             found[role] = providers[0]

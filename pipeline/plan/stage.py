@@ -11,6 +11,7 @@ from pipeline.plan.values import Plan, StagePlan
 from pipeline.runtime.counters import NoCounters, StageCounters
 
 if TYPE_CHECKING:
+    from pipeline.config.schema import Config
     from pipeline.plan.scan import Scan
     from pipeline.plan.settle import Settled
     from pipeline.runtime.job import Job
@@ -79,6 +80,8 @@ class StageSpec:
         facts: facts that affect the result besides code, options, packages, seed and inputs.
         scattered: whether the stage has several jobs, as many as the plan says, each with a folder
             and a log of its own. The key contains the number of the job and of all jobs.
+        only_if: role -> whether the stage reads this input under a configuration. The result of a
+            stage that does not read it stays valid when the input's stage runs for another one.
         optional: roles that have no input if the plan runs none of their stages.
     """
 
@@ -94,6 +97,7 @@ class StageSpec:
     shows_plan: bool = False
     facts: Callable[[Plan], dict[str, Any]] = _none
     scattered: bool = False
+    only_if: Mapping[str, Callable[[Config], bool]] = field(default_factory=dict)
     optional: tuple[str, ...] = ()
 
     @property

@@ -125,7 +125,8 @@ def _dense_points(
         )
         return None
     found = surface_points(cloud, sparse, training, config.max_points)
-    job.decide(f"{found.num_sparse} sparse points fill holes of the depth maps")
+    if found.num_sparse:
+        job.decide(f"{found.num_sparse} sparse points fill holes of the depth maps")
     return found
 
 

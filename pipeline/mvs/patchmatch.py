@@ -32,6 +32,10 @@ LIBRARY = NativeLibrary(
 )
 
 
+# Limits of the kernel.
+MAX_RADIUS, MAX_BEST = 8, 4
+
+
 @dataclass(frozen=True)
 class Picture:
     """A view with its pixels.
@@ -207,6 +211,8 @@ def _problem(
     """The kernel's input, and the arrays that it refers to."""
     if not sources:
         raise ValueError("expected at least one source")
+    if not (0 < cost.radius <= MAX_RADIUS and 0 < cost.num_best <= MAX_BEST):
+        raise ValueError(f"expected a radius up to {MAX_RADIUS}, num_best up to {MAX_BEST}")
     array = (_Source * len(sources))()
     kept: list[object] = [array]
     for item, source in zip(array, sources, strict=True):

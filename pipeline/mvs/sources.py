@@ -18,6 +18,9 @@ from pipeline.scene.views import View
 # The best triangulation angle, and the standard deviations of the weight below and above it,
 # degrees: small angles determine depth poorly, at large ones windows look different.
 BEST_ANGLE, BELOW, ABOVE = 10.0, 4.0, 12.0
+# Points with a smaller angle do not count, degrees: views from one position, as of a panorama, match
+# at any depth.
+MIN_ANGLE = 1.0
 # Weight of a point that so many chosen sources see: two are enough.
 COVERED = np.array([1.0, 1.0, 0.5, 0.25, 0.1])
 # Pairs that share fewer points are not matched.
@@ -106,6 +109,7 @@ class _Observations:
         angle = np.degrees(np.arccos(np.clip((own * ray).sum(1) / (near * far), -1.0, 1.0)))
         spread = np.where(angle < BEST_ANGLE, BELOW, ABOVE)
         weight = np.exp(-0.5 * ((angle - BEST_ANGLE) / spread) ** 2)
+        weight[angle < MIN_ANGLE] = 0.0
         ratio = self._focal[other] * near / (self._focal[index] * far)
         return np.asarray(weight * np.minimum(ratio, 1.0 / ratio))
 

@@ -31,8 +31,9 @@ _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 _PAGE, _MESH = 110.0, 450.0
 # MB per photograph of a sparse model: read; read, with views; written; copied.
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
-# Bytes per pixel of multi-view stereo: of a view in a thread, and of the views that are cached.
-_STEREO, _CACHED_VIEWS = 300.0, 170.0
+# Bytes per pixel of a view of multi-view stereo: matched in a thread; fused in a thread; of the
+# views that are cached.
+_STEREO, _FUSION, _CACHED_VIEWS = 320.0, 150.0, 170.0
 # Points of the fused cloud: share of the pixels, and maximum in millions. Bytes of a point, and of
 # one of the sample that is thinned.
 _FUSED_SHARE, _MAX_FUSED, _FUSED, _SAMPLED = 0.25, 5.0, 30.0, 150.0
@@ -149,10 +150,12 @@ def _undistort(plan: Plan, threads: int) -> float:
 
 
 def _dense(plan: Plan, threads: int) -> float:
-    views = (threads * _STEREO + _CACHED_VIEWS) * _view_pixels(plan)
-    views += threads * _DECODED * _pixels(plan)
-    # Parts of the cloud and the whole.
-    return _PROGRAM + _MODEL_READ * _photos(plan) + views + 2 * _FUSED * _fused_points(plan)
+    pixels = _view_pixels(plan)
+    # Fusion holds the parts of the cloud, and the whole.
+    fusion = (threads * _FUSION + _CACHED_VIEWS) * pixels + 2 * _FUSED * _fused_points(plan)
+    decoded = threads * _DECODED * _pixels(plan)
+    work = max(threads * _STEREO * pixels, fusion)
+    return _PROGRAM + _MODEL_READ * _photos(plan) + decoded + work
 
 
 def _fused_points(plan: Plan) -> float:

@@ -172,8 +172,10 @@ def row_of_views(positions: list[float]) -> list[View]:
 def test_sources_have_a_good_angle_and_cover_the_view():
     views = row_of_views([0.0, 0.001, 0.9, -0.9, 30.0])
     xyz = np.random.default_rng(0).uniform([-1, -1, 4.5], [1, 1, 5.5], (50, 3))
-    chosen = select_sources(views, model_of(views, xyz), 2)[0]
-    assert sorted(chosen.tolist()) == [2, 3]
+    model = model_of(views, xyz)
+    assert sorted(select_sources(views, model, 2)[0].tolist()) == [2, 3]
+    # Not the view at nearly the same position.
+    assert 1 not in select_sources(views, model, 6)[0]
 
 
 def test_sources_without_points_are_the_nearest_with_a_similar_direction():

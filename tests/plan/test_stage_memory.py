@@ -107,6 +107,18 @@ def test_jobs_reserve_what_stages_take_and_at_most_half_more(scene: Scene) -> No
         assert used <= memory_mb(stage, plan, 2) <= 1.5 * used, stage
 
 
+def test_jobs_that_estimate_depth_maps_reserve_what_they_take() -> None:
+    """With one thread; 28 of 32 and 21 of 25 photographs are training views."""
+    config = Config.model_validate({"preset": "fast", "init": {"method": "dense"}})
+    demo = Scene(32, (480, 360), (480, 360), 43_200)
+    church = Scene(25, (1152, 768), (640, 427), 68_320)
+    for scene, dense, init in ((demo, 265, 153), (church, 275, 157)):
+        thinned = config.init.model_copy(update={"max_points": scene.gaussians // 2})
+        plan = plan_of(scene, config.model_copy(update={"init": thinned}))
+        assert dense <= memory_mb("dense", plan, 1) <= 1.6 * dense
+        assert init <= memory_mb("init", plan, 1) <= 2 * init
+
+
 def test_jobs_of_a_large_scene_reserve_what_they_take() -> None:
     """The town of 300 photographs in three jobs, with two threads."""
     town = Scene(300, (640, 427), (640, 427), 100_000)

@@ -18,8 +18,8 @@ from pipeline.scene.views import View
 # The best triangulation angle, and the standard deviations of the weight below and above it,
 # degrees: small angles determine depth poorly, at large ones windows look different.
 BEST_ANGLE, BELOW, ABOVE = 10.0, 4.0, 12.0
-# Points with a smaller angle do not count, degrees: views from one position, as of a panorama, match
-# at any depth.
+# Points with a smaller angle do not count, degrees: views from one position, such as those of a
+# panorama, match at any depth.
 MIN_ANGLE = 1.0
 # Weight of a point that so many chosen sources see: two are enough.
 COVERED = np.array([1.0, 1.0, 0.5, 0.25, 0.1])

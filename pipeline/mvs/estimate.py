@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import cv2
 import numpy as np
@@ -39,14 +39,15 @@ class StereoOptions:
 
     Attributes:
         levels: from coarse to fine; the last one is of the whole resolution.
-        min_side: coarse levels are left out where the shorter side would be smaller, pixels.
+        min_side: coarse levels are left out where the shorter side would be smaller, pixels. The
+            first level that is not has the iterations, random planes and step of the coarsest.
         cost: the matching cost.
     """
 
     levels: tuple[Level, ...] = (
         Level(4, iterations=6, num_random=8, first_step=2.0),
         Level(2, iterations=3, num_random=0, first_step=1.0),
-        Level(1, iterations=2, num_random=0, first_step=0.5),
+        Level(1, iterations=1, num_random=0, first_step=0.5),
     )
     min_side: int = 24
     cost: CostOptions = field(default_factory=CostOptions)
@@ -106,6 +107,7 @@ def estimate_planes(
             continue
         small = reduced(reference, level.factor)
         if planes is None:
+            level = replace(options.levels[0], factor=level.factor)
             planes = first_planes(small.view, xyz, depths)
         else:
             planes = enlarged(planes, small.view)

@@ -53,6 +53,7 @@ def work(job: Job) -> None:
         job.section(Train),
         job.section(Experiments).train,
         training_run(job),
+        dense=job.inputs.get("dense"),
     )
     inputs.write_trained(job, trained)
 
@@ -66,9 +67,13 @@ SPEC = StageSpec(
         "views": inputs.VIEWS,
         "model": inputs.MODEL,
         "init": ("init",),
+        "dense": ("dense",),
         "coarse": ("coarse",),
         "partition": ("partition",),
         "polish": ("polish",),
+    },
+    only_if={
+        "dense": lambda config: config.init.method == "dense" and config.partition.blocks == 1
     },
     optional=("coarse", "partition", "polish"),
     options=("train", "views", "split", "experiments.train"),

@@ -338,8 +338,8 @@ class Train(Section):
     depth_loss_weight: Literal["auto"] | LossWeight = Field(
         "auto",
         description="Weight of the error of the logarithm of the depth, at sparse points and in "
-        "depth maps of depths/. 0: no depth loss; auto: 0.3 with depth maps, else 0.03 for up to "
-        "30 photographs, else 0.",
+        "depth maps of depths/, or in those of multi-view stereo with init.method: dense. 0: no "
+        "depth loss; auto: 0.3 with depth maps, else 0.03 for up to 30 photographs, else 0.",
     )
     mask_loss_weight: LossWeight = Field(
         0.1,

@@ -73,12 +73,13 @@ def settle(scan: Scan, config: Config) -> Settled:
         "sfm.camera_model": _camera_model(scan, config),
         "sfm.share_cameras": _share_cameras(scan, config),
         "train.background": _background(scan, config),
-        "train.depth_loss_weight": _depth_loss_weight(scan, config),
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
     photos_per_job, jobs_reason = _photos_per_job(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
     blocks, blocks_reason = _blocks(scan, config, budget)
+    method = AUTO_INIT_METHOD if config.init.method == "auto" else config.init.method
+    depth_weight, depth_reason = _depth_loss_weight(scan, config, method == "dense" and blocks == 1)
     settled = _updated(
         config,
         {
@@ -89,20 +90,21 @@ def settle(scan: Scan, config: Config) -> Settled:
                 name: value[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")
             },
             "init": {
-                "method": AUTO_INIT_METHOD if config.init.method == "auto" else config.init.method,
+                "method": method,
                 "max_points": min(config.init.max_points, max(1, budget // 2)),
                 "points_file": scan.cloud.path if scan.cloud else "none",
             },
             "partition": {"blocks": blocks},
             "train": {
                 "background": value["train.background"],
-                "depth_loss_weight": value["train.depth_loss_weight"],
+                "depth_loss_weight": depth_weight,
                 "density": config.train.density.model_copy(update={"max_gaussians": budget}),
             },
         },
     )
     why = {path: reason for path, (_, reason) in chosen.items()}
     why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
+    why["train.depth_loss_weight"] = depth_reason
     why["partition.blocks"] = blocks_reason
     why["features.photos_per_job"] = jobs_reason
     return Settled(settled, why)
@@ -264,13 +266,20 @@ def _masks(scan: Scan, config: Config) -> str:
     return f"{scan.num_masks} photographs have masks" if scan.num_masks else ""
 
 
-def _depth_loss_weight(scan: Scan, config: Config) -> tuple[float, str]:
-    """The weight of the depth loss; with many photographs it is not needed."""
+def _depth_loss_weight(scan: Scan, config: Config, dense: bool) -> tuple[float, str]:
+    """The weight of the depth loss; with many photographs it is not needed.
+
+    Args:
+        dense: whether depths by multi-view stereo are known.
+    """
     wanted = config.train.depth_loss_weight
     if wanted != "auto":
         return wanted, f"the loss on depths has weight {wanted:g}, as configured"
     if scan.num_depths:
         text = f"{scan.num_depths} depth maps: the loss on depths has weight {DEPTH_MAP_WEIGHT:g}"
+        return DEPTH_MAP_WEIGHT, text
+    if dense:
+        text = f"multi-view stereo: the loss on depths has weight {DEPTH_MAP_WEIGHT:g}"
         return DEPTH_MAP_WEIGHT, text
     if len(scan.planned) > FEW_PHOTOS:
         return 0.0, ""

@@ -21,6 +21,7 @@ from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.cameras.intrinsics import describe_intrinsics, with_intrinsics
 from pipeline.training.cameras.poses import describe_poses, with_common_motion
+from pipeline.training.data.dense_depths import add_dense_depths
 from pipeline.training.data.depth_maps import add_maps
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import (
@@ -104,10 +105,12 @@ def train_scene(
     experiments: TrainExperiments,
     run: TrainingRun,
     part: Part = WHOLE_RUN,
+    dense: Path | None = None,
 ) -> TrainedScene:
     """Train on the views that are not test views.
 
     Args:
+        dense: outputs of the stage dense, whose depths the depth loss uses.
         part: of the schedule.
 
     Raises:
@@ -117,7 +120,7 @@ def train_scene(
     has_alpha = any(photo.alpha for photo in manifest.photos)
     gains = NO_GAINS if has_alpha else _choose_gains(views, model, config, notes)
     trained = run_training(
-        scene_inputs(views, manifest, model, initial, gains, config, notes),
+        scene_inputs(views, manifest, model, initial, gains, config, notes, dense),
         config,
         experiments,
         run,
@@ -195,12 +198,14 @@ def scene_inputs(
     gains: ExposureGains,
     config: Train,
     notes: Notes | None = None,
+    dense: Path | None = None,
 ) -> Inputs:
     """The inputs of training a scene.
 
     Args:
         gains: of all views; empty if exposure is not modelled.
         notes: receives messages and counters about depth maps.
+        dense: outputs of the stage dense; not used beside depth maps of the user.
     """
     notes = notes or Notes()
     training = [view for view in views if not view.is_test]
@@ -213,7 +218,7 @@ def scene_inputs(
         scale=scene_scale(extent, points),
         gains=np.array([gains.of(view.name) for view in training]) if gains else None,
         depths=(
-            _known_depths(training, manifest, points, initial, notes)
+            _known_depths(training, manifest, points, initial, notes, dense)
             if config.depth_loss_weight
             else None
         ),
@@ -228,10 +233,13 @@ def _known_depths(
     points: list[KnownDepths],
     initial: Gaussians,
     notes: Notes,
+    dense: Path | None,
 ) -> list[KnownDepths]:
-    """Depths of the sparse points and of the user's depth maps, by view."""
+    """Depths of the sparse points and of the user's depth maps or of the dense ones, by view."""
     files = {p.name: (p.depth, p.depth_digest) if p.depth else None for p in manifest.photos}
     maps = [files[view.name] for view in views]
+    if dense is not None and not any(maps):
+        return add_dense_depths(views, points, dense)
     fitted_to, source = points, "sparse points"
     if any(maps) and not any(map(len, points)):
         fitted_to, source = gaussian_depths(views, initial.means.double().numpy()), "Gaussians"

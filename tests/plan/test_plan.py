@@ -173,13 +173,14 @@ def test_options_are_settled(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("sections", "reason"),
+    ("sections", "reason", "expected"),
     [
-        ({"init": {"method": "dense"}}, "init.method: dense"),
-        ({"export": {"formats": ["ply", "dense_maps"]}}, "export.formats: dense_maps"),
+        ({"init": {"method": "dense"}}, "init.method: dense", {"init", "train"}),
+        # An export reruns no training.
+        ({"export": {"formats": ["ply", "dense_maps"]}}, "export.formats: dense_maps", {"export"}),
     ],
 )
-def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason):
+def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason, expected):
     photos(tmp_path / "images", 3)
     plan = plan_of(tmp_path)
     assert not plan.runs("dense") and "init.method: points" in plan.stages["dense"].reason
@@ -187,7 +188,7 @@ def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason
     plan = plan_of(tmp_path, **sections)
     assert plan.runs("dense") and reason in plan.stages["dense"].reason
     readers = {name for name, stage in plan.stages.items() if "dense" in stage.inputs}
-    assert readers == set(sections)  # an export reruns no training
+    assert readers == expected
 
 
 def test_dense_initialisation_does_not_use_the_scenes_cloud(tmp_path):
@@ -424,6 +425,18 @@ def test_few_photographs_get_a_loss_on_the_depths_of_sparse_points(tmp_path, cou
     assert any("depths" in text for text in plan.stages["train"].decisions) == (
         count != 31 or wanted != "auto"
     )
+
+
+def test_depths_by_multi_view_stereo_are_used_in_one_block_only(tmp_path):
+    """Blocks are trained with sparse points alone."""
+    config = Config.model_validate({"init": {"method": "dense"}})
+    plan = make_plan(many(tmp_path, 40), config)
+    assert plan.config.train.depth_loss_weight == 0.3
+    assert any("multi-view stereo" in text for text in plan.stages["train"].decisions)
+    blocks = config.partition.model_copy(update={"blocks": 2})
+    plan = make_plan(many(tmp_path, 40), config.model_copy(update={"partition": blocks}))
+    assert plan.config.train.depth_loss_weight == 0.0
+    assert "dense" in plan.stages["init"].inputs and "dense" not in plan.stages["train"].inputs
 
 
 def test_depth_maps_are_used_with_any_number_of_photographs(tmp_path):

@@ -47,17 +47,7 @@ def select_sources(
 
 def seen_points(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.intp]]:
     """Indices of the sparse points whose tracks contain each view, ascending."""
-    points = model.points
-    owner = np.repeat(np.arange(len(points)), points.track_length)
-    order = np.argsort(points.track_image_id, kind="stable")
-    ids = points.track_image_id[order]
-    image_ids = {image.name: image_id for image_id, image in model.images.items()}
-    found = []
-    for view in views:
-        image_id = image_ids[view.name]
-        rows = order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, "right")]
-        found.append(np.unique(owner[rows]))
-    return found
+    return [np.unique(points) for points in model.observed_points(view.name for view in views)]
 
 
 class _Observations:

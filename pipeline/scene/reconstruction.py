@@ -6,7 +6,7 @@ half integers. ``pipeline.io`` converts other conventions when it reads and writ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field, replace
 
 import numpy as np
@@ -106,6 +106,20 @@ class Reconstruction:
 
     def by_name(self) -> dict[str, PosedImage]:
         return {image.name: image for image in self.images.values()}
+
+    def observed_points(self, names: Iterable[str]) -> list[NDArray[np.intp]]:
+        """For each named image, the index of the point of each of its observations, ascending."""
+        points = self.points
+        owner = np.repeat(np.arange(len(points)), points.track_length)
+        order = np.argsort(points.track_image_id, kind="stable")
+        ids = points.track_image_id[order]
+        image_ids = {image.name: image_id for image_id, image in self.images.items()}
+        found = []
+        for name in names:
+            image_id = image_ids[name]
+            first, last = np.searchsorted(ids, [image_id, image_id + 1])
+            found.append(owner[order[first:last]])
+        return found
 
 
 def with_poses(model: Reconstruction, poses: Mapping[str, NDArray[np.float64]]) -> Reconstruction:

@@ -40,16 +40,9 @@ def point_depths(views: Sequence[View], model: Reconstruction) -> list[KnownDept
     The weight of a point is its track length, at most eight: points of two views are often wrong.
     """
     points = model.points
-    owner = np.repeat(np.arange(len(points)), points.track_length)
-    order = np.argsort(points.track_image_id, kind="stable")
-    ids = points.track_image_id[order]
-    image_ids = {image.name: image_id for image_id, image in model.images.items()}
+    observed = model.observed_points(view.name for view in views)
     found = []
-    for view in views:
-        image_id = image_ids[view.name]
-        here = owner[
-            order[np.searchsorted(ids, image_id) : np.searchsorted(ids, image_id, "right")]
-        ]
+    for view, here in zip(views, observed, strict=True):
         # einsum, not a matrix product: BLAS may round differently with the number of threads.
         camera = np.einsum("ij,nj->ni", view.world_to_camera[:3, :3], points.xyz[here])
         camera += view.world_to_camera[:3, 3]

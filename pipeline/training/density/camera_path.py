@@ -1,8 +1,8 @@
 """Gaussians on the path of the cameras, which hide a view from between two photographs.
 
-A camera that moves from one photograph to the next has free space before it, and yet hardly a
-photograph contradicts a Gaussian there: it is outside of them, or a dot in a few. From the path
-between, it covers most of the image.
+The space around the straight path between neighbouring cameras is empty, but no photograph
+contradicts a Gaussian there that is outside of their images, or a few pixels of some. Seen from the
+path, it covers most of the image.
 """
 
 from __future__ import annotations
@@ -22,19 +22,20 @@ from pipeline.splats.gaussians import Gaussians
 
 #: The path joins each camera to so many of its nearest.
 NEIGHBOURS = 4
-#: Free space reaches from the path to this share of what the two views see as empty.
+#: Space is empty up to this share of the depth up to which both views see empty space.
 REACH_SHARE = 0.5
-#: A Gaussian on the path is as large as this share of its distance to it: of a usual lens, it
-#: covers most of the image from there.
+#: Smallest scale of a Gaussian that is removed, over its distance to the path: with a usual lens,
+#: it covers most of the image from there.
 MIN_SIZE = 0.3
-#: A Gaussian that explains a larger share of a training view, over its opacity, is no floater.
+#: A Gaussian that explains a larger share of the pixels of a training view, divided by its opacity,
+#: stays.
 MAX_VIEW_SHARE = 0.01
 #: More transparent Gaussians hide nothing.
 MIN_OPACITY = 0.02
 
 
 class Segment(NamedTuple):
-    """A straight part of the path, and the distance to which the space around it is free."""
+    """A straight part of the path, and the distance up to which the space around it is empty."""
 
     start: NDArray[np.float64]
     end: NDArray[np.float64]
@@ -110,7 +111,7 @@ def on_camera_path(
     candidates = torch.nonzero(large)[:, 0]
     if not len(candidates):
         return found
-    # Alone, without what is in front of them: they explain less in truth.
+    # Rendered without the Gaussians in front of them, so that the share is an upper bound.
     grey, share = in_grey(gaussians.select(candidates)), torch.zeros(len(candidates))
     for camera in cameras:
         pixel = 1 / (camera.width * camera.height)

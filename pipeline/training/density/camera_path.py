@@ -22,6 +22,9 @@ from pipeline.splats.gaussians import Gaussians
 
 #: The path joins each camera to so many of its nearest.
 NEIGHBOURS = 4
+#: Longest segment, over the depth up to which its cameras see empty space. A longer one can have a
+#: wall between them. Cameras that fly over streets are farther apart than the nearest points.
+MAX_LENGTH = 3.0
 #: Space is empty up to this share of the depth up to which both views see empty space.
 REACH_SHARE = 0.5
 #: Smallest scale of a Gaussian that is removed, over its distance to the path: with a usual lens,
@@ -43,8 +46,7 @@ class Segment(NamedTuple):
 
 
 def camera_path(centres: NDArray[np.float64], depths: NDArray[np.float64]) -> list[Segment]:
-    """The segments between neighbouring cameras. A segment is no longer than the empty space before
-    its cameras: farther cameras can have a wall between them.
+    """The segments between neighbouring cameras, up to ``MAX_LENGTH``.
 
     Args:
         centres: (V, 3) camera centres, world.
@@ -56,7 +58,7 @@ def camera_path(centres: NDArray[np.float64], depths: NDArray[np.float64]) -> li
     for first, (row, others) in enumerate(zip(distances, neighbours, strict=True)):
         for distance, second in zip(row, others, strict=True):
             empty = min(depths[first], depths[second])
-            if second != first and distance < empty:
+            if second != first and distance < MAX_LENGTH * empty:
                 pair = min(first, second), max(first, second)
                 segments[pair] = Segment(centres[pair[0]], centres[pair[1]], REACH_SHARE * empty)
     return [segments[pair] for pair in sorted(segments)]

@@ -14,6 +14,7 @@ from pipeline.render.views import raster_camera
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.camera_path import (
+    MAX_LENGTH,
     MIN_SIZE,
     NEIGHBOURS,
     REACH_SHARE,
@@ -69,9 +70,9 @@ def test_a_gaussian_that_a_training_view_shows_stays(scene: TinyScene) -> None:
 
 
 def test_no_path_leads_through_space_that_may_not_be_empty(scene: TinyScene) -> None:
-    """Without points, or between cameras farther apart than their empty space."""
+    """Without points, or between cameras that are too far apart for their empty space."""
     assert found(scene, between(scene), 0.0) == []
-    assert found(scene, between(scene), 0.5) == []
+    assert found(scene, between(scene), 0.5 / MAX_LENGTH) == []
 
 
 def test_damaged_gaussians_stay(scene: TinyScene) -> None:
@@ -107,7 +108,7 @@ def test_distances_are_those_to_the_nearest_segment_in_reach(
         assert bounds[0] - 0.01 < distance <= bounds[1] + 0.01 or bounds[0] == distance == np.inf
     for segment in segments:
         length = np.linalg.norm(segment.end - segment.start)
-        assert length <= segment.reach / REACH_SHARE
+        assert length <= MAX_LENGTH * segment.reach / REACH_SHARE
 
 
 def test_training_removes_them_at_its_end(scene: TinyScene, tmp_path: Path) -> None:

@@ -6,7 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Features, Init, Matches
+from pipeline.config.schema import Features, Init, Matches, Train
 from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION, PointCloudFiles
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -103,7 +103,12 @@ def work(job: Job) -> None:
         points = read_model(triangulated / "sparse" / "0").points
         extra = {"triangulated_points": len(points)}
     first = first_gaussians(
-        InitPoints(points, source, normals), training, config, experiments.init, job.seed
+        InitPoints(points, source, normals),
+        training,
+        config,
+        experiments.init,
+        job.seed,
+        skybox=job.section(Train).background == "skybox",
     )
     write_arrays(job.out / "gaussians.npz", first.gaussians.arrays())
     job.record(first.counters.model_copy(update=extra), first.decisions, first.warnings)
@@ -143,7 +148,7 @@ SPEC = StageSpec(
         "dense": ("dense",),
     },
     only_if={"dense": lambda config: config.init.method == "dense"},
-    options=("init", "views", "split", "features", "matches", *EXPERIMENTS),
+    options=("init", "train.background", "views", "split", "features", "matches", *EXPERIMENTS),
     packages=("pycolmap", "scipy", "opencv-contrib-python-headless"),
     seeded=True,
 )

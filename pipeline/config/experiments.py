@@ -173,6 +173,11 @@ class TrainExperiments(Section):
     adam_beta1: Annotated[float, Field(ge=0, lt=1), Unit("factor")] = Field(
         0.8, description="Adam's decay rate of the first moment (3DGS: 0.9)."
     )
+    adam_epsilon: Annotated[float, Field(ge=0), Unit("pixels")] = Field(
+        0.1,
+        description="Adam's epsilon: Gaussians that change the loss by less than so many pixels do "
+        "take smaller steps (3DGS: 0).",
+    )
     means_learning_rate_unit: Literal["gaussian_scale", "scene_scale", "camera_extent"] = Field(
         "gaussian_scale",
         description="Unit of means_learning_rate. gaussian_scale: each Gaussian's scales, along "

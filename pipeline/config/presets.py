@@ -51,6 +51,7 @@ PRESETS: dict[str, dict[str, Any]] = {
                 "alpha_loss_weight": 0.0,
                 "clamp_color_gradient": True,
                 "adam_beta1": 0.9,
+                "adam_epsilon": 0.0,
                 "means_learning_rate_unit": "camera_extent",
                 "means_learning_rate": 1.6e-4,
                 "means_final_learning_rate": 1.6e-6,

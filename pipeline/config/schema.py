@@ -306,10 +306,12 @@ class Train(Section):
         "on the machine and its load, so that results of two runs differ.",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the spherical harmonics.")
-    background: Literal["auto", "black", "white", "random"] = Field(
+    background: Literal["auto", "skybox", "black", "white", "random"] = Field(
         "auto",
-        description="Background colour. auto: white if images have alpha, else black; random: "
-        "another colour in each step.",
+        description="What is behind the scene. skybox: Gaussians on a distant sphere, which become "
+        "the sky and fill what no photograph shows; random: another colour in each step; auto: "
+        "white if images have alpha, black if there are masks or with strategy: original, else "
+        "skybox.",
     )
     exposure: Literal["auto", "on", "off"] = Field(
         "auto",

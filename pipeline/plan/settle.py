@@ -213,8 +213,13 @@ def _background(scan: Scan, config: Config) -> Choice:
         return wanted, f"{wanted} background, as configured"
     if 2 * scan.num_alpha > len(scan.planned):
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
-    few = f"only {scan.num_alpha} photographs have alpha" if scan.num_alpha else "no alpha"
-    return "black", f"black background: {few}"
+    if scan.num_alpha:
+        return "black", f"black background: only {scan.num_alpha} photographs have alpha"
+    if scan.num_masks and config.views.masks != "ignore":
+        return "black", "black background: masks exclude what is behind the scene"
+    if config.train.density.strategy == "original":
+        return "black", "black background, as published"
+    return "skybox", "a skybox behind the scene: neither alpha nor masks"
 
 
 def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:

@@ -14,6 +14,7 @@ from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.counters import InitCounters
 from pipeline.splats.init import InitGaussians, gaussians_from_points, gaussians_random
+from pipeline.splats.skybox import NUM_GAUSSIANS, with_skybox
 
 # With fewer sparse points than this, Gaussians are initialised at random.
 MIN_POINTS = 100
@@ -49,6 +50,7 @@ def first_gaussians(
     config: Init,
     experiments: InitExperiments,
     seed: int,
+    skybox: bool = False,
 ) -> FirstGaussians:
     """Initialise Gaussians from points, or at random if ``config.method`` is
     "random" or there are fewer than ``MIN_POINTS``.
@@ -56,22 +58,27 @@ def first_gaussians(
     Args:
         training: the training views, for random initialisation and the scale of the scene.
         seed: of random initialisation.
+        skybox: whether to add one behind the Gaussians (``pipeline.splats.skybox``).
     """
     points, source = init.points, init.source
     method, warnings = config.method, []
     if method != "random" and len(points) < MIN_POINTS:
         warnings = [f"only {len(points)} sparse points: Gaussians are initialised at random"]
         method = "random"
+    centres = np.array([view.centre for view in training])
     if method == "random":
         first = gaussians_random(list(training), 0, seed, experiments)
     else:
-        centres = np.array([view.centre for view in training])
         first = gaussians_from_points(points, centres, config, 0, experiments, init.normals)
     source = "random positions" if method == "random" else source
+    decisions = [f"{len(first)} Gaussians from {source}"]
+    if skybox:
+        first = with_skybox(first, centres)
+        decisions.append(f"{NUM_GAUSSIANS} Gaussians of a skybox behind them")
     counters = InitCounters(
         num_gaussians=len(first),
         points=len(points),
         dropped=first.num_dropped,
         thinned=first.num_thinned,
     )
-    return FirstGaussians(first, counters, [f"{len(first)} Gaussians from {source}"], warnings)
+    return FirstGaussians(first, counters, decisions, warnings)

@@ -89,7 +89,7 @@ def gaussians_from_points(
     # The squares of larger coordinates overflow float32.
     usable = np.isfinite(points.xyz).all(1) & (np.abs(points.xyz) < 1e18).all(1)
     chosen = np.flatnonzero(usable)
-    distance = _nearest_distance(points.xyz[chosen], camera_centres)
+    distance = nearest_distance(points.xyz[chosen], camera_centres)
     median = float(np.median(distance)) if len(chosen) else 0.0
     inside = (distance >= TOO_NEAR * median) & (distance <= TOO_FAR * median)
     chosen, distance = chosen[inside], distance[inside]
@@ -113,12 +113,12 @@ def gaussians_from_points(
         else np.full(1, LONE_ANGLE * median)
     )
     colour = points.rgb[chosen].astype(np.float64) / 255.0
-    result = _isotropic(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
+    result = isotropic(xyz, _clamp(spacing, distance), colour, experiments.opacity, sh_degree)
     if len(xyz) > NEIGHBOURS:
         result.quats[:] = _normal_rotations(xyz, neighbours)
     if normals is not None:
         known = np.isfinite(normals[chosen]).all(1)
-        result.quats[known] = _rotations_to(normals[chosen[known]])
+        result.quats[known] = rotations_to(normals[chosen[known]])
         result.log_scales[known, 0] += np.float32(np.log(FLATNESS))
     result.num_dropped, result.num_thinned = num_dropped, num_thinned
     return result
@@ -150,12 +150,12 @@ def gaussians_random(
         xyz[1::2] = cube[1::2]
     else:
         xyz = _in_frustums(views, scene_extent(list(views)), count, generator)
-    distance = _nearest_distance(xyz, centres)
+    distance = nearest_distance(xyz, centres)
     k = min(NEIGHBOURS, count - 1)
     spacing = cKDTree(xyz).query(xyz, k + 1)[0][:, 1:].mean(1) if k else LONE_ANGLE * distance
     colour = generator.random((count, 3))
     opacity = min(experiments.opacity, RANDOM_OPACITY)
-    return _isotropic(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
+    return isotropic(xyz, _clamp(spacing, distance), colour, opacity, sh_degree)
 
 
 def _common_ball(
@@ -197,9 +197,7 @@ def _in_frustums(
     return centres + np.einsum("nij,ni->nj", rotation, ray * depth[:, None])
 
 
-def _nearest_distance(
-    xyz: NDArray[np.float64], centres: NDArray[np.float64]
-) -> NDArray[np.float64]:
+def nearest_distance(xyz: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
     """(P,) distance of each point to the nearest camera."""
     from scipy.spatial import cKDTree
 
@@ -221,7 +219,7 @@ def _normal_rotations(
     return rotation_to_quat(axes)
 
 
-def _rotations_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
+def rotations_to(normals: NDArray[np.float64]) -> NDArray[np.float64]:
     """(N, 4) quaternions (wxyz) whose first axis is the normal (N, 3).
 
     The other axes are orthonormal (Duff et al. 2017, "Building an Orthonormal Basis, Revisited").
@@ -241,7 +239,7 @@ def _clamp(spacing: NDArray[np.float64], distance: NDArray[np.float64]) -> NDArr
     return np.maximum(scale, 1e-12)
 
 
-def _isotropic(
+def isotropic(
     xyz: NDArray[np.float64],
     scale: NDArray[np.float64],
     colour: NDArray[np.float64],

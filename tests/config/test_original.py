@@ -31,6 +31,7 @@ PUBLISHED = {
     "scaling_lr": (RATES.scales_learning_rate, 0.005),
     "rotation_lr": (RATES.quats_learning_rate, 0.001),
     "Adam's first beta": (RATES.adam_beta1, 0.9),
+    "Adam's epsilon": (RATES.adam_epsilon, 0.0),
     "initial opacity": (CONFIG.experiments.init.opacity, 0.1),
     "densify_from_iter": (DENSITY.start_step, 500),
     "densify_until_iter": (original.UNTIL_STEP, 15_000),

@@ -169,7 +169,21 @@ def test_options_are_settled(tmp_path):
     assert config.inspect.image_folder == "images"
     assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
     assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
-    assert (config.init.method, config.train.background) == ("points", "black")
+    assert (config.init.method, config.train.background) == ("points", "skybox")
+
+
+def test_no_skybox_behind_masks_alpha_or_the_published_method(tmp_path):
+    photos(tmp_path / "images", 2)
+    original = plan_of(tmp_path, train={"density": {"strategy": "original"}})
+    assert original.config.train.background == "black"
+    picture(tmp_path / "images" / "p.png", mode="RGBA")
+    assert plan_of(tmp_path).config.train.background == "black"
+    (tmp_path / "images" / "p.png").unlink()
+    (tmp_path / "masks").mkdir()
+    first = min((tmp_path / "images").iterdir()).stem
+    picture(tmp_path / "masks" / f"{first}.png", mode="L")
+    assert plan_of(tmp_path).config.train.background == "black"
+    assert plan_of(tmp_path, views={"masks": "ignore"}).config.train.background == "skybox"
 
 
 @pytest.mark.parametrize(

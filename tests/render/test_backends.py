@@ -187,7 +187,7 @@ def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> 
             each.frame_adam(m, q, log_scales, d_means, d_quats, adam)
 
         def harmonics(s: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
-            adam = ShAdam(a, b, last.clone(), 0.01, 0.002, 6)
+            adam = ShAdam(a, b, last.clone(), 0.01, 0.002, 6, eps=0.01)
             drawn = each.forward(*scene[:4], s, CAMERA, OPTIONS)
             gradients = each.backward(drawn, noise(22, 31, 3), sh_adam=adam)
             assert len(gradients.sh) == 0

@@ -129,6 +129,7 @@ FLIPS = {
     f"{_T}.max_pose_change": Flip(1e-6, under(poses="keep", train__refine_poses=True)),
     f"{_T}.max_intrinsics_change": Flip(1e-6, under(poses="keep", train__refine_intrinsics=True)),
     f"{_T}.adam_beta1": Flip(0.9, POSED),
+    f"{_T}.adam_epsilon": Flip(0.0, POSED),
     f"{_T}.means_learning_rate_unit": Flip("camera_extent", POSED),
     f"{_T}.learning_rate_factor": Flip(1.0, POSED),
     f"{_G}.start_step": Flip(3000, POSED),

@@ -28,7 +28,7 @@ from pipeline.training.data.targets import Target, Targets
 from pipeline.training.density import make_strategy
 from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.state import TrainState
-from pipeline.training.optimisers.adam import Adam
+from pipeline.training.optimisers.adam import Adam, AdamOptions
 
 Warn = Callable[[str], None]
 
@@ -98,6 +98,8 @@ def load_scene(
     background = config.background
     if background == "auto":
         background = "white" if targets.have_alpha else "black"
+    if background == "skybox":
+        background = "black"  # Behind the Gaussians of the skybox.
     gains = None if inputs.gains is None else torch.from_numpy(inputs.gains.astype(np.float32))
     return TrainingScene(inputs, targets, gains, background, near)
 
@@ -140,7 +142,8 @@ def initial_state(
     cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, config, experiments)
     order = rng.permutation(len(scene.views))
     own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
-    adam = Adam(gaussians, experiments.adam_beta1, own_frames, backend)
+    options = AdamOptions(experiments.adam_beta1, own_frames, experiments.adam_epsilon)
+    adam = Adam(gaussians, options, backend)
     return TrainState(gaussians, adam, density, cameras, rng, order, clock=start)
 
 

@@ -145,7 +145,7 @@ class TrainState:
         """Restore the state that ``arrays()`` and ``values()`` returned."""
         self.step, self.order = step, arrays["order"]
         self.gaussians = gaussians_of(arrays)
-        self.adam = Adam(self.gaussians, self.adam.beta1, self.adam.own_frames, self.adam.backend)
+        self.adam = Adam(self.gaussians, self.adam.options, self.adam.backend)
         for name in self.gaussians.tensors():
             self.adam.first[name] = torch.from_numpy(arrays[f"first.{name}"])
             self.adam.second[name] = torch.from_numpy(arrays[f"second.{name}"])

@@ -22,6 +22,7 @@ from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
 from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS, alpha_gradient
 from pipeline.training.losses.depth import depth_gradients
+from pipeline.training.optimisers.adam import AdamStep
 
 # PSNR is computed in some of the steps only: it takes a pass over the image.
 PSNR_INTERVAL = 10
@@ -73,6 +74,7 @@ class Trainer:
         rates = self.schedule.learning_rates(
             state.clock, run_length, self.rate_unit, warm_up(self.part, state.step)
         )
+        adam_step = AdamStep(state.step, rates, camera.width * camera.height)
         gradients = self.backend.backward(
             rendered,
             d_color,
@@ -80,14 +82,14 @@ class Trainer:
             d_depth,
             means2d_abs=state.density.needs_absolute_gradients,
             camera=state.cameras.enabled,
-            sh_adam=state.adam.harmonics(rates, state.step),
+            sh_adam=state.adam.harmonics(adam_step),
         )
         if gradients.camera is not None:
             state.cameras.step(index, camera, gradients.camera, self.camera_rate)
         if self.experiments.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
         state.density.before_step(state.gaussians, rendered, gradients)
-        state.adam.step(state.gaussians, gradients, rates, state.step, self.threads)
+        state.adam.step(state.gaussians, gradients, adam_step, self.threads)
         self.control_density(steps, run_length)
 
     def color_loss(

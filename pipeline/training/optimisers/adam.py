@@ -33,13 +33,43 @@ class Rates:
     shN: float
 
 
+@dataclass(frozen=True)
+class AdamStep:
+    """One optimiser step.
+
+    Attributes:
+        number: counts from 1.
+        pixels: number of pixels of the image. The loss is a mean over them and three channels.
+    """
+
+    number: int
+    rates: Rates
+    pixels: int
+
+
+@dataclass(frozen=True)
+class AdamOptions:
+    """What does not change during a run.
+
+    Attributes:
+        beta1: decay rate of the first moment.
+        own_frames: update means along, and rotations about, each Gaussian's own axes.
+        epsilon: pixels. Gaussians that change the loss by less than so many pixels do, because
+            others hide them or they are small, take smaller steps: their gradients are noise, and
+            Adam's steps do not depend on a gradient's size.
+    """
+
+    beta1: float
+    own_frames: bool
+    epsilon: float = 0.0
+
+
 class Adam:
     """First and second moments of each row of ``Gaussians``.
 
     Attributes:
-        beta1: decay rate of the first moment.
+        options: of the run.
         backend: performs the updates.
-        own_frames: update means along, and rotations about, each Gaussian's own axes.
         first, second: moments by the name of the array, of its shape, float32. With ``own_frames``,
             those of quaternions are (N, 3), about the axes. Without, the second moments of means
             and quaternions are (N, 1), shared by their components. Either way, results do not
@@ -47,16 +77,14 @@ class Adam:
         last: (N,) int32, the last step in which each row had a gradient.
     """
 
-    def __init__(
-        self, gaussians: Gaussians, beta1: float, own_frames: bool, backend: Backend | None = None
-    ):
+    def __init__(self, gaussians: Gaussians, options: AdamOptions, backend: Backend | None = None):
         self.backend = backend or make_backend()
-        self.beta1, self.own_frames = beta1, own_frames
+        self.options = options
         tensors = gaussians.tensors()
         self.first = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         self.second = {name: torch.zeros_like(tensor) for name, tensor in tensors.items()}
         count = len(gaussians)
-        if own_frames:
+        if options.own_frames:
             self.first["quats"] = torch.zeros(count, 3)
             self.second["quats"] = torch.zeros(count, 3)
         else:
@@ -64,38 +92,44 @@ class Adam:
             self.second["quats"] = torch.zeros(count, 1)
         self.last = torch.zeros(count, dtype=torch.int32)
 
-    def harmonics(self, rates: Rates, step: int) -> ShAdam:
-        """Arguments of ``backward``, which updates ``sh``; ``step`` counts from 1."""
+    def harmonics(self, step: AdamStep) -> ShAdam:
+        """Arguments of ``backward``, which updates ``sh``."""
         return ShAdam(
-            self.first["sh"], self.second["sh"], self.last, rates.sh0, rates.shN, step,
-            self.beta1, BETA2, EPSILON,
+            self.first["sh"], self.second["sh"], self.last, step.rates.sh0, step.rates.shN,
+            step.number, self.options.beta1, BETA2, self.epsilon(step),
         )  # fmt: skip
 
     def step(
-        self, gaussians: Gaussians, gradients: Gradients, rates: Rates, step: int, threads: int
+        self, gaussians: Gaussians, gradients: Gradients, step: AdamStep, threads: int
     ) -> None:
-        """Update all arrays but ``sh``, in place; ``step`` counts from 1."""
+        """Update all arrays but ``sh``, in place."""
         updated = {"sh"}
-        if self.own_frames:
+        if self.options.own_frames:
             updated |= {"means", "quats"}
             self.backend.frame_adam(
                 gaussians.means, gaussians.quats, gaussians.log_scales, gradients.means,
-                gradients.quats, self.frames(rates, step), threads,
+                gradients.quats, self.frames(step), threads,
             )  # fmt: skip
         for name, parameter in gaussians.tensors().items():
             if name in updated:
                 continue
+            # The gradient of means that move along the world's axes has another unit.
+            epsilon = EPSILON if name == "means" else self.epsilon(step)
             adam = DenseAdam(
-                self.first[name], self.second[name], getattr(rates, name), step, self.beta1, BETA2,
-                EPSILON,
+                self.first[name], self.second[name], getattr(step.rates, name), step.number,
+                self.options.beta1, BETA2, epsilon,
             )  # fmt: skip
             self.backend.adam_step(parameter, getattr(gradients, name), adam, threads)
 
-    def frames(self, rates: Rates, step: int) -> FrameAdam:
+    def frames(self, step: AdamStep) -> FrameAdam:
         return FrameAdam(
             self.first["means"], self.second["means"], self.first["quats"], self.second["quats"],
-            rates.means, rates.quats, step, self.beta1, BETA2, EPSILON,
+            step.rates.means, step.rates.quats, step.number, self.options.beta1, BETA2,
+            self.epsilon(step),
         )  # fmt: skip
+
+    def epsilon(self, step: AdamStep) -> float:
+        return max(self.options.epsilon / (3 * step.pixels), EPSILON)
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""

@@ -25,14 +25,14 @@ from pipeline.training.density.gradient import (
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
 from pipeline.training.density.strategy import rotations
-from pipeline.training.optimisers.adam import Adam
+from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
 
 
 def marked(count: int) -> tuple[Gaussians, Adam]:
     """Gaussians with moments that are equal to their row's number, from 1."""
     gaussians = ball(count, 0)
-    adam = Adam(gaussians, beta1=0.8, own_frames=True)
+    adam = Adam(gaussians, AdamOptions(0.8, own_frames=True))
     for moments in (adam.first, adam.second):
         for tensor in moments.values():
             tensor += torch.arange(1, count + 1).view(-1, *[1] * (tensor.ndim - 1))
@@ -130,7 +130,7 @@ def test_a_split_keeps_the_mean_and_shrinks() -> None:
     one = ball(1, 4)
     count = 20_000
     gaussians = one.select(torch.zeros(count, dtype=torch.int64))
-    adam = Adam(gaussians, beta1=0.8, own_frames=True)
+    adam = Adam(gaussians, AdamOptions(0.8, own_frames=True))
     density = strategy(count, split_scale=0.0)
     density.gradient_sum += 1.0
     result = refine(density, gaussians, adam)

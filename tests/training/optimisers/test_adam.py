@@ -10,7 +10,7 @@ import torch
 from pipeline.render import DenseAdam, FrameAdam, RasterOptions, backward, forward
 from pipeline.render import reference as float64
 from pipeline.render.views import raster_camera
-from pipeline.training.optimisers.adam import Adam, Rates
+from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep, Rates
 from tests.training.conftest import ball, camera_at
 
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=2e-2, shN=1e-3)
@@ -20,7 +20,7 @@ RATES = Rates(means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=
 @pytest.mark.parametrize("degree", [0, 1])
 def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool) -> None:
     gaussians = ball(37, 0).with_sh_degree(degree)
-    adam = Adam(gaussians, 0.8, own_frames)
+    adam = Adam(gaussians, AdamOptions(0.8, own_frames))
     leaves = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
     shared = {"means": torch.zeros(37, 1), "quats": torch.zeros(37, 1)}
     frames = FrameAdam(*torch.zeros(4, 37, 3), RATES.means, RATES.quats, 0, 0.8)
@@ -54,8 +54,37 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
                 rate, gradient = getattr(RATES, name), getattr(gradients, name)
                 moments = DenseAdam(first[name], second, rate, step, 0.8)
                 float64.adam_step(leaves[name], gradient, moments)
-        backward(drawn, d_color, sh_adam=adam.harmonics(RATES, step))
-        adam.step(gaussians, gradients, RATES, step, 1)
+        backward(drawn, d_color, sh_adam=adam.harmonics(AdamStep(step, RATES, 1)))
+        adam.step(gaussians, gradients, AdamStep(step, RATES, 1), 1)
     leaves["sh"] = torch.cat([dc, rest], 1)
     for name, tensor in gaussians.tensors().items():
         assert torch.allclose(tensor, leaves[name], rtol=1e-5, atol=1e-5), name
+
+
+def first_step(epsilon: float) -> dict[str, torch.Tensor]:
+    """The largest change of each Gaussian's parameters (N,) by one step at a view of the ball, of
+    which the first Gaussian is nearly transparent."""
+    gaussians = ball(37, 0)
+    gaussians.opacity_logits[0] = -5.0
+    before = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
+    adam = Adam(gaussians, AdamOptions(0.8, True, epsilon))
+    camera, options = raster_camera(camera_at(0.3)), RasterOptions(sh_degree=0)
+    drawn = forward(*gaussians.parameters(), camera, options)
+    step = AdamStep(1, RATES, camera.width * camera.height)
+    # As of the loss: a mean over all pixels and channels.
+    d_color = torch.full_like(drawn.color, 1 / (3 * step.pixels))
+    gradients = backward(drawn, d_color)
+    backward(drawn, d_color, sh_adam=adam.harmonics(step))
+    adam.step(gaussians, gradients, step, 1)
+    return {
+        name: (tensor - before[name]).abs().reshape(37, -1).amax(1)
+        for name, tensor in gaussians.tensors().items()
+    }
+
+
+def test_gaussians_that_hardly_show_change_less() -> None:
+    usual, damped = first_step(0.0), first_step(0.1)
+    for name in usual:
+        change = damped[name] / usual[name]
+        assert change[0] < 0.6 and change[0] < 0.7 * change[1:].median(), name
+    assert (damped["sh"][1:] > 0.6 * usual["sh"][1:]).all()

@@ -1,0 +1,96 @@
+"""Gaussians on a sphere around the scene, behind all others (a skybox, as in Kerbl et al. 2024,
+"A Hierarchical 3D Gaussian Representation for Real-Time Rendering of Very Large Datasets").
+
+They become the sky. Where no photograph looks they stay as they are: the colour of the nearest
+points instead of a hole. Uses numpy and scipy, not torch.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.splats.arrays import NAMES
+from pipeline.splats.init import (
+    FLATNESS,
+    SH_C0,
+    InitGaussians,
+    isotropic,
+    nearest_distance,
+    rotations_to,
+)
+
+# Number of Gaussians: one every 9 degrees, which density control splits where sky has detail.
+NUM_GAUSSIANS = 500
+# Radius: this many times the depth of all but so many of the points.
+RADIUS, DEPTH_QUANTILE = 10.0, 0.95
+# Cameras and points can be in one place.
+MIN_DEPTH = 1e-12
+# Standard deviation, in distances of neighbours. Smaller ones leave gaps.
+SPREAD = 0.7
+# They must hide the background before training has seen them.
+OPACITY = 0.95
+# The colour of a Gaussian is a mean over this many points, the nearest in direction.
+NUM_POINTS = 16
+
+
+def with_skybox(gaussians: InitGaussians, camera_centres: NDArray[np.float64]) -> InitGaussians:
+    """The Gaussians, followed by those of a skybox, flat along the rays from its centre.
+
+    Args:
+        camera_centres: (C, 3) float64 in world coordinates.
+    """
+    xyz = gaussians.means.astype(np.float64)
+    centre = camera_centres.mean(0)
+    depth = np.quantile(nearest_distance(xyz, camera_centres), DEPTH_QUANTILE)
+    outermost = np.linalg.norm(camera_centres - centre, axis=1).max()
+    radius = RADIUS * max(depth, outermost, MIN_DEPTH)
+    directions = fibonacci_sphere(NUM_GAUSSIANS)
+    colours = np.clip(0.5 + SH_C0 * gaussians.sh[:, 0].astype(np.float64), 0, 1)
+    scale = np.full(NUM_GAUSSIANS, SPREAD * radius * np.sqrt(4 * np.pi / NUM_GAUSSIANS))
+    sky = isotropic(
+        centre + radius * directions,
+        scale,
+        colours_towards(directions, centre, xyz, colours),
+        OPACITY,
+        gaussians.sh_degree,
+    )
+    sky.quats[:] = rotations_to(directions)
+    sky.log_scales[:, 0] += np.float32(np.log(FLATNESS))
+    arrays, added = gaussians.arrays(), sky.arrays()
+    both = {name: np.concatenate([arrays[name], added[name]]) for name in NAMES}
+    return InitGaussians(
+        **both, num_dropped=gaussians.num_dropped, num_thinned=gaussians.num_thinned
+    )
+
+
+def fibonacci_sphere(count: int) -> NDArray[np.float64]:
+    """(count, 3) unit vectors, evenly distributed: equal steps along an axis, turned by the golden
+    angle (González 2010, "Measurement of areas on a sphere using Fibonacci and latitude-longitude
+    lattices")."""
+    steps = np.arange(count) + 0.5
+    z = 1 - 2 * steps / count
+    angle = np.pi * (1 + 5**0.5) * steps
+    across = np.sqrt(1 - z**2)
+    return np.stack([across * np.cos(angle), across * np.sin(angle), z], 1)
+
+
+def colours_towards(
+    directions: NDArray[np.float64],
+    centre: NDArray[np.float64],
+    xyz: NDArray[np.float64],
+    colours: NDArray[np.float64],
+) -> NDArray[np.float64]:
+    """(D, 3) colour of the points (P, 3) nearest to each direction (D, 3), as seen from ``centre``.
+
+    Nearer ones count more, by a Gaussian of which the farthest is two standard deviations away.
+    """
+    from scipy.spatial import cKDTree
+
+    rays = xyz - centre
+    rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), np.finfo(float).tiny)
+    count = min(NUM_POINTS, len(rays))
+    distances, nearest = cKDTree(rays).query(directions, [*range(1, count + 1)])
+    farthest = np.maximum(distances[:, -1:], np.finfo(float).tiny)
+    weights = np.exp(-0.5 * (2 * distances / farthest) ** 2)[:, :, None]
+    return (weights * colours[nearest]).sum(1) / weights.sum(1)

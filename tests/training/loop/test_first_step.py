@@ -23,6 +23,7 @@ RATES = {
     "quats_learning_rate": 3e-3,
     "opacities_learning_rate": 5e-3,
     "sh0_learning_rate": 7e-3,
+    "adam_epsilon": 0.0,
     "learning_rate_factor": 2.0,
     "learning_rate_final_factor": 1.0,
 }

@@ -7,6 +7,9 @@ points instead of a hole. Uses numpy and scipy, not torch.
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -26,6 +29,8 @@ NUM_GAUSSIANS = 500
 RADIUS, DEPTH_QUANTILE = 10.0, 0.95
 # Cameras and points can be in one place.
 MIN_DEPTH = 1e-12
+# The sky is this many times as far from the cameras as half of the scene.
+SKY_DISTANCE = 5.0
 # Standard deviation, in distances of neighbours. Smaller ones leave gaps.
 SPREAD = 0.7
 # They must hide the background before training has seen them.
@@ -62,6 +67,31 @@ def with_skybox(gaussians: InitGaussians, camera_centres: NDArray[np.float64]) -
     return InitGaussians(
         **both, num_dropped=gaussians.num_dropped, num_thinned=gaussians.num_thinned
     )
+
+
+@dataclass(frozen=True)
+class Sky:
+    """What is much farther from the cameras than the scene: the skybox, also after training has
+    moved and split it.
+
+    Attributes:
+        camera_centres: (C, 3) float64 in world coordinates.
+    """
+
+    camera_centres: NDArray[np.float64]
+
+    def contains(
+        self, means: NDArray[Any], weights: NDArray[np.float64] | None = None
+    ) -> NDArray[np.bool_]:
+        """(N,) whether Gaussians at these means (N, 3) are sky: over ``SKY_DISTANCE`` times as far
+        away as half of all, by number or by ``weights`` (N,)."""
+        finite = np.isfinite(means).all(1)
+        distance = np.zeros(len(means))
+        distance[finite] = nearest_distance(means[finite].astype(np.float64), self.camera_centres)
+        order = np.argsort(distance, kind="stable")
+        total = np.cumsum(np.ones(len(order)) if weights is None else weights[order])
+        middle = distance[order[np.searchsorted(total, 0.5 * total[-1])]]
+        return np.asarray(distance > SKY_DISTANCE * middle)
 
 
 def fibonacci_sphere(count: int) -> NDArray[np.float64]:

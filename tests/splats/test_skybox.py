@@ -16,7 +16,7 @@ from pipeline.render.views import raster_camera
 from pipeline.runtime.errors import UserError
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import InitGaussians, gaussians_from_points
-from pipeline.splats.skybox import NUM_GAUSSIANS, RADIUS, fibonacci_sphere, with_skybox
+from pipeline.splats.skybox import NUM_GAUSSIANS, RADIUS, Sky, fibonacci_sphere, with_skybox
 from tests.splats.test_init import CENTRES, assert_valid, coordinate, looking_at, points_at
 
 RED, BLUE = (255, 0, 0), (0, 0, 255)
@@ -79,3 +79,13 @@ def test_it_is_finite_for_any_points(rows: list) -> None:
 def test_cameras_and_points_in_one_place_do_not_make_it_infinite() -> None:
     gaussians = replace(scene(), means=np.zeros((300, 3), np.float32))
     assert_valid(with_skybox(gaussians, np.zeros((2, 3))))
+
+
+def test_the_sky_is_the_skybox_and_nothing_else() -> None:
+    gaussians = with_skybox(scene(), CENTRES)
+    gaussians.means[3] = np.nan
+    expected = np.arange(len(gaussians)) >= len(gaussians) - NUM_GAUSSIANS
+    weights = np.where(expected, 0.1, 1.0)
+    assert np.array_equal(Sky(CENTRES).contains(gaussians.means, weights), expected)
+    many = with_skybox(scene(600), CENTRES).means
+    assert np.array_equal(Sky(CENTRES).contains(many), np.arange(len(many)) >= 600)

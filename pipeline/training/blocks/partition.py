@@ -15,7 +15,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 
 from pipeline.config.schema import Train
 from pipeline.plan.budget import TRAINING_PIXELS_PER_GAUSSIAN
@@ -26,6 +25,7 @@ from pipeline.scene.blocks import Block, BlockView, Box, Partition, bounds_of
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, scene_extent, scene_up
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.skybox import Sky
 from pipeline.training.blocks.shares import IMAGE_FACTOR, SHOWN_SHARE, explained_shares
 from pipeline.training.data.targets import usable_factor
 
@@ -45,8 +45,6 @@ MARGIN_SHARE, MIN_MARGIN, MAX_MARGIN = 0.9, 0.01, 0.1
 EXTENT_QUANTILES = 0.02, 0.98
 # The far field begins at this distance from the scene, in extents of the scene.
 FAR_SHARE = 0.5
-# What is this many times as far from the cameras as half of the explained pixels is the sky.
-SKY_DISTANCE = 5.0
 MIN_BLOCK_GAUSSIANS = 1000
 # Views that look through the region of a block in this share of their pixels, outside of their
 # window, are its overviews. One in so many reduced pixels is examined, in both directions.
@@ -148,7 +146,9 @@ def make_partition(
     pixels = np.zeros(len(coarse))
     for camera in cameras:
         pixels += contributions(grey, camera, raster, factor**2, backend).numpy()
-    pixels[_is_sky(coarse, views, pixels)] = 0
+    # The sky fills many pixels and would decide the division.
+    sky = Sky(np.array([view.centre for view in views]))
+    pixels[sky.contains(coarse.means.numpy(), pixels)] = 0
     whole = Box(options.axes, np.full(3, -np.inf), np.full(3, np.inf))
     local = whole.along_axes(coarse.means.numpy())
     reach = 3 * coarse.log_scales.amax(1).exp().double().numpy()
@@ -177,13 +177,6 @@ def make_partition(
             for cell, margin, region, found in zip(cells, margins, regions, shares, strict=True)
         ),
     )
-
-
-def _is_sky(coarse: Gaussians, views: Sequence[View], pixels: Array) -> NDArray[np.bool_]:
-    """(N,) whether each Gaussian, which explains so many pixels (N,), is much farther than the
-    scene. The sky fills many pixels and would decide the division."""
-    distance = KDTree([view.centre for view in views]).query(coarse.means.double().numpy())[0]
-    return np.asarray(distance > SKY_DISTANCE * _quantile(distance, pixels, 0.5))
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Gradient, Mcmc, Original
+from pipeline.splats.skybox import Sky
 from pipeline.training.density.gradient import GradientDensity
 from pipeline.training.density.mcmc import McmcDensity
 from pipeline.training.density.original import OriginalDensity
@@ -24,6 +25,7 @@ def make_strategy(
     steps: int,
     scale: float,
     extent: float,
+    sky: Sky | None = None,
 ) -> Strategy:
     """The strategy that ``config`` names.
 
@@ -31,6 +33,7 @@ def make_strategy(
         steps: length of the schedule.
         scale: size of the scene (``training.data.known_depths.scene_scale``), world units.
         extent: 3DGS's size of the scene (``scene.views.scene_extent``), world units.
+        sky: None without a skybox.
     """
     match config:
         case Mcmc():
@@ -41,4 +44,4 @@ def make_strategy(
             options = experiments.gradient
             if experiments.isotropic:  # a sphere has no longest axis
                 options = options.model_copy(update={"split_kind": "sampled"})
-            return GradientDensity(options, steps, scale)
+            return GradientDensity(options, steps, scale, sky)

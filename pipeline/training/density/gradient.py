@@ -18,6 +18,7 @@ from torch import Tensor
 from pipeline.config.experiments import GradientExperiments
 from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.skybox import Sky
 from pipeline.training.density.strategy import Changes, Strategy, not_finite, rotations
 from pipeline.training.density.timeline import Timeline, shrunk
 from pipeline.training.optimisers.adam import Adam
@@ -43,6 +44,7 @@ class GradientDensity(Strategy):
         steps: length of the schedule.
         scale: size of the scene (``training.data.known_depths.scene_scale``): the unit of
             thresholds of scales.
+        sky: is neither too large nor reset. None without a skybox.
         reset_interval: steps between opacity resets.
         gradient_sum: (N,) float32, sum of the norms of the gradients of the projected centres, in
             normalised device coordinates (independent of the resolution).
@@ -52,6 +54,7 @@ class GradientDensity(Strategy):
     options: GradientExperiments
     steps: int
     scale: float
+    sky: Sky | None = None
     timeline: Timeline = field(init=False)
     reset_interval: int = field(init=False)
     gradient_sum: Tensor = field(default_factory=lambda: torch.zeros(0))
@@ -148,7 +151,9 @@ class GradientDensity(Strategy):
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
         """Limit every opacity to ``RESET_OPACITY``; those of useful Gaussians recover."""
-        gaussians.opacity_logits.clamp_(max=math.log(RESET_OPACITY / (1 - RESET_OPACITY)))
+        limit = torch.full_like(gaussians.opacity_logits, math.inf)
+        limit[~self._sky(gaussians)] = math.log(RESET_OPACITY / (1 - RESET_OPACITY))
+        torch.minimum(gaussians.opacity_logits, limit, out=gaussians.opacity_logits)
         adam.forget("opacity_logits")
 
     def arrays(self) -> dict[str, NDArray[Any]]:
@@ -162,8 +167,14 @@ class GradientDensity(Strategy):
         """(N,) bool: too transparent, too large (``prune_large``), or not finite."""
         useless = torch.sigmoid(gaussians.opacity_logits) < self.options.prune_opacity
         if prune_large:
-            useless |= self._longest(gaussians) > self.options.prune_scale * self.scale
+            large = self._longest(gaussians) > self.options.prune_scale * self.scale
+            useless |= large & ~self._sky(gaussians)
         return useless | not_finite(gaussians)
+
+    def _sky(self, gaussians: Gaussians) -> Tensor:
+        if self.sky is None:
+            return torch.zeros(len(gaussians), dtype=torch.bool)
+        return torch.from_numpy(self.sky.contains(gaussians.means.numpy()))
 
     def _large(self, gaussians: Gaussians) -> Tensor:
         """(N,) bool: Gaussians that are split rather than cloned."""

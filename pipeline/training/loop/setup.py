@@ -21,6 +21,7 @@ from pipeline.runtime.memory import release_free_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
+from pipeline.splats.skybox import Sky
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
 from pipeline.training.data.inputs import Inputs
@@ -43,6 +44,7 @@ class TrainingScene:
         gains: (V, 3) float32 factors of the renders, or None.
         background: black, white or random.
         near: near plane, world units.
+        sky: None without a skybox.
     """
 
     inputs: Inputs
@@ -50,6 +52,7 @@ class TrainingScene:
     gains: Tensor | None
     background: str
     near: float
+    sky: Sky | None
     _cameras: dict[tuple[int, int], RasterCamera] = field(default_factory=dict)
 
     @property
@@ -98,10 +101,12 @@ def load_scene(
     background = config.background
     if background == "auto":
         background = "white" if targets.have_alpha else "black"
+    sky = None
     if background == "skybox":
         background = "black"  # Behind the Gaussians of the skybox.
+        sky = Sky(np.array([view.centre for view in inputs.views]))
     gains = None if inputs.gains is None else torch.from_numpy(inputs.gains.astype(np.float32))
-    return TrainingScene(inputs, targets, gains, background, near)
+    return TrainingScene(inputs, targets, gains, background, near, sky)
 
 
 def choose_image_store(
@@ -136,7 +141,12 @@ def initial_state(
     # A copy: the initial Gaussians stay as they are.
     gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
     density = make_strategy(
-        config.density, experiments, steps=steps, scale=inputs.size, extent=inputs.extent
+        config.density,
+        experiments,
+        steps=steps,
+        scale=inputs.size,
+        extent=inputs.extent,
+        sky=scene.sky,
     )
     density.start(len(gaussians))
     cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, config, experiments)

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import morton_order
+from pipeline.splats.skybox import Sky
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.density import Changes, Strategy
 from pipeline.training.loop.curve import CurveRecord
@@ -93,15 +94,19 @@ class TrainState:
         self.gaussians = self.gaussians.select(order)
         self.adam.select(order, torch.zeros(len(order), dtype=torch.bool))
 
-    def drop_unseen(self, views: int) -> None:
+    def drop_unseen(self, views: int, sky: Sky | None) -> None:
         """At the end, remove Gaussians without a gradient in a whole epoch of ``views`` views: no
-        training view constrains them, and other cameras can see them as floaters."""
+        training view constrains them, and other cameras can see them as floaters. The sky stays,
+        which fills what no view shows."""
         # So many steps contain a whole epoch, in any order of the views.
         before = self.step - 2 * views + 1
         seen = self.adam.last > before
         if before > 0 and seen.any():
-            self.counters.unseen = int((~seen).sum())
-            self.gaussians = self.gaussians.select(torch.nonzero(seen)[:, 0])
+            kept = seen
+            if sky is not None:
+                kept = seen | torch.from_numpy(sky.contains(self.gaussians.means.numpy()))
+            self.counters.unseen = int((~kept).sum())
+            self.gaussians = self.gaussians.select(torch.nonzero(kept)[:, 0])
 
     def record(self) -> None:
         """Add a record to the curve and begin a new window."""

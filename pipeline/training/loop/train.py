@@ -113,7 +113,7 @@ def train(
                 session.after_step(before, trainer.factor())
         # With a limit of gradients per pixel, Gaussians that are seen may have none.
         if not experiments.gradients_per_pixel:
-            state.drop_unseen(len(scene.views))
+            state.drop_unseen(len(scene.views), scene.sky)
         trainer.clear_camera_path()
         # Of a block, overviews see nothing where others are in front of it.
         if state.counters.blind_steps and inputs.open_layers is None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from types import SimpleNamespace
 
 import numpy as np
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
 from pipeline.config.schema import Gradient, Mcmc, Original
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.skybox import Sky
 from pipeline.training.density import make_strategy
 from pipeline.training.density.gradient import (
     HALVES_OPACITY,
@@ -198,6 +200,19 @@ def test_an_opacity_reset_limits_opacities_and_clears_moments() -> None:
     assert torch.allclose(opacity[1:], torch.tensor(0.01))
     assert not adam.first["opacity_logits"].any()
     assert adam.first["means"].all()
+
+
+def test_the_sky_is_neither_reset_nor_too_large() -> None:
+    gaussians, adam = marked(6)
+    gaussians.means[0] = torch.tensor([0.0, 0.0, 1e4])
+    gaussians.log_scales[:2] = 5.0
+    density = replace(strategy(6), sky=Sky(np.zeros((1, 3))))
+    density.start(6)
+    before = gaussians.opacity_logits[0].clone()
+    density.reset_opacity(gaussians, adam)
+    assert gaussians.opacity_logits[0] == before
+    assert torch.allclose(torch.sigmoid(gaussians.opacity_logits[1:]), torch.tensor(0.01))
+    assert density.useless(gaussians, prune_large=True)[:2].tolist() == [False, True]
 
 
 def test_without_splits_all_are_cloned_and_without_clones_all_are_split() -> None:

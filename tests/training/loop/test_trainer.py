@@ -96,6 +96,11 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
     assert not (places == initial.means[0]).all(1).any()
     assert not (places == initial.means[1]).all(1).any()
     assert (places == initial.means[2]).all(1).any()
+    # With a skybox, the far one is part of it.
+    initial.means[0] = torch.tensor([0.0, -500.0, 0.0])
+    sky = fixed.train.model_copy(update={"background": "skybox"})
+    kept = run(planted, tmp_path / "c", Options(sky, fixed[1])).gaussians.means
+    assert (kept == initial.means[0]).all(1).any() and not (kept == initial.means[1]).all(1).any()
     steps = 2 * len(scene.views) - 1
     short = run(
         planted, tmp_path / "b", Options(fixed.train.model_copy(update={"steps": steps}), fixed[1])

@@ -14,6 +14,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     "fast": {
         "views": {"max_long_side_px": 640},
         "features": {"max_features": 3000, "max_long_side_px": 1200},
+        "init": {"method": "points"},
         "train": {"steps": 1500, "density": {"pixels_per_gaussian": 4.0}},
     },
     "balanced": {},
@@ -33,7 +34,7 @@ PRESETS: dict[str, dict[str, Any]] = {
     },
     "original": {
         "views": {"max_long_side_px": 1600},
-        "init": {"max_points": 10_000_000},
+        "init": {"method": "points", "max_points": 10_000_000},
         "train": {
             "steps": 30_000,
             "exposure": "off",

@@ -219,7 +219,8 @@ class Init(Section):
         "auto",
         description="points: from the sparse points, which are triangulated if the given poses "
         "have none, or from a point cloud of the scene; dense: from depth maps that multi-view "
-        "stereo estimates; auto: points.",
+        "stereo estimates; auto: dense for up to 30 photographs without alpha, masks, depth maps "
+        "or a point cloud, else points.",
     )
     max_points: Annotated[int, Field(gt=0), Unit("points")] = Field(
         200_000,

@@ -11,7 +11,7 @@ import posixpath
 from collections import Counter
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any
 
 from pipeline.config.schema import Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
@@ -32,7 +32,7 @@ MIN_SPATIAL_SHARE = 0.9
 # camera: at least so many bodies, or so many camera groups per photograph.
 MIXED_BODIES = 3
 MIXED_GROUP_SHARE = 0.5
-# Up to this many photographs, a loss on the depths of sparse points improves test views.
+# Up to this many photographs, depths improve test views: depth maps, or those of sparse points.
 FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
 # Scenes of more photographs are trained in blocks, one for so many.
@@ -40,9 +40,6 @@ MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
 # Features and matches of more photographs are computed in several jobs, one for so many. A job of
 # 250 photographs takes minutes on two cores; to start one takes seconds.
 MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
-
-# What ``init.method: auto`` chooses.
-AUTO_INIT_METHOD: Literal["points", "dense"] = "points"
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
@@ -78,7 +75,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     photos_per_job, jobs_reason = _photos_per_job(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
     blocks, blocks_reason = _blocks(scan, config, budget)
-    method = AUTO_INIT_METHOD if config.init.method == "auto" else config.init.method
+    method = _init_method(scan, config)
     depth_weight, depth_reason = _depth_loss_weight(scan, config, method == "dense" and blocks == 1)
     settled = _updated(
         config,
@@ -220,6 +217,16 @@ def _background(scan: Scan, config: Config) -> Choice:
     if config.train.density.strategy == "original":
         return "black", "black background, as published"
     return "skybox", "a skybox behind the scene: neither alpha nor masks"
+
+
+def _init_method(scan: Scan, config: Config) -> str:
+    """What Gaussians are initialised from. Photographs with alpha or masks show objects, on which
+    sparse points are dense; given depths are better than estimated ones."""
+    if config.init.method != "auto":
+        return config.init.method
+    other = scan.cloud is not None or scan.num_alpha or scan.num_masks or scan.num_depths
+    few = len(scan.planned) <= FEW_PHOTOS and not scan.num_panoramas
+    return "dense" if few and not other else "points"
 
 
 def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:

@@ -7,12 +7,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from pipeline.config.presets import PRESETS
 from pipeline.config.schema import Config
 from pipeline.geometry.cube import panorama_face_side
 from pipeline.io.colmap import read_model, write_model
 from pipeline.plan import stage_memory
 from pipeline.plan.plan import describe, input_folders
 from pipeline.plan.scan import Scan, scan
+from pipeline.plan.settle import FEW_PHOTOS
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, Reconstruction
@@ -67,7 +69,7 @@ def test_raw_needs_decode(tmp_path):
 def test_given_colmap_poses(tmp_path, model, undistort):
     files = photos(tmp_path / "images", 3)
     write_sparse(tmp_path / "sparse" / "0", [path.name for path in files], (64, 48), model)
-    plan = plan_of(tmp_path)
+    plan = plan_of(tmp_path, init={"method": "points"})
     runs = {"features", "matches", "sfm", "decode", "undistort"} - set(skipped(plan))
     assert sorted(runs) == undistort
     assert "3 cameras" in plan.stages["sfm"].reason and model in plan.stages["undistort"].reason
@@ -169,7 +171,7 @@ def test_options_are_settled(tmp_path):
     assert config.inspect.image_folder == "images"
     assert (config.matches.pairs, config.sfm.mapper) == ("exhaustive", "incremental")
     assert (config.sfm.camera_model, config.sfm.share_cameras) == ("SIMPLE_RADIAL", "group")
-    assert (config.init.method, config.train.background) == ("points", "skybox")
+    assert (config.init.method, config.train.background) == ("dense", "skybox")
 
 
 def test_no_skybox_behind_masks_alpha_or_the_published_method(tmp_path):
@@ -196,7 +198,8 @@ def test_no_skybox_behind_masks_alpha_or_the_published_method(tmp_path):
 )
 def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason, expected):
     photos(tmp_path / "images", 3)
-    plan = plan_of(tmp_path)
+    sections = {"init": {"method": "points"}} | sections
+    plan = plan_of(tmp_path, init={"method": "points"})
     assert not plan.runs("dense") and "init.method: points" in plan.stages["dense"].reason
     assert "dense" not in plan.stages["init"].inputs
     plan = plan_of(tmp_path, **sections)
@@ -205,10 +208,20 @@ def test_depth_maps_are_estimated_for_what_needs_them(tmp_path, sections, reason
     assert readers == expected
 
 
+def test_few_photographs_are_initialised_from_depth_maps(tmp_path):
+    photos(tmp_path / "images", 3)
+    assert plan_of(tmp_path).config.init.method == "dense"
+    assert all(PRESETS[preset]["init"]["method"] == "points" for preset in ("fast", "original"))
+    for count, method in ((FEW_PHOTOS, "dense"), (FEW_PHOTOS + 1, "points")):
+        found = many(tmp_path / str(count), count)
+        assert make_plan(found, Config()).config.init.method == method
+
+
 def test_dense_initialisation_does_not_use_the_scenes_cloud(tmp_path):
     names = [path.name for path in photos(tmp_path / "images", 3)]
     write_sparse(tmp_path / "sparse" / "0", names, (64, 48))
     (tmp_path / "points.xyz").write_text("0 0 0\n1 1 1\n")
+    assert plan_of(tmp_path).config.init.method == "points"
     init = plan_of(tmp_path, init={"method": "dense"}).stages["init"]
     assert "fused depth maps" in init.reason and "init.method: points" in init.decisions[0]
 
@@ -433,8 +446,8 @@ def test_the_published_strategy_is_limited_by_its_maximum_alone(tmp_path):
     "count, wanted, weight", [(30, "auto", 0.03), (31, "auto", 0.0), (31, 0.5, 0.5), (9, 0.0, 0.0)]
 )
 def test_few_photographs_get_a_loss_on_the_depths_of_sparse_points(tmp_path, count, wanted, weight):
-    config = Config.model_validate({"train": {"depth_loss_weight": wanted}})
-    plan = make_plan(many(tmp_path, count), config)
+    sections = {"train": {"depth_loss_weight": wanted}, "init": {"method": "points"}}
+    plan = make_plan(many(tmp_path, count), Config.model_validate(sections))
     assert plan.config.train.depth_loss_weight == weight
     assert any("depths" in text for text in plan.stages["train"].decisions) == (
         count != 31 or wanted != "auto"

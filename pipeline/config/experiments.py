@@ -174,7 +174,7 @@ class TrainExperiments(Section):
         0.8, description="Adam's decay rate of the first moment (3DGS: 0.9)."
     )
     adam_epsilon: Annotated[float, Field(ge=0), Unit("pixels")] = Field(
-        0.1,
+        0.03,
         description="Adam's epsilon: Gaussians that change the loss by less than so many pixels do "
         "take smaller steps (3DGS: 0).",
     )

@@ -28,7 +28,8 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
         reason = f"{scan.num_test} test views: the split that the given poses list"
     elif every == 0:
         reason = "no test views: measured on the training views"
-    return StagePlan(run=True, reason=reason, decisions=truth)
+    published = [settled.why["split.source"]] if settled.why["split.source"] else []
+    return StagePlan(run=True, reason=reason, decisions=[*published, *truth])
 
 
 def work(job: Job) -> None:
@@ -36,6 +37,7 @@ def work(job: Job) -> None:
     from pipeline.metrics.evaluate import evaluate_views
     from pipeline.metrics.pose import pose_error
     from pipeline.metrics.protocol import choose_protocol
+    from pipeline.metrics.published import against_published
     from pipeline.scene.exposure import ExposureGains
 
     train, views = job.section(Train), inputs.trained_views(job)
@@ -49,6 +51,11 @@ def work(job: Job) -> None:
         gains=ExposureGains.read_for(job.inputs["train"], [view.name for view in views]),
         threads=job.threads,
     )
+    if (known := job.key["published"]) is not None:
+        published = against_published(known["scene"], known["deviations"], protocol, evaluation)
+        described = evaluation.protocol.model_copy(update={"published": published})
+        evaluation = evaluation.model_copy(update={"protocol": described})
+        job.decide(published.text)
     job.add_messages([], evaluation.warnings)
     if (truth := job.inputs["inspect"] / "truth").is_dir():
         # The truth has the poses of photographs, not of the views of split ones.
@@ -65,9 +72,13 @@ def work(job: Job) -> None:
 
 def facts(plan: Plan) -> dict[str, Any]:
     from pipeline.metrics.lpips import weights_found
+    from pipeline.plan.published import planned_deviations
 
     weights = weights_found(plan.config.evaluate.lpips_net)
-    return {"lpips_weights": weights, "truth": plan.facts.truth_digest}
+    scene, published = plan.facts.published_scene, None
+    if scene is not None:
+        published = {"scene": scene, "deviations": planned_deviations(plan)}
+    return {"lpips_weights": weights, "truth": plan.facts.truth_digest, "published": published}
 
 
 SPEC = StageSpec(

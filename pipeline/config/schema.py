@@ -63,11 +63,13 @@ def _not_all(every: int) -> int:
 class Split(Section):
     """Test views: excluded from training, used for evaluation."""
 
-    source: Literal["auto", "every"] = Field(
+    source: Literal["auto", "every", "published"] = Field(
         "auto",
         description="auto: the split that the given poses list (transforms_train.json and "
         "transforms_test.json, or nerfstudio's train_filenames and test_filenames), else every "
-        "n-th view. every: every n-th view of all photographs.",
+        "n-th view. every: every n-th view of all photographs. published: as papers measure the "
+        "scene, which its folder's name and photographs identify: their test views, image size, "
+        "masks and background (instead of the options for these), with the given poses unchanged.",
     )
     test_every: Annotated[int, Field(ge=0), AfterValidator(_not_all), Unit("views")] = Field(
         8,

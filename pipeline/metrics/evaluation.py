@@ -22,6 +22,24 @@ class ViewMetrics(JsonObject):
     render: str = Field(description="File in `evaluate/renders/`.")
 
 
+class PublishedProtocol(JsonObject):
+    """The published benchmark that a scene is of."""
+
+    benchmark: str = Field(description="Name of the data set.")
+    scene: str = Field(description="Name of the scene in it.")
+    deviations: tuple[str, ...] = Field(
+        description="What was done otherwise than papers on 3D Gaussian splatting do with this "
+        "scene. Only without any do the measures compare with published ones."
+    )
+
+    @property
+    def text(self) -> str:
+        """In words."""
+        if not self.deviations:
+            return f"{self.scene} of {self.benchmark}, measured as published"
+        return f"{self.scene} of {self.benchmark}, NOT as published: {'; '.join(self.deviations)}"
+
+
 class ProtocolDescription(JsonObject):
     """How quality was measured; sentences for people."""
 
@@ -43,6 +61,9 @@ class ProtocolDescription(JsonObject):
     background: Vector3 = Field(description="RGB in 0..1 behind transparent photographs.")
     exposure: str | None = Field(description="Use of exposure gains; null without gains.")
     poses: str | None = Field(description="Adjustment of test cameras; null without.")
+    published: PublishedProtocol | None = Field(
+        None, description="null for scenes of no published benchmark."
+    )
 
 
 class SceneQuality(JsonObject):

@@ -13,7 +13,7 @@ from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
 from pipeline.io.names import NameIndex, match_names
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import GivenPoses, listed_photos
-from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
+from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
 from pipeline.runtime.errors import UserError
 
 # Suffixes of folders with full-size photographs and with copies at 1/2, 1/4 and 1/8.
@@ -105,8 +105,9 @@ def _choose_copy(
     longest, full = found[0]
     usable = [entry for entry in found if _is_complete(folder, entry[1], full, poses, config)]
     large_enough = [entry for entry in usable if entry[0] >= needed]
-    published = MIP_NERF_360.get(benchmark_scene(folder.name))
-    of_papers = [entry for entry in usable if entry[1].path == published]
+    published = PUBLISHED_SCENES.get(benchmark_scene(folder.name))
+    wanted = published.image_folder if published and published.image_folder != "images" else None
+    of_papers = [entry for entry in usable if entry[1].path == wanted]
     if of_papers:
         longest, best = of_papers[0]
     elif large_enough:
@@ -115,8 +116,8 @@ def _choose_copy(
         longest, best = max(usable, key=lambda entry: entry[0])
     others = [f"{entry.path}/ ({size} px)" for size, entry in found if entry is not best]
     reason = f"{best.path}/ ({longest} px long side)"
-    if of_papers:
-        reason += f": the copy that papers use for {benchmark_scene(folder.name)} of Mip-NeRF 360"
+    if published and of_papers:
+        reason += f": the copy that papers use for {published.title}"
     elif others:
         rule = "the smallest of at least" if longest >= needed else "the largest; none has"
         reason += f": {rule} {needed} px; others: {', '.join(others)}"
@@ -131,7 +132,7 @@ def _is_complete(
         return True
     suffix = copy.path[len("images") :]
     for kind in ("masks", "depths"):
-        used = kind == "depths" or config.views.masks == "auto"
+        used = kind == "depths" or uses_masks(config)
         if used and (folder / kind).is_dir() and not (folder / f"{kind}{suffix}").is_dir():
             return False
     if poses is not None and poses.format.names == "scene":
@@ -141,6 +142,11 @@ def _is_complete(
     needed = match_names(poses.names, full.names) if poses is not None else full.names
     in_copy = NameIndex(copy.names)
     return all(in_copy.find(name) for name in needed)
+
+
+def uses_masks(config: Config) -> bool:
+    """Whether masks in the scene folder are used: not for measures as published."""
+    return config.views.masks == "auto" and config.split.source != "published"
 
 
 def read_all(

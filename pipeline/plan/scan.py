@@ -31,7 +31,7 @@ from pipeline.io.posefiles import (
 from pipeline.io.recorded import digest_of
 from pipeline.plan.listed_split import Part, listed_split
 from pipeline.plan.panoramas import partial_panoramas
-from pipeline.plan.photo_folder import choose_photo_folder, read_all
+from pipeline.plan.photo_folder import choose_photo_folder, read_all, uses_masks
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
@@ -379,7 +379,7 @@ def _listed_split(
     warnings: list[str],
 ) -> dict[str, Part | None]:
     """Photograph -> its part of the scene's own split; empty where that is not used."""
-    if poses is None or not poses.splits or config.split.source != "auto":
+    if poses is None or not poses.splits or config.split.source == "every":
         return {}
     prefix = poses.format.prefix(chosen.base)
     found = listed_split(poses.splits, [prefix + name for name in names], warnings)
@@ -397,7 +397,7 @@ def _masks(
     facts: Mapping[str, FileFacts],
     cache: FactCache,
 ) -> dict[str, Path]:
-    if config.views.masks == "ignore":
+    if not uses_masks(config):
         return {}
     masks = companions(folder, [f"masks{suffix}", "masks"], sorted(facts))
     for name, listed in chosen.masks.items():

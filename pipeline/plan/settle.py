@@ -17,6 +17,7 @@ from pipeline.config.schema import Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget, typical_view
 from pipeline.plan.panoramas import check_panorama_sizes
+from pipeline.plan.published import as_published, published_line
 from pipeline.plan.scan import Scan
 from pipeline.plan.training_memory import MEMORY_MARGIN, blocks_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
@@ -62,8 +63,10 @@ def settle(scan: Scan, config: Config) -> Settled:
     """Settle the options for a scene.
 
     Raises:
-        UserError: ``partition.memory_mb`` is too small.
+        UserError: ``partition.memory_mb`` is too small, or ``split.source: published`` for a scene
+            of no published benchmark.
     """
+    config = as_published(scan, config)
     chosen = {
         "matches.pairs": _pairs(scan, config),
         "sfm.mapper": _mapper(config),
@@ -103,6 +106,7 @@ def settle(scan: Scan, config: Config) -> Settled:
     why |= {"train.density.max_gaussians": budget_reason, "views.masks": _masks(scan, config)}
     why["train.depth_loss_weight"] = depth_reason
     why["partition.blocks"] = blocks_reason
+    why["split.source"] = published_line(scan, config)
     why["features.photos_per_job"] = jobs_reason
     return Settled(settled, why)
 

@@ -82,6 +82,11 @@ class SceneFacts(BaseModel):
     )
     training_memory_mb: int = Field(description="Estimate of the memory of training, MB.")
     given_poses: PoseSummary | None = Field(description="null where no poses are given or used.")
+    published_scene: str | None = Field(
+        None,
+        description="Scene of a published benchmark that the folder is, by its name and its "
+        "photographs; null for others.",
+    )
     truth: str | None = Field(description="Folder of ground truth poses; null without any.")
     truth_digest: str | None = Field(description="Digest of the ground truth poses.")
     fingerprint: str = Field(

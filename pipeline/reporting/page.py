@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from pipeline.metrics.evaluation import PublishedProtocol
 from pipeline.reporting.blocks import blocks_section
 from pipeline.reporting.charts import histogram, line_chart
 from pipeline.reporting.coverage import coverage_section
@@ -90,6 +91,8 @@ def _lead(data: ReportData) -> str:
         parts.append(str(sizes[0]) if len(sizes) == 1 else f"{sizes[0]} to {sizes[-1]}")
     if protocol.get("split"):
         parts.append(str(protocol["split"]))
+    if protocol.get("published"):
+        parts.append(PublishedProtocol.model_validate(protocol["published"]).text)
     return escape(" \u00b7 ".join(parts))
 
 

@@ -120,7 +120,7 @@ def load_views(
     posed = model.by_name()
     photos = sorted((p for p in manifest.photos if p.name in posed), key=lambda photo: photo.name)
     parts = {photo.split for photo in photos}
-    listed = split.source == "auto" and parts == {"train", "test"}
+    listed = split.source != "every" and parts == {"train", "test"}
     # Views of one photograph are all test views or all training views: they overlap.
     sources = {name: i for i, name in enumerate(sorted({p.source or p.name for p in photos}))}
     # A single photograph is for training.

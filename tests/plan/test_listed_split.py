@@ -5,6 +5,7 @@ import pytest
 
 from pipeline.config.schema import Split, Train, Views
 from pipeline.metrics.protocol import choose_protocol
+from pipeline.plan.settle import settle
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.views import View, load_views
 from stages.evaluate import decide
@@ -91,11 +92,9 @@ def test_the_file_lists_of_nerfstudio_are_a_split(tmp_path):
 
 
 def test_the_plan_says_which_views_are_measured(tmp_path):
-    class Settled:
-        config = config()
-
     nerf_synthetic(tmp_path, train=3, test=2)
-    assert decide(look(tmp_path), Settled()).reason.startswith("2 test views")
+    found = look(tmp_path)
+    assert decide(found, settle(found, config())).reason.startswith("2 test views")
 
 
 @pytest.mark.parametrize("test_photos", [(), ("p01.jpg",)])

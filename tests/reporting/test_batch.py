@@ -10,7 +10,7 @@ from statistics import fmean
 import pytest
 
 from pipeline.config.runs import Run
-from pipeline.plan.protocols import MIP_NERF_360, benchmark_scene
+from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
 from pipeline.reporting.batch import (
     PUBLISHED,
     Result,
@@ -198,8 +198,11 @@ def test_a_published_scene_is_identified_by_name_and_number_of_photographs():
 
 
 def test_benchmark_scenes_are_the_published_ones():
-    published = json.loads(PUBLISHED.read_text())["photographs"]["Mip-NeRF 360"]
-    assert published.keys() == MIP_NERF_360.keys()
+    for benchmark, scenes in json.loads(PUBLISHED.read_text())["photographs"].items():
+        known = {s.scene: s for s in PUBLISHED_SCENES.values() if s.benchmark == benchmark}
+        assert scenes.keys() == known.keys()
+        for name, counts in scenes.items():
+            assert known[name].every is None or tuple(counts) == known[name].photographs
     assert benchmark_scene("360_v2_Bonsai") == benchmark_scene("mipnerf360-bonsai") == "bonsai"
     assert benchmark_scene("living_room") == "living_room"
 

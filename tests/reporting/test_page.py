@@ -193,6 +193,17 @@ def test_missing_lpips_shows_the_reason() -> None:
     assert "LPIPS n/a weights not found: put them there" in text
 
 
+def test_a_deviation_from_a_published_protocol_is_at_the_top() -> None:
+    shown = metrics()
+    benchmark = {"benchmark": "NeRF-synthetic", "scene": "lego"}
+    shown["protocol"]["published"] = {**benchmark, "deviations": ["40 test views, not 200"]}
+    text = "lego of NeRF-synthetic, NOT as published: 40 test views, not 200"
+    assert text in report_html(report(metrics=shown)).split("<nav>")[0]
+    shown["protocol"]["published"]["deviations"] = []
+    html = report_html(report(metrics=shown))
+    assert "lego of NeRF-synthetic, measured as published" in html.split("<nav>")[0]
+
+
 def test_warnings_come_first_and_once() -> None:
     html = report_html(report())
     assert html.count("<li>it is dark</li>") == 1

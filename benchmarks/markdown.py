@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import statistics
 from collections.abc import Sequence
 
 
@@ -20,3 +21,15 @@ def table(rows: Sequence[Sequence[str]]) -> str:
 def cell(value: float | None, form: str) -> str:
     """The formatted value; a dash for None."""
     return "-" if value is None else format(value, form)
+
+
+def middle(values: Sequence[float], form: str) -> str:
+    """The median, and of several values half their range.
+
+    Args:
+        form: format string, such as "{:.2f}".
+    """
+    median = form.format(statistics.median(values))
+    if len(values) == 1:
+        return median
+    return f"{median} ±{form.format((max(values) - min(values)) / 2)}"

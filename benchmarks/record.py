@@ -25,7 +25,16 @@ POSES = (
     *("decode", "extract", "features", "pairs", "match", "matches", "sfm"),
     *("refine", "undistort"),
 )
-PROTOCOL = ("num_views", "resolution", "split", "background", "exposure", "masks", "poses")
+PROTOCOL = (
+    "num_views",
+    "resolution",
+    "split",
+    "background",
+    "exposure",
+    "masks",
+    "poses",
+    "published",
+)
 # Of the same machine and build, wherever the run was.
 SAME = ("commit", "processor", "cores", "memory_mb", "instruction_set", "compiler", "threads")
 
@@ -90,7 +99,7 @@ def _run(folder: Path) -> dict[str, Any]:
         "scene": metrics["scene"].split("@")[0],
         "photographs": metrics["total_images"],
         "where": {key: trained[key] for key in SAME},
-        "protocol": {key: metrics["protocol"][key] for key in PROTOCOL},
+        "protocol": {key: metrics["protocol"].get(key) for key in PROTOCOL},
         "measured": measured,
     }
 

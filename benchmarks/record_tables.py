@@ -12,11 +12,13 @@ from typing import Any
 from pydantic import ValidationError
 
 from benchmarks import markdown
+from benchmarks.budgets import tables as budget_tables
 from benchmarks.judge.truth import Grade
 from benchmarks.markdown import cell
 from benchmarks.measured import Record, Result
 from benchmarks.results import (
     BlocksResult,
+    BudgetResult,
     CoverageResult,
     DenseResult,
     GrowthResult,
@@ -346,6 +348,15 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
     return markdown.table(rows)
 
 
+def budgets(records: Sequence[Stored]) -> str:
+    return budget_tables.table(results(records, Record[BudgetResult]))
+
+
+def budget_curves(records: Sequence[Stored]) -> str:
+    """PSNR by training time."""
+    return budget_tables.curves(results(records, Record[BudgetResult]))
+
+
 TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "mesh": mesh,
     "dense": dense,
@@ -358,6 +369,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "page": page,
     "raster_stress": raster_stress,
     "blocks": blocks,
+    "budgets": budgets,
     "scaling": scaling,
     "slurm": slurm,
     "video": video,

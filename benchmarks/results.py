@@ -397,3 +397,48 @@ class SlurmResult:
     wall_s: float
     busy_s: float
     blocks_s: float | None = None
+
+
+# ---- benchmarks.budgets ----
+
+
+@dataclass(frozen=True)
+class BudgetResult:
+    """A scene trained for a time.
+
+    Attributes:
+        trainer: "splatmake", or the name and version of another program.
+        options: the configuration besides the time; of another program, its command.
+        minutes: the time budget of training.
+        steps: number of optimiser steps.
+        psnr, ssim, lpips: of the test views; ``lpips`` is None where it was not measured.
+        wall_minutes, cpu_minutes: of training, as measured.
+        other_cpu_minutes: of the stages before training; None for another program, which gets
+            their result.
+        threads: of training.
+        load_average: of the last minute at the end of training.
+        test_views: their number. pixels: their sizes.
+        benchmark, published_scene, deviations: see ``PublishedProtocol``; None and empty for
+            scenes of no published benchmark.
+    """
+
+    scene: str
+    trainer: str
+    options: str
+    seed: int
+    minutes: float
+    steps: int
+    psnr: float
+    ssim: float
+    lpips: float | None
+    gaussians: int
+    wall_minutes: float
+    cpu_minutes: float
+    other_cpu_minutes: float | None
+    threads: int
+    load_average: float | None
+    test_views: int
+    pixels: str
+    benchmark: str | None
+    published_scene: str | None
+    deviations: list[str]

@@ -1,7 +1,7 @@
 """Writes the tables and figures of the docs from stored records: ``python -m benchmarks.tables``.
 
 A table stands below a line ``<!-- KIND: RECORD [RECORD ...] -->``, of records in
-``benchmarks/records``; a figure within a sentence stands in
+``benchmarks/records``, or ``-`` where there is none yet; a figure within a sentence stands in
 ``<!-- figure: RECORD NAME -->...<!-- end -->``. ``--check`` writes nothing and exits with 1 where a
 page and its records differ.
 """
@@ -17,13 +17,17 @@ from pathlib import Path
 from typing import Any
 
 from benchmarks import markdown, record_tables
+from benchmarks.like_for_like import like_for_like
 from benchmarks.raster.tables import steps_table, table
 from benchmarks.record import POSES
+from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
 from pipeline.reporting.batch import published_for
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "records"
+NONE = "-"
+"""Stands for the records of a table that has none yet."""
 Record = dict[str, Any]
 
 
@@ -58,8 +62,8 @@ def scenes(records: Sequence[Record]) -> str:
                 str(record["photographs"]),
                 f"{protocol['num_views']}, {', '.join(protocol['resolution'])}",
                 str(len(runs)),
-                _middle([run["psnr"] for run in runs], "{:.2f}"),
-                _middle([run["ssim"] for run in runs], "{:.3f}"),
+                markdown.middle([run["psnr"] for run in runs], "{:.2f}"),
+                markdown.middle([run["ssim"] for run in runs], "{:.3f}"),
                 f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",
                 f"{min(run['registered'] for run in runs)}",
                 poses,
@@ -83,19 +87,20 @@ def headline(records: Sequence[Record]) -> str:
                 record["training"],
                 f"{protocol['num_views']}, {', '.join(protocol['resolution'])}",
                 str(len(runs)),
-                _middle([run["psnr"] for run in runs], "{:.2f}"),
-                _middle([run["ssim"] for run in runs], "{:.3f}"),
+                markdown.middle([run["psnr"] for run in runs], "{:.2f}"),
+                markdown.middle([run["ssim"] for run in runs], "{:.3f}"),
                 f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",
-                _middle([sum(run["cpu_s"].values()) / 60 for run in runs], "{:.1f}"),
+                markdown.middle([sum(run["cpu_s"].values()) / 60 for run in runs], "{:.1f}"),
                 f"{record['cores']} cores, {record['instruction_set']}",
             ]
         )
         for entry in published_for(scene, record["photographs"]):
-            if entry["method"].startswith("3DGS"):
+            if entry["method"].startswith("3DGS, ") and not entry["differs"]:
+                width, height = PUBLISHED_SCENES[benchmark_scene(scene)].size
                 published[entry["method"]] = [
                     scene,
                     f"{entry['method']}, published",
-                    *("", ""),
+                    *(f"{width}x{height}", ""),
                     f"{entry['psnr']:.2f}",
                     f"{entry['ssim']:.3f}",
                     *("", "", "GPU"),
@@ -140,15 +145,7 @@ def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
     if not runs[0]["cpu_s"].keys() & set(stages):
         return "-"
     sums = [sum(run["cpu_s"].get(stage, 0.0) for stage in stages) / 60 for run in runs]
-    return _middle(sums, "{:.1f}")
-
-
-def _middle(values: Sequence[float], form: str) -> str:
-    """The median, and of several values half their range."""
-    middle = form.format(statistics.median(values))
-    if len(values) == 1:
-        return middle
-    return f"{middle} ±{form.format((max(values) - min(values)) / 2)}"
+    return markdown.middle(sums, "{:.1f}")
 
 
 KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
@@ -158,6 +155,8 @@ KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "headline": headline,
     "sources": sources,
     "stages": stages,
+    "like-for-like": like_for_like,
+    "budget-curves": record_tables.budget_curves,
     **record_tables.TABLES,
 }
 MARKER = re.compile(
@@ -188,7 +187,7 @@ def rewritten(page: str) -> str:
 
     def fill(match: re.Match[str]) -> str:
         kind, names = match[1], match[2].split()
-        made = KINDS[kind]([read_record(name) for name in names])
+        made = KINDS[kind]([read_record(name) for name in names if name != NONE])
         return f"<!-- {kind}: {' '.join(names)} -->\n\n{made}"
 
     def figure(match: re.Match[str]) -> str:

@@ -52,6 +52,6 @@ def _test_views(scene: PublishedScene, protocol: Protocol) -> list[str]:
         return [
             f"test views are not every {scene.every}th view"
             if scene.every
-            else "views are held out; papers train and measure on all"
+            else "there are test views; papers train and measure on all views"
         ]
     return []

@@ -198,12 +198,13 @@ def published_for(scene: str, count: int | None) -> list[dict[str, Any]]:
     """Published figures for a scene, by the name of its folder and its number of photographs.
 
     Returns:
-        One dict per method: ``method``, ``dataset``, ``source``, ``protocol`` and its measures.
+        One dict per method: ``method``, ``dataset``, ``source``, ``protocol``, ``differs`` (how
+        from the protocol of the data set; None if not at all) and its measures.
     """
     data = json.loads(PUBLISHED.read_text())
     name = benchmark_scene(scene)
     return [
-        {key: entry[key] for key in ("method", "dataset", "source", "protocol")}
+        {key: entry[key] for key in ("method", "dataset", "source", "protocol", "differs")}
         | entry["scenes"][name]
         for entry in data["results"]
         if name in entry["scenes"] and count in data["photographs"][entry["dataset"]][name]

@@ -272,6 +272,7 @@ def _scene(batch: Batch, scene: str) -> str:
         f"{', '.join(sizes)} pixels, {protocol.get('split', '')}"
     )
     rows = []
+    published = published_for(scene, photographs(results, scene))
     for config, spreads in means.items():
         runs = [r for r in done if r.run.config == config]
         names = [f"seed {r.metrics['seed']}" for r in runs] if len(runs) > 1 else [_label(config)]
@@ -280,8 +281,7 @@ def _scene(batch: Batch, scene: str) -> str:
             for r, name in zip(runs, names, strict=True)
         )
         lead = pages if len(runs) == 1 else f"{escape(_label(config))} <small>{pages}</small>"
-        rows.append((lead, _cells(spreads)))
-    published = published_for(scene, photographs(results, scene))
+        rows.append((lead + (_unlike(runs) if published else ""), _cells(spreads)))
     table = _table(rows, [(f"{p['method']} (published)", p) for p in published])
     chart = ""
     if len(means) > 1:
@@ -299,6 +299,15 @@ def _scene(batch: Batch, scene: str) -> str:
         else ""
     )
     return f'<p class="hint">{escape(hint)}</p>{_thumbs(batch, scene, done)}{table}{chart}{picture}'
+
+
+def _unlike(runs: Sequence[Result]) -> str:
+    """The mark of runs that were not measured as published; empty if all were."""
+    found = [r.metrics["protocol"].get("published") for r in runs]
+    if all(f and not f["deviations"] for f in found):
+        return ""
+    why = "; ".join(dict.fromkeys(text for f in found if f for text in f["deviations"]))
+    return f' <small title="{escape(why)}">(not as published)</small>'
 
 
 def _thumbs(batch: Batch, scene: str, done: Sequence[Result]) -> str:

@@ -15,6 +15,7 @@ from benchmarks.measured import Record, command_line, measured, write_record
 from benchmarks.results import (
     Accuracy,
     BlocksResult,
+    BudgetResult,
     CoverageResult,
     DenseResult,
     GrowthResult,
@@ -56,6 +57,15 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
         ),
         "| town@fast | 1 | 300 | 38, 640x420 | 1, 4 | 26.00, 27.12 | 0.8000, 0.8500 | 68k, 90k | "
         "850, 480 | 850, 500 | 60, 150 | 41 | 1.250, 1.300 | 1.040 |",
+    ),
+    "budgets": (
+        Record[BudgetResult],
+        BudgetResult(
+            *("fox", "splatmake", "{}", 0, 4.0, 9000, 30.126, 0.9514, 0.2, 150_000, 4.1, 7.9),
+            *(1.25, 2, 1.9, 7, "450x800", None, None, []),
+        ),
+        "| fox | splatmake | 7, 450x800 | 4 | 1 | 30.13 | 0.951 | 0.200 | 150k | 9000 | 4.1, 7.9 | "
+        "1.2 | 2 | 1.9 |",
     ),
     "scaling": (
         Record[ScalingResult],

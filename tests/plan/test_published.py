@@ -132,7 +132,7 @@ def test_given_poses_and_photographs_stay_as_they_are(benchmark: str, tmp_path: 
         (mip_nerf_360, {"inspect": {"image_folder": "images"}}, "of images/, not of images_2/"),
         (nerf_synthetic, {"train": {"background": "black"}}, "the background is not white"),
         (nerf_synthetic, {"split": {"source": "every"}}, "not those that the data set lists"),
-        (dtu, {"split": {"test_every": 8}}, "views are held out"),
+        (dtu, {"split": {"test_every": 8}}, "there are test views"),
         (dtu, {"train": {"background": "white"}}, "the background is not black"),
     ],
 )

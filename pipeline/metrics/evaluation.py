@@ -62,7 +62,9 @@ class ProtocolDescription(JsonObject):
     exposure: str | None = Field(description="Use of exposure gains; null without gains.")
     poses: str | None = Field(description="Adjustment of test cameras; null without.")
     published: PublishedProtocol | None = Field(
-        None, description="null for scenes of no published benchmark."
+        None,
+        description="null for scenes of no published benchmark, and for models that `python -m "
+        "pipeline evaluate` measures.",
     )
 
 

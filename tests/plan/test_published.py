@@ -31,7 +31,7 @@ PUBLISHED = {"split": {"source": "published"}}
 # Eleven photographs, so that 0 and 8 are test views.
 SMALL = {
     "bonsai": {"photographs": (11,), "size": (48, 32)},
-    "truck": {"photographs": (11,), "size": (64, 48)},
+    "truck": {"photographs": (11,)},
     "lego": {"size": (16, 16), "num_test": 3},
     "scan24": {"photographs": (11,), "size": (32, 24)},
 }
@@ -55,9 +55,11 @@ def mip_nerf_360(folder: Path) -> Path:
 
 
 def tanks_and_temples(folder: Path) -> Path:
-    photos(folder / "truck" / "images", 11)
-    write_sparse(folder / "truck" / "sparse" / "0", [f"p{i:02d}.jpg" for i in range(11)], (64, 48))
-    return folder / "truck"
+    """As released: the cameras are of about twice the photographs' size."""
+    scene = folder / "truck"
+    photos(scene / "images", 11, (979, 546))
+    write_sparse(scene / "sparse" / "0", [f"p{i:02d}.jpg" for i in range(11)], (1957, 1091))
+    return scene
 
 
 def nerf_synthetic(folder: Path) -> Path:
@@ -146,8 +148,8 @@ def test_what_differs_from_the_published_protocol_is_named(
 
 def test_published_options_take_precedence_over_size_test_views_and_masks(tmp_path: Path) -> None:
     scene = tanks_and_temples(tmp_path)
-    photos(scene / "masks", 11, mode="L")
-    changed = {"split": {"source": "published", "test_every": 3}, "views": {"max_long_side_px": 9}}
+    photos(scene / "masks", 11, (979, 546), mode="L")
+    changed = {"split": {"source": "published", "test_every": 3}, "views": {"max_long_side_px": 90}}
     assert measured(scene, **changed).deviations == ()
     assert "masked pixels are excluded" in measured(scene).deviations
 

@@ -86,6 +86,7 @@ class Backend(ABC, Generic[Projected, Binned]):
         d_depth: torch.Tensor | None = None,
         *,
         means2d_abs: bool = True,
+        colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
@@ -96,6 +97,7 @@ class Backend(ABC, Generic[Projected, Binned]):
             d_color: (H, W, 3) float32.
             d_alpha, d_depth: (H, W) float32 or None.
             means2d_abs: compute ``Gradients.means2d_abs``.
+            colors: compute ``Gradients.colors``.
             camera: compute ``Gradients.camera``.
             sh_adam: update the SH coefficients of the Gaussians with a gradient in place by Adam
                 instead of returning their gradients. SH coefficients are four fifths of all

@@ -26,6 +26,7 @@ from pipeline.render.types import (
     Subset,
     Surroundings,
 )
+from pipeline.splats.init import SH_C0
 
 
 @dataclass(frozen=True)
@@ -126,6 +127,7 @@ class ReferenceBackend(Backend[Projected, Projected]):
         d_depth: torch.Tensor | None = None,
         *,
         means2d_abs: bool = True,
+        colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
@@ -150,13 +152,15 @@ class ReferenceBackend(Backend[Projected, Projected]):
         d_means2d[index] = d_centres.sum(0).float()
         d_abs[index] = d_centres.abs().sum(0).float()
         d_sh = arrays[4]
+        # The constant basis function is the same for every direction.
+        d_colors = (d_sh[:, 0] / SH_C0).float() if colors else None
         if sh_adam is not None:
             updated = torch.cat([g.reshape(count, -1) for g in arrays], 1).any(1)
             _step_sh(projected.parameters[4], d_sh, updated, sh_adam)
             d_sh = d_sh[:0]
         return Gradients(
             arrays[0].float(), arrays[1].float(), arrays[2].float(), arrays[3].float(),
-            d_sh.float(), d_means2d, d_abs if means2d_abs else None,
+            d_sh.float(), d_means2d, d_abs if means2d_abs else None, d_colors,
             CameraGradients(*d_change.split([3, 3, 2, 2])) if camera else None,
         )  # fmt: skip
 

@@ -200,6 +200,7 @@ class Gradients:
         means2d: (N, 2) gradient of the projected mean, per pixel.
         means2d_abs: (N, 2) sum over pixels of the absolute values of each pixel's contribution to
             ``means2d`` (AbsGS, Ye et al. 2024); None if not requested.
+        colors: (N, 3) gradient of the colours before they are clamped at 0; None if not requested.
         camera: None if not requested.
     """
 
@@ -210,6 +211,7 @@ class Gradients:
     sh: torch.Tensor
     means2d: torch.Tensor
     means2d_abs: torch.Tensor | None
+    colors: torch.Tensor | None
     camera: CameraGradients | None
 
 

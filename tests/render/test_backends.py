@@ -48,13 +48,13 @@ def test_images_and_gradients_equal_the_reference(backend: Backend, scene: Scene
         drawn = each.forward(*scene, CAMERA, OPTIONS)
         images.append((drawn.color, drawn.alpha, drawn.depth, drawn.median_depth, drawn.radii))
         d = noise(22, 31, 3), noise(22, 31, seed=1), noise(22, 31, seed=2)
-        gradients.append(each.backward(drawn, *d, camera=True))
+        gradients.append(each.backward(drawn, *d, colors=True, camera=True))
         assert drawn.num_visible > 0 == drawn.num_dropped
     for found, expected in zip(*images, strict=True):
         assert found.dtype == torch.float32
         assert torch.allclose(found, expected, atol=2e-5)
     found, expected = gradients
-    for name in (*NAMES, "means2d", "means2d_abs"):
+    for name in (*NAMES, "means2d", "means2d_abs", "colors"):
         assert getattr(found, name).dtype == torch.float32
         assert relative(getattr(found, name), getattr(expected, name)) < 1e-5, name
     for name in ("rotation", "translation", "focal", "principal"):

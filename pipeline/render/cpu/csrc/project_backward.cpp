@@ -113,6 +113,7 @@ void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t
     clear(out.opacity_logits, 1);
     clear(out.means2d, 2);
     clear(out.means2d_abs, 2);
+    clear(out.colors, 3);
     clear(out.sh, sh_width);
 }
 
@@ -199,6 +200,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         const auto clear = [&](f32x16& v) { v = keep(sound, v); };
         g.each(clear);
         for (f32x16& v : absolute) clear(v);
+        for (f32x16& v : d_rgb) clear(v);
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
         if (out.camera)
@@ -210,6 +212,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         write_column(g.opacity_logit, group.count, out.opacity_logits + first);
         write_rows(g.means2d, group.count, out.means2d + 2 * first);
         if (out.means2d_abs) write_rows(absolute, group.count, out.means2d_abs + 2 * first);
+        if (out.colors) write_rows(d_rgb, group.count, out.colors + 3 * first);
         sh.to_rows(view.sh_degree);
         if (out.sh) sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);
         if (sh_adam) sh_adam->update(view.sh_degree, sh, first, sh_width, drawn);

@@ -126,7 +126,7 @@ def train_scene(studio: Studio, views: Sequence[View], steps: int, extent: float
     config = Train(
         steps=steps,
         background="black",
-        exposure="off",
+        appearance="none",
         density=Gradient(max_gaussians=MAX_GAUSSIANS),
     )
     experiments = TrainExperiments(learning_rate_factor=4.0)

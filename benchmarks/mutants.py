@@ -218,6 +218,27 @@ MUTANTS: dict[str, Mutant] = {
         "exposure left out of the gradient",
         ("tests/training/loop/test_first_step.py",),
     ),
+    "embedding_scale": Mutant(
+        "pipeline/training/appearance/embedding.py",
+        "weights = torch.from_numpy(embedding).float() * SH_C0",
+        "weights = torch.from_numpy(embedding).float()",
+        "the factor from SH coefficients to colours left out of the gradient of appearance",
+        ("tests/training/appearance/test_embedding.py",),
+    ),
+    "embedding_kept": Mutant(
+        "pipeline/training/loop/state.py",
+        "            self.appearance.restore(arrays)",
+        "            pass",
+        "embeddings not restored from a checkpoint",
+        ("tests/training/appearance/test_training.py",),
+    ),
+    "fitted_on_all": Mutant(
+        "pipeline/training/appearance/fit.py",
+        "left[:, : fitted_columns(photo.shape[1])] = True",
+        "left[:] = True",
+        "the appearance of a test view fitted on the half that is measured",
+        ("tests/metrics/test_evaluate.py",),
+    ),
     "exposure_free": Mutant(
         "pipeline/photos/exposure.py",
         "gains[measured] -= gains[measured].mean(axis=0)",

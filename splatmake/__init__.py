@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.schema import Evaluate, Train
 from pipeline.io import splat_files
+from pipeline.io.appearance_files import read_appearance
 from pipeline.io.camera_files import choose_views
 from pipeline.metrics.evaluate import evaluate_views
 from pipeline.metrics.image import psnr, ssim
@@ -29,6 +30,7 @@ from pipeline.plan.posed_scene import PosedScene, posed_scene
 from pipeline.render.views import Render, render_view
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import usable_cores
+from pipeline.scene.appearance import Appearance
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 
@@ -70,18 +72,26 @@ class Scene:
         gaussians: the model.
         posed: the views, and the settings that the scene was trained with.
         threads: threads for rendering; the number does not affect results.
+        appearance: of these Gaussians in photographs; None if it is not modelled.
 
     Attributes:
         gaussians: the model; can be replaced.
         views: all views, sorted by name.
     """
 
-    def __init__(self, gaussians: Gaussians, posed: PosedScene, threads: int):
+    def __init__(
+        self,
+        gaussians: Gaussians,
+        posed: PosedScene,
+        threads: int,
+        appearance: Appearance | None = None,
+    ):
         self.gaussians = gaussians
         self.views: list[View] = posed.views
         self._train: Train = posed.train
         self._protocol: Protocol = choose_protocol(posed.views, posed.split, posed.train)
         self._gains = posed.gains
+        self._loaded, self._appearance = gaussians, appearance
         self._threads = threads
 
     @property
@@ -134,6 +144,8 @@ class Scene:
                 self._train,
                 Path(renders),
                 gains=self._gains,
+                # Of other Gaussians it is not known.
+                appearance=self._appearance if self.gaussians is self._loaded else None,
                 threads=self._threads,
             )
         _warn(found.warnings)
@@ -173,7 +185,9 @@ def load(
             f"snakemake --cores all {folder}/metrics.json",
         )
     _warn(posed.warnings)
-    return Scene(read_gaussians(file), posed, threads or usable_cores())
+    gaussians = read_gaussians(file)
+    appearance = None if model is not None else read_appearance(file.parent, len(gaussians))
+    return Scene(gaussians, posed, threads or usable_cores(), appearance)
 
 
 def read_gaussians(file: str | PathLike[str]) -> Gaussians:

@@ -33,6 +33,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.io.appearance_files import read_appearance
     from pipeline.io.colmap import read_model
     from pipeline.metrics.evaluate import evaluate_views
     from pipeline.metrics.pose import pose_error
@@ -42,13 +43,15 @@ def work(job: Job) -> None:
 
     train, views = job.section(Train), inputs.trained_views(job)
     protocol = choose_protocol(views, job.section(Split), train)
+    gaussians = inputs.trained_gaussians(job)
     evaluation = evaluate_views(
-        inputs.trained_gaussians(job),
+        gaussians,
         protocol,
         job.section(Evaluate),
         train,
         job.out / "renders",
         gains=ExposureGains.read_for(job.inputs["train"], [view.name for view in views]),
+        appearance=read_appearance(job.inputs["train"], len(gaussians)),
         threads=job.threads,
     )
     if (known := job.key["published"]) is not None:

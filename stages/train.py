@@ -1,6 +1,6 @@
 """Optimise the Gaussians, or unite those of the blocks that the scene was trained in. Outputs:
-``gaussians.npz``, ``curve.json``, ``exposure.json``; and ``sparse/0`` if poses or intrinsics were
-refined."""
+``gaussians.npz``, ``curve.json``, ``exposure.json``; ``sparse/0`` if poses or intrinsics were
+refined; ``appearance.json`` and ``appearance.npz`` if colours differ between photographs."""
 
 from __future__ import annotations
 

@@ -160,6 +160,9 @@ class TrainExperiments(Section):
         description="Share of the training pixels that is replaced by black or white at random. "
         "Test views are not changed.",
     )
+    appearance_size: Annotated[int, Field(ge=1, le=6), Unit("numbers")] = Field(
+        3, description="With train.appearance: embedding: size of a photograph's embedding."
+    )
     max_pose_change: Annotated[float, Field(gt=0, lt=1), Unit("radians, scene extents")] = Field(
         0.02,
         description="With train.refine_poses: upper limit of a camera's total rotation and "

@@ -37,7 +37,7 @@ PRESETS: dict[str, dict[str, Any]] = {
         "init": {"method": "points", "max_points": 10_000_000},
         "train": {
             "steps": 30_000,
-            "exposure": "off",
+            "appearance": "none",
             "ssim_loss_weight": 0.2,
             "depth_loss_weight": 0.0,
             "mask_loss_weight": 0.0,

@@ -21,6 +21,7 @@ RENAMED: dict[str, tuple[str, ...]] = {
     "train.pose_reach": ("experiments.train.max_pose_change",),
     "train.intrinsics_reach": ("experiments.train.max_intrinsics_change",),
     "train.salt_and_pepper": ("experiments.train.salt_and_pepper_share",),
+    "train.exposure": ("train.appearance",),
     "train.black_stays": ("experiments.train.clamp_color_gradient",),
     "train.gradients_per_pixel": ("experiments.train.gradients_per_pixel",),
     "train.isotropic": ("experiments.train.isotropic",),

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -25,6 +26,7 @@ from pipeline.photos.load import load_view
 from pipeline.render.views import render_rgb, to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
+from pipeline.scene.appearance import Appearance, fitted_columns
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -42,12 +44,52 @@ EXPOSURE_PROTOCOL = (
     "renders multiplied by each photograph's gains (one per channel), which are measured at the "
     "sparse points, in test photographs as well; psnr_without_gains is without this"
 )
+APPEARANCE_PROTOCOL = (
+    "the appearance of each test photograph is fitted on its left half and measured on its "
+    "right half (NeRF in the Wild); psnr_without_fit is of the scene's own colours on the same half"
+)
 POSES_PROTOCOL = (
     "the pose of each test camera is optimised on its photograph, with the scene held fixed"
 )
 POSES_OF_ALL = "from all photographs, test views included (as usual in the field)"
 POSES_OF_SPLIT = "poses are given; points are given or from the training photographs alone"
 Mask = NDArray[np.bool_]
+
+
+@dataclass(frozen=True)
+class Rendered:
+    """A render and its photograph.
+
+    Attributes:
+        rgb: (H, W, 3) float32.
+        own: the same in the scene's own colours; None if the appearance was not fitted.
+        photo: (H, W, 3) uint8.
+        mask: (H, W), False for ignored pixels; None if there are none.
+    """
+
+    rgb: NDArray[np.float32]
+    own: NDArray[np.float32] | None
+    photo: NDArray[np.uint8]
+    mask: Mask | None
+
+    @property
+    def columns(self) -> slice:
+        """The measured columns: the right half if the appearance was fitted on the left one."""
+        return slice(0 if self.own is None else fitted_columns(self.photo.shape[1]), None)
+
+    @property
+    def measured_mask(self) -> Mask | None:
+        return None if self.mask is None else self.mask[:, self.columns]
+
+    def psnr(self, image: NDArray[np.uint8]) -> float:
+        """PSNR of an image over the measured columns."""
+        here = self.columns
+        return psnr(image[:, here], self.photo[:, here], self.measured_mask)
+
+    def ssim(self, image: NDArray[np.uint8]) -> float:
+        """SSIM of an image over the measured columns."""
+        here = self.columns
+        return ssim(image[:, here], self.photo[:, here], self.measured_mask)
 
 
 def evaluate_views(
@@ -58,6 +100,7 @@ def evaluate_views(
     out: Path,
     *,
     gains: ExposureGains = NO_GAINS,
+    appearance: Appearance | None = None,
     threads: int,
 ) -> Evaluation:
     """Render each view, write it as 8-bit PNG, and compare that image with the photograph.
@@ -65,6 +108,9 @@ def evaluate_views(
     Args:
         gains: of all views of the protocol, by which renders are multiplied; empty if exposure is
             not modelled.
+        appearance: of the Gaussians in photographs; None if it is not modelled. Views without an
+            embedding of their own get one that is fitted on their left half, and are measured on
+            the right half.
         out: folder for the renders, ``<index>.png`` in the order of the views.
 
     Returns:
@@ -74,7 +120,16 @@ def evaluate_views(
         UserError: the masks hide all views.
     """
     lpips, reason = lpips_available(config.lpips_net)
-    smallest = min(min(view.width, view.height) for view in protocol.views)
+    fitted = {view.name for view in protocol.views} if appearance else set()
+    if appearance:
+        fitted -= appearance.embeddings.keys()
+    smallest = min(
+        min(
+            view.height,
+            view.width - (fitted_columns(view.width) if view.name in fitted else 0),
+        )
+        for view in protocol.views
+    )
     if lpips is not None and smallest < MIN_SIDE:
         lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
@@ -82,57 +137,64 @@ def evaluate_views(
     progress = Progress("evaluating", len(protocol.views) + len(protocol.training_views), "views")
     warnings: list[str] = []
     unadjusted: list[float] = []
+    unfitted: list[float] = []
     options = protocol.options(train, threads)
 
-    def render_and_load(view: View) -> tuple[NDArray[np.float32], NDArray[np.uint8], Mask | None]:
+    def render_and_load(view: View) -> Rendered:
         pixels = load_view(view)
-        photo = pixels.over(protocol.background)
+        photo, shown, own = pixels.over(protocol.background), gaussians, None
+        if appearance is not None:
+            from pipeline.training.appearance.fit import in_photograph
+
+            shown = in_photograph(gaussians, appearance, view, photo, pixels.mask, options)
         if train.refine_poses and view.is_test:
             from pipeline.training.cameras.fit_pose import fit_pose
 
             gain, weight = gains.of(view.name), train.ssim_loss_weight
-            view = fit_pose(
-                gaussians, view, photo, pixels.mask, gain, options, protocol.extent, weight
-            )
-        return render_rgb(gaussians, view, options), photo, pixels.mask
+            view = fit_pose(shown, view, photo, pixels.mask, gain, options, protocol.extent, weight)
+        if view.name in fitted:
+            own = render_rgb(gaussians, view, options)
+        return Rendered(render_rgb(shown, view, options), own, photo, pixels.mask)
 
     def with_exposure(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
         gain = gains.of(view.name)
         return to_bytes(rgb if gain is None else rgb * np.array(gain, np.float32))
 
-    def measure(
-        index: int, rgb: NDArray[np.float32], photo: NDArray[np.uint8], mask: Mask | None
-    ) -> tuple[ViewMetrics, float | None]:
+    def measure(index: int, found: Rendered) -> tuple[ViewMetrics, float | None, float | None]:
         view = protocol.views[index]
-        image = with_exposure(rgb, view)
+        image = with_exposure(found.rgb, view)
         name = f"{index:04d}.png"
         Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
-        quality = psnr(image, photo, mask), ssim(image, photo, mask)
         record = ViewMetrics(
-            name=view.name, psnr=quality[0], ssim=quality[1], lpips=None, render=name
+            name=view.name, psnr=found.psnr(image), ssim=found.ssim(image), lpips=None, render=name
         )
-        return record, psnr(to_bytes(rgb), photo, mask) if gains else None
+        without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
+        own = None if found.own is None else found.psnr(to_bytes(found.own))
+        return record, without_gains, own
 
-    def collect(future: Future[tuple[ViewMetrics, float | None]]) -> None:
-        record, psnr_without_gains = future.result()
+    def collect(future: Future[tuple[ViewMetrics, float | None, float | None]]) -> None:
+        record, psnr_without_gains, psnr_without_fit = future.result()
         per_view.append(record)
         if psnr_without_gains is not None:
             unadjusted.append(psnr_without_gains)
+        if psnr_without_fit is not None:
+            unfitted.append(psnr_without_fit)
         progress.advance(note=f"PSNR {record.psnr:.2f} dB")
 
     # Views are measured while the next ones are rendered. The queue is short: it holds the images.
-    pending: deque[Future[tuple[ViewMetrics, float | None]]] = deque()
+    pending: deque[Future[tuple[ViewMetrics, float | None, float | None]]] = deque()
     distances: list[float] = []
     with ThreadPoolExecutor(max(threads, 1)) as pool:
         for index, view in enumerate(protocol.views):
-            rgb, photo, mask = render_and_load(view)
-            if _hides_all(mask):
+            found = render_and_load(view)
+            if _hides_all(found.measured_mask):
                 warnings.append(f"{view.name}: its mask leaves no pixel to measure")
                 progress.advance()
                 continue
-            pending.append(pool.submit(measure, index, rgb, photo, mask))
+            pending.append(pool.submit(measure, index, found))
             if lpips is not None:
-                distances.append(lpips(with_exposure(rgb, view), photo, mask))
+                here, image = found.columns, with_exposure(found.rgb, view)
+                distances.append(lpips(image[:, here], found.photo[:, here], found.measured_mask))
             if len(pending) > threads:
                 collect(pending.popleft())
         while pending:
@@ -144,9 +206,9 @@ def evaluate_views(
         ]
     training: list[float] = []
     for view in protocol.training_views:
-        rgb, photo, mask = render_and_load(view)
-        if not _hides_all(mask):
-            training.append(psnr(with_exposure(rgb, view), photo, mask))
+        found = render_and_load(view)
+        if not _hides_all(found.measured_mask):
+            training.append(found.psnr(with_exposure(found.rgb, view)))
         progress.advance()
     if not per_view:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
@@ -158,6 +220,7 @@ def evaluate_views(
         psnr=mean_psnr,
         train_psnr=train_psnr,
         psnr_without_gains=float(np.mean(unadjusted)) if gains else None,
+        psnr_without_fit=float(np.mean(unfitted)) if unfitted else None,
         ssim=float(np.mean([v.ssim for v in per_view])),
         lpips=float(np.mean(distances)) if lpips is not None else None,
         lpips_reason=reason,
@@ -174,6 +237,7 @@ def evaluate_views(
             masks="masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
             background=protocol.background,
             exposure=EXPOSURE_PROTOCOL if gains else None,
+            appearance=APPEARANCE_PROTOCOL if unfitted else None,
             poses=POSES_PROTOCOL if train.refine_poses else None,
         ),
         model=EvaluatedModel(num_gaussians=len(gaussians), sh_degree=gaussians.sh_degree),

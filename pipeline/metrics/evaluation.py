@@ -60,6 +60,9 @@ class ProtocolDescription(JsonObject):
     masks: str | None = Field(description="Use of masks; null without masks.")
     background: Vector3 = Field(description="RGB in 0..1 behind transparent photographs.")
     exposure: str | None = Field(description="Use of exposure gains; null without gains.")
+    appearance: str | None = Field(
+        None, description="Fit of appearance to test photographs; null without."
+    )
     poses: str | None = Field(description="Adjustment of test cameras; null without.")
     published: PublishedProtocol | None = Field(
         None,
@@ -82,6 +85,11 @@ class SceneQuality(JsonObject):
     )
     psnr_without_gains: float | None = Field(
         description="PSNR without the views' exposure gains; null where there are none."
+    )
+    psnr_without_fit: float | None = Field(
+        None,
+        description="PSNR in the scene's own colours, over the same half of each photograph; null "
+        "where no appearance is fitted.",
     )
     per_view: tuple[ViewMetrics, ...] = Field(description="In the order of the views' names.")
     protocol: ProtocolDescription = Field(description="How quality was measured.")

@@ -33,7 +33,11 @@ def against_published(
         found.append(f"only {described.num_views} of {len(protocol.views)} views are measured")
     if scene.background is not None and protocol.background != BACKGROUNDS[scene.background]:
         found.append(f"the background is not {scene.background}")
-    found += [text for text in (described.masks, described.exposure, described.poses) if text]
+    found += [
+        text
+        for text in (described.masks, described.exposure, described.appearance, described.poses)
+        if text
+    ]
     if described.ssim != SSIM_VARIANT:
         found.append(f"SSIM: {described.ssim}")
     if evaluation.lpips is not None and described.lpips != LPIPS_VARIANTS["vgg"]:

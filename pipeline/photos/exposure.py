@@ -77,7 +77,7 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
     if not point_of:
         return Exposures(np.ones((len(views), 3)), 0.0, 0)
     point, view_index = np.concatenate(point_of), np.concatenate(view_of)
-    found = _solve(point, view_index, np.concatenate(colours), len(groups))
+    found = solve_gains(point, view_index, np.concatenate(colours), len(groups))
     return Exposures(found.gains[group], found.spread, found.measured)
 
 
@@ -101,7 +101,9 @@ def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
     return usable, np.log2(colours[usable])
 
 
-def _solve(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> Exposures:
+def solve_gains(
+    point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
+) -> Exposures:
     """Solve for the gains.
 
     Args:

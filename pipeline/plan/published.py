@@ -45,8 +45,8 @@ def as_published(scan: Scan, config: Config) -> Config:
     train: dict[str, Any] = {}
     if config.train.background == "auto" and scene.background is not None:
         train["background"] = scene.background
-    if config.train.exposure == "auto":
-        train["exposure"] = "off"
+    if config.train.appearance == "auto":
+        train["appearance"] = "none"
     changes = {
         "views": config.views.model_copy(
             update={"max_long_side_px": max(scene.size), "masks": "ignore"}

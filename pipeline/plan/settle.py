@@ -63,8 +63,8 @@ def settle(scan: Scan, config: Config) -> Settled:
     """Settle the options for a scene.
 
     Raises:
-        UserError: ``partition.memory_mb`` is too small, or ``split.source: published`` for a scene
-            of no published benchmark.
+        UserError: ``partition.memory_mb`` is too small, ``split.source: published`` for a scene
+            of no published benchmark, or appearance embeddings for a scene in blocks.
     """
     config = as_published(scan, config)
     chosen = {
@@ -78,6 +78,11 @@ def settle(scan: Scan, config: Config) -> Settled:
     photos_per_job, jobs_reason = _photos_per_job(scan, config)
     budget, budget_reason = gaussian_budget(scan, config)
     blocks, blocks_reason = _blocks(scan, config, budget)
+    if blocks > 1 and config.train.appearance == "embedding":
+        raise UserError(
+            f"train.appearance: embedding is not available in blocks, and the scene has {blocks}",
+            fix="set train.appearance: exposure, or partition.blocks: 1",
+        )
     method = _init_method(scan, config)
     depth_weight, depth_reason = _depth_loss_weight(scan, config, method == "dense" and blocks == 1)
     settled = _updated(

@@ -106,6 +106,8 @@ def _cards(data: ReportData) -> str:
     note = "" if train_psnr is None else f"; training views: {fixed(train_psnr, 2)} dB"
     plain = m.get("psnr_without_gains")
     note += "" if plain is None else f"; without exposure gains: {fixed(plain, 2)} dB"
+    own = m.get("psnr_without_fit")
+    note += "" if own is None else f"; without fitted appearance: {fixed(own, 2)} dB"
     whole = f'<span class="unit"> / {count(total)}</span>' if total is not None else ""
     ran = [s for s in stages if not s.get("skipped")]
     cpu, rss = sum(s["cpu_s"] for s in ran), max((s["peak_rss_mb"] for s in ran), default=0.0)

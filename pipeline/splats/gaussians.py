@@ -4,7 +4,7 @@ the stages that write files handle ``arrays.GaussianArrays``."""
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -29,6 +29,9 @@ class Gaussians:
         opacity_logits: (N,) logits: the opacity is their sigmoid.
         sh: (N, K, 3) spherical harmonics of R, G and B, K = (degree + 1)^2, ordered and signed as
             in 3DGS; coefficient 0 is the constant (DC).
+        appearance: (N, K, 3), added to SH coefficient 0 in proportion to the K numbers of a
+            photograph's appearance embedding (``training.appearance``); None without a model of
+            appearance. Only training has it.
     """
 
     means: Tensor
@@ -36,6 +39,7 @@ class Gaussians:
     quats: Tensor
     opacity_logits: Tensor
     sh: Tensor
+    appearance: Tensor | None = None
 
     def __len__(self) -> int:
         return len(self.means)
@@ -46,11 +50,13 @@ class Gaussians:
         return round(self.sh.shape[1] ** 0.5) - 1
 
     def tensors(self) -> dict[str, Tensor]:
-        """The tensors by name, in the order of the fields; not copies."""
-        return {field.name: getattr(self, field.name) for field in fields(self)}
+        """The tensors by name, in the order of the fields; not copies. Without those that are
+        None."""
+        found = {field.name: getattr(self, field.name) for field in fields(self)}
+        return {name: tensor for name, tensor in found.items() if tensor is not None}
 
     def parameters(self) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """The tensors in the order of the fields, which are the rasterizer's first arguments."""
+        """The rasterizer's first arguments, in order."""
         return self.means, self.log_scales, self.quats, self.opacity_logits, self.sh
 
     def arrays(self) -> dict[str, NDArray[np.float32]]:
@@ -58,8 +64,8 @@ class Gaussians:
         return {name: tensor.numpy() for name, tensor in self.tensors().items()}
 
     def as_arrays(self) -> GaussianArrays:
-        """The same Gaussians in numpy arrays that share their memory."""
-        return GaussianArrays(**self.arrays())
+        """The same Gaussians, without ``appearance``, in numpy arrays that share their memory."""
+        return GaussianArrays(**replace(self, appearance=None).arrays())
 
     def chunks(self, *names: str) -> Iterator[list[Array]]:
         """See ``arrays.GaussianSource``."""
@@ -70,10 +76,12 @@ class Gaussians:
         """Gaussians with copies of numpy arrays, which are named as the fields."""
         if isinstance(arrays, GaussianArrays):
             arrays = arrays.arrays()
-        copies = (
-            np.array(arrays[field.name], np.float32, order="C") for field in fields(Gaussians)
+        import torch
+
+        names = [field.name for field in fields(Gaussians) if field.name in arrays]
+        return Gaussians(
+            **{n: torch.from_numpy(np.array(arrays[n], np.float32, order="C")) for n in names}
         )
-        return Gaussians.sharing(GaussianArrays(*copies))
 
     @staticmethod
     def sharing(arrays: GaussianArrays) -> Gaussians:
@@ -84,30 +92,23 @@ class Gaussians:
 
     def select(self, which: Tensor) -> Gaussians:
         """Copies of the Gaussians selected by a boolean mask (N,) or int64 indices (M,)."""
-        return Gaussians(*(tensor[which].contiguous() for tensor in self.tensors().values()))
+        return Gaussians(**{k: v[which].contiguous() for k, v in self.tensors().items()})
 
     def clone(self) -> Gaussians:
         """A copy of all tensors."""
-        return Gaussians(*(tensor.clone() for tensor in self.tensors().values()))
+        return Gaussians(**{k: v.clone() for k, v in self.tensors().items()})
 
     def with_sh_degree(self, degree: int) -> Gaussians:
         """The Gaussians with SH bands removed, or zeros added, to reach ``degree``."""
-        return Gaussians(
-            self.means,
-            self.log_scales,
-            self.quats,
-            self.opacity_logits,
-            resize_bands(self.sh, degree),
-        )
+        return replace(self, sh=resize_bands(self.sh, degree))
 
 
 def concat(parts: list[Gaussians]) -> Gaussians:
     """Concatenate Gaussians of the same SH degree."""
     import torch
 
-    return Gaussians(
-        *(torch.cat([getattr(part, field.name) for part in parts]) for field in fields(Gaussians))
-    )
+    tensors = [part.tensors() for part in parts]
+    return Gaussians(**{name: torch.cat([part[name] for part in tensors]) for name in tensors[0]})
 
 
 def resize_bands(sh: Tensor, degree: int) -> Tensor:

@@ -12,13 +12,14 @@ import numpy as np
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.photos.exposure import measure_exposures, sample_views
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
 from pipeline.scene.views import View, scene_extent
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.appearance.choose import choose_appearance
+from pipeline.training.appearance.start import initial_embeddings
 from pipeline.training.cameras.intrinsics import describe_intrinsics, with_intrinsics
 from pipeline.training.cameras.poses import describe_poses, with_common_motion
 from pipeline.training.data.dense_depths import add_dense_depths
@@ -37,9 +38,6 @@ from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.train import train
 
-# Standard deviation in stops from which photographs are taken as differently exposed: with fixed
-# exposure it is 0 to 0.1, in collections from the internet 0.5.
-EXPOSURES_DIFFER = 0.2
 # Epochs (passes over the training views) below which no scene is sharp.
 MIN_EPOCHS = 3.0
 FITS = {
@@ -118,9 +116,23 @@ def train_scene(
     """
     notes = Notes()
     has_alpha = any(photo.alpha for photo in manifest.photos)
-    gains = NO_GAINS if has_alpha else _choose_gains(views, model, config, notes)
+    appearance = choose_appearance(
+        views,
+        model,
+        initial.means.double().numpy(),
+        config.appearance,
+        has_alpha=has_alpha,
+        in_blocks=part != WHOLE_RUN,
+    )
+    notes.decisions += appearance.decisions
+    notes.counters |= appearance.counters
+    gains = appearance.gains
+    inputs = scene_inputs(views, manifest, model, initial, gains, config, notes, dense)
+    if appearance.embeddings:
+        size = experiments.appearance_size
+        inputs = replace(inputs, embeddings=initial_embeddings(inputs.views, size))
     trained = run_training(
-        scene_inputs(views, manifest, model, initial, gains, config, notes, dense),
+        inputs,
         config,
         experiments,
         run,
@@ -254,27 +266,6 @@ def _known_depths(
         )
     notes.counters["depth_maps"] = sum(kinds.values())
     return known
-
-
-def _choose_gains(
-    views: list[View], model: Reconstruction, config: Train, notes: Notes
-) -> ExposureGains:
-    """The gains of all views; empty if the photographs are exposed alike."""
-    if config.exposure == "off":
-        return NO_GAINS
-    if config.exposure == "auto":
-        spread = measure_exposures(sample_views(views), model).spread
-        notes.counters["exposure_spread_stops"] = round(spread, 4)
-        if spread < EXPOSURES_DIFFER:
-            return NO_GAINS
-    found = measure_exposures(views, model)
-    photographs = len({view.source or view.name for view in views})
-    notes.decisions.append(
-        f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
-        f"measured in {found.measured} of {photographs} photographs"
-    )
-    names = [view.name for view in views]
-    return ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
 
 
 def _describe(result: TrainResult, num_views: int, config: Train, part: Part, notes: Notes) -> None:

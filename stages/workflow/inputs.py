@@ -90,6 +90,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
     Args:
         gaussians: the result; None: those that were trained.
     """
+    from pipeline.io.appearance_files import write_appearance
     from pipeline.io.colmap import write_model
     from pipeline.io.npz import write_npz
 
@@ -99,6 +100,8 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
         write_model(job.out / "sparse" / "0", trained.model)
     trained.result.curve.write(job.out)
     trained.gains.write(job.out)
+    if trained.result.appearance is not None:
+        write_appearance(job.out, trained.result.appearance)
     job.record(trained.counters, trained.decisions, trained.warnings)
     job.timings = trained.timings
 

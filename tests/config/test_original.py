@@ -58,7 +58,7 @@ def test_nothing_is_added_to_the_published_method():
     assert DENSITY.clone and DENSITY.split and DENSITY.split_kind == "sampled"
     assert not DENSITY.recycle_share and not DENSITY.absolute_gradient
     assert not (train.antialias or train.refine_poses or train.refine_intrinsics)
-    assert train.exposure == "off"
+    assert train.appearance == "none"
     losses = (
         train.depth_loss_weight,
         train.mask_loss_weight,

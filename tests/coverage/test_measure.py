@@ -17,7 +17,7 @@ from pipeline.render.views import to_bytes
 from pipeline.splats.gaussians import Gaussians
 from tests.coverage.scenes import UP, camera, renderer, wall
 
-TRAIN = Train(background="black", exposure="off", sh_degree=0)
+TRAIN = Train(background="black", appearance="none", sh_degree=0)
 
 
 def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> CoverageRecord:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 from PIL import Image
 
 from pipeline.config.schema import Evaluate, Split, Train
@@ -11,9 +12,11 @@ from pipeline.metrics.evaluate import diagnose, evaluate_views
 from pipeline.metrics.protocol import NUM_TRAINING_VIEWS, choose_protocol
 from pipeline.photos.load import ViewPixels
 from pipeline.runtime.errors import UserError
+from pipeline.scene.appearance import Appearance
 from pipeline.scene.exposure import ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
+from pipeline.splats.init import SH_C0
 
 SIZE = 32
 
@@ -108,6 +111,66 @@ def test_gains_multiply_the_renders(tmp_path):
     assert found.psnr == 100
     assert found.psnr_without_gains < 5
     assert "gains" in found.protocol.exposure
+
+
+def lit(gaussians, colour):
+    """A wall in front of the camera, of this display value."""
+    wall = Gaussians.from_arrays(gaussians.arrays())
+    wall.means[:] = torch.tensor([0.0, 0.0, 3.0])
+    wall.log_scales[:] = 3.0
+    wall.opacity_logits[:] = 12.0
+    wall.sh[:] = (colour - 0.5) / SH_C0
+    return wall
+
+
+def test_appearance_is_fitted_on_the_left_half_and_measured_on_the_right(tmp_path):
+    """The light of test photographs is that of no training photograph, and only their left halves
+    tell it."""
+    appearance = Appearance(
+        np.full((1, 1, 3), 0.2 / SH_C0, np.float32), {"b": np.array([1.0]), "c": np.array([-1.0])}
+    )
+    photo = np.full_like(black(), 150)
+    views = [view(tmp_path, "a", photo)]
+    views += [
+        view(tmp_path, n, np.full_like(black(), v), is_test=False)
+        for n, v in (("b", 178), ("c", 76))
+    ]
+    config = Train(background="black")
+
+    def measured(views):
+        return evaluate_views(
+            lit(nothing(), 0.5), choose_protocol(views, Split(), config), Evaluate(), config,
+            tmp_path / "out", appearance=appearance, threads=1,
+        )  # fmt: skip
+
+    found = measured(views)
+    assert found.psnr > 40
+    assert found.train_psnr > 35, "training views have their own embeddings"
+    assert found.psnr_without_fit == pytest.approx(-20 * np.log10((150 - 127.5) / 255), abs=0.3)
+    assert "left half" in found.protocol.appearance
+    # The right half changes nothing but the measure; a change of the left half changes the fit.
+    other = photo.copy()
+    other[:, SIZE // 2 :] = 100
+    darker = measured([view(tmp_path, "a", other), *views[1:]])
+    assert darker.psnr == pytest.approx(-20 * np.log10(50 / 255), abs=0.3)
+    # Photographs that the scene was trained on are measured as a whole.
+    alone = measured(views[1:])
+    assert alone.psnr > 35
+    assert alone.psnr_without_fit is None and alone.protocol.appearance is None
+
+
+def test_a_mask_of_the_measured_half_hides_the_view(tmp_path):
+    appearance = Appearance(np.zeros((1, 1, 3), np.float32), {"c": np.array([1.0])})
+    mask = np.ones((SIZE, SIZE), bool)
+    mask[:, SIZE // 2 :] = False
+    views = [view(tmp_path, "a", black(), mask), view(tmp_path, "b", black())]
+    config = Train(background="black")
+    found = evaluate_views(
+        nothing(), choose_protocol(views, Split(), config), Evaluate(), config, tmp_path / "out",
+        appearance=appearance, threads=1,
+    )  # fmt: skip
+    assert [v.name for v in found.per_view] == ["b"]
+    assert "a: its mask leaves no pixel" in found.warnings[0]
 
 
 def test_the_protocol_reports_a_missing_test_split(tmp_path):

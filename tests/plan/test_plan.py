@@ -544,6 +544,15 @@ def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, block
     assert chosen.config.partition.blocks == 2 and chosen.stages["block"].jobs == 2
 
 
+def test_blocks_have_no_appearance_embeddings(tmp_path):
+    options = {"train": {"appearance": "embedding"}}
+    scan = many(tmp_path, 40)
+    assert make_plan(scan, Config.model_validate(options)).config.partition.blocks == 1
+    with pytest.raises(UserError, match=r"embedding is not available in blocks, .* 2\n") as caught:
+        make_plan(scan, Config.model_validate(options | {"partition": {"blocks": 2}}))
+    assert "train.appearance: exposure" in str(caught.value)
+
+
 def test_a_scene_is_divided_until_its_training_fits(tmp_path):
     size = {"width": lambda i: 800, "height": lambda i: 500}
     scan = many(tmp_path, 200, **size)

@@ -121,7 +121,7 @@ def test_a_scene_is_measured_as_published_on_request(benchmark: str, tmp_path: P
 @pytest.mark.parametrize("benchmark", LAYOUTS)
 def test_given_poses_and_photographs_stay_as_they_are(benchmark: str, tmp_path: Path) -> None:
     plan = planned(LAYOUTS[benchmark](tmp_path), **PUBLISHED)
-    assert plan.config.poses == "keep" and plan.config.train.exposure == "off"
+    assert plan.config.poses == "keep" and plan.config.train.appearance == "none"
     assert not any(plan.runs(stage) for stage in ("sfm", "refine", "undistort"))
     assert "measured as published" in plan.stages["evaluate"].decisions[0]
 

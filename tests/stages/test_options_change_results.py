@@ -40,7 +40,7 @@ def under(**options: Any) -> dict[str, Any]:
         "views": {"max_long_side_px": 64},
         "train": {
             "steps": 40,
-            "exposure": "off",  # measuring exposures takes as long as these steps
+            "appearance": "none",  # measuring exposures takes as long as these steps
             "density": {"strategy": "gradient", "max_gaussians": 600},
         },
     }
@@ -109,7 +109,8 @@ FLIPS = {
     "train.budget_minutes": Flip(0.01, POSED),
     "train.sh_degree": Flip(1, POSED),
     "train.background": Flip("random", POSED),
-    "train.exposure": Flip("on", POSED),
+    "train.appearance": Flip("exposure", POSED),
+    f"{_T}.appearance_size": Flip(2, under(poses="keep", train__appearance="embedding")),
     "train.refine_poses": Flip(True, POSED),
     "train.refine_intrinsics": Flip(True, POSED),
     "train.antialias": Flip(True, POSED),

@@ -12,10 +12,10 @@ import pytest
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.scene.exposure import NO_GAINS
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.training import scene as stage
+from pipeline.training.appearance.choose import AppearanceChoice
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import SCALE_SHARE, KnownDepths
 from tests.training.conftest import ball, camera_at
@@ -41,7 +41,7 @@ def test_the_scale_follows_the_depths_of_training_views(
         return lambda *_, **__: value
 
     monkeypatch.setattr(stage, "train", train)
-    monkeypatch.setattr(stage, "_choose_gains", always(NO_GAINS))
+    monkeypatch.setattr(stage, "choose_appearance", always(AppearanceChoice()))
     monkeypatch.setattr(stage, "scene_extent", always(50.0))
     monkeypatch.setattr(stage, "point_depths", lambda training, _: [known] * len(training))
     with pytest.raises(Started):

@@ -13,7 +13,7 @@ from pipeline.config.schema import Train
 from pipeline.training.data.inputs import Inputs
 
 # Increment when the contents of checkpoints or their meaning change.
-STATE_VERSION = 17
+STATE_VERSION = 18
 
 
 def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, seed: int) -> str:
@@ -26,9 +26,10 @@ def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, se
     ]
     sizes = (inputs.extent, inputs.size, inputs.seen_share)
     gains = None if inputs.gains is None else inputs.gains.tolist()
+    embeddings = None if inputs.embeddings is None else inputs.embeddings.tolist()
     empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
     options = [config.model_dump(), experiments.model_dump()]
-    text = json.dumps([STATE_VERSION, options, seed, sizes, views, gains, empty])
+    text = json.dumps([STATE_VERSION, options, seed, sizes, views, gains, embeddings, empty])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
     for known in inputs.depths or ():

@@ -28,6 +28,8 @@ class Inputs:
         gains: (V, 3) brightness of each photograph relative to the scene's typical one
             (``photos.exposure``), by which renders are multiplied before the loss. Only for views
             without alpha.
+        embeddings: (V, K) appearance embeddings of the photographs before training
+            (``training.appearance``); None: appearance is not modelled. Only for a whole scene.
         depths: known depths of each view for the depth loss (``training.losses.depth``).
         empty_depths: (V,) camera z, world units, up to which each view sees empty space
             (``training.density.floaters.empty_depths``); 0 if unknown.
@@ -42,6 +44,7 @@ class Inputs:
     extent: float
     scale: float | None = None
     gains: NDArray[np.float64] | None = None
+    embeddings: NDArray[np.float64] | None = None
     depths: Sequence[KnownDepths] | None = None
     empty_depths: NDArray[np.float64] | None = None
     seen_share: float = 1.0
@@ -59,6 +62,7 @@ class Inputs:
             self,
             views=[self.views[index] for index in kept],
             gains=None if self.gains is None else self.gains[kept],
+            embeddings=None if self.embeddings is None else self.embeddings[kept],
             depths=None if self.depths is None else [self.depths[index] for index in kept],
             empty_depths=None if self.empty_depths is None else self.empty_depths[kept],
         )

@@ -38,7 +38,13 @@ class TrainCounters(StageCounters):
     exposure_spread_stops: float | None = Field(
         None,
         description="Standard deviation of the photographs' exposures, stops; absent unless "
-        "`train.exposure` is `auto`, and for photographs with alpha.",
+        "`train.appearance` is `auto`, and for photographs with alpha.",
+    )
+    colour_disagreement: float | None = Field(
+        None,
+        description="Standard deviation of log2 of the colours of a point over the photographs, "
+        "after gains that compensate exposure; absent unless `train.appearance` is `auto`, for "
+        "photographs with alpha, and for blocks.",
     )
     changes: ChangeCounters = Field(
         description="Changes of the set of Gaussians by density control, totals of the run."

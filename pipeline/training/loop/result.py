@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.scene.appearance import Appearance
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.loop.curve import TrainingCurve
 from pipeline.training.loop.setup import TrainingScene
@@ -19,7 +20,7 @@ class TrainResult:
     """A trained scene.
 
     Attributes:
-        gaussians: with SH of the configured degree.
+        gaussians: with SH of the configured degree, in the colours of the mean photograph.
         curve: deterministic.
         curve_seconds: training time of each record; differs between runs.
         counters: totals of the run (``state.Counters``).
@@ -31,6 +32,7 @@ class TrainResult:
         poses: (4, 4) refined world to camera of each view by name, or None.
         intrinsics: (3,) change of each camera's intrinsics by id
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
+        appearance: of the Gaussians in the training views, or None.
     """
 
     gaussians: Gaussians
@@ -44,6 +46,7 @@ class TrainResult:
     seconds: float
     poses: dict[str, NDArray[np.float64]] | None
     intrinsics: dict[int, NDArray[np.float64]] | None
+    appearance: Appearance | None
 
 
 def result_of(
@@ -52,8 +55,11 @@ def result_of(
     """The result of a finished training."""
     poses, intrinsics = state.cameras.poses, state.cameras.intrinsics
     names = [view.name for view in scene.views]
+    gaussians, appearance = state.gaussians, None
+    if state.appearance is not None:
+        gaussians, appearance = state.appearance.centred(gaussians, names)
     return TrainResult(
-        gaussians=state.gaussians.with_sh_degree(sh_degree),
+        gaussians=gaussians.with_sh_degree(sh_degree),
         curve=TrainingCurve(tuple(state.curve)),
         curve_seconds=state.curve_seconds,
         counters=asdict(state.counters),
@@ -64,4 +70,5 @@ def result_of(
         seconds=state.seconds,
         poses=None if poses is None else dict(zip(names, poses.poses, strict=True)),
         intrinsics=None if intrinsics is None else intrinsics.by_id(),
+        appearance=appearance,
     )

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import islice
 
 import numpy as np
@@ -22,6 +22,7 @@ from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
 from pipeline.splats.skybox import Sky
+from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStore
 from pipeline.training.data.inputs import Inputs
@@ -140,6 +141,11 @@ def initial_state(
     gaussians = inputs.initial if start else inputs.initial.with_sh_degree(0)
     # A copy: the initial Gaussians stay as they are.
     gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
+    appearance = None
+    if inputs.embeddings is not None:
+        appearance = AppearanceEmbeddings(inputs.embeddings.copy())
+        size = inputs.embeddings.shape[1]
+        gaussians = replace(gaussians, appearance=torch.zeros(len(gaussians), size, 3))
     density = make_strategy(
         config.density,
         experiments,
@@ -154,7 +160,7 @@ def initial_state(
     own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
     options = AdamOptions(experiments.adam_beta1, own_frames, experiments.adam_epsilon)
     adam = Adam(gaussians, options, backend)
-    return TrainState(gaussians, adam, density, cameras, rng, order, clock=start)
+    return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
 
 
 def learning_rate_unit(inputs: Inputs, experiments: TrainExperiments) -> float:

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import morton_order
 from pipeline.splats.skybox import Sky
+from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.density import Changes, Strategy
 from pipeline.training.loop.curve import CurveRecord
@@ -60,6 +61,7 @@ class TrainState:
     Attributes:
         clock: position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
+        appearance: the embeddings of the views; None if appearance is not modelled.
         curve: records without times; ``curve_seconds`` has the time of each.
         seconds: training time so far, in all processes.
     """
@@ -70,6 +72,7 @@ class TrainState:
     cameras: CameraRefinement
     rng: np.random.Generator
     order: NDArray[np.int64]
+    appearance: AppearanceEmbeddings | None = None
     position: int = 0
     step: int = 0
     clock: int = 0
@@ -131,6 +134,8 @@ class TrainState:
             result[f"first.{name}"] = self.adam.first[name].numpy()
             result[f"second.{name}"] = self.adam.second[name].numpy()
         result |= self.density.arrays() | self.cameras.arrays()
+        if self.appearance is not None:
+            result |= self.appearance.arrays()
         return result | {"last": self.adam.last.numpy()}
 
     def values(self) -> dict[str, Any]:
@@ -157,6 +162,8 @@ class TrainState:
         self.adam.last = torch.from_numpy(arrays["last"])
         self.density.restore(arrays)
         self.cameras.restore(arrays)
+        if self.appearance is not None:
+            self.appearance.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]
         counters = dict(values["counters"])

@@ -10,9 +10,18 @@ from torch import Tensor
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
-from pipeline.render import BACKGROUNDS, Backend, Color, Forward, RasterCamera, RasterOptions
+from pipeline.render import (
+    BACKGROUNDS,
+    Backend,
+    Color,
+    Forward,
+    Gradients,
+    RasterCamera,
+    RasterOptions,
+)
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import release_free_memory
+from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.data.targets import Target, usable_factor
 from pipeline.training.density.camera_path import on_camera_path
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
@@ -65,6 +74,8 @@ class Trainer:
         index, factor = state.next_view(), self.factor()
         target, camera = self.scene.target(index, factor), self.camera(index, factor)
         background = self.draw_background()
+        appearance = state.appearance
+        colours = None if appearance is None else appearance.show(state.gaussians, index)
         rendered = self.backend.forward(
             *state.gaussians.parameters(), camera, self.options(background)
         )
@@ -81,9 +92,13 @@ class Trainer:
             d_alpha,
             d_depth,
             means2d_abs=state.density.needs_absolute_gradients,
+            colors=appearance is not None,
             camera=state.cameras.enabled,
             sh_adam=state.adam.harmonics(adam_step),
         )
+        if appearance is not None and colours is not None:
+            appearance.hide(state.gaussians, colours)
+            self.step_appearance(appearance, index, gradients, adam_step)
         if gradients.camera is not None:
             state.cameras.step(index, camera, gradients.camera, self.camera_rate)
         if self.experiments.isotropic:
@@ -91,6 +106,26 @@ class Trainer:
         state.density.before_step(state.gaussians, rendered, gradients)
         state.adam.step(state.gaussians, gradients, adam_step, self.threads)
         self.control_density(steps, run_length)
+
+    def step_appearance(
+        self,
+        appearance: AppearanceEmbeddings,
+        index: int,
+        gradients: Gradients,
+        adam_step: AdamStep,
+    ) -> None:
+        """Update the embedding of the view and the appearance of the Gaussians."""
+        state = self.state
+        assert gradients.colors is not None
+        appearance.step(
+            index,
+            state.gaussians,
+            gradients.colors,
+            state.adam.appearance(adam_step),
+            self.camera_rate(1 / len(self.scene.views)),
+            self.backend,
+            self.threads,
+        )
 
     def color_loss(
         self, rendered: Forward, target: Target, index: int, background: Color

@@ -1,4 +1,4 @@
-"""Adam for the five arrays of Gaussians, whose rows change with density control.
+"""Adam for the arrays of Gaussians, whose rows change with density control.
 
 SH coefficients, most of a Gaussian's data, are updated inside the backward pass, and only for
 visible Gaussians. Means and rotations are updated along and about each Gaussian's own axes, or as
@@ -99,11 +99,18 @@ class Adam:
             step.number, self.options.beta1, BETA2, self.epsilon(step),
         )  # fmt: skip
 
+    def appearance(self, step: AdamStep) -> DenseAdam:
+        """Adam of ``Gaussians.appearance``, at the learning rate of SH coefficient 0."""
+        return DenseAdam(
+            self.first["appearance"], self.second["appearance"], step.rates.sh0, step.number,
+            self.options.beta1, BETA2, self.epsilon(step),
+        )  # fmt: skip
+
     def step(
         self, gaussians: Gaussians, gradients: Gradients, step: AdamStep, threads: int
     ) -> None:
-        """Update all arrays but ``sh``, in place."""
-        updated = {"sh"}
+        """Update all arrays but ``sh`` and ``appearance``, in place."""
+        updated = {"sh", "appearance"}
         if self.options.own_frames:
             updated |= {"means", "quats"}
             self.backend.frame_adam(

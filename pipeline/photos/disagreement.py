@@ -1,0 +1,135 @@
+"""How much photographs disagree on the colours of the same points, apart from exposure.
+
+Photographs of one scene in one light agree but for noise, highlights and inaccurate points. In
+photographs of another time of day, weather or processing, colours differ from point to point.
+
+Photographs in very different light have few matches, so that tracks hardly connect them. Points
+that one of several photographs from the same place observes are therefore observed by all of them:
+nothing occludes a point in one of these photographs alone.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.photos.exposure import BRIGHT, DARK, MIN_OBSERVATIONS, sample_views, solve_gains
+from pipeline.photos.load import load_view
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
+
+# Photographs are from the same place if their centres are no farther apart than this share of the
+# depth of the nearest tenth of what they see, and their viewing directions differ by less than this
+# angle: features move by a few pixels.
+SAME_PLACE, SAME_DIRECTION = 0.005, np.radians(3.0)
+# Colours are means over squares of this size, in pixels: points are not more accurate.
+WINDOW = 5
+# Ratio of the standard deviation to the median absolute value of a normal distribution.
+TO_DEVIATION = 1.4826
+
+Array = NDArray[np.float64]
+
+
+def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Array) -> float:
+    """Robust standard deviation of log2 of the colours of a point over the photographs, after gains
+    that compensate exposure and white balance; the median over a sample of the views. 0 if too few
+    points are seen by several views.
+
+    Args:
+        views: views of images of ``model``, matched by name.
+        points: (N, 3) of the scene, for a model without points.
+    """
+    views = sample_views(views)
+    tracked = len(model.points) > 0
+    means = np.asarray(model.points.xyz if tracked else points, np.float64)
+    observed = _tracks(views, model) if tracked else None
+    projected = [_project(view, means) for view in views]
+    if observed is None:
+        observed = [
+            np.flatnonzero(_inside(view, p)) for view, p in zip(views, projected, strict=True)
+        ]
+    depths = [
+        float(np.quantile(p[o, 2], 0.1)) if len(o) else 0.0
+        for p, o in zip(projected, observed, strict=True)
+    ]
+    point, view_index, colours = [], [], []
+    for index, (view, place) in enumerate(zip(views, _same_places(views, depths), strict=True)):
+        if not tracked and len(place) == 1:
+            continue  # What hides a point from one of two places is not known.
+        rows = np.unique(np.concatenate([observed[other] for other in place]))
+        rows = rows[_inside(view, projected[index][rows])]
+        usable, values = _log_colours(view, projected[index][rows])
+        point.append(rows[usable])
+        view_index.append(np.full(len(values), index))
+        colours.append(values)
+    if not point:
+        return 0.0
+    return _spread(
+        np.concatenate(point), np.concatenate(view_index), np.concatenate(colours), len(views)
+    )
+
+
+def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> float:
+    """See ``colour_disagreement``; arguments as of ``solve_gains``."""
+    _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
+    several = observed[point] >= 2
+    point, view, y = point[several], view[several], y[several]
+    if not len(point):
+        return 0.0
+    y = y - np.log2(solve_gains(point, view, y, count).gains)[view]
+    _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
+    means = np.stack([np.bincount(point, y[:, c]) for c in range(3)], axis=1) / observed[:, None]
+    # The mean of n values is closer to each of them than the truth, by sqrt((n - 1) / n).
+    residual = (y - means[point]) * np.sqrt(observed / (observed - 1.0))[point][:, None]
+    of_views = [residual[view == v] for v in range(count)]
+    found = [np.median(np.abs(r)) for r in of_views if len(r) >= MIN_OBSERVATIONS]
+    return float(np.median(found)) * TO_DEVIATION if found else 0.0
+
+
+def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int64]]:
+    """Rows of the points that each view observes."""
+    points = model.points
+    owner = np.repeat(np.arange(len(points)), points.track_length)
+    numbers = {image.name: number for number, image in model.images.items()}
+    return [np.unique(owner[points.track_image_id == numbers[view.name]]) for view in views]
+
+
+def _same_places(views: Sequence[View], depths: Sequence[float]) -> list[list[int]]:
+    """For each view, the views from the same place, itself among them."""
+    centres = np.array([view.centre for view in views])
+    axes = np.array([view.world_to_camera[2, :3] for view in views])
+    result = []
+    for centre, axis, depth in zip(centres, axes, depths, strict=True):
+        near = np.linalg.norm(centres - centre, axis=1) <= SAME_PLACE * depth
+        ahead = (axes * axis).sum(1) > np.cos(SAME_DIRECTION)
+        result.append(np.flatnonzero(near & ahead).tolist())
+    return result
+
+
+def _project(view: View, points: Array) -> Array:
+    """(N, 3) pixel coordinates and depth."""
+    pose = view.world_to_camera
+    x, y, z = np.einsum("ij,nj->in", pose[:3, :3], points) + pose[:3, 3:]
+    with np.errstate(divide="ignore", invalid="ignore"):
+        return np.stack([view.fx * x / z + view.cx, view.fy * y / z + view.cy, z], axis=1)
+
+
+def _inside(view: View, projected: Array) -> NDArray[np.bool_]:
+    """(N,) True for points in the image."""
+    x, y, z = projected.T
+    with np.errstate(invalid="ignore"):
+        return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
+
+
+def _log_colours(view: View, projected: Array) -> tuple[NDArray[np.bool_], Array]:
+    """(M,) True for the usable ones of the points (M, 3), and (K, 3) log2 of their colours."""
+    pixels = load_view(view)
+    column, row = projected[:, 0].astype(int), projected[:, 1].astype(int)
+    colours = cv2.blur(pixels.rgb, (WINDOW, WINDOW))[row, column] / 255.0
+    usable = ((colours > DARK) & (colours < BRIGHT)).all(axis=1)
+    if pixels.mask is not None:
+        usable &= pixels.mask[row, column]
+    return usable, np.log2(colours[usable])

@@ -1,0 +1,1 @@
+"""Appearance of photographs: light, weather and processing that differ between them."""

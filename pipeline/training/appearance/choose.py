@@ -1,0 +1,88 @@
+"""The choice of a model for the appearance of photographs (``train.appearance``)."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.photos.disagreement import colour_disagreement
+from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.scene.exposure import NO_GAINS, ExposureGains
+from pipeline.scene.reconstruction import Reconstruction
+from pipeline.scene.views import View
+
+# Standard deviation in stops from which photographs are taken as differently exposed: with fixed
+# exposure it is 0 to 0.1, in collections from the internet 0.5.
+EXPOSURES_DIFFER = 0.2
+# Disagreement on colours (``colour_disagreement``) from which photographs are taken to be in
+# different light. It is up to 0.1 in photographs of one day, and 0.15 or more in collections from
+# the internet.
+COLOURS_DISAGREE = 0.13
+
+
+@dataclass
+class AppearanceChoice:
+    """How the colours of photographs differ.
+
+    Attributes:
+        gains: exposure gains of all views; empty if exposure is not modelled.
+        embeddings: whether views have appearance embeddings.
+        decisions: sentences for the user.
+        counters: what was measured, by the name of its counter.
+    """
+
+    gains: ExposureGains = NO_GAINS
+    embeddings: bool = False
+    decisions: list[str] = field(default_factory=list)
+    counters: dict[str, float] = field(default_factory=dict)
+
+
+def choose_appearance(
+    views: Sequence[View],
+    model: Reconstruction,
+    points: NDArray[np.float64],
+    wanted: str,
+    *,
+    has_alpha: bool,
+    in_blocks: bool,
+) -> AppearanceChoice:
+    """Settle ``train.appearance``.
+
+    Args:
+        views: all views.
+        points: (N, 3) of the scene, for a model without points.
+        wanted: the option.
+        has_alpha: whether photographs have alpha: exposure is not modelled.
+        in_blocks: whether the scene is trained in blocks: ``auto`` chooses no embeddings.
+    """
+    choice = AppearanceChoice(embeddings=wanted == "embedding")
+    if wanted in ("none", "embedding") or has_alpha:
+        return choice
+    if wanted == "auto" and not in_blocks:
+        training = [view for view in views if not view.is_test]
+        disagreement = colour_disagreement(training, model, points)
+        choice.counters["colour_disagreement"] = round(disagreement, 4)
+        if disagreement > COLOURS_DISAGREE:
+            choice.embeddings = True
+            choice.decisions.append(
+                f"photographs disagree on colours after exposure (by {disagreement:.2f} in log2): "
+                "each has an appearance embedding (train.appearance)"
+            )
+            return choice
+    if wanted == "auto":
+        spread = measure_exposures(sample_views(views), model).spread
+        choice.counters["exposure_spread_stops"] = round(spread, 4)
+        if spread < EXPOSURES_DIFFER:
+            return choice
+    found = measure_exposures(views, model)
+    photographs = len({view.source or view.name for view in views})
+    choice.decisions.append(
+        f"exposures differ by {found.spread:.2f} stops: renders are multiplied by gains that were "
+        f"measured in {found.measured} of {photographs} photographs"
+    )
+    names = [view.name for view in views]
+    choice.gains = ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
+    return choice

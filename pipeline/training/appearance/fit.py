@@ -1,0 +1,98 @@
+"""The appearance of a trained scene in a photograph, which may not be a training photograph."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.render import Backend, RasterOptions, make_backend
+from pipeline.render.views import limit_sh_degree, raster_camera
+from pipeline.scene.appearance import Appearance, fitted_columns
+from pipeline.scene.views import View
+from pipeline.splats.gaussians import Gaussians
+from pipeline.training.appearance.embedding import with_appearance
+
+Array = NDArray[np.float64]
+
+# Gauss-Newton steps. Only colours that are clamped at 0 make the problem nonlinear.
+STEPS = 4
+# Difference of an embedding at which a render is linearised, in standard deviations.
+DIFFERENCE = 0.1
+# The prior has the deviations of the training photographs' embeddings; one deviation costs as much
+# as this sum of squared errors. It matters only where the fitted pixels hardly depend on a number
+# of the embedding.
+PRIOR = 1.0
+
+
+def in_photograph(
+    gaussians: Gaussians,
+    appearance: Appearance,
+    view: View,
+    photo: NDArray[np.uint8],
+    mask: NDArray[np.bool_] | None,
+    options: RasterOptions,
+    backend: Backend | None = None,
+) -> Gaussians:
+    """The Gaussians in the colours of a photograph. The embedding of a photograph that is not a
+    training photograph is fitted on its left half.
+
+    Args:
+        gaussians: of the scene.
+        photo, mask: see ``fit_embedding``; the mask is False for ignored pixels.
+    """
+    gaussians = replace(gaussians, appearance=torch.from_numpy(appearance.colors))
+    embedding = appearance.embeddings.get(view.name)
+    if embedding is None:
+        left = np.zeros(photo.shape[:2], bool)
+        left[:, : fitted_columns(photo.shape[1])] = True
+        pixels = left if mask is None else left & mask
+        known = np.array(list(appearance.embeddings.values()))
+        embedding = fit_embedding(gaussians, view, photo, pixels, known, options, backend)
+    return replace(with_appearance(gaussians, embedding), appearance=None)
+
+
+def fit_embedding(
+    gaussians: Gaussians,
+    view: View,
+    photo: NDArray[np.uint8],
+    pixels: NDArray[np.bool_],
+    known: Array,
+    options: RasterOptions,
+    backend: Backend | None = None,
+) -> Array:
+    """(K,) embedding with which the render is closest to some pixels of a photograph, by least
+    squares.
+
+    Args:
+        gaussians: with ``appearance``.
+        photo: (H, W, 3), over the background of ``options``.
+        pixels: (H, W), those to fit.
+        known: (V, K) embeddings of the training photographs, of mean 0.
+        backend: None: the default.
+    """
+    backend = backend or make_backend()
+    options = limit_sh_degree(options, gaussians)
+    camera, target = raster_camera(view), photo[pixels] / 255.0
+    deviations = np.sqrt((known**2).mean(0)) + 1e-6
+    prior = PRIOR / deviations**2
+
+    def render(embedding: Array) -> Array:
+        shown = with_appearance(gaussians, embedding)
+        color = backend.forward(*shown.parameters(), camera, options).color.numpy()
+        return color[pixels].astype(np.float64)
+
+    embedding = np.zeros(known.shape[1])
+    for _ in range(STEPS):
+        now = render(embedding)
+        slopes = [
+            (render(embedding + step) - now) / step.sum()
+            for step in np.diag(DIFFERENCE * deviations)
+        ]
+        # Not matrix products: BLAS may round differently with the number of threads.
+        normal = np.array([[np.sum(a * b) for b in slopes] for a in slopes])
+        right = np.array([np.sum(a * (target - now)) for a in slopes])
+        embedding = embedding + np.linalg.solve(normal + np.diag(prior), right - prior * embedding)
+    return embedding

@@ -1,0 +1,56 @@
+"""The choice of a model for the appearance of photographs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from pipeline.training.appearance.choose import AppearanceChoice, choose_appearance
+from tests.photos.test_disagreement import photographs
+
+ALIKE = np.ones((8, 3))
+EXPOSED = np.array([[0.7] * 3, [1.4] * 3] * 4)
+
+
+def choose(
+    folder: Path,
+    wanted: str,
+    lights: list[int],
+    gains: np.ndarray = ALIKE,
+    *,
+    has_alpha: bool = False,
+    in_blocks: bool = False,
+) -> AppearanceChoice:
+    views, model, points = photographs(folder, lights, gains)
+    return choose_appearance(views, model, points, wanted, has_alpha=has_alpha, in_blocks=in_blocks)
+
+
+def test_auto_chooses_by_what_the_photographs_show(tmp_path: Path) -> None:
+    alike = choose(tmp_path, "auto", [0] * 8)
+    assert not alike.gains and not alike.embeddings and not alike.decisions
+    assert alike.counters["colour_disagreement"] < 0.03
+    exposed = choose(tmp_path, "auto", [0] * 8, EXPOSED)
+    assert exposed.gains and not exposed.embeddings
+    assert "exposures differ" in exposed.decisions[0]
+    lights = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED)
+    assert lights.embeddings and not lights.gains
+    assert "train.appearance" in lights.decisions[0]
+
+
+@pytest.mark.parametrize(
+    ("wanted", "gains", "embeddings"),
+    [("none", False, False), ("exposure", True, False), ("embedding", False, True)],
+)
+def test_a_chosen_model_is_used(tmp_path: Path, wanted: str, gains: bool, embeddings: bool) -> None:
+    found = choose(tmp_path, wanted, [0, 1] * 4)
+    assert bool(found.gains) == gains and found.embeddings == embeddings
+    assert not found.counters
+
+
+def test_blocks_have_no_embeddings_and_alpha_no_gains(tmp_path: Path) -> None:
+    in_blocks = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED, in_blocks=True)
+    assert in_blocks.gains and not in_blocks.embeddings
+    with_alpha = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED, has_alpha=True)
+    assert not with_alpha.gains and not with_alpha.embeddings and not with_alpha.counters

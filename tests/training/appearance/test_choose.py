@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from pipeline.training.appearance import choose as choose_module
 from pipeline.training.appearance.choose import AppearanceChoice, choose_appearance
 from tests.photos.test_disagreement import photographs
 
@@ -54,3 +56,16 @@ def test_blocks_have_no_embeddings_and_alpha_no_gains(tmp_path: Path) -> None:
     assert in_blocks.gains and not in_blocks.embeddings
     with_alpha = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED, has_alpha=True)
     assert not with_alpha.gains and not with_alpha.embeddings and not with_alpha.counters
+
+
+@pytest.mark.parametrize("cameras", [1, 8])
+def test_a_collection_by_many_cameras_needs_less_evidence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cameras: int
+) -> None:
+    """Where points are inaccurate, photographs of one camera disagree as well."""
+    monkeypatch.setattr(choose_module, "colour_disagreement", lambda *_: 0.2)
+    views, model, points = photographs(tmp_path, [0] * 8, ALIKE)
+    for number, image in model.images.items():
+        model.images[number] = replace(image, camera_id=number % cameras + 1)
+    found = choose_appearance(views, model, points, "auto", has_alpha=False, in_blocks=False)
+    assert found.embeddings == (cameras == 8)

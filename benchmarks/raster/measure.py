@@ -121,7 +121,7 @@ class Step:
         def project_backward() -> None:
             kept["gradients"] = kernels.project_backward(
                 *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
-                kept["slots"], False, False, False, *moments[4], last, sh_adam, threads,
+                kept["slots"], False, False, False, False, *moments[4], last, sh_adam, threads,
             )  # fmt: skip
 
         def adam() -> None:

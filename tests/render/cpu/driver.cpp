@@ -126,7 +126,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
             d_color.get());
     Array<float> slot_gradients(entries.size * kSlotFloats);
     Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
-    Array<float> d_means2d(2 * n), d_abs(2 * n);
+    Array<float> d_means2d(2 * n), d_abs(2 * n), d_colors(3 * n);
     Array<double> d_camera(kCameraParameters);
     for (const bool everything : {true, false}) {
         blend_backward(records.get(), pairs, view,
@@ -137,7 +137,8 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
         project_view_backward(
             in, view, threads, records.get(), radii.get(), slots.get(), slot_gradients.get(),
             {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), d_sh.get(),
-             d_means2d.get(), d_abs.get(), everything ? d_camera.get() : nullptr},
+             d_means2d.get(), d_abs.get(), everything ? d_colors.get() : nullptr,
+             everything ? d_camera.get() : nullptr},
             nullptr);
     }
     Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
@@ -147,7 +148,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
                           slot_gradients.get(),
                           {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), nullptr,
-                           d_means2d.get(), d_abs.get(), nullptr},
+                           d_means2d.get(), d_abs.get(), nullptr, nullptr},
                           &sh_adam);
     expect_finite(d_camera, "d_camera");
     for (Array<float>* moments : {&m, &v}) expect_finite(*moments, "moments");
@@ -243,7 +244,7 @@ int run_file(const char* input, const char* output) {
     project_view_backward(gaussians, view, threads, records.get(), radii.get(), slots.get(),
                           slot_gradients.get(),
                           {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                           d_sh.get(), d_means2d.get(), d_abs.get(), d_camera.get()},
+                           d_sh.get(), d_means2d.get(), d_abs.get(), nullptr, d_camera.get()},
                           nullptr);
     l1_ssim({h.width, h.height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
             d_loss.get());

@@ -205,7 +205,7 @@ def run(name: str, call: int, tally: Tally) -> None:
     image = reference.blend(projection, colors, camera, options)
     sure = image.margin > MARGIN
     d_color *= sure[..., None]
-    found = backward(drawn, d_color, camera=True)
+    found = backward(drawn, d_color, colors=True, camera=True)
 
     values = [drawn.color, drawn.alpha, drawn.depth, drawn.median_depth, drawn.radii]
     values += [getattr(found, f.name) for f in fields(found) if f.name != "camera"]

@@ -16,6 +16,7 @@ ROOMS = (
     *("runtime", "config", "geometry", "scene", "splats", "io", "plan", "photos", "sfm", "mvs"),
     "render",
     *("training.data", "training.losses", "training.optimisers", "training.cameras"),
+    "training.appearance",
     *("training.density", "training.checkpoints", "training.loop", "training.scene"),
     "training.blocks",
     *("metrics", "coverage", "surface", "export", "reporting", "watching", "demo"),

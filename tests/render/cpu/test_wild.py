@@ -33,7 +33,8 @@ def check(
     gen = torch.Generator().manual_seed(seed)
     shape = (cam.height, cam.width)
     d_alpha, d_depth = torch.randn(shape, generator=gen), torch.randn(shape, generator=gen)
-    g = render.backward(fwd, torch.randn(*shape, 3, generator=gen), d_alpha, d_depth, camera=True)
+    d_color = torch.randn(*shape, 3, generator=gen)
+    g = render.backward(fwd, d_color, d_alpha, d_depth, colors=True, camera=True)
     assert g.camera is not None
     assert all(value.isfinite().all() for value in vars(g.camera).values())
     for field in dataclasses.fields(g):

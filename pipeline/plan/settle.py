@@ -21,6 +21,7 @@ from pipeline.plan.published import as_published, published_line
 from pipeline.plan.scan import Scan
 from pipeline.plan.training_memory import MEMORY_MARGIN, blocks_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
+from pipeline.scene.collection import MIXED_BODIES, MIXED_GROUP_SHARE, camera_bodies
 
 # Up to this many photographs (780 pairs), all pairs are matched. For more, retrieval takes a
 # fraction of the time.
@@ -29,10 +30,6 @@ MAX_EXHAUSTIVE_PHOTOS = 40
 # and positions of most photographs.
 MIN_SPATIAL_EXTENT_M = 50.0
 MIN_SPATIAL_SHARE = 0.9
-# Collections of photographs by many people, in which photographs of the same size need not share a
-# camera: at least so many bodies, or so many camera groups per photograph.
-MIXED_BODIES = 3
-MIXED_GROUP_SHARE = 0.5
 # Up to this many photographs, depths improve test views: depth maps, or those of sparse points.
 FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
@@ -200,7 +197,7 @@ def _share_cameras(scan: Scan, config: Config) -> Choice:
     if wanted != "auto":
         return wanted, f"cameras shared by {wanted}, as configured"
     groups = {photo.camera_group for photo in scan.planned}
-    bodies = {group.split(" | ")[0] for group in groups if " | " in group}
+    bodies = camera_bodies(groups)
     count = len(scan.planned)
     if len(bodies) >= MIXED_BODIES:
         return "image", f"one camera per image: photographs by {len(bodies)} different cameras"

@@ -121,6 +121,7 @@ def train_scene(
         model,
         initial.means.double().numpy(),
         config.appearance,
+        cameras=[photo.camera_group for photo in manifest.photos],
         has_alpha=has_alpha,
         in_blocks=part != WHOLE_RUN,
     )

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from pipeline.photos.disagreement import colour_disagreement
 from pipeline.photos.exposure import measure_exposures, sample_views
+from pipeline.scene.collection import is_collection
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
@@ -20,9 +21,7 @@ EXPOSURES_DIFFER = 0.2
 # Disagreement on colours (``colour_disagreement``) from which photographs are taken to be in
 # different light. Of one camera on one day it is up to 0.1, or 0.2 where points are inaccurate (a
 # street driven along); with another light, 0.6. In collections by many cameras it is 0.15 or more.
-COLOURS_DISAGREE, COLOURS_OF_MANY_CAMERAS_DISAGREE = 0.3, 0.13
-# A collection has at least so many cameras per photograph.
-MANY_CAMERAS = 0.5
+COLOURS_DISAGREE, COLOURS_OF_COLLECTION_DISAGREE = 0.3, 0.13
 
 
 @dataclass
@@ -48,6 +47,7 @@ def choose_appearance(
     points: NDArray[np.float64],
     wanted: str,
     *,
+    cameras: Sequence[str],
     has_alpha: bool,
     in_blocks: bool,
 ) -> AppearanceChoice:
@@ -57,6 +57,7 @@ def choose_appearance(
         views: all views.
         points: (N, 3) of the scene, for a model without points.
         wanted: the option.
+        cameras: camera group of each photograph.
         has_alpha: whether photographs have alpha: exposure is not modelled.
         in_blocks: whether the scene is trained in blocks: ``auto`` chooses no embeddings.
     """
@@ -67,7 +68,9 @@ def choose_appearance(
         training = [view for view in views if not view.is_test]
         disagreement = colour_disagreement(training, model, points)
         choice.counters["colour_disagreement"] = round(disagreement, 4)
-        if disagreement > _least_disagreement(training, model):
+        collection = is_collection(cameras)
+        limit = COLOURS_OF_COLLECTION_DISAGREE if collection else COLOURS_DISAGREE
+        if disagreement > limit:
             choice.embeddings = True
             choice.decisions.append(
                 f"photographs disagree on colours after exposure (by {disagreement:.2f} in log2): "
@@ -88,11 +91,3 @@ def choose_appearance(
     names = [view.name for view in views]
     choice.gains = ExposureGains(dict(zip(names, found.gains.tolist(), strict=True)))
     return choice
-
-
-def _least_disagreement(views: Sequence[View], model: Reconstruction) -> float:
-    """Disagreement on colours from which photographs are taken to be in different light."""
-    cameras = {image.name: image.camera_id for image in model.images.values()}
-    used = {cameras[view.name] for view in views if view.name in cameras}
-    many = len(used) >= MANY_CAMERAS * len(views)
-    return COLOURS_OF_MANY_CAMERAS_DISAGREE if many else COLOURS_DISAGREE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -26,7 +25,15 @@ def choose(
     in_blocks: bool = False,
 ) -> AppearanceChoice:
     views, model, points = photographs(folder, lights, gains)
-    return choose_appearance(views, model, points, wanted, has_alpha=has_alpha, in_blocks=in_blocks)
+    return choose_appearance(
+        views,
+        model,
+        points,
+        wanted,
+        cameras=["one"] * len(views),
+        has_alpha=has_alpha,
+        in_blocks=in_blocks,
+    )
 
 
 def test_auto_chooses_by_what_the_photographs_show(tmp_path: Path) -> None:
@@ -64,8 +71,7 @@ def test_a_collection_by_many_cameras_needs_less_evidence(
 ) -> None:
     """Where points are inaccurate, photographs of one camera disagree as well."""
     monkeypatch.setattr(choose_module, "colour_disagreement", lambda *_: 0.2)
-    views, model, points = photographs(tmp_path, [0] * 8, ALIKE)
-    for number, image in model.images.items():
-        model.images[number] = replace(image, camera_id=number % cameras + 1)
-    found = choose_appearance(views, model, points, "auto", has_alpha=False, in_blocks=False)
+    scene = photographs(tmp_path, [0] * 8, ALIKE)
+    groups = [f"{number % cameras}" for number in range(8)]
+    found = choose_appearance(*scene, "auto", cameras=groups, has_alpha=False, in_blocks=False)
     assert found.embeddings == (cameras == 8)

@@ -218,7 +218,7 @@ def _background(scan: Scan, config: Config) -> Choice:
         return "white", f"white background: {scan.num_alpha} photographs have alpha"
     if scan.num_alpha:
         return "black", f"black background: only {scan.num_alpha} photographs have alpha"
-    if scan.num_masks and config.views.masks != "ignore":
+    if scan.num_masks:
         return "black", "black background: masks exclude what is behind the scene"
     if config.train.density.strategy == "original":
         return "black", "black background, as published"
@@ -226,8 +226,8 @@ def _background(scan: Scan, config: Config) -> Choice:
 
 
 def _init_method(scan: Scan, config: Config) -> str:
-    """What Gaussians are initialised from. Photographs with alpha or masks show objects, on which
-    sparse points are dense; given depths are better than estimated ones."""
+    """What Gaussians are initialised from: depth maps of few photographs, unless points or depths
+    are given. Alpha, masks and panoramas exclude them: whether they pay there is not known."""
     if config.init.method != "auto":
         return config.init.method
     other = scan.cloud is not None or scan.num_alpha or scan.num_masks or scan.num_depths

@@ -85,6 +85,8 @@ class Sky:
     ) -> NDArray[np.bool_]:
         """(N,) whether Gaussians at these means (N, 3) are sky: over ``SKY_DISTANCE`` times as far
         away as half of all, by number or by ``weights`` (N,)."""
+        if not len(means):
+            return np.zeros(0, bool)
         finite = np.isfinite(means).all(1)
         distance = np.zeros(len(means))
         distance[finite] = nearest_distance(means[finite].astype(np.float64), self.camera_centres)

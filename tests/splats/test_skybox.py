@@ -87,5 +87,6 @@ def test_the_sky_is_the_skybox_and_nothing_else() -> None:
     expected = np.arange(len(gaussians)) >= len(gaussians) - NUM_GAUSSIANS
     weights = np.where(expected, 0.1, 1.0)
     assert np.array_equal(Sky(CENTRES).contains(gaussians.means, weights), expected)
+    assert Sky(CENTRES).contains(gaussians.means[:0]).shape == (0,)
     many = with_skybox(scene(600), CENTRES).means
     assert np.array_equal(Sky(CENTRES).contains(many), np.arange(len(many)) >= 600)

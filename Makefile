@@ -43,7 +43,7 @@ $(VENV)/product: pyproject.toml
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
 
-$(VENV)/watch $(VENV)/dev $(VENV)/test $(VENV)/docs $(VENV)/slurm: $(VENV)/product
+$(VENV)/watch $(VENV)/gpu $(VENV)/dev $(VENV)/test $(VENV)/docs $(VENV)/slurm: $(VENV)/product
 	@echo "installing the packages of '$(@F)' into $(VENV)"
 	@$(PIP_INSTALL) $@.txt
 	@touch $@
@@ -69,7 +69,7 @@ WORKERS := 3
 # These start a Slurm cluster on this machine, of which there is one at a time.
 SLURM_TESTS := tests/cluster
 
-test: setup $(VENV)/dev
+test: setup $(VENV)/dev $(VENV)/gpu
 	@$(BIN)/python -m pytest tests --ignore=$(SLURM_TESTS) -n $(WORKERS) --dist worksteal
 
 test-slurm: setup $(VENV)/dev $(VENV)/slurm
@@ -77,7 +77,7 @@ test-slurm: setup $(VENV)/dev $(VENV)/slurm
 
 # What a C++ compiler can change; CXX chooses it.
 NATIVE_TESTS := tests/render tests/sfm/test_matching.py tests/training
-test-native: setup $(VENV)/dev
+test-native: setup $(VENV)/dev $(VENV)/gpu
 	@$(BIN)/python -m pytest $(NATIVE_TESTS) -n $(WORKERS) --dist worksteal
 
 # Other projects' readers and decoders: without them, the tests that compare with them are skipped.

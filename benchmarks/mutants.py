@@ -46,8 +46,8 @@ class Mutant:
 
 
 _CSRC = "pipeline/render/cpu/csrc"
-_KERNELS = ("tests/render/cpu/test_kernels.py",)
-_LOSS = ("tests/render/cpu/test_loss_adam.py",)
+_KERNELS = ("tests/render/test_kernels.py",)
+_LOSS = ("tests/render/test_loss_adam.py",)
 
 MUTANTS: dict[str, Mutant] = {
     "half_gradient": Mutant(

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import StressResult
-from pipeline.render import RasterCamera, RasterOptions, backward, forward, reference
+from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend, reference
 from pipeline.runtime.progress import Progress
 
 PER_CALL = 512  # Gaussians per call; each is a case
@@ -180,7 +180,7 @@ class Tally:
         )
 
 
-def run(name: str, call: int, tally: Tally) -> None:
+def run(name: str, call: int, tally: Tally, backend: Backend) -> None:
     """One call: ``PER_CALL`` cases of a family, forward, backward and the reference."""
     rng = np.random.default_rng([list(FAMILIES).index(name), call])
     case = Case(rng)
@@ -194,7 +194,7 @@ def run(name: str, call: int, tally: Tally) -> None:
     )
     options = RasterOptions(antialias=bool(rng.integers(2)), background=(0.1, 0.5, 0.9), threads=1)
     means, log_scales, quats, logits, sh = scene
-    drawn = forward(means, log_scales, quats, logits, sh, camera, options)
+    drawn = backend.forward(means, log_scales, quats, logits, sh, camera, options)
     d_color = torch.from_numpy(rng.standard_normal((height, width, 3)).astype(np.float32))
 
     leaves = [t.double().requires_grad_() for t in scene]
@@ -205,7 +205,7 @@ def run(name: str, call: int, tally: Tally) -> None:
     image = reference.blend(projection, colors, camera, options)
     sure = image.margin > MARGIN
     d_color *= sure[..., None]
-    found = backward(drawn, d_color, colors=True, camera=True)
+    found = backend.backward(drawn, d_color, colors=True, camera=True)
 
     values = [drawn.color, drawn.alpha, drawn.depth, drawn.median_depth, drawn.radii]
     values += [getattr(found, f.name) for f in fields(found) if f.name != "camera"]
@@ -237,15 +237,17 @@ def main() -> None:
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     parser.add_argument("--cases", type=int, default=20_000, help="Gaussians over all families")
+    parser.add_argument("--device", default="cpu", help="cpu, gpu or gpu:N")
     add_record_options(parser)
     args = parser.parse_args()
+    backend = make_backend(args.device)
     torch.set_num_threads(1)
     calls = -(-args.cases // (PER_CALL * len(FAMILIES)))
     progress = Progress("stress", calls * len(FAMILIES), unit="calls")
     tallies = {name: Tally() for name in FAMILIES}
     for call in range(calls):
         for name, tally in tallies.items():
-            run(name, call, tally)
+            run(name, call, tally, backend)
             progress.advance()
     print(
         f"{'':32} {'cases':>8} {'drawn':>8} {'dropped':>8} {'not finite':>10} {'colour':>9} "

@@ -194,21 +194,38 @@ def _memory() -> list[Finding]:
 
 
 def _graphics() -> list[Finding]:
-    """Graphics cards and Vulkan devices, which are listed but not used."""
+    """Graphics cards, the devices that can train, and which one ``train.device: auto`` takes."""
     query = ["nvidia-smi", "--query-gpu=name,memory.total,driver_version", "--format=csv,noheader"]
     cards = _output(query).splitlines()
     gpu = [Finding("GPU", f"{card.strip()} (NVIDIA)", "there") for card in cards if card.strip()]
-    names = re.findall(r"deviceName\s*=\s*(.+)", _output(["vulkaninfo", "--summary"]))
     drivers = _vulkan_drivers()
-    vulkan = [Finding("Vulkan", name.strip(), "there") for name in dict.fromkeys(names)]
-    if not vulkan and drivers:
-        text = f"drivers {', '.join(drivers)}; vulkaninfo, which names devices, is not installed"
-        vulkan = [Finding("Vulkan", text, "there")]
+    vulkan = [Finding("Vulkan", f"drivers {', '.join(drivers)}", "there")] if drivers else []
     none = "none found; everything runs on the processor"
     return [
-        *(gpu or [Finding("GPU", none, "absent")]),
+        *(gpu or ([] if vulkan else [Finding("GPU", none, "absent")])),
         *(vulkan or [Finding("Vulkan", none, "absent")]),
+        *_training_devices(bool(gpu or vulkan)),
     ]
+
+
+def _training_devices(has_graphics: bool) -> list[Finding]:
+    if find_spec("wgpu") is None:
+        fix = "pip install 'splatmake[gpu]', to train on a GPU" if has_graphics else None
+        return [Finding("training", "on the processor; wgpu is not installed", "absent", fix)]
+    try:
+        from pipeline.render.gpu.choose import choose_device
+        from pipeline.render.gpu.device import adapters
+
+        found = adapters()
+        device, reason = choose_device()
+    except (ImportError, UserError) as error:
+        return [Finding("training", f"on the processor: {error}", "absent")]
+    used = [device == f"gpu:{adapter.number}" for adapter in found]
+    listed = [
+        Finding(f"gpu:{adapter.number}", f"{adapter}, {adapter.driver}", "used" if it else "there")
+        for adapter, it in zip(found, used, strict=True)
+    ]
+    return [*listed, Finding("training", reason)]
 
 
 def _vulkan_drivers() -> list[str]:

@@ -23,7 +23,12 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     from pipeline.plan.budget import length_line, memory_line, resolution_line
 
     config, why = settled.config, settled.why
-    settled_options = ("train.density.max_gaussians", "train.background", "train.depth_loss_weight")
+    settled_options = (
+        "train.device",
+        "train.density.max_gaussians",
+        "train.background",
+        "train.depth_loss_weight",
+    )
     decisions = [
         resolution_line(scan, config),
         *(why[name] for name in (*settled_options, "views.masks")),

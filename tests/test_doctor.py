@@ -12,7 +12,10 @@ import pytest
 
 from pipeline import doctor
 from pipeline.command.main import main
+from pipeline.render.gpu import choose, device
+from pipeline.render.gpu.device import Adapter
 from pipeline.runtime import processor
+from tests.tools import need_package
 
 REPOSITORY = Path(__file__).parents[1]
 
@@ -108,10 +111,36 @@ def test_graphics_devices_are_shown_as_not_used(bare, tmp_path):
     gpus = [finding.text for finding in doctor._graphics() if finding.topic == "GPU"]
     assert [text.partition(",")[0] for text in gpus] == ["NVIDIA X1", "NVIDIA X2"]
     assert "radeon_icd" in topics(tmp_path)["Vulkan"].text
-    program(bare, "vulkaninfo", "GPU0:\n  deviceName = Radeon 1\nGPU1:\n  deviceName  = llvmpipe")
-    names = [finding.text for finding in doctor._graphics() if finding.topic == "Vulkan"]
-    assert names == ["Radeon 1", "llvmpipe"]
-    assert all(finding.state == "there" for finding in doctor._graphics())
+    found = doctor._graphics()
+    assert {finding.state for finding in found if finding.topic != "training"} == {"there"}
+
+
+def test_the_device_that_trains_is_shown_with_the_reason(bare, monkeypatch):
+    """A GPU if it is faster in the stored measurement; never one in software."""
+    need_package("wgpu")
+    card = Adapter(1, "Radeon 1", "driver 2", "discrete", "Vulkan")
+    software = Adapter(0, "llvmpipe", "Mesa", "software", "Vulkan")
+    found = [software]
+    monkeypatch.setattr(device, "adapters", lambda: found)
+    monkeypatch.setattr(choose, "adapters", lambda: found)
+    monkeypatch.setattr(choose, "_measured", lambda *_: (0.010, 0.025))
+
+    def shown() -> dict[str, doctor.Finding]:
+        return {finding.topic: finding for finding in doctor._graphics()}
+
+    assert "llvmpipe, is software" in shown()["training"].text
+    found.insert(0, card)
+    assert shown()["gpu:1"].state == "used" and shown()["gpu:0"].state == "there"
+    assert "10 ms on Radeon 1 (discrete, Vulkan), 25 without" in shown()["training"].text
+    monkeypatch.setattr(choose, "_measured", lambda *_: (0.025, 0.010))
+    assert shown()["gpu:1"].state == "there"
+    assert shown()["training"].text.startswith("trained on the processor: ")
+    found.clear()
+    assert choose.choose_device() == (
+        "cpu", "trained on the processor, not on a GPU: none was found"
+    )  # fmt: skip
+    monkeypatch.setattr(choose, "find_spec", lambda _: None)
+    assert choose.choose_device() == ("cpu", "")
 
 
 def test_little_disk_and_memory_are_said(bare, tmp_path, monkeypatch):

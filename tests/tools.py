@@ -67,6 +67,15 @@ def need_package(name: str, exactly: str | None = None) -> None:
         pytest.skip(f"not run: {name} {found} (pip install {wanted})")
 
 
+def need_gpu() -> None:
+    """Skips the test without a device of WebGPU; one in software is enough."""
+    need_package("wgpu")
+    from pipeline.render.gpu.device import adapters
+
+    if not adapters():
+        pytest.skip("not run: no Vulkan device (apt-get install mesa-vulkan-drivers)")
+
+
 def need_data(name: str) -> Path:
     """A file or folder of the shared data; skips the test where it is missing."""
     path = SHARED_DATA / name

@@ -22,7 +22,7 @@ from benchmarks.results import JudgeResult
 from pipeline.config.schema import Sfm
 from pipeline.io.colmap import read_model
 from pipeline.runtime.isolate import run_isolated
-from pipeline.sfm.attempts import Attempt, map_until_good
+from pipeline.sfm.attempts import MAX_ATTEMPTS, Attempt, map_until_good
 from pipeline.sfm.mappers import Mapper
 from pipeline.sfm.models import write_model
 from pipeline.sfm.quiet import quiet_colmap
@@ -140,7 +140,7 @@ def main() -> int:
     )
     parser.add_argument("--mapper", choices=["incremental", "global"], default="incremental")
     parser.add_argument(
-        "--budget", type=int, default=Sfm().max_attempts, help="largest number of attempts"
+        "--budget", type=int, default=MAX_ATTEMPTS, help="largest number of attempts"
     )
     add_record_options(parser)
     args = parser.parse_args()

@@ -26,6 +26,7 @@ from pipeline.config.section import (
     Unit,
 )
 
+Device = Literal["auto", "cpu", "gpu"] | Annotated[str, Field(pattern=r"^gpu:\d+$")]
 SHDegree = Annotated[int, Field(ge=0, le=3), Unit("degree")]
 
 
@@ -184,11 +185,6 @@ class Sfm(Section):
     min_registered_share: Share = Field(
         0.5, description="A model with a smaller share of registered photographs is an error."
     )
-    max_attempts: Count = Field(
-        4,
-        description="Maximum number of reconstructions while the model is not good: the other "
-        "mapper, one camera per size, other focal lengths, a fisheye model.",
-    )
     georeference: Literal["auto", "gps", "gcp", "none"] = Field(
         "auto",
         description="Coordinate frame of the model. gcp: metres in the projection of gcp_list.txt "
@@ -307,6 +303,12 @@ class Train(Section):
         None,
         description="Train for this time instead of a number of steps. The number of steps depends "
         "on the machine and its load, so that results of two runs differ.",
+    )
+    device: Device = Field(
+        "auto",
+        description="What trains: cpu, the processor; gpu, a GPU through WebGPU, or another than "
+        "the first (gpu:1); it needs `pip install splatmake[gpu]`. auto: a GPU if a short "
+        "measurement on this machine finds that it is faster, but not on a cluster.",
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the spherical harmonics.")
     background: Literal["auto", "skybox", "black", "white", "random"] = Field(

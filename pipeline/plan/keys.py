@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from functools import cache
-from importlib.metadata import version
+from importlib.metadata import PackageNotFoundError, version
 from typing import Any
 
 from pipeline.config.options import select
@@ -11,11 +11,19 @@ from pipeline.plan.plan import plan_record
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
 from pipeline.runtime.record import canonical
-from pipeline.runtime.source import stage_source_hash
+from pipeline.runtime.source import gpu_source_hash, stage_source_hash
 
 # Computed once for all runs of a batch.
 _version = cache(version)
 _source_hash = cache(stage_source_hash)
+
+
+def installed_version(package: str) -> str | None:
+    """None if it is not installed, which the job reports."""
+    try:
+        return _version(package)
+    except PackageNotFoundError:
+        return None
 
 
 def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
@@ -36,6 +44,9 @@ def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
+    if "train" in spec.options and plan.config.train.device != "cpu":
+        key |= {"gpu_source": gpu_source_hash()}
+        key["packages"] = {**key["packages"], "wgpu": installed_version("wgpu")}
     if spec.scattered:
         key |= {"job": job, "jobs": plan.stages[spec.name].jobs}
     if spec.shows_plan:

@@ -16,7 +16,7 @@ from pipeline.plan.panoramas import panorama_hints
 from pipeline.plan.published import published_scene
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
-from pipeline.plan.settle import gps_extent_m, settle
+from pipeline.plan.settle import PROCESSOR, Choice, gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.summary import found
 from pipeline.plan.values import Plan, SceneFacts
@@ -26,15 +26,22 @@ MAX_LISTED = 20
 
 
 def make_plan(
-    scan: Scan, config: Config, stages: Mapping[str, StageSpec], folder: str = ""
+    scan: Scan,
+    config: Config,
+    stages: Mapping[str, StageSpec],
+    folder: str = "",
+    device: Choice = PROCESSOR,
 ) -> Plan:
     """Decide which of ``stages`` a scene needs, and settle its options.
+
+    Args:
+        device: the machine's, for ``train.device: auto``.
 
     Raises:
         UserError: see ``settle``.
     """
     scan = scan.with_frames(config.video.max_frames)
-    settled = settle(scan, config)
+    settled = settle(scan, config, device)
     decided = {name: spec.decide(scan, settled) for name, spec in stages.items()}
     running = {name for name, stage in decided.items() if stage.run}
     for name in running:

@@ -42,6 +42,8 @@ MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
 """An option's value, and the sentence that gives the value and the reason."""
+PROCESSOR: Choice = ("cpu", "")
+"""The device of a machine without a GPU."""
 
 
 @dataclass(frozen=True)
@@ -56,8 +58,11 @@ class Settled:
     why: Mapping[str, str]
 
 
-def settle(scan: Scan, config: Config) -> Settled:
+def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
     """Settle the options for a scene.
+
+    Args:
+        device: the machine's, for ``train.device: auto``.
 
     Raises:
         UserError: ``partition.memory_mb`` is too small, ``split.source: published`` for a scene
@@ -70,6 +75,7 @@ def settle(scan: Scan, config: Config) -> Settled:
         "sfm.camera_model": _camera_model(scan, config),
         "sfm.share_cameras": _share_cameras(scan, config),
         "train.background": _background(scan, config),
+        "train.device": _device(config, device),
     }
     value = {path: choice for path, (choice, _) in chosen.items()}
     photos_per_job, jobs_reason = _photos_per_job(scan, config)
@@ -99,6 +105,7 @@ def settle(scan: Scan, config: Config) -> Settled:
             "partition": {"blocks": blocks},
             "train": {
                 "background": value["train.background"],
+                "device": value["train.device"],
                 "depth_loss_weight": depth_weight,
                 "density": config.train.density.model_copy(update={"max_gaussians": budget}),
             },
@@ -223,6 +230,16 @@ def _background(scan: Scan, config: Config) -> Choice:
     if config.train.density.strategy == "original":
         return "black", "black background, as published"
     return "skybox", "a skybox behind the scene: neither alpha nor masks"
+
+
+def _device(config: Config, device: Choice) -> Choice:
+    wanted = config.train.device
+    if wanted == "auto":
+        return device
+    if wanted == "cpu":
+        return wanted, ""
+    number = wanted.removeprefix("gpu").removeprefix(":") or "0"
+    return f"gpu:{number}", f"trained on GPU {number}, as configured"
 
 
 def _init_method(scan: Scan, config: Config) -> str:

@@ -16,6 +16,7 @@ import torch
 
 from pipeline.render import checks
 from pipeline.render.checks import Parameters
+from pipeline.render.resident import ResidentTraining
 from pipeline.render.types import (
     AlphaChangeLoss,
     DenseAdam,
@@ -54,6 +55,10 @@ class Backend(ABC, Generic[Projected, Binned]):
     def facts(self) -> Mapping[str, str]:
         """What determines the rounding of results besides the inputs, by name: instruction set,
         compiler, device. Compiles or loads the backend if necessary."""
+
+    def resident(self) -> ResidentTraining | None:
+        """Training in the memory of the backend's device; None if that is the CPU's."""
+        return None
 
     @abstractmethod
     def project(

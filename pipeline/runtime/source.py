@@ -18,10 +18,14 @@ from pipeline.runtime.native import cache_folder
 
 ROOT = Path(__file__).resolve().parents[2]
 
+GPU = "pipeline.render.gpu"
+
 # Modules that do not affect results; values of options are in the stage's key anyway.
 NEUTRAL = (
     "pipeline.runtime",
     "pipeline.config",
+    # Only stages that a GPU computes depend on it (``gpu_source_hash``).
+    GPU,
     "pipeline.plan.plan",
     "pipeline.plan.settle",
     "pipeline.plan.stage",
@@ -53,6 +57,20 @@ def stage_source_hash(module: str) -> str:
     digest = hashlib.sha256()
     for name in sorted(_reachable(module)):
         digest.update(f"{name}={_module_hash(name)}\n".encode())
+    _save_cache()
+    return digest.hexdigest()[:16]
+
+
+@cache
+def gpu_source_hash() -> str:
+    """Hash of the GPU backend's modules and kernels."""
+    folder = ROOT.joinpath(*GPU.split("."))
+    digest = hashlib.sha256()
+    for file in sorted(folder.glob("*.py")):
+        digest.update(f"{file.name}={_parsed(f'{GPU}.{file.stem}')[1]}\n".encode())
+    for file in sorted(folder.glob("wgsl/*.wgsl")):
+        text = _COMMENT.sub(lambda m: m.group(1) or " ", file.read_text("utf-8"))
+        digest.update(f"{file.name}={' '.join(text.split())}\n".encode())
     _save_cache()
     return digest.hexdigest()[:16]
 

@@ -29,6 +29,9 @@ FISHEYE_FOCAL = 0.4
 # A lens with a focal length over the longer side below this may be a fisheye.
 FISHEYE_BELOW = 0.6
 
+# Reconstructions of a scene at most.
+MAX_ATTEMPTS = 4
+
 
 @dataclass(frozen=True)
 class Attempt:
@@ -59,7 +62,12 @@ class Attempt:
 
 
 def map_until_good(
-    database: Path, first: Mapper, total: int, min_share: float, seed: int, budget: int
+    database: Path,
+    first: Mapper,
+    total: int,
+    min_share: float,
+    seed: int,
+    budget: int = MAX_ATTEMPTS,
 ) -> tuple[Attempt, list[AttemptRecord]]:
     """Map a scene until a model is good.
 

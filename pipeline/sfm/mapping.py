@@ -77,7 +77,6 @@ def reconstruct(
             total,
             config.min_registered_share,
             seed,
-            config.max_attempts,
         )
         decisions = [_describe(record, total) for record in attempts]
         if attempt.verdict.grade == "failed" or attempt.evidence is None:

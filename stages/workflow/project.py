@@ -14,12 +14,15 @@ from typing import Any, NoReturn
 from pipeline.config.config_file import check_config_file
 from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, name_fault, parse_run
+from pipeline.config.schema import Config
 from pipeline.plan import duration, stage_memory
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import describe, input_folders, make_plan, plan_record
 from pipeline.plan.scan import scan
+from pipeline.plan.settle import PROCESSOR, Choice
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
+from pipeline.render.gpu.choose import choose_device
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error
@@ -230,11 +233,19 @@ class SnakemakeProject:
         config = scene_config(self._raw, run.scene, run.config, run.seed)
         folder = self._root / run.scene
         found = scan(folder, run.scene, config, cache=RESULTS / name / SCAN_CACHE)
-        plan = make_plan(found, config, STAGES, str(folder))
+        plan = make_plan(found, config, STAGES, str(folder), self._device(config))
         first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
         return plan
+
+    def _device(self, config: Config) -> Choice:
+        """The device for ``train.device: auto``. On a cluster, a plan must be the same on every
+        node: there, a GPU is used only if the option names it."""
+        flow = self._workflow
+        if config.train.device != "auto" or flow.non_local_exec or "SLURM_JOB_ID" in os.environ:
+            return PROCESSOR
+        return choose_device()
 
     def _check_results(self, name: str) -> None:
         """Check that the run can have a folder of results: otherwise Snakemake would end with an

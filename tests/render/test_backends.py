@@ -21,6 +21,7 @@ from pipeline.render import (
 )
 from pipeline.render.registry import BACKENDS
 from tests.render.scenes import NAMES, Scene, camera, random_scene, relative
+from tests.tools import need_gpu
 
 REFERENCE = make_backend("reference")
 CAMERA = camera(31, 22, rotated=True)
@@ -29,6 +30,8 @@ OPTIONS = RasterOptions(background=(0.2, 0.5, 0.9))
 
 @pytest.fixture(params=BACKENDS)
 def backend(request: pytest.FixtureRequest) -> Backend:
+    if request.param == "gpu":
+        need_gpu()
     return make_backend(request.param)
 
 
@@ -217,5 +220,5 @@ def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:
 
 
 def test_an_unknown_backend_is_an_error() -> None:
-    with pytest.raises(ValueError, match="no backend 'x'; there are cpu, reference"):
+    with pytest.raises(ValueError, match="no backend 'x'; there are cpu, gpu, reference"):
         make_backend("x")

@@ -56,8 +56,12 @@ class Target:
         difference = rendered - image.to(torch.float32) * scale
         if self.ignored is not None:
             difference = difference[~self.ignored]
-        error = float(difference.square().mean()) if difference.numel() else 0.0
-        return -10 * math.log10(max(error, 1e-10))
+        return psnr_of(float(difference.square().mean()) if difference.numel() else 0.0)
+
+
+def psnr_of(squared_error: float) -> float:
+    """PSNR in dB of a mean squared error of values in [0, 1]."""
+    return -10 * math.log10(max(squared_error, 1e-10))
 
 
 @dataclass(frozen=True)

@@ -65,6 +65,10 @@ class GradientDensity(Strategy):
         self.reset_interval = max(1, shrunk(self.options.opacity_reset_interval, self.steps))
 
     @property
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        return self.gradient_sum, self.seen
+
+    @property
     def needs_absolute_gradients(self) -> bool:
         return self.options.absolute_gradient
 

@@ -65,6 +65,22 @@ class Strategy:
     timeline: Timeline
 
     @property
+    def statistics(self) -> tuple[Tensor, Tensor] | None:
+        """``gradient_sum`` and ``seen`` of ``render.resident.Optimised``, if that is all that the
+        hooks of a step do, so that a device can do it; else None."""
+        return None
+
+    def is_due(self, steps: range) -> bool:
+        """Whether ``after_step`` reads or changes the Gaussians after these steps, if it is not to
+        ``prune``. Only of strategies with ``statistics``."""
+        rules = (
+            self.timeline.densifies_after,
+            self.timeline.prunes_after,
+            self.resets_opacity_after,
+        )
+        return any(rule(step) for rule in rules for step in steps)
+
+    @property
     def needs_absolute_gradients(self) -> bool:
         """Whether ``observe`` reads ``Gradients.means2d_abs``."""
         return False

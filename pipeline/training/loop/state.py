@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -62,6 +63,7 @@ class TrainState:
         clock: position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
         appearance: the embeddings of the views; None if appearance is not modelled.
+        fetch: called before the tensors are read, which may be newer on a device.
         curve: records without times; ``curve_seconds`` has the time of each.
         seconds: training time so far, in all processes.
     """
@@ -81,6 +83,7 @@ class TrainState:
     curve: list[CurveRecord] = field(default_factory=list)
     curve_seconds: list[float] = field(default_factory=list)
     seconds: float = 0.0
+    fetch: Callable[[], None] = lambda: None
 
     def next_view(self) -> int:
         """Index of the next view: each view once in each shuffled epoch."""
@@ -128,6 +131,7 @@ class TrainState:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of a checkpoint, sharing memory."""
+        self.fetch()
         result: dict[str, NDArray[Any]] = {"order": self.order}
         for name, tensor in self.gaussians.tensors().items():
             result[f"parameter.{name}"] = tensor.numpy()

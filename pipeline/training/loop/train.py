@@ -52,7 +52,7 @@ def train(
             the machine or container, which is the limit in any case.
         metrics_log: file for the progress (``training.loop.metrics_log``).
         on_log: called with each warning, and with the instruction set and the time per step.
-        backend: of the rasterizer; None: the default.
+        backend: of the rasterizer; None: of ``config.device``.
         part: of the schedule.
 
     Raises:
@@ -65,7 +65,8 @@ def train(
             f"{len(inputs.initial)} Gaussians",
             fix="check the split and the initialisation",
         )
-    backend = backend or make_backend()
+    # The plan settles "auto".
+    backend = backend or make_backend("cpu" if config.device == "auto" else config.device)
     log = on_log or (lambda text: None)
     warnings: list[str] = []
 
@@ -111,6 +112,7 @@ def train(
                 before = state.clock
                 trainer.step()
                 session.after_step(before, trainer.factor())
+        state.fetch()
         # With a limit of gradients per pixel, Gaussians that are seen may have none.
         if not experiments.gradients_per_pixel:
             state.drop_unseen(len(scene.views), scene.sky)

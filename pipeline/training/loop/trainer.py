@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 
 import numpy as np
 import torch
@@ -19,13 +20,16 @@ from pipeline.render import (
     RasterCamera,
     RasterOptions,
 )
+from pipeline.render.resident import Planes, ResidentImage, ResidentStep, StepResult
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import release_free_memory
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
-from pipeline.training.data.targets import Target, usable_factor
+from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.data.targets import Target, psnr_of, usable_factor
 from pipeline.training.density.camera_path import on_camera_path
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
 from pipeline.training.loop.clock import Clock
+from pipeline.training.loop.resident import DeviceSteps
 from pipeline.training.loop.schedule import Schedule, warm_up
 from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
@@ -60,6 +64,9 @@ class Trainer:
         self.rate_unit = learning_rate_unit(scene.inputs, experiments)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))
         depths = scene.inputs.empty_depths
+        self.device = DeviceSteps.of(backend, state, isotropic=experiments.isotropic)
+        if self.device is not None:
+            state.fetch = self.device.fetch
         self.floaters = None
         if depths is not None and getattr(config.density, "remove_floaters", False):
             self.floaters = FloaterRemoval(depths, self.schedule.steps)
@@ -74,22 +81,40 @@ class Trainer:
         index, factor = state.next_view(), self.factor()
         target, camera = self.scene.target(index, factor), self.camera(index, factor)
         background = self.draw_background()
+        run_length = self.clock.run_length(state)
+        rates = self.schedule.learning_rates(
+            state.clock, run_length, self.rate_unit, warm_up(self.part, state.step)
+        )
+        adam_step = AdamStep(state.step, rates, camera.width * camera.height)
+        if self.device is not None:
+            self.step_on_device(self.device, target, camera, index, factor, background, adam_step)
+        else:
+            self.step_by_operators(target, camera, index, background, adam_step)
+        self.control_density(steps, run_length)
+        state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
+
+    def step_by_operators(
+        self,
+        target: Target,
+        camera: RasterCamera,
+        index: int,
+        background: Color,
+        adam_step: AdamStep,
+    ) -> None:
+        """Render, differentiate and update by the backend's operators."""
+        state = self.state
+        self.leave_device()
         appearance = state.appearance
         colours = None if appearance is None else appearance.show(state.gaussians, index)
         rendered = self.backend.forward(
             *state.gaussians.parameters(), camera, self.options(background)
         )
         d_color, d_alpha = self.color_loss(rendered, target, index, background)
-        d_alpha, d_depth = self.other_losses(rendered, target, index, d_alpha)
-        run_length = self.clock.run_length(state)
-        rates = self.schedule.learning_rates(
-            state.clock, run_length, self.rate_unit, warm_up(self.part, state.step)
-        )
-        adam_step = AdamStep(state.step, rates, camera.width * camera.height)
+        by_alpha, d_depth = self.other_losses(rendered, target, index)
         gradients = self.backend.backward(
             rendered,
             d_color,
-            d_alpha,
+            _sum(d_alpha, by_alpha),
             d_depth,
             means2d_abs=state.density.needs_absolute_gradients,
             colors=appearance is not None,
@@ -105,7 +130,56 @@ class Trainer:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
         state.density.before_step(state.gaussians, rendered, gradients)
         state.adam.step(state.gaussians, gradients, adam_step, self.threads)
-        self.control_density(steps, run_length)
+
+    def step_on_device(
+        self,
+        device: DeviceSteps,
+        target: Target,
+        camera: RasterCamera,
+        index: int,
+        factor: int,
+        background: Color,
+        adam_step: AdamStep,
+    ) -> None:
+        """The same in the memory of a device."""
+        state, fixed = self.state, target.alpha is None or self.scene.background != "random"
+        gain = None if self.scene.gains is None else self.scene.gains[index].tolist()
+        red, green, blue = gain or (1.0, 1.0, 1.0)
+        image = ResidentImage(
+            key=(index, factor) if fixed else None,
+            target=target.over(background),
+            mask=target.ignored,
+            gain=(red, green, blue),
+            surroundings=target.surroundings,
+        )
+
+        def losses(planes: Planes) -> tuple[Tensor | None, Tensor | None]:
+            return self.other_losses(planes, target, index)
+
+        result = device.step(
+            ResidentStep(
+                camera=camera,
+                options=self.options(background),
+                image=image,
+                ssim_weight=self.config.ssim_loss_weight,
+                l2_weight=self.experiments.squared_error_loss_weight,
+                absolute=state.density.needs_absolute_gradients,
+                camera_gradients=state.cameras.enabled,
+                alpha_loss=BLOCK_ALPHA_LOSS,
+                losses=losses if self.has_other_losses(target, index) else None,
+                adam=state.adam.resident(adam_step),
+            )
+        )
+        self.check(result.loss, result, index)
+        self.add_to_window(result.loss, lambda: psnr_of(result.squared_error))
+        if result.camera is not None:
+            state.cameras.step(index, camera, result.camera, self.camera_rate)
+
+    def leave_device(self) -> None:
+        """Make the state's tensors current, before they are changed."""
+        if self.device is not None:
+            self.device.fetch()
+            self.device.invalidate()
 
     def step_appearance(
         self,
@@ -132,7 +206,7 @@ class Trainer:
     ) -> tuple[Tensor, Tensor | None]:
         """Gradients of L1, squared error and D-SSIM with respect to the rendered colours and, for a
         block among its surroundings, alpha."""
-        state, around = self.state, target.surroundings
+        around = target.surroundings
         image = target.over(background)
         gain = None if self.scene.gains is None else self.scene.gains[index]
         color = rendered.color
@@ -149,11 +223,7 @@ class Trainer:
             self.threads,
         )
         self.check(float(loss.loss), rendered, index)
-        state.window.loss += float(loss.loss)
-        state.window.steps += 1
-        if (state.step - 1) % self.psnr_interval == 0:
-            state.window.psnr += target.psnr(color, image)
-            state.window.samples += 1
+        self.add_to_window(float(loss.loss), lambda: target.psnr(color, image))
         d_color = loss.grad if gain is None else loss.grad * gain
         if around is None:
             return d_color, None
@@ -161,30 +231,55 @@ class Trainer:
             around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads
         )
 
+    def add_to_window(self, loss: float, psnr: Callable[[], float]) -> None:
+        """Add a step to the sums of the curve's next record."""
+        window = self.state.window
+        window.loss += loss
+        window.steps += 1
+        if (self.state.step - 1) % self.psnr_interval == 0:
+            window.psnr += psnr()
+            window.samples += 1
+
     def other_losses(
-        self, rendered: Forward, target: Target, index: int, by_color: Tensor | None
+        self, rendered: Planes, target: Target, index: int
     ) -> tuple[Tensor | None, Tensor | None]:
-        """Gradients with respect to alpha and depth, with that of the colour loss; None without
-        these losses."""
-        by_alpha = alpha_gradient(
+        """Gradients of the other losses with respect to alpha and depth; None without these
+        losses."""
+        d_alpha = alpha_gradient(
             rendered.alpha,
             target,
             self.config.mask_loss_weight,
             self.experiments.alpha_loss_weight,
             self.experiments.squared_error_loss_weight,
         )
-        d_alpha = _sum(by_color, by_alpha)
-        depths, weight = self.scene.inputs.depths, self.config.depth_loss_weight
-        known = None if depths is None else depths[index]
-        if not known or weight == "auto" or self.state.step % DEPTH_INTERVAL:
+        weight, known = self.config.depth_loss_weight, self.depths_due(index)
+        if known is None or weight == "auto":
             return d_alpha, None
         view = self.scene.views[index]
         by_depth, d_depth = depth_gradients(rendered, known, view, weight * DEPTH_INTERVAL)
         return _sum(by_depth, d_alpha), d_depth
 
+    def has_other_losses(self, target: Target, index: int) -> bool:
+        """Whether ``other_losses`` may return gradients."""
+        masks = target.ignored is not None and self.config.mask_loss_weight > 0
+        alpha = target.alpha is not None and self.experiments.alpha_loss_weight > 0
+        return masks or alpha or self.depths_due(index) is not None
+
+    def depths_due(self, index: int) -> KnownDepths | None:
+        """The known depths of a view, if the depth loss is computed in this step."""
+        depths, weight = self.scene.inputs.depths, self.config.depth_loss_weight
+        known = None if depths is None else depths[index]
+        if not known or weight == "auto" or self.state.step % DEPTH_INTERVAL:
+            return None
+        return known
+
     def control_density(self, steps: range, run_length: float) -> None:
         """Add noise, densify, prune and reset opacities after these steps of the schedule."""
         state, schedule = self.state, self.schedule
+        if self.device is not None:
+            if not self.floaters_due(steps, run_length) and not state.density.is_due(steps):
+                return
+            self.leave_device()
         floaters = self.fade_floaters(steps, run_length)
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
         update = state.density.after_step(
@@ -211,11 +306,10 @@ class Trainer:
                     fix="check the poses and the masks; init.method: points may help",
                 )
         state.counters.opacity_resets += opacity_reset
-        state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
 
     def fade_floaters(self, steps: range, run_length: float) -> int:
         """The number of floaters, made transparent if their removal is due."""
-        if self.floaters is None or not self.floaters.is_due(steps, run_length):
+        if self.floaters is None or not self.floaters_due(steps, run_length):
             return 0
         cameras, factor = self.reduced_cameras()
         found = self.floaters.fade(
@@ -227,6 +321,9 @@ class Trainer:
         )
         self.state.counters.floaters += found
         return found
+
+    def floaters_due(self, steps: range, run_length: float) -> bool:
+        return self.floaters is not None and self.floaters.is_due(steps, run_length)
 
     def clear_camera_path(self) -> None:
         """At the end, remove the Gaussians that hide views from between the cameras."""
@@ -285,6 +382,7 @@ class Trainer:
         """Coefficients of higher degrees are allocated when they come into use."""
         degree = self.schedule.sh_degree_at(self.state.clock)
         if degree > self.state.gaussians.sh_degree:
+            self.leave_device()
             self.state.gaussians = self.state.gaussians.with_sh_degree(degree)
             self.state.adam.resize_bands(degree)
 
@@ -296,7 +394,7 @@ class Trainer:
             return red, green, blue
         return BACKGROUNDS[self.scene.background]
 
-    def check(self, loss: float, rendered: Forward, index: int) -> None:
+    def check(self, loss: float, rendered: Forward | StepResult, index: int) -> None:
         """Stop if the loss is not finite or no view sees a Gaussian."""
         counters, step, views = self.state.counters, self.state.step, self.scene.views
         counters.num_dropped += rendered.num_dropped

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.render import Forward
+from pipeline.render.resident import Planes
 from pipeline.scene.views import View
 from pipeline.training.data.known_depths import KnownDepths
 
@@ -21,7 +21,7 @@ MIN_ALPHA = 0.1
 
 
 def depth_gradients(
-    rendered: Forward, known: KnownDepths, view: View, weight: float
+    rendered: Planes, known: KnownDepths, view: View, weight: float
 ) -> tuple[Tensor, Tensor]:
     """Gradients of ``weight`` times the mean Huber loss of log(D / z), D being the rendered depth
     over alpha. In logarithms, relative errors count the same at all depths.
@@ -32,18 +32,19 @@ def depth_gradients(
     Returns:
         d_alpha, d_depth: (H, W) float32, for ``render.backward``.
     """
-    height, width = rendered.alpha.shape
+    image_alpha = rendered.alpha
+    height, width = image_alpha.shape
     column = torch.from_numpy((known.xy[:, 0] * (width / view.width)).astype(np.int64))
     row = torch.from_numpy((known.xy[:, 1] * (height / view.height)).astype(np.int64))
     column, row = column.clamp_(max=width - 1), row.clamp_(max=height - 1)
-    alpha, depth = rendered.alpha[row, column], rendered.depth[row, column]
+    alpha, depth = image_alpha[row, column], rendered.depth[row, column]
     usable = ((alpha > MIN_ALPHA) & (depth > 0)).to(torch.float32)
     alpha, depth = alpha.clamp(min=MIN_ALPHA), depth.where(usable > 0, torch.ones(()))
     off = torch.log(depth / alpha / torch.from_numpy(known.z)) * usable
     share = torch.from_numpy(known.weight) * (weight / max(1, len(known)))
     # d log(depth / alpha): 1 / depth and -1 / alpha.
     gradient = (off / TOLERANCE).clamp(-1, 1) * share
-    d_alpha, d_depth = torch.zeros_like(rendered.alpha), torch.zeros_like(rendered.alpha)
+    d_alpha, d_depth = torch.zeros_like(image_alpha), torch.zeros_like(image_alpha)
     d_alpha.index_put_((row, column), -gradient / alpha, accumulate=True)
     d_depth.index_put_((row, column), gradient / depth, accumulate=True)
     return d_alpha, d_depth

@@ -7,12 +7,13 @@ in 3DGS.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 
 import torch
 from torch import Tensor
 
 from pipeline.render import Backend, DenseAdam, FrameAdam, Gradients, ShAdam, make_backend
+from pipeline.render.resident import GaussianAdam
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
@@ -133,6 +134,14 @@ class Adam:
             self.first["means"], self.second["means"], self.first["quats"], self.second["quats"],
             step.rates.means, step.rates.quats, step.number, self.options.beta1, BETA2,
             self.epsilon(step),
+        )  # fmt: skip
+
+    def resident(self, step: AdamStep) -> GaussianAdam:
+        """The same updates, of all arrays, by a device."""
+        epsilon = self.epsilon(step)
+        return GaussianAdam(
+            asdict(step.rates), step.number, self.options.own_frames, self.options.beta1, BETA2,
+            epsilon, EPSILON,
         )  # fmt: skip
 
     def epsilon(self, step: AdamStep) -> float:

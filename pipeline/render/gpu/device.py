@@ -1,0 +1,304 @@
+"""The GPU: choosing and opening a device, buffers, and running kernels."""
+
+from __future__ import annotations
+
+import os
+import struct
+import tempfile
+from dataclasses import dataclass
+from functools import cache
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.render.gpu.kernels import source
+from pipeline.runtime.errors import UserError
+
+THREADS = 256  # kThreads in common.wgsl
+SMALLEST = 256  # bytes of a buffer: bindings must not be smaller than their struct
+MAX_UNIFORMS = 1024  # kept
+MAX_GROUPS = 65535  # of a dispatch, in one dimension: the limit of WebGPU
+# What the kernels need beyond WebGPU's defaults.
+NEEDED = {
+    "max-compute-workgroup-storage-size": 32 * 1024,
+    "max-storage-buffers-per-shader-stage": 13,
+}
+# What is requested as far as the device has it: the size of a scene depends on it.
+WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
+
+NO_WGPU = "install it with pip install 'splatmake[gpu]', or set device: cpu"
+NO_GPU = (
+    "install the GPU's driver with Vulkan (Linux: vulkaninfo lists devices), or set device: cpu; "
+    "python -m pipeline doctor shows what is found"
+)
+
+Buffer = Any  # wgpu.GPUBuffer: wgpu is imported only if a GPU is used.
+
+
+@dataclass(frozen=True)
+class Adapter:
+    """A GPU of this machine.
+
+    Attributes:
+        number: ``gpu:N`` chooses it.
+        name, driver: as the driver reports them.
+        kind: ``discrete``, ``integrated``, ``software`` (the CPU) or ``unknown``.
+        api: ``Vulkan``, ``Metal`` or ``D3D12``.
+    """
+
+    number: int
+    name: str
+    driver: str
+    kind: str
+    api: str
+
+    def __str__(self) -> str:
+        return f"{self.name} ({self.kind}, {self.api})"
+
+
+def adapters() -> list[Adapter]:
+    """The GPUs of this machine, the fastest kinds first; empty if there is none.
+
+    Raises:
+        UserError: the package wgpu is not installed.
+    """
+    return [
+        Adapter(
+            number,
+            adapter.info["device"],
+            adapter.info["description"],
+            _kind(adapter),
+            adapter.info["backend_type"],
+        )
+        for number, adapter in enumerate(_adapters())
+    ]
+
+
+class Gpu:
+    """An open device.
+
+    Kernels are named as their WGSL files; ``name.entry`` is another entry point than ``main``.
+
+    Raises:
+        UserError: there is no such device, or it lacks what the kernels need.
+    """
+
+    def __init__(self, number: int = 0):
+        found = _adapters()
+        if number >= len(found):
+            raise UserError(f"no GPU {number}: {len(found)} found", fix=NO_GPU)
+        adapter = found[number]
+        self.adapter = adapters()[number]
+        limits = adapter.limits
+        for name, least in NEEDED.items():
+            if limits[name] < least:
+                raise UserError(
+                    f"{self.adapter}: {name} is {limits[name]}, the kernels need {least}",
+                    fix="use another GPU (device: gpu:N), or device: cpu",
+                )
+        requested = {name: limits[name] for name in (*NEEDED, *WANTED)}
+        self.device = adapter.request_device_sync(required_limits=requested)
+        self.max_bytes = min(limits[name] for name in WANTED)
+        self._pipelines: dict[str, tuple[Any, Any]] = {}
+        self._layouts: dict[str, tuple[Any, Any]] = {}
+        self._placeholders: list[Buffer] = []
+        self._uniforms: dict[bytes, Buffer] = {}
+        self._encoder: Any = None
+        self._pass: Any = None
+
+    # ---- Buffers ----
+
+    def empty(self, size: int, *, what: str = "an array") -> Buffer:
+        """A buffer of zeros of at least ``size`` bytes.
+
+        Raises:
+            UserError: more than the device's limit, or than its memory.
+        """
+        import wgpu
+
+        size = max(SMALLEST, (size + 3) // 4 * 4)
+        if size > self.max_bytes:
+            raise UserError(
+                f"{what} needs {size / 1e6:.0f} MB in one buffer; {self.adapter} has at most "
+                f"{self.max_bytes / 1e6:.0f} MB",
+                fix="lower train.density.max_gaussians or train.max_size, or set device: cpu",
+            )
+        usage = wgpu.BufferUsage
+        try:
+            return self.device.create_buffer(
+                size=size, usage=usage.STORAGE | usage.UNIFORM | usage.COPY_SRC | usage.COPY_DST
+            )
+        except (wgpu.GPUOutOfMemoryError, wgpu.GPUValidationError) as error:
+            raise UserError(
+                f"{self.adapter}: no memory for {what} of {size / 1e6:.0f} MB: {error}",
+                fix="lower train.density.max_gaussians or train.max_size, or set device: cpu",
+            ) from error
+
+    def upload(self, array: NDArray[Any], *, what: str = "an array") -> Buffer:
+        """A new buffer with the array's bytes."""
+        buffer = self.empty(array.nbytes, what=what)
+        self._write(buffer, array, 0)
+        return buffer
+
+    def uniform(self, format: str, *values: float) -> Buffer:
+        """A buffer of the fields of a struct, whose types are as in the module ``struct``; to be
+        read only. Equal ones are made once."""
+        packed = struct.pack("<" + format, *values)
+        if packed not in self._uniforms:
+            if len(self._uniforms) == MAX_UNIFORMS:
+                self._uniforms.clear()
+            self._uniforms[packed] = self.upload(np.frombuffer(packed, np.uint8))
+        return self._uniforms[packed]
+
+    def write(self, buffer: Buffer, array: NDArray[Any], offset: int = 0) -> None:
+        """Copy an array into a buffer, after the kernels before. Its bytes are padded to a multiple
+        of four."""
+        self.submit()
+        self._write(buffer, array, offset)
+
+    def _write(self, buffer: Buffer, array: NDArray[Any], offset: int) -> None:
+        data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
+        if data.nbytes % 4:
+            data = np.concatenate([data, np.zeros(-data.nbytes % 4, np.uint8)])
+        if data.nbytes:
+            self.device.queue.write_buffer(buffer, offset, data)
+
+    def copy(self, source: Buffer, start: int, target: Buffer, offset: int, size: int) -> None:
+        """Record a copy of ``size`` bytes, from ``start`` on, to ``offset`` of another buffer."""
+        self._end_pass()
+        self._encode().copy_buffer_to_buffer(source, start, target, offset, size)
+
+    def read(self, buffer: Buffer, dtype: Any, count: int, offset: int = 0) -> NDArray[Any]:
+        """A copy of ``count`` numbers of a buffer; waits for the kernels before.
+
+        Raises:
+            UserError: the device is lost.
+        """
+        self.submit()
+        size = count * np.dtype(dtype).itemsize
+        if not size:
+            return np.zeros(0, dtype)
+        try:
+            data = self.device.queue.read_buffer(buffer, offset, (size + 3) // 4 * 4)
+        except Exception as error:
+            raise UserError(
+                f"{self.adapter} was lost: {error}",
+                fix="start again: training resumes from its checkpoint. If it recurs, lower "
+                "train.density.max_gaussians or set device: cpu",
+            ) from error
+        return np.frombuffer(data, np.uint8)[:size].view(dtype).copy()
+
+    # ---- Kernels ----
+
+    def run(self, kernel: str, groups: int | tuple[int, int, int], **buffers: Buffer) -> None:
+        """Record a kernel; it runs after those recorded before.
+
+        Args:
+            groups: number of workgroups, of ``THREADS`` threads; a single number may exceed the
+                limit of one dimension.
+            buffers: by the names of the kernel's bindings. Missing ones are not used by it.
+        """
+        if groups == 0:
+            return
+        if isinstance(groups, int):
+            across = min(groups, MAX_GROUPS)
+            groups = across, -(-groups // across), 1
+        pipeline, layout = self._pipeline(kernel)
+        entries = []
+        for binding in source(kernel.partition(".")[0]).bindings:
+            buffer = buffers.pop(binding.name, None)
+            if buffer is None:
+                buffer = self._placeholder(binding.number)
+            resource = {"buffer": buffer, "offset": 0, "size": buffer.size}
+            entries.append({"binding": binding.number, "resource": resource})
+        assert not buffers, f"{kernel} has no bindings {', '.join(buffers)}"
+        group = self.device.create_bind_group(layout=layout, entries=entries)
+        if self._pass is None:
+            self._pass = self._encode().begin_compute_pass()
+        self._pass.set_pipeline(pipeline)
+        self._pass.set_bind_group(0, group)
+        self._pass.dispatch_workgroups(*groups)
+
+    def clear(self, buffer: Buffer) -> None:
+        """Fill a buffer with zeros."""
+        self._end_pass()
+        self._encode().clear_buffer(buffer)
+
+    def submit(self) -> None:
+        """Start the recorded kernels."""
+        self._end_pass()
+        encoder, self._encoder = self._encoder, None
+        if encoder is not None:
+            self.device.queue.submit([encoder.finish()])
+
+    def _encode(self) -> Any:
+        if self._encoder is None:
+            self._encoder = self.device.create_command_encoder()
+        return self._encoder
+
+    def _end_pass(self) -> None:
+        if self._pass is not None:
+            self._pass.end()
+            self._pass = None
+
+    def _placeholder(self, number: int) -> Buffer:
+        # One for each binding: a buffer cannot be bound twice if a kernel may write to it.
+        while len(self._placeholders) <= number:
+            self._placeholders.append(self.empty(256))
+        return self._placeholders[number]
+
+    def _pipeline(self, kernel: str) -> tuple[Any, Any]:
+        if kernel not in self._pipelines:
+            name, _, entry = kernel.partition(".")
+            if name not in self._layouts:
+                self._layouts[name] = self._make_layout(name)
+            layout, module = self._layouts[name]
+            pipeline = self.device.create_compute_pipeline(
+                layout=self.device.create_pipeline_layout(bind_group_layouts=[layout]),
+                compute={"module": module, "entry_point": entry or "main"},
+            )
+            self._pipelines[kernel] = pipeline, layout
+        return self._pipelines[kernel]
+
+    def _make_layout(self, name: str) -> tuple[Any, Any]:
+        import wgpu
+
+        types = {"uniform": "uniform", "read": "read-only-storage", "read_write": "storage"}
+        entries = [
+            {
+                "binding": binding.number,
+                "visibility": wgpu.ShaderStage.COMPUTE,
+                "buffer": {"type": types[binding.kind]},
+            }
+            for binding in source(name).bindings
+        ]
+        module = self.device.create_shader_module(label=name, code=source(name).code)
+        return self.device.create_bind_group_layout(entries=entries), module
+
+
+def blocks(count: int, size: int = THREADS) -> int:
+    """The number of workgroups for ``count`` elements, ``size`` each."""
+    return -(-count // size)
+
+
+@cache
+def _adapters() -> list[Any]:
+    try:
+        import wgpu
+        from wgpu.backends.wgpu_native.extras import set_instance_extras
+    except ImportError as error:
+        raise UserError("the package wgpu is not installed", fix=NO_WGPU) from error
+    # Without a desktop, drivers write a line to stderr for each device.
+    os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
+    # OpenGL lacks what the kernels need.
+    set_instance_extras(backends=["Vulkan", "Metal", "DX12"])
+    found = wgpu.gpu.enumerate_adapters_sync()
+    kinds = ["discrete", "integrated", "unknown", "software"]
+    return sorted(found, key=lambda adapter: kinds.index(_kind(adapter)))
+
+
+def _kind(adapter: Any) -> str:
+    kind = adapter.info["adapter_type"]
+    names = {"DiscreteGPU": "discrete", "IntegratedGPU": "integrated", "CPU": "software"}
+    return names.get(kind, "unknown")

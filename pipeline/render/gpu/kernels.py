@@ -1,0 +1,78 @@
+"""The sources of the kernels: WGSL files, their imports, and the constants of the C++ kernels.
+
+A line ``#import name`` is replaced by ``wgsl/name.wgsl``, once. The bindings of a kernel are read
+from its declarations, so that they are declared in one place.
+"""
+
+from __future__ import annotations
+
+import re
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+
+FOLDER = Path(__file__).parent / "wgsl"
+CONSTANTS = Path(__file__).parents[1] / "cpu/csrc/constants.h"
+# The constants of the method and of the layout that the kernels share with the C++ ones.
+SHARED = (
+    "kDilation", "kAlphaMin", "kLog2AlphaMin", "kAlphaMax", "kTransmittanceMin", "kQuatNorm2Min",
+    "kCompensationMin", "kShMax", "kTile",
+)  # fmt: skip
+
+_BINDING = re.compile(
+    r"@group\(0\) @binding\((?P<number>\d+)\) var<(?P<kind>uniform|storage)"
+    r"(?:, (?P<access>read|read_write))?> (?P<name>\w+):"
+)
+_CONSTANT = re.compile(r"constexpr (?P<type>double|float|int) (?P<name>k\w+) = (?P<value>[^;]+);")
+_IMPORT = re.compile(r"^#import (\w+)$", re.MULTILINE)
+
+
+@dataclass(frozen=True)
+class Binding:
+    """One buffer of a kernel. ``kind``: ``uniform``, ``read`` or ``read_write``."""
+
+    number: int
+    name: str
+    kind: str
+
+
+@dataclass(frozen=True)
+class Source:
+    """A WGSL module."""
+
+    code: str
+    bindings: tuple[Binding, ...]
+
+
+@cache
+def source(name: str) -> Source:
+    """The module ``wgsl/name.wgsl`` with its imports and the constants."""
+    text = constants() + _with_imports((FOLDER / f"{name}.wgsl").read_text("utf-8"), {name})
+    bindings = tuple(
+        Binding(int(m["number"]), m["name"], "uniform" if m["kind"] == "uniform" else m["access"])
+        for m in _BINDING.finditer(text)
+    )
+    return Source(text, bindings)
+
+
+@cache
+def constants() -> str:
+    """The constants of ``constants.h`` in WGSL."""
+    found = {m["name"]: m for m in _CONSTANT.finditer(CONSTANTS.read_text("utf-8"))}
+    lines = []
+    for name in SHARED:
+        value = re.sub(r"(?<=\d)f\b", "", found[name]["value"])
+        suffix = "u" if found[name]["type"] == "int" else ""
+        lines.append(f"const {name} = {value}{suffix};\n")
+    return "".join(lines)
+
+
+def _with_imports(text: str, seen: set[str]) -> str:
+    def replacement(match: re.Match[str]) -> str:
+        name = match[1]
+        if name in seen:
+            return ""
+        seen.add(name)
+        return _with_imports((FOLDER / f"{name}.wgsl").read_text("utf-8"), seen)
+
+    return _IMPORT.sub(replacement, text)

@@ -1,0 +1,65 @@
+"""How data lies in buffers; the structs and sections of the WGSL files."""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Mapping
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.render.types import RasterCamera, RasterOptions
+
+TILE = 16  # kTile in constants.h
+RECORD_BYTES = 48  # Record in record.wgsl
+BOX_BYTES = 16  # Box in tile.wgsl
+SLOT_BYTES = 48  # kMoments floats in moments.wgsl
+CAMERA_PARAMETERS = 10  # kCameraParameters in project_backward.wgsl
+ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
+BYTES, MASKED = 1, 2  # flags of Loss in loss_images.wgsl
+FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
+SH_ADAM, CAMERA = 1, 2  # flags of Options in project_backward.wgsl
+
+# The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the
+# offsets of the parameters, project_backward.wgsl those of the gradients.
+GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
+GRADIENTS = GEOMETRY | {"means2d": 2, "means2d_abs": 2, "colors": 3}
+
+
+def floats(sections: Mapping[str, int]) -> int:
+    """The number of floats of one Gaussian."""
+    return sum(sections.values())
+
+
+def offsets(sections: Mapping[str, int], count: int) -> dict[str, tuple[int, int]]:
+    """The first float and the number of floats of each section of ``count`` rows."""
+    found, at = {}, 0
+    for name, width in sections.items():
+        found[name] = at, width * count
+        at += width * count
+    return found
+
+
+def tiles_of(width: int, height: int) -> tuple[int, int]:
+    """The number of tiles across and down an image."""
+    return -(-width // TILE), -(-height // TILE)
+
+
+def pack_view(
+    camera: RasterCamera, options: RasterOptions, count: int, coefficients: int
+) -> NDArray[np.uint8]:
+    """The bytes of ``View`` in view.wgsl, of ``count`` Gaussians with ``coefficients`` SH
+    coefficients each."""
+    pose = camera.world_to_camera.detach().double().numpy()
+    rotation, centre = pose[:3, :3], -pose[:3, :3].T @ pose[:3, 3]
+    min_u, max_u, min_v, max_v = camera.slopes
+    flags = ANTIALIAS * options.antialias + CLAMP_COLOR_GRADIENT * options.clamp_color_gradient
+    packed = struct.pack(
+        "<8I8f 3ff 3fI 3fI 3fI 3fI",
+        camera.width, camera.height, *tiles_of(camera.width, camera.height),
+        count, coefficients, options.sh_degree, flags,
+        camera.fx, camera.fy, camera.cx, camera.cy, min_u, min_v, max_u, max_v,
+        *rotation[0], options.near, *rotation[1], options.gradients_per_pixel,
+        *rotation[2], 0, *centre, 0, *(options.background or (0.0, 0.0, 0.0)), 0,
+    )  # fmt: skip
+    return np.frombuffer(packed, np.uint8)

@@ -1,0 +1,321 @@
+"""The kernels of a rendered view and of its gradients, in order."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+
+from pipeline.render.gpu import layout
+from pipeline.render.gpu.device import Buffer, Gpu, blocks
+from pipeline.render.gpu.sort import scan, sort
+from pipeline.render.gpu.workspace import Workspace
+from pipeline.render.types import AlphaChangeLoss, CameraGradients, Surroundings
+from pipeline.runtime.errors import UserError
+
+# Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
+MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
+DEPTH_BITS = 32
+SUM_ROWS = 1024  # of a workgroup of sum_rows.wgsl
+
+
+@dataclass(frozen=True)
+class Scene:
+    """The parameters of ``count`` Gaussians on the device.
+
+    Attributes:
+        geometry: the sections ``layout.GEOMETRY``.
+        sh: (N, K, 3), K = ``coefficients``.
+    """
+
+    count: int
+    coefficients: int
+    geometry: Buffer
+    sh: Buffer
+
+
+@dataclass(frozen=True)
+class Projection:
+    """The Gaussians on the image plane; arrays of N.
+
+    Attributes:
+        view: ``View``.
+        size: (width, height) of the image.
+        records, boxes: ``Record`` and ``Box``, of visible Gaussians.
+        radii: see ``Forward.radii``.
+        tile_counts: number of tiles of each Gaussian.
+        visible: 1 for visible Gaussians, else 0.
+        dropped: see ``Forward.num_dropped``.
+    """
+
+    view: Buffer
+    size: tuple[int, int]
+    records: Buffer
+    boxes: Buffer
+    radii: Buffer
+    tile_counts: Buffer
+    visible: Buffer
+    dropped: Buffer
+
+
+@dataclass(frozen=True)
+class Lists:
+    """The (Gaussian, tile) pairs. Pairs are numbered by depth of their Gaussian.
+
+    Attributes:
+        num_visible, num_dropped: see ``Forward``.
+        length: number of pairs.
+        gaussian_of: the Gaussian of each pair.
+        pairs: the pairs, by tile and front to back.
+        ranges: the range of each tile in ``pairs``.
+        slots: the first pair of each Gaussian.
+    """
+
+    num_visible: int
+    num_dropped: int
+    length: int
+    gaussian_of: Buffer
+    pairs: Buffer
+    ranges: Buffer
+    slots: Buffer
+
+
+@dataclass(frozen=True)
+class Image:
+    """A rendered view: ``color`` (H, W, 3); ``planes`` alpha, depth and median depth (3, H, W);
+    ``ends`` (H, W) of blend.wgsl."""
+
+    color: Buffer
+    planes: Buffer
+    ends: Buffer
+
+
+def project(
+    gpu: Gpu, space: Workspace, scene: Scene, view: Buffer, size: tuple[int, int]
+) -> Projection:
+    """Project all Gaussians."""
+    count = scene.count
+    result = Projection(
+        view=view,
+        size=size,
+        records=space.get("records", layout.RECORD_BYTES * count),
+        boxes=space.get("boxes", layout.BOX_BYTES * count),
+        radii=space.get("radii", 4 * count),
+        tile_counts=space.get("tile counts", 4 * count),
+        visible=space.get("visible", 4 * count),
+        dropped=space.get("dropped", 4),
+    )
+    gpu.clear(result.dropped)
+    gpu.run(
+        "project",
+        blocks(count),
+        view=view,
+        geometry=scene.geometry,
+        sh=scene.sh,
+        records=result.records,
+        boxes=result.boxes,
+        radii=result.radii,
+        tile_counts=result.tile_counts,
+        visible=result.visible,
+        dropped=result.dropped,
+    )
+    return result
+
+
+def list_pairs(gpu: Gpu, space: Workspace, projection: Projection, count: int) -> Lists:
+    """List the Gaussians that overlap each tile, front to back.
+
+    Raises:
+        UserError: too many pairs.
+    """
+    p = projection
+    tiles_x, tiles_y = layout.tiles_of(*p.size)
+    tiles = tiles_x * tiles_y
+    ranges = space.get("tile ranges", 8 * tiles)
+    gpu.clear(ranges)
+    slots = space.get("slots of Gaussians", 4 * count)
+    size = gpu.uniform("I", count)
+    places = space.get("places of visible Gaussians", 4 * count)
+    gpu.copy(p.visible, 0, places, 0, 4 * count)
+    scan(gpu, space, places, count)
+    depths, visible = space.get("depths", 4 * count), space.get("visible Gaussians", 4 * count)
+    num_visible = space.get("number of visible Gaussians", 4)
+    gpu.clear(num_visible)
+    gpu.run(
+        "compact",
+        blocks(count),
+        size=size,
+        records=p.records,
+        radii=p.radii,
+        places=places,
+        depths=depths,
+        gaussians=visible,
+        length=num_visible,
+    )
+    _, ordered = sort(gpu, space, depths, visible, num_visible, capacity=count, bits=DEPTH_BITS)
+    # One more than the Gaussians: the last prefix sum is the number of pairs.
+    first = space.get("first pairs", 4 * (count + 1))
+    gpu.run(
+        "order",
+        blocks(count + 1),
+        size=gpu.uniform("I", count + 1),
+        length=num_visible,
+        gaussians=ordered,
+        tile_counts=p.tile_counts,
+        ordered=first,
+    )
+    scan(gpu, space, first, count + 1)
+    totals = space.get("totals", 12)
+    gpu.copy(num_visible, 0, totals, 0, 4)
+    gpu.copy(p.dropped, 0, totals, 4, 4)
+    gpu.copy(first, 4 * count, totals, 8, 4)
+    seen, dropped, length = map(int, gpu.read(totals, np.uint32, 3))
+    if length > MAX_INTERSECTIONS:
+        raise UserError(
+            f"{seen} Gaussians overlap more than {MAX_INTERSECTIONS} tiles of 16 x 16 pixels in "
+            "one view",
+            fix="render smaller images, or remove Gaussians that are far too large",
+        )
+    tile_of, numbers = space.get("tiles of pairs", 4 * length), space.get("pairs", 4 * length)
+    gaussian_of = space.get("Gaussians of pairs", 4 * length)
+    gpu.run(
+        "pairs",
+        blocks(seen),
+        size=gpu.uniform("IIII", count, tiles, tiles_x, length),
+        length=num_visible,
+        gaussians=ordered,
+        first=first,
+        tile_counts=p.tile_counts,
+        records=p.records,
+        boxes=p.boxes,
+        tiles=tile_of,
+        numbers=numbers,
+        gaussian_of=gaussian_of,
+        slots=slots,
+    )
+    if length:
+        tile_of, numbers = sort(
+            gpu, space, tile_of, numbers, gpu.uniform("I", length),
+            capacity=length, bits=tiles.bit_length(),
+        )  # fmt: skip
+        gpu.run(
+            "ranges",
+            blocks(length),
+            size=gpu.uniform("II", length, tiles),
+            tile_of=tile_of,
+            ranges=ranges,
+        )
+    return Lists(seen, dropped, length, gaussian_of, numbers, ranges, slots)
+
+
+def blend(gpu: Gpu, space: Workspace, projection: Projection, lists: Lists) -> Image:
+    """Composite the image."""
+    width, height = projection.size
+    pixels = width * height
+    image = Image(
+        color=space.get("image", 12 * pixels),
+        planes=space.get("alpha and depths", 12 * pixels),
+        ends=space.get("ends of pixels", 4 * pixels),
+    )
+    gpu.run(
+        "blend",
+        (*layout.tiles_of(width, height), 1),
+        view=projection.view,
+        records=projection.records,
+        gaussian_of=lists.gaussian_of,
+        pairs=lists.pairs,
+        ranges=lists.ranges,
+        color=image.color,
+        planes=image.planes,
+        ends=image.ends,
+    )
+    return image
+
+
+def blend_backward(
+    gpu: Gpu,
+    space: Workspace,
+    projection: Projection,
+    lists: Lists,
+    image: Image,
+    d_color: Buffer,
+    d_planes: Buffer,
+) -> Buffer:
+    """The slots of gradients (``moments.wgsl``), from the gradients on the colour (H, W, 3) and on
+    alpha and depth (2, H, W)."""
+    slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.length)
+    gpu.run(
+        "blend_backward",
+        (*layout.tiles_of(*projection.size), 1),
+        view=projection.view,
+        records=projection.records,
+        gaussian_of=lists.gaussian_of,
+        pairs=lists.pairs,
+        ranges=lists.ranges,
+        ends=image.ends,
+        color=image.color,
+        planes=image.planes,
+        d_color=d_color,
+        d_planes=d_planes,
+        slots=slots,
+    )
+    return slots
+
+
+def loss_uniform(
+    gpu: Gpu,
+    size: tuple[int, int],
+    count: int,
+    ssim_weight: float,
+    l2_weight: float,
+    *,
+    is_bytes: bool,
+    masked: bool,
+    gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
+) -> Buffer:
+    """``Loss`` in loss_images.wgsl; ``count``: the number of unmasked values."""
+    flags = layout.BYTES * is_bytes + layout.MASKED * masked
+    return gpu.uniform(
+        "4I8f", *size, flags, 0, l2_weight, (1 - ssim_weight) / count, -ssim_weight / count, 0.0,
+        *gain, 0.0,
+    )  # fmt: skip
+
+
+def sum_rows(
+    gpu: Gpu, space: Workspace, rows: Buffer, count: int, width: int
+) -> NDArray[np.float64]:
+    """The sum of ``count`` rows of ``width`` float32."""
+    groups = blocks(count, SUM_ROWS)
+    sums = space.get(f"sums of rows of {width}", 4 * width * groups)
+    gpu.run("sum_rows", groups, size=gpu.uniform("II", count, width), values=rows, sums=sums)
+    found = gpu.read(sums, np.float32, width * groups).reshape(-1, width)
+    return found.sum(0, dtype=np.float64)
+
+
+def camera_gradients(gpu: Gpu, space: Workspace, rows: Buffer, count: int) -> CameraGradients:
+    """The sum of the Gaussians' parts (N, ``CAMERA_PARAMETERS``)."""
+    total = torch.from_numpy(sum_rows(gpu, space, rows, count, layout.CAMERA_PARAMETERS))
+    return CameraGradients(*total.split([3, 3, 2, 2]))
+
+
+def upload_layers(gpu: Gpu, around: Surroundings) -> dict[str, Buffer]:
+    """The images of the surroundings, by the names of compose.wgsl."""
+    layers = {
+        "behind": around.behind,
+        "alpha_before": around.alpha,
+        "front": around.front,
+        "transmittance": around.transmittance,
+        "correction": around.correction,
+    }
+    return {k: gpu.upload(v.numpy()) for k, v in layers.items() if v is not None}
+
+
+def layers_uniform(gpu: Gpu, around: Surroundings, pixels: int, loss: AlphaChangeLoss) -> Buffer:
+    """``Layers`` in compose.wgsl."""
+    flags = layout.FRONT * (around.front is not None)
+    flags |= layout.CORRECTION * (around.correction is not None)
+    return gpu.uniform(
+        "II4f8x", pixels, flags, loss.fade, loss.growth, 2 * loss.weight / pixels, 0.0
+    )

@@ -1,0 +1,59 @@
+// Adam (Kingma & Ba 2015) over the elements of an array (`elements`), or over rows that share the
+// second moment of their mean square (`rows`).
+#import common
+
+struct Adam {
+    count: u32,    // elements, or rows
+    width: u32,    // elements of a row
+    num_rates: u32,
+    parameter_at: u32,  // first element in its array
+    beta1: f32,
+    beta2: f32,
+    rest1: f32,    // 1 - beta1
+    rest2: f32,
+    epsilon: f32,
+    to_root: f32,  // bias correction of the root of the second moment
+    gradient_at: u32,   // first element in its array
+    unused: f32,
+}
+
+@group(0) @binding(0) var<uniform> adam: Adam;
+@group(0) @binding(1) var<storage, read> rates: array<f32>;  // repeated, with the bias correction
+@group(0) @binding(2) var<storage, read> gradient: array<f32>;
+@group(0) @binding(3) var<storage, read_write> parameter: array<f32>;
+@group(0) @binding(4) var<storage, read_write> exp_avg: array<f32>;
+@group(0) @binding(5) var<storage, read_write> exp_avg_sq: array<f32>;
+
+@compute @workgroup_size(kThreads)
+fn elements(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+            @builtin(local_invocation_index) local: u32) {
+    let i = thread_number(group, groups, local);
+    if (i >= adam.count) { return; }
+    let g = gradient[adam.gradient_at + i];
+    let m = exp_avg[i] * adam.beta1 + g * adam.rest1;
+    let v = exp_avg_sq[i] * adam.beta2 + g * g * adam.rest2;
+    exp_avg[i] = m;
+    exp_avg_sq[i] = v;
+    parameter[adam.parameter_at + i] -= rates[i % adam.num_rates] * m / (sqrt(v) * adam.to_root + adam.epsilon);
+}
+
+@compute @workgroup_size(kThreads)
+fn rows(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let row = thread_number(group, groups, local);
+    if (row >= adam.count) { return; }
+    var squares = 0.0;
+    for (var k = 0u; k < adam.width; k++) {
+        let g = gradient[adam.gradient_at + row * adam.width + k];
+        squares += g * g;
+    }
+    let v = exp_avg_sq[row] * adam.beta2 + squares * adam.rest2 / f32(adam.width);
+    exp_avg_sq[row] = v;
+    let far = rates[0] / (sqrt(v) * adam.to_root + adam.epsilon);
+    for (var k = 0u; k < adam.width; k++) {
+        let at = row * adam.width + k;
+        let m = exp_avg[at] * adam.beta1 + gradient[adam.gradient_at + at] * adam.rest1;
+        exp_avg[at] = m;
+        parameter[adam.parameter_at + at] -= far * m;
+    }
+}

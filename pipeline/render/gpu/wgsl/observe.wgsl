@@ -1,0 +1,25 @@
+// Statistics for density control: the sum of the norms of the gradients of the projected centres, in
+// normalised device coordinates, and the number of steps in which a Gaussian was visible.
+#import common
+
+struct Options {
+    gaussians: u32,
+    gradient_at: u32,  // first element of the section of gradients
+    half_size: vec2<f32>,  // of the image, pixels
+}
+
+@group(0) @binding(0) var<uniform> options: Options;
+@group(0) @binding(1) var<storage, read> gradients: array<f32>;
+@group(0) @binding(2) var<storage, read> radii: array<f32>;
+@group(0) @binding(3) var<storage, read_write> gradient_sum: array<f32>;
+@group(0) @binding(4) var<storage, read_write> seen: array<f32>;
+
+@compute @workgroup_size(kThreads)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let i = thread_number(group, groups, local);
+    if (i >= options.gaussians || radii[i] <= 0.0) { return; }
+    let at = options.gradient_at + 2u * i;
+    gradient_sum[i] += length(vec2(gradients[at], gradients[at + 1u]) * options.half_size);
+    seen[i] += 1.0;
+}

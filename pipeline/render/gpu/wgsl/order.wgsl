@@ -1,0 +1,22 @@
+// The number of tiles of each visible Gaussian, front to back; zeros after the last.
+#import common
+
+struct Size {
+    count: u32,
+}
+
+@group(0) @binding(0) var<uniform> size: Size;
+@group(0) @binding(1) var<storage, read> length: u32;
+@group(0) @binding(2) var<storage, read> gaussians: array<u32>;
+@group(0) @binding(3) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(4) var<storage, read_write> ordered: array<u32>;
+
+@compute @workgroup_size(kThreads)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let rank = thread_number(group, groups, local);
+    if (rank >= size.count) { return; }
+    var count = 0u;
+    if (rank < length) { count = tile_counts[gaussians[rank]]; }
+    ordered[rank] = count;
+}

@@ -1,0 +1,53 @@
+// Lists the (Gaussian, tile) pairs of the visible Gaussians, front to back. The pairs of a Gaussian
+// are contiguous, and start at its slot.
+#import common
+#import record
+#import tile
+
+struct Size {
+    count: u32,
+    tiles: u32,
+    tiles_x: u32,
+    pairs: u32,
+}
+
+@group(0) @binding(0) var<uniform> size: Size;
+@group(0) @binding(1) var<storage, read> length: u32;  // number of visible Gaussians
+@group(0) @binding(2) var<storage, read> gaussians: array<u32>;
+@group(0) @binding(3) var<storage, read> first: array<u32>;  // pair of each rank
+@group(0) @binding(4) var<storage, read> tile_counts: array<u32>;
+@group(0) @binding(5) var<storage, read> records: array<Record>;
+@group(0) @binding(6) var<storage, read> boxes: array<Box>;
+@group(0) @binding(7) var<storage, read_write> tiles: array<u32>;
+@group(0) @binding(8) var<storage, read_write> numbers: array<u32>;
+@group(0) @binding(9) var<storage, read_write> gaussian_of: array<u32>;
+@group(0) @binding(10) var<storage, read_write> slots: array<u32>;
+
+@compute @workgroup_size(kThreads)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let rank = thread_number(group, groups, local);
+    if (rank >= length) { return; }
+    let i = gaussians[rank];
+    let r = records[i];
+    let box = boxes[i];
+    var next = first[rank];
+    let end = min(next + tile_counts[i], size.pairs);
+    slots[i] = next;
+    for (var y = box.top; y <= box.bottom; y++) {
+        for (var x = box.left; x <= box.right; x++) {
+            if (next < end && overlaps(r, vec2(x, y))) {
+                tiles[next] = y * size.tiles_x + x;
+                numbers[next] = next;
+                gaussian_of[next] = i;
+                next++;
+            }
+        }
+    }
+    // Compilers may round differently in the kernel that has counted: pairs of no tile.
+    for (; next < end; next++) {
+        tiles[next] = size.tiles;
+        numbers[next] = next;
+        gaussian_of[next] = i;
+    }
+}

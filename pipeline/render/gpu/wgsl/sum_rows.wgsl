@@ -1,0 +1,26 @@
+// Sums of blocks of 1024 rows, in a fixed order; the caller adds the few sums of blocks.
+#import common
+
+struct Size {
+    rows: u32,
+    columns: u32,  // at most kThreads
+}
+
+@group(0) @binding(0) var<uniform> size: Size;
+@group(0) @binding(1) var<storage, read> values: array<f32>;
+@group(0) @binding(2) var<storage, read_write> sums: array<f32>;
+
+const kRows = 1024u;
+
+@compute @workgroup_size(kThreads)
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
+        @builtin(local_invocation_index) local: u32) {
+    let block = group_number(group, groups);
+    let begin = block * kRows;
+    if (begin >= size.rows || local >= size.columns) { return; }
+    var sum = 0.0;
+    for (var row = begin; row < min(begin + kRows, size.rows); row++) {
+        sum += values[row * size.columns + local];
+    }
+    sums[block * size.columns + local] = sum;
+}

@@ -13,7 +13,7 @@ from pipeline.config.schema import Train
 from pipeline.training.data.inputs import Inputs
 
 # Increment when the contents of checkpoints or their meaning change.
-STATE_VERSION = 18
+STATE_VERSION = 19
 
 
 def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, seed: int) -> str:
@@ -28,7 +28,8 @@ def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, se
     gains = None if inputs.gains is None else inputs.gains.tolist()
     embeddings = None if inputs.embeddings is None else inputs.embeddings.tolist()
     empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
-    options = [config.model_dump(), experiments.model_dump()]
+    # Another device can continue: the log says so.
+    options = [config.model_dump(exclude={"device"}), experiments.model_dump()]
     text = json.dumps([STATE_VERSION, options, seed, sizes, views, gains, embeddings, empty])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())

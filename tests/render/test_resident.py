@@ -1,0 +1,220 @@
+"""Steps in the memory of a device do what the backend's operators do, one after another."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import pytest
+import torch
+
+from pipeline.render import (
+    AlphaChangeLoss,
+    Backend,
+    CameraGradients,
+    DenseAdam,
+    FrameAdam,
+    RasterOptions,
+    ShAdam,
+    Surroundings,
+    make_backend,
+)
+from pipeline.render.resident import (
+    GaussianAdam,
+    Optimised,
+    Planes,
+    ResidentImage,
+    ResidentStep,
+)
+from tests.render.scenes import NAMES, camera, random_scene
+from tests.tools import need_gpu
+
+HEIGHT, WIDTH = 37, 50
+CAMERA = camera(WIDTH, HEIGHT, rotated=True)
+RATES = {
+    "means": 0.01, "log_scales": 0.02, "quats": 0.01, "opacity_logits": 0.03, "sh0": 0.01,
+    "shN": 0.002,
+}  # fmt: skip
+ADAM = GaussianAdam(RATES, 1, True, 0.9, 0.999, 1e-7, 1e-9)
+ALPHA_LOSS = AlphaChangeLoss(0.5, 0.1, 0.2)
+
+
+def uniform(*shape: int, seed: int = 0) -> torch.Tensor:
+    return torch.rand(*shape, generator=torch.Generator().manual_seed(seed))
+
+
+def pixels(*shape: int, seed: int = 0) -> torch.Tensor:
+    return (255 * uniform(*shape, seed=seed)).byte()
+
+
+def constant_losses(planes: Planes) -> tuple[torch.Tensor | None, torch.Tensor | None]:
+    """Losses that are linear in alpha and depth, and depend on both."""
+    return 1e-3 * planes.depth, 1e-3 * planes.alpha
+
+
+IMAGE = ResidentImage((0, 1), pixels(HEIGHT, WIDTH, 3), None, (1.0, 1.0, 1.0), None)
+STEP = ResidentStep(
+    camera=CAMERA,
+    options=RasterOptions(background=(0.1, 0.7, 0.2)),
+    image=IMAGE,
+    ssim_weight=0.2,
+    l2_weight=0.5,
+    absolute=True,
+    camera_gradients=False,
+    alpha_loss=ALPHA_LOSS,
+    losses=None,
+    adam=ADAM,
+)
+MASKED = replace(IMAGE, key=None, mask=uniform(HEIGHT, WIDTH, seed=1) > 0.6)
+FLOATS = replace(IMAGE, target=uniform(HEIGHT, WIDTH, 3, seed=2), gain=(1.2, 0.9, 0.7))
+AROUND = Surroundings(
+    behind=pixels(HEIGHT, WIDTH, 3, seed=3),
+    alpha=pixels(HEIGHT, WIDTH, seed=4),
+    front=pixels(HEIGHT, WIDTH, 3, seed=5) // 2,
+    transmittance=pixels(HEIGHT, WIDTH, seed=6),
+    correction=(pixels(HEIGHT, WIDTH, 3, seed=7) // 8).to(torch.int8) - 16,
+)
+STEPS = {
+    "plain": STEP,
+    "world's axes": replace(STEP, adam=replace(ADAM, frames=False), absolute=False),
+    "masked": replace(STEP, image=MASKED),
+    "gains": replace(STEP, image=FLOATS),
+    "cameras": replace(STEP, camera_gradients=True),
+    "other losses": replace(STEP, losses=constant_losses),
+    "a block": replace(STEP, image=replace(MASKED, surroundings=AROUND), losses=constant_losses),
+    "few gradients": replace(STEP, options=RasterOptions(antialias=True, gradients_per_pixel=3)),
+}
+
+
+def start(frames: bool) -> Optimised:
+    parameters = dict(zip(NAMES, random_scene(3, 400, size=0.12), strict=True))
+    first = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
+    second = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
+    if frames:
+        first["quats"], second["quats"] = torch.zeros(400, 3), torch.zeros(400, 3)
+    else:
+        second["means"], second["quats"] = torch.zeros(400, 1), torch.zeros(400, 1)
+    last = torch.zeros(400, dtype=torch.int32)
+    return Optimised(parameters, first, second, last, torch.zeros(400), torch.zeros(400))
+
+
+@dataclass(frozen=True)
+class DrawnPlanes:
+    alpha: torch.Tensor
+    depth: torch.Tensor
+
+
+def by_operators(
+    backend: Backend, state: Optimised, step: ResidentStep
+) -> tuple[float, CameraGradients | None]:
+    """The step, by the operators; returns the loss as well."""
+    p, first, second, image, adam = (
+        state.parameters, state.first, state.second, step.image, step.adam,
+    )  # fmt: skip
+    drawn = backend.forward(*(p[name] for name in NAMES), step.camera, step.options)
+    color, around, gain = drawn.color, image.surroundings, torch.tensor(image.gain)
+    if around is not None:
+        color = backend.compose(around, color, drawn.alpha)
+    loss = backend.l1_ssim(color * gain, image.target, step.ssim_weight, image.mask, step.l2_weight)
+    d_color, d_alpha, d_depth = loss.grad * gain, torch.zeros_like(drawn.alpha), None
+    if around is not None:
+        d_color, d_alpha = backend.compose_backward(around, drawn.alpha, d_color, step.alpha_loss)
+    if step.losses is not None:
+        by_alpha, d_depth = step.losses(DrawnPlanes(drawn.alpha, drawn.depth))
+        assert by_alpha is not None
+        d_alpha = d_alpha + by_alpha
+    decay = {"step": adam.step, "beta1": adam.beta1, "beta2": adam.beta2}
+    harmonics = ShAdam(
+        first["sh"], second["sh"], state.last, adam.rates["sh0"], adam.rates["shN"],
+        eps=adam.eps, **decay,
+    )  # fmt: skip
+    g = backend.backward(
+        drawn, d_color, d_alpha, d_depth, camera=step.camera_gradients, sh_adam=harmonics
+    )
+    change = g.means2d_abs if step.absolute else g.means2d
+    assert change is not None
+    state.gradient_sum.add_(torch.hypot(change[:, 0] * WIDTH / 2, change[:, 1] * HEIGHT / 2))
+    state.seen.add_(drawn.radii > 0)
+    dense = ["log_scales", "opacity_logits"]
+    if adam.frames:
+        frame = FrameAdam(
+            first["means"], second["means"], first["quats"], second["quats"],
+            adam.rates["means"], adam.rates["quats"], eps=adam.eps, **decay,
+        )  # fmt: skip
+        backend.frame_adam(p["means"], p["quats"], p["log_scales"], g.means, g.quats, frame)
+    else:
+        dense += ["means", "quats"]
+    for name in dense:
+        eps = adam.means_eps if name == "means" else adam.eps
+        each = DenseAdam(first[name], second[name], adam.rates[name], eps=eps, **decay)
+        backend.adam_step(p[name], getattr(g, name), each)
+    return loss.loss, g.camera
+
+
+def tensors(state: Optimised) -> dict[str, torch.Tensor]:
+    found = {f"parameter {name}": tensor for name, tensor in state.parameters.items()}
+    found |= {f"first {name}": tensor for name, tensor in state.first.items()}
+    found |= {f"second {name}": tensor for name, tensor in state.second.items()}
+    return found | {
+        "last": state.last, "gradient_sum": state.gradient_sum, "seen": state.seen,
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize("name", STEPS)
+def test_resident_steps_equal_the_operators(name: str) -> None:
+    """To the last bit, but for what the operators leave to the CPU: sums of losses and of cameras,
+    and norms of gradients."""
+    need_gpu()
+    backend, step = make_backend("gpu"), STEPS[name]
+    training = backend.resident()
+    assert training is not None
+    ours, theirs = start(step.adam.frames), start(step.adam.frames)
+    training.load(ours)
+    for number in (1, 2, 5):
+        each = replace(step, adam=replace(step.adam, step=number))
+        found = training.step(each)
+        loss, cameras = by_operators(backend, theirs, each)
+        assert found.loss == pytest.approx(loss, rel=1e-5)
+        assert (found.camera is None) == (cameras is None)
+        if found.camera is not None and cameras is not None:
+            for part, expected in vars(cameras).items():
+                torch.testing.assert_close(getattr(found.camera, part), expected)
+    untouched = start(step.adam.frames)
+    for key, tensor in tensors(ours).items():
+        assert torch.equal(tensor, tensors(untouched)[key]), f"{key} changed before store"
+    training.store(ours)
+    for key, tensor in tensors(ours).items():
+        if key == "gradient_sum":
+            torch.testing.assert_close(tensor, theirs.gradient_sum)
+        else:
+            assert torch.equal(tensor, tensors(theirs)[key]), key
+    assert (ours.seen == 3).any() and (ours.last == 5).any()
+    assert not torch.equal(ours.parameters["means"], untouched.parameters["means"])
+
+
+def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatch) -> None:
+    need_gpu()
+    from pipeline.render.gpu import resident
+
+    monkeypatch.setattr(resident, "IMAGE_CACHE", 3 * HEIGHT * WIDTH + 10)
+    results = []
+    for cached in (True, False):
+        training = make_backend("gpu").resident()
+        assert training is not None
+        state = start(True)
+        training.load(state)
+        for number in range(1, 6):
+            index = number % 2
+            image = replace(
+                IMAGE,
+                key=(index, 1) if cached else None,
+                target=pixels(HEIGHT, WIDTH, 3, seed=index),
+            )
+            training.step(replace(STEP, image=image, adam=replace(ADAM, step=number)))
+        training.store(state)
+        results.append(tensors(state))
+    for key, tensor in results[0].items():
+        assert torch.equal(tensor, results[1][key]), key
+
+
+def test_the_backend_of_the_processor_has_no_other_memory() -> None:
+    assert make_backend("cpu").resident() is None

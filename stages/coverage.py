@@ -23,8 +23,10 @@ def work(job: Job) -> None:
     from pipeline.coverage.measure import measure_coverage, world_frame
     from pipeline.metrics.evaluation import Evaluation
     from pipeline.metrics.protocol import choose_protocol
+    from pipeline.render.registry import use_device
 
     views, train = inputs.trained_views(job), job.section(Train)
+    use_device(train.device)
     measure_coverage(
         job.out,
         inputs.trained_gaussians(job),

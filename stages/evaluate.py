@@ -39,9 +39,11 @@ def work(job: Job) -> None:
     from pipeline.metrics.pose import pose_error
     from pipeline.metrics.protocol import choose_protocol
     from pipeline.metrics.published import against_published
+    from pipeline.render.registry import use_device
     from pipeline.scene.exposure import ExposureGains
 
     train, views = job.section(Train), inputs.trained_views(job)
+    use_device(train.device)
     protocol = choose_protocol(views, job.section(Split), train)
     gaussians = inputs.trained_gaussians(job)
     evaluation = evaluate_views(

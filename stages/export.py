@@ -32,9 +32,11 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
+    from pipeline.render.registry import use_device
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
+    use_device(job.section(Train).device)
     manifest, model, split = (
         inputs.read_manifest(job, "views"),
         inputs.trained_model(job),

@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.config.presets import PRESETS
+from pipeline.render.registry import DEVICE
 from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.machine import usable_cores
 
@@ -93,8 +94,13 @@ def _convert(**options: Any) -> None:
     _print(convert(**options, warnings=warnings), warnings)
 
 
-def _render(threads: int, background: str, antialias: bool, max_side: int, **options: Any) -> None:
+def _render(
+    device: str, threads: int, background: str, antialias: bool, max_side: int, **options: Any
+) -> None:
     from pipeline.commands import Rendering, render
+    from pipeline.render.registry import use_device
+
+    use_device(device)
 
     warnings: list[str] = []
     how = Rendering(background, antialias, max_side, threads)
@@ -102,9 +108,12 @@ def _render(threads: int, background: str, antialias: bool, max_side: int, **opt
 
 
 def _evaluate(
-    threads: int, background: str, antialias: bool, max_side: int, **options: Any
+    device: str, threads: int, background: str, antialias: bool, max_side: int, **options: Any
 ) -> None:
     from pipeline.commands import Rendering, evaluate
+    from pipeline.render.registry import use_device
+
+    use_device(device)
 
     found = evaluate(**options, how=Rendering(background, antialias, max_side, threads))
     width = max(len(view.name) for view in found.per_view)
@@ -122,10 +131,12 @@ def _evaluate(
     _print(lines, found.warnings)
 
 
-def _view(model: Path, cameras: Path | None, **options: Any) -> None:
+def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> None:
+    from pipeline.render.registry import use_device
     from pipeline.watching.server import serve
     from pipeline.watching.source import Source
 
+    use_device(device)
     serve(Source(model, cameras), **options)
 
 
@@ -277,6 +288,7 @@ def _parser() -> argparse.ArgumentParser:
     sub.add_argument(
         "--side", type=_positive, default=800, metavar="PIXELS", help="longer side (default: 800)"
     )
+    _add_device(sub)
     sub.add_argument(
         "--threads", type=_positive, default=1, help="(default: 1, leaving the others to training)"
     )
@@ -372,12 +384,25 @@ def _add_rendering(parser: argparse.ArgumentParser, background: str, antialias: 
         action=argparse.BooleanOptionalAction,
         help=f"Mip-Splatting's opacity compensation (default: {antialias})",
     )
+    _add_device(parser)
     parser.add_argument(
         "--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this"
     )
     parser.add_argument(
         "--threads", type=_positive, default=usable_cores(), help="(default: all cores)"
     )
+
+
+def _add_device(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--device", type=_device, default="cpu", help="cpu, gpu or gpu:N (default: cpu)"
+    )
+
+
+def _device(text: str) -> str:
+    if not DEVICE.fullmatch(text):
+        raise argparse.ArgumentTypeError(f"expected cpu, gpu or gpu:N, found {text!r}")
+    return text
 
 
 def _share(text: str) -> float:

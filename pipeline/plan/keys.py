@@ -44,7 +44,8 @@ def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
-    if "train" in spec.options and plan.config.train.device != "cpu":
+    draws = not {"train", "train.device"}.isdisjoint(spec.options)
+    if draws and plan.config.train.device != "cpu":
         key |= {"gpu_source": gpu_source_hash()}
         key["packages"] = {**key["packages"], "wgpu": installed_version("wgpu")}
     if spec.scattered:

@@ -4,7 +4,7 @@
 default backend is ``cpu``: C++ kernels that are compiled at first use, or beforehand by
 ``python -m pipeline.render.cpu.build``. ``reference`` is a readable implementation in torch,
 float64. ``forward``, ``backward``, ``l1_ssim``, ``adam_step`` and ``frame_adam`` are operators of
-the default backend; ``render`` wraps the first two for autograd. Importing this package does not
+``cpu``; ``render`` wraps the first two for autograd. Importing this package does not
 import torch.
 """
 

@@ -1,4 +1,4 @@
-"""The default backend's operators as functions, and rendering with autograd."""
+"""The processor's operators as functions, and rendering with autograd."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ import torch
 from pipeline.render.registry import make_backend
 from pipeline.render.types import RasterCamera, RasterOptions, RenderOutput
 
-_backend = make_backend()
+_backend = make_backend("cpu")
 forward, backward, l1_ssim = _backend.forward, _backend.backward, _backend.l1_ssim
 adam_step, frame_adam = _backend.adam_step, _backend.frame_adam
 

@@ -1,18 +1,33 @@
-"""The backends by name."""
+"""The backends by name, and the default one. Importing this module does not import torch."""
 
 from __future__ import annotations
 
+import re
 from functools import cache
+from typing import TYPE_CHECKING
 
-from pipeline.render.backend import Backend
+if TYPE_CHECKING:
+    from pipeline.render.backend import Backend
 
 BACKENDS = ("cpu", "gpu", "reference")
+DEVICE = re.compile(r"cpu|gpu(:\d+)?")
+
+_default = "cpu"
 
 
-def make_backend(name: str = "cpu") -> Backend:
-    """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first."""
+def use_device(device: str) -> None:
+    """Make the backend of this device (``cpu``, ``gpu``, ``gpu:N``) the default of the process."""
+    global _default
+    assert DEVICE.fullmatch(device), device
+    _default = device
+
+
+def make_backend(name: str | None = None) -> Backend:
+    """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first; None:
+    the default, the processor's unless ``use_device`` was called."""
+    name = name or _default
     kind, _, number = name.partition(":")
-    if kind not in BACKENDS or (number and not (kind == "gpu" and number.isdecimal())):
+    if name not in BACKENDS and not DEVICE.fullmatch(name):
         raise ValueError(f"no backend {name!r}; there are {', '.join(BACKENDS)}")
     return _backend(kind, int(number or 0))
 

@@ -128,8 +128,33 @@ class StepResult:
     camera: CameraGradients | None
 
 
+@dataclass(frozen=True)
+class TrainingSize:
+    """What the memory of a training depends on.
+
+    Attributes:
+        gaussians: at most.
+        sh_coefficients: of each Gaussian, at the end.
+        pixels: of the largest view.
+        image_bytes: of all training images.
+    """
+
+    gaussians: int
+    sh_coefficients: int
+    pixels: int
+    image_bytes: int
+
+
 class ResidentTraining(ABC):
     """Gaussians in a device's memory, with Adam's moments and the statistics of density control."""
+
+    @abstractmethod
+    def memory_line(self, size: TrainingSize) -> str:
+        """A line for the log with the memory that a training takes.
+
+        Raises:
+            UserError: more than the device has, as far as it is known.
+        """
 
     @abstractmethod
     def load(self, optimised: Optimised) -> None:

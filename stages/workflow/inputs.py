@@ -31,7 +31,7 @@ MODEL = ("undistort", *POSES)
 TRAINED = {"views": VIEWS, "model": MODEL, "train": ("train",), "poses": POSES}
 
 # Options that rendering outside of training depends on.
-DRAWING_OPTIONS = ("train.sh_degree", "train.antialias", "train.background")
+DRAWING_OPTIONS = ("train.device", "train.sh_degree", "train.antialias", "train.background")
 
 
 def of_jobs(job: Job, role: str) -> list[Path]:

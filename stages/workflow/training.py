@@ -3,11 +3,14 @@ would change with the code of training."""
 
 from __future__ import annotations
 
+from pipeline.config.schema import Train
+from pipeline.render.registry import use_device
 from pipeline.runtime.job import Job
 from pipeline.training.scene import TrainingRun
 
 
 def training_run(job: Job) -> TrainingRun:
+    use_device(job.section(Train).device)
     return TrainingRun(
         seed=job.seed,
         threads=job.threads,

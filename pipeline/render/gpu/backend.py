@@ -72,6 +72,7 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def __init__(self, number: int = 0):
         self.number = number
+        self._last: tuple[object, rasterise.Scene, Parameters] | None = None
 
     @cached_property
     def gpu(self) -> Gpu:
@@ -88,14 +89,7 @@ class GpuBackend(Backend[Projected, Binned]):
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
         gpu, count, sh = self.gpu, len(parameters[0]), parameters[4]
-        names = ("means", "log_scales", "quats", "opacity_logits")
-        arrays = dict(zip(names, (p.numpy() for p in parameters[:4]), strict=True))
-        scene = rasterise.Scene(
-            count,
-            sh.shape[1],
-            self._sections(layout.GEOMETRY, arrays, count),
-            gpu.upload(sh.numpy(), what="the SH coefficients"),
-        )
+        scene = self._scene(parameters)
         view = gpu.upload(layout.pack_view(camera, options, count, sh.shape[1]))
         size = camera.width, camera.height
         projection = rasterise.project(gpu, Workspace(gpu), scene, view, size)
@@ -327,6 +321,24 @@ class GpuBackend(Backend[Projected, Binned]):
         for name, tensor in moments.items():
             self._fetch(buffers[name], tensor)
 
+    def _scene(self, parameters: Parameters) -> rasterise.Scene:
+        """The parameters on the device. Those of the last call are copied once: usually, a scene is
+        rendered from many views."""
+        key = tuple((p.data_ptr(), p._version, p.shape) for p in parameters)
+        if self._last is None or self._last[0] != key:
+            names = ("means", "log_scales", "quats", "opacity_logits")
+            arrays = dict(zip(names, (p.numpy() for p in parameters[:4]), strict=True))
+            count, sh = len(parameters[0]), parameters[4]
+            scene = rasterise.Scene(
+                count,
+                sh.shape[1],
+                self._sections(layout.GEOMETRY, arrays, count),
+                self.gpu.upload(sh.numpy(), what="the SH coefficients"),
+            )
+            # The tensors are kept, so that others cannot get their addresses.
+            self._last = key, scene, parameters
+        return self._last[1]
+
     def _sections(
         self, sections: Mapping[str, int], arrays: Mapping[str, NDArray[np.float32]], count: int
     ) -> Buffer:
@@ -346,9 +358,8 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def _fetch(self, buffer: Buffer, tensor: torch.Tensor) -> None:
         """Copy a buffer into a tensor."""
-        array = tensor.detach().numpy()
-        found = self.gpu.read(buffer, array.dtype, tensor.numel())
-        np.copyto(array, found.reshape(array.shape))
+        found = self.gpu.read(buffer, tensor.detach().numpy().dtype, tensor.numel())
+        tensor.detach().copy_(torch.from_numpy(found).view(tensor.shape))
 
     def _composition(
         self,

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
 import struct
 import tempfile
@@ -21,16 +22,20 @@ MAX_UNIFORMS = 1024  # kept
 MAX_GROUPS = 65535  # of a dispatch, in one dimension: the limit of WebGPU
 # What the kernels need beyond WebGPU's defaults.
 NEEDED = {
-    "max-compute-workgroup-storage-size": 32 * 1024,
-    "max-storage-buffers-per-shader-stage": 13,
+    "max-compute-workgroup-storage-size": 24 * 1024,
+    "max-storage-buffers-per-shader-stage": 12,
 }
 # What is requested as far as the device has it: the size of a scene depends on it.
 WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
 
-NO_WGPU = "install it with pip install 'splatmake[gpu]', or set device: cpu"
+SMALLER = (
+    "lower train.density.max_gaussians or views.max_long_side_px, set partition.blocks, or set "
+    "train.device: cpu"
+)
+NO_WGPU = "install it with pip install 'splatmake[gpu]', or set train.device: cpu"
 NO_GPU = (
-    "install the GPU's driver with Vulkan (Linux: vulkaninfo lists devices), or set device: cpu; "
-    "python -m pipeline doctor shows what is found"
+    "install the GPU's driver with Vulkan (vulkaninfo lists devices), or set train.device: "
+    "cpu; splatmake doctor shows what is found"
 )
 
 Buffer = Any  # wgpu.GPUBuffer: wgpu is imported only if a GPU is used.
@@ -95,7 +100,7 @@ class Gpu:
             if limits[name] < least:
                 raise UserError(
                     f"{self.adapter}: {name} is {limits[name]}, the kernels need {least}",
-                    fix="use another GPU (device: gpu:N), or device: cpu",
+                    fix="use another GPU (gpu:N), or train.device: cpu",
                 )
         requested = {name: limits[name] for name in (*NEEDED, *WANTED)}
         self.device = adapter.request_device_sync(required_limits=requested)
@@ -119,11 +124,7 @@ class Gpu:
 
         size = max(SMALLEST, (size + 3) // 4 * 4)
         if size > self.max_bytes:
-            raise UserError(
-                f"{what} needs {size / 1e6:.0f} MB in one buffer; {self.adapter} has at most "
-                f"{self.max_bytes / 1e6:.0f} MB",
-                fix="lower train.density.max_gaussians or train.max_size, or set device: cpu",
-            )
+            raise too_large(what, size, self)
         usage = wgpu.BufferUsage
         try:
             return self.device.create_buffer(
@@ -132,7 +133,7 @@ class Gpu:
         except (wgpu.GPUOutOfMemoryError, wgpu.GPUValidationError) as error:
             raise UserError(
                 f"{self.adapter}: no memory for {what} of {size / 1e6:.0f} MB: {error}",
-                fix="lower train.density.max_gaussians or train.max_size, or set device: cpu",
+                fix=SMALLER,
             ) from error
 
     def upload(self, array: NDArray[Any], *, what: str = "an array") -> Buffer:
@@ -184,8 +185,7 @@ class Gpu:
         except Exception as error:
             raise UserError(
                 f"{self.adapter} was lost: {error}",
-                fix="start again: training resumes from its checkpoint. If it recurs, lower "
-                "train.density.max_gaussians or set device: cpu",
+                fix=f"start again: training resumes from its checkpoint. If it recurs, {SMALLER}",
             ) from error
         return np.frombuffer(data, np.uint8)[:size].view(dtype).copy()
 
@@ -277,6 +277,12 @@ class Gpu:
         return self.device.create_bind_group_layout(entries=entries), module
 
 
+def too_large(what: str, size: int, gpu: Gpu) -> UserError:
+    """The error for an array of so many bytes."""
+    holds = f"a buffer of {gpu.adapter} holds {gpu.max_bytes / 1e6:.0f} MB"
+    return UserError(f"{what}: {size / 1e6:.0f} MB; {holds}", fix=SMALLER)
+
+
 def blocks(count: int, size: int = THREADS) -> int:
     """The number of workgroups for ``count`` elements, ``size`` each."""
     return -(-count // size)
@@ -292,7 +298,8 @@ def _adapters() -> list[Any]:
     # Without a desktop, drivers write a line to stderr for each device.
     os.environ.setdefault("XDG_RUNTIME_DIR", tempfile.gettempdir())
     # OpenGL lacks what the kernels need.
-    set_instance_extras(backends=["Vulkan", "Metal", "DX12"])
+    with contextlib.suppress(RuntimeError):  # Another library may have used wgpu before.
+        set_instance_extras(backends=["Vulkan", "Metal", "DX12"])
     found = wgpu.gpu.enumerate_adapters_sync()
     kinds = ["discrete", "integrated", "unknown", "software"]
     return sorted(found, key=lambda adapter: kinds.index(_kind(adapter)))

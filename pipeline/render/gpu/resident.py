@@ -11,6 +11,7 @@ import torch
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_uniform, frame_uniform, sh_options
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
+from pipeline.render.gpu.memory import memory_line
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
     GaussianAdam,
@@ -19,6 +20,7 @@ from pipeline.render.resident import (
     ResidentStep,
     ResidentTraining,
     StepResult,
+    TrainingSize,
 )
 from pipeline.render.types import DenseAdam, FrameAdam, ShAdam
 
@@ -100,6 +102,9 @@ class GpuTraining(ResidentTraining):
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.buffers: dict[str, Buffer] = {}
 
+    def memory_line(self, size: TrainingSize) -> str:
+        return memory_line(self.gpu, size, IMAGE_CACHE)
+
     def load(self, optimised: Optimised) -> None:
         parameters, count = optimised.parameters, len(optimised.last)
         whole = np.concatenate([parameters[n].numpy().reshape(-1) for n in layout.GEOMETRY])
@@ -121,9 +126,8 @@ class GpuTraining(ResidentTraining):
         tensors = _moments(optimised) | {"sh": parameters["sh"]}
         for name, tensor in tensors.items():
             buffer = self.scene.sh if name == "sh" else self.buffers[name]
-            array = tensor.numpy()
-            found = self.gpu.read(buffer, array.dtype, tensor.numel())
-            np.copyto(array, found.reshape(array.shape))
+            found = self.gpu.read(buffer, tensor.numpy().dtype, tensor.numel())
+            tensor.copy_(torch.from_numpy(found).view(tensor.shape))
 
     def step(self, step: ResidentStep) -> StepResult:
         gpu, space, scene, camera = self.gpu, self.space, self.scene, step.camera

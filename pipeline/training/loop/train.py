@@ -6,7 +6,7 @@ threads, on when checkpoints were written, or on how often the run was interrupt
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,8 +15,10 @@ import torch
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.schema import Train
 from pipeline.render import Backend, make_backend
+from pipeline.render.resident import TrainingSize
 from pipeline.runtime import termination
 from pipeline.runtime.errors import UserError
+from pipeline.scene.views import View
 from pipeline.training.checkpoints.identity import identity_of
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.result import TrainResult, result_of
@@ -107,6 +109,10 @@ def train(
             unit="steps" if config.budget_minutes is None else "parts",
         )
         trainer = Trainer(scene, state, config, experiments, backend, threads, span)
+        if trainer.device is not None:
+            log(trainer.device.training.memory_line(training_size(inputs.views, config)))
+        elif config.device != "cpu":
+            log("the GPU computes operator by operator: the run needs the processor in each step")
         with termination.deferred():
             while state.clock < span.stop:
                 before = state.clock
@@ -123,3 +129,10 @@ def train(
         return result_of(state, scene, config.sh_degree, warnings)
     finally:
         torch.set_num_threads(torch_threads)
+
+
+def training_size(views: Sequence[View], config: Train) -> TrainingSize:
+    """At full resolution and SH degree."""
+    pixels = [view.width * view.height for view in views]
+    bands = (config.sh_degree + 1) ** 2
+    return TrainingSize(config.density.max_gaussians, bands, max(pixels), 3 * sum(pixels))

@@ -1,0 +1,59 @@
+"""The memory of training on a device, known before it starts."""
+
+from __future__ import annotations
+
+from pipeline.render.gpu import layout
+from pipeline.render.gpu.device import Gpu, too_large
+from pipeline.render.resident import TrainingSize
+
+# Tiles that a Gaussian overlaps, on average over all Gaussians: typical of trained scenes.
+PAIRS_PER_GAUSSIAN = 8
+# Bytes of a Gaussian, of a pair and of a pixel in the arrays that are not the largest: counts,
+# radii and ranks; keys and values of sorting; images and their gradients.
+GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 48, 20, 48
+
+
+def large_arrays(size: TrainingSize) -> dict[str, int]:
+    """Bytes of the arrays that can exceed the limit of one buffer."""
+    count = size.gaussians
+    return {
+        "SH coefficients": 12 * size.sh_coefficients * count,
+        "gradients": 4 * layout.floats(layout.GRADIENTS) * count,
+        "slots of gradients": layout.SLOT_BYTES * PAIRS_PER_GAUSSIAN * count,
+        "derivatives of SSIM": 36 * size.pixels,
+    }
+
+
+def training_bytes(size: TrainingSize, cached: int) -> int:
+    """All arrays.
+
+    Args:
+        cached: training images on the device at most, bytes.
+    """
+    parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
+    per_gaussian = layout.RECORD_BYTES + layout.BOX_BYTES + GAUSSIAN_BYTES
+    per_gaussian += PAIRS_PER_GAUSSIAN * PAIR_BYTES
+    # Parameters with two moments; those of SH are among the large arrays once.
+    moments = 3 * parameters - 12 * size.sh_coefficients
+    return (
+        sum(large_arrays(size).values())
+        + (moments + per_gaussian) * size.gaussians
+        + PIXEL_BYTES * size.pixels
+        + min(cached, size.image_bytes)
+    )
+
+
+def memory_line(gpu: Gpu, size: TrainingSize, cached: int) -> str:
+    """A line for the log.
+
+    Raises:
+        UserError: an array is larger than the device's buffers can be.
+    """
+    arrays = large_arrays(size)
+    name = max(arrays, key=lambda each: arrays[each])
+    if arrays[name] > gpu.max_bytes:
+        raise too_large(name, arrays[name], gpu)
+    return (
+        f"{gpu.adapter}: about {training_bytes(size, cached) / 1e6:.0f} MB of its memory for up to "
+        f"{size.gaussians} Gaussians and images of {size.pixels / 1e6:.2f} megapixels"
+    )

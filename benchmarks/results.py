@@ -253,6 +253,37 @@ class StressResult:
     gradient_worst: float
 
 
+# ---- benchmarks.gpu ----
+
+
+@dataclass(frozen=True)
+class GpuResult:
+    """A scene on a GPU, and on the processor of the same machine.
+
+    Attributes:
+        phase_ms: time of the kernels of each phase of a training step, by the device's timestamps.
+        step_ms, cpu_step_ms: wall time of a step.
+        frames_per_s, cpu_frames_per_s: of rendering alone, with the copy of the image.
+        bandwidth: bytes per second that copies inside the device's memory read and write.
+        moments_bandwidth: bytes of SH coefficients and moments over the time of the kernel that
+            updates them.
+    """
+
+    device: str
+    driver: str
+    scene: str
+    gaussians: int
+    width: int
+    height: int
+    phase_ms: dict[str, float]
+    step_ms: float
+    cpu_step_ms: float
+    frames_per_s: float
+    cpu_frames_per_s: float
+    bandwidth: float
+    moments_bandwidth: float
+
+
 # ---- benchmarks.video ----
 
 

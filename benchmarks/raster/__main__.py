@@ -34,19 +34,12 @@ from benchmarks.raster.measure import (
 )
 from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.probe import OPERATORS, versus
-from benchmarks.raster.scenes import Scene, synthetic, trained
+from benchmarks.raster.scenes import Scene, size_of, synthetic, trained
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 
 COUNTS = [10_000, 50_000, 200_000, 1_000_000]
 SIZES = [(480, 270), (960, 540), (1920, 1080)]
-
-
-def _size(text: str) -> tuple[int, int]:
-    width, _, height = text.partition("x")
-    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
-        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, found {text!r}")
-    return int(width), int(height)
 
 
 def _share(text: str) -> float:
@@ -64,7 +57,7 @@ def _arguments() -> argparse.Namespace:
     )
     parser.add_argument("--counts", type=int, nargs="+", default=COUNTS, help="Gaussians")
     parser.add_argument(
-        "--sizes", type=_size, nargs="+", metavar="WxH",
+        "--sizes", type=size_of, nargs="+", metavar="WxH",
         help="image sizes, pixels; without it 480x270 960x540 1920x1080, or the model's own",
     )  # fmt: skip
     parser.add_argument("--radius", type=float, default=5.0, help="mean 3-sigma radius, pixels")

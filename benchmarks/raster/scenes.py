@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -105,3 +106,11 @@ def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
 
 def _view(camera: Camera, pose: np.ndarray) -> RasterCamera:
     return RasterCamera(camera.width, camera.height, *camera.pinhole, torch.from_numpy(pose))
+
+
+def size_of(text: str) -> tuple[int, int]:
+    """The width and height of "WIDTHxHEIGHT", on a command line."""
+    width, _, height = text.partition("x")
+    if not (width.isdecimal() and height.isdecimal() and int(width) and int(height)):
+        raise argparse.ArgumentTypeError(f"expected WIDTHxHEIGHT, found {text!r}")
+    return int(width), int(height)

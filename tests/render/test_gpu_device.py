@@ -10,6 +10,7 @@ from pipeline.render.gpu import device, kernels
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.device import Gpu
 from pipeline.render.gpu.memory import memory_line, training_bytes
+from pipeline.render.gpu.profile import profiled
 from pipeline.render.gpu.sort import scan, sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import TrainingSize
@@ -107,6 +108,36 @@ def test_sorting_is_stable(gpu: Gpu, length: int, capacity: int, bits: int) -> N
     order = np.argsort(keys[:length], kind="stable")
     assert (gpu.read(found[0], np.uint32, length) == keys[order]).all()
     assert (gpu.read(found[1], np.uint32, length) == order).all()
+
+
+def test_a_workspace_keeps_what_recorded_kernels_read(gpu: Gpu) -> None:
+    """A uniform that changes before its kernel is submitted, and a buffer that grows between two
+    uses of the same kernel."""
+    space = Workspace(gpu)
+    values = np.arange(2000, dtype=np.uint32)
+    for count in (3, 2000, 7):
+        buffer = space.get("values", 4 * count)
+        gpu.write(buffer, values[:count])
+        sums = space.get("sums", 64)
+        for part in (count // 2, count):
+            size = space.uniform("size", "I", part)
+            space.run("scan.blocks", 1, size=size, values=buffer, sums=sums)
+        half = count // 2
+        once = np.concatenate([np.cumsum(values[:half]) - values[:half], values[half:count]])
+        part = min(count, 1024)
+        expected = once.astype(np.uint32)
+        expected[:part] = np.cumsum(once[:part]) - once[:part]
+        assert (gpu.read(buffer, np.uint32, count) == expected).all(), count
+
+
+def test_kernels_are_timed_one_by_one(gpu: Gpu) -> None:
+    with profiled(gpu) as profile:
+        for _ in range(3):
+            scan(gpu, Workspace(gpu), gpu.upload(np.ones(5000, np.uint32)), 5000)
+            profile.collect()
+    assert set(profile.seconds) == {"scan.blocks", "scan.add"}
+    assert 0 < profile.seconds["scan.blocks"] < 10
+    assert gpu.profile is None
 
 
 def test_the_constants_are_those_of_the_cpp_kernels() -> None:

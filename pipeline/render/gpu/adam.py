@@ -8,42 +8,50 @@ import numpy as np
 import torch
 
 from pipeline.render.gpu import layout
-from pipeline.render.gpu.device import Buffer, Gpu
+from pipeline.render.gpu.device import Buffer
+from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import DenseAdam, FrameAdam, ShAdam
 
 
 def adam_uniform(
-    gpu: Gpu, adam: DenseAdam, count: int, width: int, at: int = 0
+    space: Workspace, name: str, adam: DenseAdam, count: int, width: int, at: int = 0
 ) -> tuple[Buffer, Buffer]:
-    """``Adam`` of adam.wgsl for ``count`` elements or rows of ``width``, and the rates; ``at``: the
-    first element in the arrays of parameters and gradients."""
+    """``Adam`` of adam.wgsl for ``count`` elements or rows of ``width``, and the rates.
+
+    Args:
+        name: of the parameter.
+        at: the first element in the arrays of parameters and gradients.
+    """
     to_rate, to_root = corrections(adam)
     rates = torch.atleast_1d(torch.tensor(adam.lr, dtype=torch.float64)) * to_rate
-    uniform = gpu.uniform(
-        "4I6fIf", count, width, len(rates), at, *decay(adam), adam.eps, to_root, at, 0.0
+    sizes = count, width, len(rates), at
+    uniform = space.uniform(
+        f"Adam of {name}", "4I6fIf", *sizes, *decay(adam), adam.eps, to_root, at, 0.0
     )
-    return uniform, gpu.upload(rates.numpy().astype(np.float32))
+    packed = rates.numpy().astype(np.float32).tobytes()
+    return uniform, space.write_uniform(f"rates of {name}", packed)
 
 
-def frame_uniform(gpu: Gpu, adam: FrameAdam, count: int) -> Buffer:
+def frame_uniform(space: Workspace, adam: FrameAdam, count: int) -> Buffer:
     """``Adam`` of frame_adam.wgsl."""
     to_rate, to_root = corrections(adam)
-    return gpu.uniform(
-        "I9f8x", count, adam.mean_rate * to_rate, adam.rotation_rate * to_rate, adam.eps,
-        *decay(adam), to_root, 0.0,
-    )  # fmt: skip
+    rates = adam.mean_rate * to_rate, adam.rotation_rate * to_rate
+    return space.uniform(
+        "Adam of frames", "I9f8x", count, *rates, adam.eps, *decay(adam), to_root, 0.0
+    )
 
 
-def sh_options(gpu: Gpu, adam: ShAdam | None, camera: bool) -> Buffer:
+def sh_options(space: Workspace, adam: ShAdam | None, camera: bool) -> Buffer:
     """``Options`` of project_backward.wgsl."""
     flags = layout.CAMERA * camera
     if adam is None:
-        return gpu.uniform("II10f", flags, *[0] * 11)
+        return space.uniform("options of SH", "II10f", flags, *[0] * 11)
     to_rate, to_root = corrections(adam)
-    return gpu.uniform(
-        "II10f", flags | layout.SH_ADAM, adam.step, adam.dc_rate * to_rate, adam.rate * to_rate,
-        *decay(adam), adam.eps, to_root, adam.beta1 / math.sqrt(adam.beta2), 0.0,
-    )  # fmt: skip
+    rates = adam.dc_rate * to_rate, adam.rate * to_rate
+    ratio = adam.beta1 / math.sqrt(adam.beta2)
+    flags |= layout.SH_ADAM
+    values = flags, adam.step, *rates, *decay(adam), adam.eps, to_root, ratio, 0.0
+    return space.uniform("options of SH", "II10f", *values)
 
 
 def corrections(adam: DenseAdam | FrameAdam | ShAdam) -> tuple[float, float]:

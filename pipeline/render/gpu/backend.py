@@ -174,7 +174,7 @@ class GpuBackend(Backend[Projected, Binned]):
             "project_backward",
             blocks(count),
             view=projection.view,
-            options=sh_options(gpu, sh_adam, camera),
+            options=sh_options(Workspace(gpu), sh_adam, camera),
             geometry=scene.geometry,
             sh=updated,
             records=projection.records,
@@ -266,7 +266,7 @@ class GpuBackend(Backend[Projected, Binned]):
         checks.check_adam(param, grad, adam)
         gpu, shared = self.gpu, adam.exp_avg_sq.shape != param.shape
         count = len(param) if shared else param.numel()
-        uniform, rates = adam_uniform(gpu, adam, count, param[:1].numel())
+        uniform, rates = adam_uniform(Workspace(gpu), "a tensor", adam, count, param[:1].numel())
         buffers = {
             "parameter": gpu.upload(param.detach().numpy()),
             "exp_avg": gpu.upload(adam.exp_avg.numpy()),
@@ -310,7 +310,7 @@ class GpuBackend(Backend[Projected, Binned]):
         self.gpu.run(
             "frame_adam",
             blocks(count),
-            adam=frame_uniform(self.gpu, adam, count),
+            adam=frame_uniform(Workspace(self.gpu), adam, count),
             geometry=geometry,
             gradients=self._sections(sections, _arrays(gradients), count),
             **buffers,

@@ -6,15 +6,19 @@ import contextlib
 import os
 import struct
 import tempfile
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render.gpu.kernels import source
 from pipeline.runtime.errors import UserError
+
+if TYPE_CHECKING:
+    from pipeline.render.gpu.profile import Profile
 
 THREADS = 256  # kThreads in common.wgsl
 SMALLEST = 256  # bytes of a buffer: bindings must not be smaller than their struct
@@ -26,6 +30,7 @@ NEEDED = {
     "max-storage-buffers-per-shader-stage": 12,
 }
 # What is requested as far as the device has it: the size of a scene depends on it.
+OPTIONAL_FEATURES = ("timestamp-query",)
 WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
 
 SMALLER = (
@@ -103,7 +108,10 @@ class Gpu:
                     fix="use another GPU (gpu:N), or train.device: cpu",
                 )
         requested = {name: limits[name] for name in (*NEEDED, *WANTED)}
-        self.device = adapter.request_device_sync(required_limits=requested)
+        features = [name for name in OPTIONAL_FEATURES if name in adapter.features]
+        self.device = adapter.request_device_sync(
+            required_limits=requested, required_features=features
+        )
         self.max_bytes = min(limits[name] for name in WANTED)
         self._pipelines: dict[str, tuple[Any, Any]] = {}
         self._layouts: dict[str, tuple[Any, Any]] = {}
@@ -111,6 +119,8 @@ class Gpu:
         self._uniforms: dict[bytes, Buffer] = {}
         self._encoder: Any = None
         self._pass: Any = None
+        self.submissions = 0  # number of submitted command buffers
+        self.profile: Profile | None = None
 
     # ---- Buffers ----
 
@@ -139,7 +149,7 @@ class Gpu:
     def upload(self, array: NDArray[Any], *, what: str = "an array") -> Buffer:
         """A new buffer with the array's bytes."""
         buffer = self.empty(array.nbytes, what=what)
-        self._write(buffer, array, 0)
+        self.write_now(buffer, array)
         return buffer
 
     def uniform(self, format: str, *values: float) -> Buffer:
@@ -156,9 +166,10 @@ class Gpu:
         """Copy an array into a buffer, after the kernels before. Its bytes are padded to a multiple
         of four."""
         self.submit()
-        self._write(buffer, array, offset)
+        self.write_now(buffer, array, offset)
 
-    def _write(self, buffer: Buffer, array: NDArray[Any], offset: int) -> None:
+    def write_now(self, buffer: Buffer, array: NDArray[Any], offset: int = 0) -> None:
+        """As ``write``, but before the kernels that are not submitted yet."""
         data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         if data.nbytes % 4:
             data = np.concatenate([data, np.zeros(-data.nbytes % 4, np.uint8)])
@@ -199,25 +210,36 @@ class Gpu:
                 limit of one dimension.
             buffers: by the names of the kernel's bindings. Missing ones are not used by it.
         """
+        self.dispatch(kernel, groups, self.bind(kernel, buffers))
+
+    def bind(self, kernel: str, buffers: Mapping[str, Buffer]) -> Any:
+        """The bind group of a kernel's buffers, by the names of its bindings."""
+        _, layout = self._pipeline(kernel)
+        bindings = source(kernel.partition(".")[0]).bindings
+        unknown = buffers.keys() - {binding.name for binding in bindings}
+        assert not unknown, f"{kernel} has no bindings {', '.join(unknown)}"
+        entries = []
+        for binding in bindings:
+            buffer = buffers.get(binding.name) or self._placeholder(binding.number)
+            resource = {"buffer": buffer, "offset": 0, "size": buffer.size}
+            entries.append({"binding": binding.number, "resource": resource})
+        return self.device.create_bind_group(layout=layout, entries=entries)
+
+    def dispatch(self, kernel: str, groups: int | tuple[int, int, int], bound: Any) -> None:
+        """Record a kernel with the result of ``bind``."""
         if groups == 0:
             return
         if isinstance(groups, int):
             across = min(groups, MAX_GROUPS)
             groups = across, -(-groups // across), 1
-        pipeline, layout = self._pipeline(kernel)
-        entries = []
-        for binding in source(kernel.partition(".")[0]).bindings:
-            buffer = buffers.pop(binding.name, None)
-            if buffer is None:
-                buffer = self._placeholder(binding.number)
-            resource = {"buffer": buffer, "offset": 0, "size": buffer.size}
-            entries.append({"binding": binding.number, "resource": resource})
-        assert not buffers, f"{kernel} has no bindings {', '.join(buffers)}"
-        group = self.device.create_bind_group(layout=layout, entries=entries)
-        if self._pass is None:
+        if self.profile is not None:
+            self._end_pass()
+            writes = self.profile.timestamp_writes(kernel)
+            self._pass = self._encode().begin_compute_pass(timestamp_writes=writes)
+        elif self._pass is None:
             self._pass = self._encode().begin_compute_pass()
-        self._pass.set_pipeline(pipeline)
-        self._pass.set_bind_group(0, group)
+        self._pass.set_pipeline(self._pipeline(kernel)[0])
+        self._pass.set_bind_group(0, bound)
         self._pass.dispatch_workgroups(*groups)
 
     def clear(self, buffer: Buffer) -> None:
@@ -230,6 +252,7 @@ class Gpu:
         self._end_pass()
         encoder, self._encoder = self._encoder, None
         if encoder is not None:
+            self.submissions += 1
             self.device.queue.submit([encoder.finish()])
 
     def _encode(self) -> Any:

@@ -108,7 +108,7 @@ def project(
         dropped=space.get("dropped", 4),
     )
     gpu.clear(result.dropped)
-    gpu.run(
+    space.run(
         "project",
         blocks(count),
         view=view,
@@ -143,7 +143,7 @@ def list_pairs(gpu: Gpu, space: Workspace, projection: Projection, count: int) -
     depths, visible = space.get("depths", 4 * count), space.get("visible Gaussians", 4 * count)
     num_visible = space.get("number of visible Gaussians", 4)
     gpu.clear(num_visible)
-    gpu.run(
+    space.run(
         "compact",
         blocks(count),
         size=size,
@@ -157,7 +157,7 @@ def list_pairs(gpu: Gpu, space: Workspace, projection: Projection, count: int) -
     _, ordered = sort(gpu, space, depths, visible, num_visible, capacity=count, bits=DEPTH_BITS)
     # One more than the Gaussians: the last prefix sum is the number of pairs.
     first = space.get("first pairs", 4 * (count + 1))
-    gpu.run(
+    space.run(
         "order",
         blocks(count + 1),
         size=gpu.uniform("I", count + 1),
@@ -180,10 +180,10 @@ def list_pairs(gpu: Gpu, space: Workspace, projection: Projection, count: int) -
         )
     tile_of, numbers = space.get("tiles of pairs", 4 * length), space.get("pairs", 4 * length)
     gaussian_of = space.get("Gaussians of pairs", 4 * length)
-    gpu.run(
+    space.run(
         "pairs",
         blocks(seen),
-        size=gpu.uniform("IIII", count, tiles, tiles_x, length),
+        size=space.uniform("sizes of pairs", "IIII", count, tiles, tiles_x, length),
         length=num_visible,
         gaussians=ordered,
         first=first,
@@ -197,13 +197,13 @@ def list_pairs(gpu: Gpu, space: Workspace, projection: Projection, count: int) -
     )
     if length:
         tile_of, numbers = sort(
-            gpu, space, tile_of, numbers, gpu.uniform("I", length),
+            gpu, space, tile_of, numbers, space.uniform("length", "I", length),
             capacity=length, bits=tiles.bit_length(),
         )  # fmt: skip
-        gpu.run(
+        space.run(
             "ranges",
             blocks(length),
-            size=gpu.uniform("II", length, tiles),
+            size=space.uniform("sizes of ranges", "II", length, tiles),
             tile_of=tile_of,
             ranges=ranges,
         )
@@ -219,7 +219,7 @@ def blend(gpu: Gpu, space: Workspace, projection: Projection, lists: Lists) -> I
         planes=space.get("alpha and depths", 12 * pixels),
         ends=space.get("ends of pixels", 4 * pixels),
     )
-    gpu.run(
+    space.run(
         "blend",
         (*layout.tiles_of(width, height), 1),
         view=projection.view,
@@ -246,7 +246,7 @@ def blend_backward(
     """The slots of gradients (``moments.wgsl``), from the gradients on the colour (H, W, 3) and on
     alpha and depth (2, H, W)."""
     slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.length)
-    gpu.run(
+    space.run(
         "blend_backward",
         (*layout.tiles_of(*projection.size), 1),
         view=projection.view,
@@ -289,7 +289,7 @@ def sum_rows(
     """The sum of ``count`` rows of ``width`` float32."""
     groups = blocks(count, SUM_ROWS)
     sums = space.get(f"sums of rows of {width}", 4 * width * groups)
-    gpu.run("sum_rows", groups, size=gpu.uniform("II", count, width), values=rows, sums=sums)
+    space.run("sum_rows", groups, size=gpu.uniform("II", count, width), values=rows, sums=sums)
     found = gpu.read(sums, np.float32, width * groups).reshape(-1, width)
     return found.sum(0, dtype=np.float64)
 

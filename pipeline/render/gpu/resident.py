@@ -132,9 +132,8 @@ class GpuTraining(ResidentTraining):
     def step(self, step: ResidentStep) -> StepResult:
         gpu, space, scene, camera = self.gpu, self.space, self.scene, step.camera
         size = camera.width, camera.height
-        view = space.get("view", 256)
         packed = layout.pack_view(camera, step.options, scene.count, scene.coefficients)
-        gpu.write(view, packed)
+        view = space.write_uniform("view", packed.tobytes())
         projection = rasterise.project(gpu, space, scene, view, size)
         lists = rasterise.list_pairs(gpu, space, projection, scene.count)
         image = rasterise.blend(gpu, space, projection, lists)
@@ -231,7 +230,7 @@ class GpuTraining(ResidentTraining):
         slots: Buffer,
     ) -> tuple[Buffer, Buffer | None]:
         """The gradients of all but SH, which are updated, and those of the camera."""
-        gpu, space, scene, adam = self.gpu, self.space, self.scene, step.adam
+        space, scene, adam = self.space, self.scene, step.adam
         gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
         nothing = torch.empty(0)
         sh_adam = ShAdam(
@@ -241,11 +240,11 @@ class GpuTraining(ResidentTraining):
         d_camera = None
         if step.camera_gradients:
             d_camera = space.get("camera gradients", 4 * layout.CAMERA_PARAMETERS * scene.count)
-        gpu.run(
+        space.run(
             "project_backward",
             blocks(scene.count),
             view=projection.view,
-            options=sh_options(gpu, sh_adam, step.camera_gradients),
+            options=sh_options(space, sh_adam, step.camera_gradients),
             geometry=scene.geometry,
             sh=scene.sh,
             records=projection.records,
@@ -267,10 +266,10 @@ class GpuTraining(ResidentTraining):
         name = "means2d_abs" if step.absolute else "means2d"
         at, _ = layout.offsets(layout.GRADIENTS, count)[name]
         half = 0.5 * step.camera.width, 0.5 * step.camera.height
-        self.gpu.run(
+        self.space.run(
             "observe",
             blocks(count),
-            options=self.gpu.uniform("IIff", count, at, *half),
+            options=self.space.uniform("options of statistics", "IIff", count, at, *half),
             gradients=gradients,
             radii=projection.radii,
             gradient_sum=self.buffers["gradient_sum"],
@@ -286,10 +285,10 @@ class GpuTraining(ResidentTraining):
                 nothing, nothing, nothing, nothing, adam.rates["means"], adam.rates["quats"],
                 adam.step, adam.beta1, adam.beta2, adam.eps,
             )  # fmt: skip
-            self.gpu.run(
+            self.space.run(
                 "frame_adam",
                 blocks(count),
-                adam=frame_uniform(self.gpu, frame, count),
+                adam=frame_uniform(self.space, frame, count),
                 gradients=gradients,
                 geometry=self.scene.geometry,
                 mean_avg=self.buffers["first means"],
@@ -308,8 +307,8 @@ class GpuTraining(ResidentTraining):
                 nothing, nothing, adam.rates[name], adam.step, adam.beta1, adam.beta2, eps
             )
             elements = count if rows else numbers
-            uniform, rates = adam_uniform(self.gpu, dense_adam, elements, each, at)
-            self.gpu.run(
+            uniform, rates = adam_uniform(self.space, name, dense_adam, elements, each, at)
+            self.space.run(
                 "adam.rows" if rows else "adam.elements",
                 blocks(elements),
                 adam=uniform,

@@ -14,10 +14,10 @@ def scan(gpu: Gpu, space: Workspace, values: Buffer, count: int, level: int = 0)
     groups = blocks(count, BLOCK)
     sums = space.get(f"scan sums {level}", 4 * groups)
     arguments = {"size": gpu.uniform("I", count), "values": values, "sums": sums}
-    gpu.run("scan.blocks", groups, **arguments)
+    space.run("scan.blocks", groups, **arguments)
     if groups > 1:
         scan(gpu, space, sums, groups, level + 1)
-        gpu.run("scan.add", groups, **arguments)
+        space.run("scan.add", groups, **arguments)
 
 
 def sort(
@@ -53,8 +53,8 @@ def sort(
             "sorted_keys": others[0],
             "sorted_values": others[1],
         }
-        gpu.run("sort.histogram", groups, **arguments)
+        space.run("sort.histogram", groups, **arguments)
         scan(gpu, space, places, 16 * groups)
-        gpu.run("sort.scatter", groups, **arguments)
+        space.run("sort.scatter", groups, **arguments)
         here, others = others, here
     return here

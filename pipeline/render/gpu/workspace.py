@@ -1,10 +1,16 @@
-"""Buffers by name that grow when they are too small."""
+"""Buffers by name that are used again, and the bind groups of kernels that use them."""
 
 from __future__ import annotations
+
+import struct
+from typing import Any
+
+import numpy as np
 
 from pipeline.render.gpu.device import Buffer, Gpu
 
 GROWTH = 1.25  # over what is needed, if a buffer is replaced by a larger one
+MAX_GROUPS = 1024  # bind groups that are kept
 
 
 class Workspace:
@@ -13,11 +19,41 @@ class Workspace:
     def __init__(self, gpu: Gpu):
         self.gpu = gpu
         self._buffers: dict[str, Buffer] = {}
+        self._uniforms: dict[str, tuple[bytes, int]] = {}
+        # With the buffers, whose ids are the key.
+        self._groups: dict[tuple[Any, ...], tuple[Any, dict[str, Buffer]]] = {}
 
     def get(self, name: str, size: int) -> Buffer:
         """The buffer of this name, with at least ``size`` bytes."""
         found = self._buffers.get(name)
         if found is None or found.size < size:
             grown = size if found is None else min(int(GROWTH * size), self.gpu.max_bytes)
+            self._groups.clear()  # They hold the old buffer.
             found = self._buffers[name] = self.gpu.empty(max(size, grown), what=name)
         return found
+
+    def uniform(self, name: str, format: str, *values: float) -> Buffer:
+        """The buffer of this name with the fields of a struct, whose types are as in the module
+        ``struct``."""
+        return self.write_uniform(name, struct.pack("<" + format, *values))
+
+    def write_uniform(self, name: str, packed: bytes) -> Buffer:
+        """The buffer of this name with these bytes, for kernels that are recorded from now on."""
+        buffer = self.get(name, len(packed))
+        before, used = self._uniforms.get(name, (b"", -1))
+        if packed != before:
+            if used == self.gpu.submissions:
+                self.gpu.submit()  # A recorded kernel may read the bytes before.
+            self.gpu.write_now(buffer, np.frombuffer(packed, np.uint8))
+        self._uniforms[name] = packed, self.gpu.submissions
+        return buffer
+
+    def run(self, kernel: str, groups: int | tuple[int, int, int], **buffers: Buffer) -> None:
+        """``Gpu.run`` for buffers that are used again in the next step: their bind group is made
+        once, which takes longer than to record a kernel."""
+        key = (kernel, *map(id, buffers.values()))
+        if key not in self._groups:
+            if len(self._groups) == MAX_GROUPS:
+                self._groups.clear()
+            self._groups[key] = self.gpu.bind(kernel, buffers), buffers
+        self.gpu.dispatch(kernel, groups, self._groups[key][0])

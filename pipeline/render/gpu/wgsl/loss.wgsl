@@ -23,22 +23,19 @@ const kSide = kTile + 2u * kRadius;
 const kArea = kSide * kSide;
 const kC1 = 1e-4;
 const kC2 = 9e-4;
-// exp(-i^2 / (2 1.5^2)), normalised, from the centre outwards
-const kTaps = array<f32, kRadius + 1u>(
-    0.26601171493530273, 0.21300552785396576, 0.1093606874346733, 0.03600076958537102,
-    0.0075987582094967365, 0.001028380123898387,
-);
+// exp(-i^2 / (2 1.5^2)), normalised, from the centre outwards. One by one: an array would be in memory.
+const kTap0 = 0.26601171493530273;
+const kTap1 = 0.21300552785396576;
+const kTap2 = 0.1093606874346733;
+const kTap3 = 0.03600076958537102;
+const kTap4 = 0.0075987582094967365;
+const kTap5 = 0.001028380123898387;
 
 var<workgroup> tile_x: array<f32, kArea>;
 var<workgroup> tile_y: array<f32, kArea>;
 var<workgroup> tile_z: array<f32, kArea>;
 var<workgroup> across: array<vec4<f32>, kTile * kSide>;  // blurred along x
 var<workgroup> partial: array<vec4<f32>, kThreads>;
-
-fn tap(i: u32) -> f32 {
-    var taps = kTaps;
-    return taps[select(kRadius - i, i - kRadius, i > kRadius)];
-}
 
 fn byte(word: u32, at: u32) -> u32 {
     return (word >> (8u * (at & 3u))) & 255u;
@@ -54,6 +51,38 @@ fn target_at(at: u32) -> f32 {
 fn rendered_at(at: u32, pixel: u32, channel: u32) -> f32 {
     if (is_masked(pixel)) { return target_at(at); }
     return rendered[at] * loss.gain[channel];
+}
+
+// x, y, x^2 + y^2, x y
+fn products(i: u32) -> vec4<f32> {
+    let x = tile_x[i];
+    let y = tile_y[i];
+    return vec4(x, y, x * x + y * y, x * y);
+}
+fn blurred_products(i: u32) -> vec4<f32> {
+    return kTap0 * products(i) + kTap1 * (products(i - 1u) + products(i + 1u))
+        + kTap2 * (products(i - 2u) + products(i + 2u))
+        + kTap3 * (products(i - 3u) + products(i + 3u))
+        + kTap4 * (products(i - 4u) + products(i + 4u))
+        + kTap5 * (products(i - 5u) + products(i + 5u));
+}
+fn derivatives_at(i: u32) -> vec4<f32> {
+    return vec4(tile_x[i], tile_y[i], tile_z[i], 0.0);
+}
+fn blurred_derivatives(i: u32) -> vec4<f32> {
+    return kTap0 * derivatives_at(i) + kTap1 * (derivatives_at(i - 1u) + derivatives_at(i + 1u))
+        + kTap2 * (derivatives_at(i - 2u) + derivatives_at(i + 2u))
+        + kTap3 * (derivatives_at(i - 3u) + derivatives_at(i + 3u))
+        + kTap4 * (derivatives_at(i - 4u) + derivatives_at(i + 4u))
+        + kTap5 * (derivatives_at(i - 5u) + derivatives_at(i + 5u));
+}
+// Along y, of a row of `across`.
+fn blurred_down(i: u32) -> vec4<f32> {
+    return kTap0 * across[i] + kTap1 * (across[i - kTile] + across[i + kTile])
+        + kTap2 * (across[i - 2u * kTile] + across[i + 2u * kTile])
+        + kTap3 * (across[i - 3u * kTile] + across[i + 3u * kTile])
+        + kTap4 * (across[i - 4u * kTile] + across[i + 4u * kTile])
+        + kTap5 * (across[i - 5u * kTile] + across[i + 5u * kTile]);
 }
 
 struct Place {
@@ -86,20 +115,10 @@ fn forward(@builtin(workgroup_id) tile: vec3<u32>, @builtin(num_workgroups) tile
     }
     workgroupBarrier();
     for (var k = local; k < kTile * kSide; k += kThreads) {
-        let first = (k / kTile) * kSide + k % kTile;
-        var sum = vec4(0.0);
-        for (var t = 0u; t < 2u * kRadius + 1u; t++) {
-            let x = tile_x[first + t];
-            let y = tile_y[first + t];
-            sum += tap(t) * vec4(x, y, x * x + y * y, x * y);
-        }
-        across[k] = sum;
+        across[k] = blurred_products((k / kTile) * kSide + k % kTile + kRadius);
     }
     workgroupBarrier();
-    var m = vec4(0.0);
-    for (var t = 0u; t < 2u * kRadius + 1u; t++) {
-        m += tap(t) * across[(inside.y + t) * kTile + inside.x];
-    }
+    let m = blurred_down((inside.y + kRadius) * kTile + inside.x);
     let position = tile.xy * kTile + inside.xy;
     var sum = vec4(0.0);  // error, SSIM, squared difference
     if (all(position < loss.size)) {
@@ -153,20 +172,12 @@ fn backward(@builtin(workgroup_id) tile: vec3<u32>,
     }
     workgroupBarrier();
     for (var k = local; k < kTile * kSide; k += kThreads) {
-        let first = (k / kTile) * kSide + k % kTile;
-        var sum = vec3(0.0);
-        for (var t = 0u; t < 2u * kRadius + 1u; t++) {
-            sum += tap(t) * vec3(tile_x[first + t], tile_y[first + t], tile_z[first + t]);
-        }
-        across[k] = vec4(sum, 0.0);
+        across[k] = blurred_derivatives((k / kTile) * kSide + k % kTile + kRadius);
     }
     workgroupBarrier();
     let position = tile.xy * kTile + inside.xy;
     if (any(position >= loss.size)) { return; }
-    var blurred = vec3(0.0);
-    for (var t = 0u; t < 2u * kRadius + 1u; t++) {
-        blurred += tap(t) * across[(inside.y + t) * kTile + inside.x].xyz;
-    }
+    let blurred = blurred_down((inside.y + kRadius) * kTile + inside.x);
     let pixel = position.y * loss.size.x + position.x;
     let at = 3u * pixel + tile.z;
     if (is_masked(pixel)) {

@@ -31,7 +31,9 @@ fn color_of(i: u32, mean: vec3<f32>) -> vec4<f32> {
     var most = 0.0;
     var bounded = true;
     let row = 3u * view.sh_coefficients * i;
-    for (var k = 0u; k < sh_count(view.sh_degree); k++) {
+    let used = sh_count(view.sh_degree);
+    for (var k = 0u; k < kBands; k++) {
+        if (k >= used) { continue; }
         let value = vec3(sh[row + 3u * k], sh[row + 3u * k + 1u], sh[row + 3u * k + 2u]);
         bounded &= finite3(value);
         most = max(most, max(abs(value.x), max(abs(value.y), abs(value.z))));

@@ -215,7 +215,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     let row = 3u * view.sh_coefficients * i;
     let used = sh_count(view.sh_degree);
     var d_direction = vec3(0.0);
-    for (var k = 0u; k < used; k++) {
+    for (var k = 0u; k < kBands; k++) {
+        if (k >= used) { continue; }
         let at = row + 3u * k;
         d_direction += dot(vec3(sh[at], sh[at + 1u], sh[at + 2u]), g.rgb) * derivatives[k];
     }
@@ -231,7 +232,8 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     write(i, g);
     if ((options.flags & kShAdam) != 0u) {
         let missed = missed_steps(last_step[i]);
-        for (var k = 0u; k < used; k++) {
+        for (var k = 0u; k < kBands; k++) {
+            if (k >= used) { continue; }
             let rate = select(options.rate, options.rate0, k == 0u);
             for (var channel = 0u; channel < 3u; channel++) {
                 step_sh(row + 3u * k + channel, basis[k] * g.rgb[channel], rate, missed);
@@ -239,9 +241,9 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
         }
         last_step[i] = i32(options.step);
     } else {
-        for (var k = 0u; k < view.sh_coefficients; k++) {
-            var value = vec3(0.0);
-            if (k < used) { value = basis[k] * g.rgb; }
+        for (var k = 0u; k < kBands; k++) {
+            if (k >= view.sh_coefficients) { continue; }
+            let value = select(vec3(0.0), basis[k] * g.rgb, k < used);
             d_sh[row + 3u * k] = value.x;
             d_sh[row + 3u * k + 1u] = value.y;
             d_sh[row + 3u * k + 2u] = value.z;

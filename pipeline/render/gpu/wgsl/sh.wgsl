@@ -1,5 +1,7 @@
 // Spherical harmonics of unit directions (polynomials of Sloan 2013, ordered and signed as in
 // 3DGS).
+// Loops over bands have this constant length, so that compilers unroll them and keep the basis in
+// registers.
 const kBands = 16u;
 
 const a0 = 0.28209479177387814;

@@ -212,8 +212,7 @@ def _training_devices(has_graphics: bool) -> list[Finding]:
         fix = "pip install 'splatmake[gpu]', to train on a GPU" if has_graphics else None
         return [Finding("training", "on the processor; wgpu is not installed", "absent", fix)]
     try:
-        from pipeline.render.gpu.choose import choose_device
-        from pipeline.render.gpu.device import adapters
+        from pipeline.render.devices import adapters, choose_device
 
         found = adapters()
         device, reason = choose_device()

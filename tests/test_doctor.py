@@ -12,8 +12,8 @@ import pytest
 
 from pipeline import doctor
 from pipeline.command.main import main
-from pipeline.render.gpu import choose, device
-from pipeline.render.gpu.device import Adapter
+from pipeline.render import devices
+from pipeline.render.devices import Adapter
 from pipeline.runtime import processor
 from tests.tools import need_package
 
@@ -121,9 +121,8 @@ def test_the_device_that_trains_is_shown_with_the_reason(bare, monkeypatch):
     card = Adapter(1, "Radeon 1", "driver 2", "discrete", "Vulkan")
     software = Adapter(0, "llvmpipe", "Mesa", "software", "Vulkan")
     found = [software]
-    monkeypatch.setattr(device, "adapters", lambda: found)
-    monkeypatch.setattr(choose, "adapters", lambda: found)
-    monkeypatch.setattr(choose, "_measured", lambda *_: (0.010, 0.025))
+    monkeypatch.setattr(devices, "adapters", lambda: found)
+    monkeypatch.setattr(devices, "_measured", lambda *_: (0.010, 0.025))
 
     def shown() -> dict[str, doctor.Finding]:
         return {finding.topic: finding for finding in doctor._graphics()}
@@ -132,15 +131,15 @@ def test_the_device_that_trains_is_shown_with_the_reason(bare, monkeypatch):
     found.insert(0, card)
     assert shown()["gpu:1"].state == "used" and shown()["gpu:0"].state == "there"
     assert "10 ms on Radeon 1 (discrete, Vulkan), 25 without" in shown()["training"].text
-    monkeypatch.setattr(choose, "_measured", lambda *_: (0.025, 0.010))
+    monkeypatch.setattr(devices, "_measured", lambda *_: (0.025, 0.010))
     assert shown()["gpu:1"].state == "there"
     assert shown()["training"].text.startswith("trained on the processor: ")
     found.clear()
-    assert choose.choose_device() == (
+    assert devices.choose_device() == (
         "cpu", "trained on the processor, not on a GPU: none was found"
     )  # fmt: skip
-    monkeypatch.setattr(choose, "find_spec", lambda _: None)
-    assert choose.choose_device() == ("cpu", "")
+    monkeypatch.setattr(devices, "find_spec", lambda _: None)
+    assert devices.choose_device() == ("cpu", "")
 
 
 def test_little_disk_and_memory_are_said(bare, tmp_path, monkeypatch):

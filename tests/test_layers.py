@@ -64,7 +64,9 @@ def test_only_the_render_room_imports_a_backend() -> None:
         for path in (ROOT / folder).rglob("*.py"):
             inside = path.is_relative_to(ROOT / "pipeline" / "render")
             backends = {
-                n for n in imports(path) if n.startswith(("render.cpu", "render.reference"))
+                n
+                for n in imports(path)
+                if n.startswith(("render.cpu", "render.gpu", "render.reference"))
             }
             assert inside or not backends, f"{path} imports {sorted(backends)}"
 

@@ -22,7 +22,7 @@ from pipeline.plan.scan import scan
 from pipeline.plan.settle import PROCESSOR, Choice
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
-from pipeline.render.gpu.choose import choose_device
+from pipeline.render.devices import choose_device
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error

@@ -137,7 +137,7 @@ def test_kernels_are_timed_one_by_one(gpu: Gpu) -> None:
             profile.collect()
     assert set(profile.seconds) == {"scan.blocks", "scan.add"}
     assert 0 < profile.seconds["scan.blocks"] < 10
-    assert gpu.profile is None
+    assert gpu.timer is None
 
 
 def test_the_constants_are_those_of_the_cpp_kernels() -> None:

@@ -9,16 +9,13 @@ import tempfile
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cache
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.render.gpu.kernels import source
 from pipeline.runtime.errors import UserError
-
-if TYPE_CHECKING:
-    from pipeline.render.gpu.profile import Profile
 
 THREADS = 256  # kThreads in common.wgsl
 SMALLEST = 256  # bytes of a buffer: bindings must not be smaller than their struct
@@ -85,6 +82,13 @@ def adapters() -> list[Adapter]:
     ]
 
 
+class KernelTimer(Protocol):
+    """Measures kernels (``profile.Profile``)."""
+
+    def timestamp_writes(self, kernel: str) -> dict[str, Any]:
+        """For the pass of the next kernel."""
+
+
 class Gpu:
     """An open device.
 
@@ -120,7 +124,7 @@ class Gpu:
         self._encoder: Any = None
         self._pass: Any = None
         self.submissions = 0  # number of submitted command buffers
-        self.profile: Profile | None = None
+        self.timer: KernelTimer | None = None
 
     # ---- Buffers ----
 
@@ -232,9 +236,9 @@ class Gpu:
         if isinstance(groups, int):
             across = min(groups, MAX_GROUPS)
             groups = across, -(-groups // across), 1
-        if self.profile is not None:
+        if self.timer is not None:
             self._end_pass()
-            writes = self.profile.timestamp_writes(kernel)
+            writes = self.timer.timestamp_writes(kernel)
             self._pass = self._encode().begin_compute_pass(timestamp_writes=writes)
         elif self._pass is None:
             self._pass = self._encode().begin_compute_pass()

@@ -66,12 +66,12 @@ class Profile:
 def profiled(gpu: Gpu) -> Iterator[Profile]:
     """Kernels inside are measured."""
     gpu.submit()
-    gpu.profile = profile = Profile(gpu)
+    gpu.timer = profile = Profile(gpu)
     try:
         yield profile
         profile.collect()
     finally:
-        gpu.profile = None
+        gpu.timer = None
 
 
 def seconds_per_tick(gpu: Gpu) -> float:

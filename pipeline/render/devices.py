@@ -1,4 +1,5 @@
-"""Whether to train on a GPU: decided by a measurement, which is stored for the next time."""
+"""The devices of this machine, and which of them to train on: decided by a measurement, which is
+stored for the next time. Importing this module does not import torch."""
 
 from __future__ import annotations
 
@@ -6,11 +7,13 @@ import json
 from importlib.util import find_spec
 from pathlib import Path
 
-from pipeline.render.gpu.device import adapters
+from pipeline.render.gpu.device import Adapter, adapters
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.native import cache_folder
+
+__all__ = ["Adapter", "adapters", "choose_device"]
 
 RECORD = "devices.json"
 

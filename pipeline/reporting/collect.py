@@ -44,6 +44,7 @@ def collect_metrics(
         told = read_stage(folder / name).warnings
         warnings += [f"{name}: {text}" for text in told if text not in plan.warnings]
     inspect = read_counters(folder / "inspect", InspectCounters)
+    train = read_counters(folder / "train", TrainCounters)
     sfm = read_counters(folder / "sfm", SfmCounters) if "sfm" in ran else None
     refined = read_counters(folder / "refine", RefineCounters) if "refine" in ran else None
     decoded = read_counters(folder / "decode", DecodeCounters) if "decode" in ran else None
@@ -54,7 +55,8 @@ def collect_metrics(
             "scene": scene,
             "input": found(plan.facts, frames if decoded and plan.facts.videos else None),
             **{name: getattr(evaluation, name) for name in SceneQuality.model_fields},
-            "num_gaussians": read_counters(folder / "train", TrainCounters).num_gaussians,
+            "num_gaussians": train.num_gaussians,
+            "device": train.device,
             "registered_images": sfm.registered if sfm else inspect.given_poses,
             "total_images": inspect.photos + inspect.left_out + frames,
             "reprojection_error_px": sfm.mean_reprojection_error_px if sfm else error_px,

@@ -36,6 +36,7 @@ class Metrics(JsonFile, SceneQuality):
     input: str = Field(description="What the scene folder holds, in one line.")
     seed: int | None = Field(description="Of the run.")
     num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
+    device: Literal["cpu", "gpu"] = Field("cpu", description="What trained the scene.")
     registered_images: int | None = Field(description="Photographs that have a pose.")
     total_images: int = Field(
         description="Photographs in the scene folder, and frames chosen of its videos."

@@ -184,10 +184,12 @@ def run_training(
         num_gaussians=len(result.gaussians),
         steps=result.steps,
         known_depths=sum(map(len, inputs.depths or ())),
+        device="gpu" if config.device.startswith("gpu") else "cpu",
         **notes.counters,
         **result.counters,
     )
     timings = {
+        "built": dict(result.built),
         "ms_per_step": round(1e3 * result.seconds / result.steps, 3),
         "curve_seconds": result.curve_seconds,
         "earlier_s": round(earlier, 3),

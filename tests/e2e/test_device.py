@@ -26,6 +26,7 @@ def test_a_scene_on_a_gpu_is_as_good_as_on_the_processor(finished: Path, tmp_pat
     after = metrics(project, "tiny")
     assert after["psnr"] == pytest.approx(before["psnr"], abs=0.2)
     assert after["ssim"] == pytest.approx(before["ssim"], abs=0.005)
+    assert (before["device"], after["device"]) == ("cpu", "gpu")
     for stage in ("train", "evaluate", "coverage", "export"):
         key = json.loads((project / "results" / "tiny" / stage / "stage.json").read_text())["key"]
         assert key["config"]["train"]["device"] == "gpu:0", stage

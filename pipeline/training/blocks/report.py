@@ -44,7 +44,8 @@ def joined_counters(blocks: Sequence[TrainCounters], num_gaussians: int) -> Trai
         name: sum(getattr(block.changes, name) for block in blocks)
         for name in ChangeCounters.model_fields
     }
-    return TrainCounters.model_validate(sums | {"num_gaussians": num_gaussians, "changes": changes})
+    others = {"num_gaussians": num_gaussians, "changes": changes, "device": blocks[0].device}
+    return TrainCounters.model_validate(sums | others)
 
 
 def joined_curve(curves: Sequence[TrainingCurve]) -> TrainingCurve:

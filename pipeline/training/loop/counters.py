@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 from pydantic import BaseModel, Field
 
 from pipeline.runtime.counters import StageCounters
@@ -24,6 +26,9 @@ class TrainCounters(StageCounters):
     """Counters of the train stage."""
 
     num_gaussians: int = Field(ge=0, description="Number of trained Gaussians.")
+    device: Literal["cpu", "gpu"] = Field(
+        "cpu", description="What computed the steps: the processor, or a GPU (`run.json` names it)."
+    )
     steps: int = Field(ge=0, description="Number of optimiser steps.")
     known_depths: int = Field(
         ge=0,

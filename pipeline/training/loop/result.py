@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
@@ -29,6 +30,7 @@ class TrainResult:
         warnings: for the user; deterministic.
         steps: number of optimiser steps.
         seconds: training time in all processes of the run.
+        built: ``Backend.facts`` of the last process.
         poses: (4, 4) refined world to camera of each view by name, or None.
         intrinsics: (3,) change of each camera's intrinsics by id
             (``cameras.intrinsics.IntrinsicsRefinement``), or None.
@@ -44,13 +46,18 @@ class TrainResult:
     warnings: list[str]
     steps: int
     seconds: float
+    built: Mapping[str, str]
     poses: dict[str, NDArray[np.float64]] | None
     intrinsics: dict[int, NDArray[np.float64]] | None
     appearance: Appearance | None
 
 
 def result_of(
-    state: TrainState, scene: TrainingScene, sh_degree: int, warnings: list[str]
+    state: TrainState,
+    scene: TrainingScene,
+    sh_degree: int,
+    warnings: list[str],
+    built: Mapping[str, str],
 ) -> TrainResult:
     """The result of a finished training."""
     poses, intrinsics = state.cameras.poses, state.cameras.intrinsics
@@ -68,6 +75,7 @@ def result_of(
         warnings=warnings,
         steps=state.step,
         seconds=state.seconds,
+        built=built,
         poses=None if poses is None else dict(zip(names, poses.poses, strict=True)),
         intrinsics=None if intrinsics is None else intrinsics.by_id(),
         appearance=appearance,

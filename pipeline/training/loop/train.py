@@ -126,7 +126,7 @@ def train(
         # Of a block, overviews see nothing where others are in front of it.
         if state.counters.blind_steps and inputs.open_layers is None:
             warn(f"in {state.counters.blind_steps} steps the view saw no Gaussian")
-        return result_of(state, scene, config.sh_degree, warnings)
+        return result_of(state, scene, config.sh_degree, warnings, backend.facts())
     finally:
         torch.set_num_threads(torch_threads)
 

@@ -4,9 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+import torch
 
-from pipeline.render import make_backend
-from pipeline.render.gpu import device, kernels
+from pipeline.render import RasterOptions, make_backend
+from pipeline.render.gpu import device, kernels, rasterise
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.device import Gpu
 from pipeline.render.gpu.memory import memory_line, training_bytes
@@ -15,6 +16,7 @@ from pipeline.render.gpu.sort import scan, sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import TrainingSize
 from pipeline.runtime.errors import UserError
+from tests.render.scenes import camera, random_scene
 from tests.tools import need_gpu
 
 LARGE = TrainingSize(1_000_000, 16, 1600 * 1067, 3 * 200 * 1600 * 1067)
@@ -69,6 +71,17 @@ def test_a_limit_that_is_exceeded_names_the_options(
     space = Workspace(gpu)
     space.get("grows", 100 << 20)
     assert space.get("grows", 120 << 20).size == 128 << 20, "no more than the device allows"
+
+
+def test_bands_of_tiles_give_the_same_bits(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
+    backend, scene, view = make_backend("gpu"), random_scene(1, 300), camera(70, 90)
+    results = []
+    for tiles in (10**6, 7):
+        monkeypatch.setattr(rasterise, "TILES_OF_BAND", tiles)
+        drawn = backend.forward(*scene, view, RasterOptions())
+        found = backend.backward(drawn, torch.ones(90, 70, 3))
+        results.append([drawn.color, drawn.depth, found.means, found.sh])
+    assert all(torch.equal(a, b) for a, b in zip(*results, strict=True))
 
 
 def test_a_lost_device_is_an_error(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -150,8 +163,8 @@ def test_the_constants_are_those_of_the_cpp_kernels() -> None:
 def test_each_kernel_declares_its_bindings_in_order() -> None:
     names = [file.stem for file in kernels.FOLDER.glob("*.wgsl")]
     found = {name: kernels.source(name).bindings for name in names}
-    assert [b.number for b in found["blend"]] == list(range(8))
-    assert [b.kind for b in found["blend"]] == ["uniform"] + 4 * ["read"] + 3 * ["read_write"]
+    kinds = [b.kind for b in found["blend"]]
+    assert kinds == ["uniform"] + 4 * ["read"] + 3 * ["read_write"] + ["uniform"]
     for name, bindings in found.items():
         assert [b.number for b in bindings] == list(range(len(bindings))), name
         storage = sum(b.kind != "uniform" for b in bindings)

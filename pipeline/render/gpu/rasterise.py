@@ -18,6 +18,8 @@ from pipeline.runtime.errors import UserError
 # Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
 MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
 DEPTH_BITS = 32
+# Of one dispatch: an image of 1024 x 1024 pixels.
+TILES_OF_BAND = 4096
 SUM_ROWS = 1024  # of a workgroup of sum_rows.wgsl
 
 
@@ -219,9 +221,11 @@ def blend(gpu: Gpu, space: Workspace, projection: Projection, lists: Lists) -> I
         planes=space.get("alpha and depths", 12 * pixels),
         ends=space.get("ends of pixels", 4 * pixels),
     )
-    space.run(
+    _run_in_bands(
+        gpu,
+        space,
         "blend",
-        (*layout.tiles_of(width, height), 1),
+        projection.size,
         view=projection.view,
         records=projection.records,
         gaussian_of=lists.gaussian_of,
@@ -246,9 +250,11 @@ def blend_backward(
     """The slots of gradients (``moments.wgsl``), from the gradients on the colour (H, W, 3) and on
     alpha and depth (2, H, W)."""
     slots = space.get("slots of gradients", layout.SLOT_BYTES * lists.length)
-    space.run(
+    _run_in_bands(
+        gpu,
+        space,
         "blend_backward",
-        (*layout.tiles_of(*projection.size), 1),
+        projection.size,
         view=projection.view,
         records=projection.records,
         gaussian_of=lists.gaussian_of,
@@ -262,6 +268,19 @@ def blend_backward(
         slots=slots,
     )
     return slots
+
+
+def _run_in_bands(
+    gpu: Gpu, space: Workspace, kernel: str, size: tuple[int, int], **buffers: Buffer
+) -> None:
+    """Run a kernel of tiles in bands of at most ``TILES_OF_BAND`` tiles."""
+    across, down = layout.tiles_of(*size)
+    rows = max(1, TILES_OF_BAND // across)
+    for first in range(0, down, rows):
+        if first:
+            gpu.submit()
+        band = across, min(rows, down - first), 1
+        space.run(kernel, band, first_row=gpu.uniform("I", first), **buffers)
 
 
 def loss_uniform(

@@ -15,15 +15,18 @@
 @group(0) @binding(6) var<storage, read_write> planes: array<f32>;
 // The number of the tile's pairs up to the last one that contributes to the pixel.
 @group(0) @binding(7) var<storage, read_write> ends: array<u32>;
+// Long dispatches are divided into bands of rows of tiles: drivers of displays end those of seconds.
+@group(0) @binding(8) var<uniform> first_row: u32;
 
 var<workgroup> batch: array<Record, kThreads>;
 var<workgroup> going: atomic<u32>;  // number of pixels that have not stopped
 var<workgroup> any_going: u32;
 
 @compute @workgroup_size(kTile, kTile)
-fn main(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let position = tile.xy * kTile + inside.xy;
+    let tile = group.xy + vec2(0u, first_row);
+    let position = tile * kTile + inside.xy;
     let pixel = vec2<f32>(position) + 0.5;
     let range = ranges[tile.y * view.tiles.x + tile.x];
     var transmittance = 1.0;

@@ -22,6 +22,8 @@
 @group(0) @binding(8) var<storage, read> d_color: array<f32>;
 @group(0) @binding(9) var<storage, read> d_planes: array<f32>;  // of alpha and depth
 @group(0) @binding(10) var<storage, read_write> slots: array<f32>;
+// Long dispatches are divided into bands of rows of tiles: drivers of displays end those of seconds.
+@group(0) @binding(11) var<uniform> first_row: u32;
 
 const kBatch = 8u;
 const kPerGaussian = kThreads / kBatch;  // threads that sum one Gaussian's moments
@@ -35,10 +37,11 @@ var<workgroup> last: atomic<u32>;
 var<workgroup> tile_end: u32;
 
 @compute @workgroup_size(kTile, kTile)
-fn main(@builtin(workgroup_id) tile: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
+fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) inside: vec3<u32>,
         @builtin(local_invocation_index) local: u32) {
-    let corner = vec2<f32>(tile.xy * kTile) + 0.5;
-    let position = tile.xy * kTile + inside.xy;
+    let tile = group.xy + vec2(0u, first_row);
+    let corner = vec2<f32>(tile * kTile) + 0.5;
+    let position = tile * kTile + inside.xy;
     let pixel = corner + vec2<f32>(inside.xy);
     let range = ranges[tile.y * view.tiles.x + tile.x];
     var end = 0u;

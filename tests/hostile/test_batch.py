@@ -15,7 +15,10 @@ from tests.pictures import photos
 
 # Snakemake's, in a dry run.
 WORKFLOW = SimpleNamespace(
-    basedir=str(Path(__file__).parents[2]), is_main_process=True, executor_plugin=None
+    basedir=str(Path(__file__).parents[2]),
+    is_main_process=True,
+    executor_plugin=None,
+    non_local_exec=False,
 )
 NAMES = ("<x>", "{x}", "ab" * 20, "n" * 250, "a\nb", "\udcff")
 
@@ -110,7 +113,7 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"))
     batch = SimpleNamespace(wildcards=SimpleNamespace())
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
-    flow = SimpleNamespace(**vars(WORKFLOW), dag=dag, non_local_exec=False)
+    flow = SimpleNamespace(**vars(WORKFLOW), dag=dag)
     project = SnakemakeProject({}, flow)
     project.before_jobs()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "good")

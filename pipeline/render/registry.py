@@ -16,16 +16,16 @@ _default = "cpu"
 
 
 def use_device(device: str) -> None:
-    """Make the backend of this device (``cpu``, ``gpu``, ``gpu:N``) the default of the process."""
+    """Make the backend of this device (see ``make_backend``) the default of the process."""
     global _default
-    assert DEVICE.fullmatch(device), device
     _default = device
 
 
 def make_backend(name: str | None = None) -> Backend:
-    """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first; None:
-    the default, the processor's unless ``use_device`` was called."""
-    name = name or _default
+    """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first;
+    ``auto``, which plans settle, is the processor; None: the default, the processor's unless
+    ``use_device`` was called."""
+    name = (name or _default).replace("auto", "cpu")
     kind, _, number = name.partition(":")
     if name not in BACKENDS and not DEVICE.fullmatch(name):
         raise ValueError(f"no backend {name!r}; there are {', '.join(BACKENDS)}")

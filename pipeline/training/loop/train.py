@@ -67,8 +67,7 @@ def train(
             f"{len(inputs.initial)} Gaussians",
             fix="check the split and the initialisation",
         )
-    # The plan settles "auto".
-    backend = backend or make_backend("cpu" if config.device == "auto" else config.device)
+    backend = backend or make_backend(config.device)
     log = on_log or (lambda text: None)
     warnings: list[str] = []
 
@@ -111,7 +110,7 @@ def train(
         trainer = Trainer(scene, state, config, experiments, backend, threads, span)
         if trainer.device is not None:
             log(trainer.device.training.memory_line(training_size(inputs.views, config)))
-        elif config.device != "cpu":
+        elif config.device.startswith("gpu"):
             log("the GPU computes operator by operator: the run needs the processor in each step")
         with termination.deferred():
             while state.clock < span.stop:

@@ -118,6 +118,7 @@ for spec in project.stages:
         resources:
             mem_mb=project.memory_mb(spec),
             runtime=project.minutes(spec),
+            gpu=project.gpus(spec),
         params:
             out=subpath(output.stage, parent=True),
             key=project.key(spec),

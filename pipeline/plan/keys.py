@@ -44,8 +44,7 @@ def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
         "packages": {name: _version(name) for name in spec.packages},
         "config": select(plan.config, spec.options),
     }
-    draws = not {"train", "train.device"}.isdisjoint(spec.options)
-    if draws and plan.config.train.device != "cpu":
+    if uses_gpu(spec, plan):
         key |= {"gpu_source": gpu_source_hash()}
         key["packages"] = {**key["packages"], "wgpu": installed_version("wgpu")}
     if spec.scattered:
@@ -53,3 +52,9 @@ def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
     if spec.shows_plan:
         key["plan"] = plan_record(plan).model_dump(mode="json")
     return canonical(key | spec.facts(plan))
+
+
+def uses_gpu(spec: StageSpec, plan: Plan) -> bool:
+    """Whether the stage trains or renders on a GPU."""
+    renders = not {"train", "train.device"}.isdisjoint(spec.options)
+    return renders and plan.config.train.device.startswith("gpu")

@@ -108,6 +108,7 @@ def _resident(
         l2_weight=0.0,
         absolute=False,
         camera_gradients=False,
+        embedding=None,
         alpha_loss=AlphaChangeLoss(0.0, 0.0, 0.0),
         losses=None,
         adam=GaussianAdam(rates, 1, True, 0.9, 0.999, 1e-15, 1e-15),

@@ -38,7 +38,7 @@ class Optimised:
 
     Attributes:
         parameters: means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,) and sh
-            (N, K, 3), by name.
+            (N, K, 3), by name; and ``appearance`` (N, E, 3) if colours depend on the photograph.
         first, second: Adam's moments by the names of the parameters. With ``GaussianAdam.frames``
             those of quats are (N, 3); without, second moments of means and quats are (N, 1).
         last: (N,) int32, see ``ShAdam``.
@@ -100,6 +100,8 @@ class ResidentStep:
         ssim_weight, l2_weight: see ``Backend.l1_ssim``.
         absolute: the statistics are of ``Gradients.means2d_abs``.
         camera_gradients: compute them.
+        embedding: of the photograph, if there is a parameter ``appearance``: the constant SH
+            coefficients are those in the photograph (``training.appearance.embedding``).
         alpha_loss: on alpha, if the image has surroundings.
         losses: other losses, which are computed on the CPU; None: none.
     """
@@ -111,6 +113,7 @@ class ResidentStep:
     l2_weight: float
     absolute: bool
     camera_gradients: bool
+    embedding: tuple[float, ...] | None
     alpha_loss: AlphaChangeLoss
     losses: HostLosses | None
     adam: GaussianAdam
@@ -119,13 +122,15 @@ class ResidentStep:
 @dataclass(frozen=True)
 class StepResult:
     """Of one step: ``loss`` as ``LossResult.loss``; ``squared_error``, the mean squared difference
-    of the unmasked values; the others as of ``Forward`` and ``Gradients``."""
+    of the unmasked values; ``embedding``, the gradient of the embedding; the others as of
+    ``Forward`` and ``Gradients``."""
 
     loss: float
     squared_error: float
     num_visible: int
     num_dropped: int
     camera: CameraGradients | None
+    embedding: tuple[float, ...] | None
 
 
 @dataclass(frozen=True)

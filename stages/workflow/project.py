@@ -16,7 +16,7 @@ from pipeline.config.load import load_project, scene_config
 from pipeline.config.runs import Run, all_runs, name_fault, parse_run
 from pipeline.config.schema import Config
 from pipeline.plan import duration, stage_memory
-from pipeline.plan.keys import stage_key
+from pipeline.plan.keys import stage_key, uses_gpu
 from pipeline.plan.plan import describe, input_folders, make_plan, plan_record
 from pipeline.plan.scan import scan
 from pipeline.plan.settle import PROCESSOR, Choice
@@ -202,6 +202,10 @@ class SnakemakeProject:
         return lambda wildcards, attempt: (
             attempt * duration.minutes(spec.name, self._plan(wildcards.scene))
         )
+
+    def gpus(self, spec: StageSpec) -> Callable[[Any], int]:
+        """Resources function: the number of GPUs that the stage's job computes on."""
+        return lambda wildcards: int(uses_gpu(spec, self._plan(wildcards.scene)))
 
     def plan(self, wildcards: Any) -> str:
         """Params function: the plan as canonical JSON."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 
+import numpy as np
 import pytest
 import torch
 
@@ -25,7 +26,8 @@ from pipeline.render.resident import (
     ResidentImage,
     ResidentStep,
 )
-from tests.render.scenes import NAMES, camera, random_scene
+from pipeline.training.appearance.embedding import appearance_gradients, colour_offsets
+from tests.render.scenes import NAMES, camera, random_scene, relative
 from tests.tools import need_gpu
 
 HEIGHT, WIDTH = 37, 50
@@ -60,6 +62,7 @@ STEP = ResidentStep(
     l2_weight=0.5,
     absolute=True,
     camera_gradients=False,
+    embedding=None,
     alpha_loss=ALPHA_LOSS,
     losses=None,
     adam=ADAM,
@@ -81,12 +84,15 @@ STEPS = {
     "cameras": replace(STEP, camera_gradients=True),
     "other losses": replace(STEP, losses=constant_losses),
     "a block": replace(STEP, image=replace(MASKED, surroundings=AROUND), losses=constant_losses),
+    "an appearance": replace(STEP, embedding=(0.7, -1.2)),
     "few gradients": replace(STEP, options=RasterOptions(antialias=True, gradients_per_pixel=3)),
 }
 
 
-def start(frames: bool) -> Optimised:
+def start(frames: bool, embedding: tuple[float, ...] | None = None) -> Optimised:
     parameters = dict(zip(NAMES, random_scene(3, 400, size=0.12), strict=True))
+    if embedding is not None:
+        parameters["appearance"] = uniform(400, len(embedding), 3, seed=8) - 0.5
     first = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
     second = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
     if frames:
@@ -105,11 +111,15 @@ class DrawnPlanes:
 
 def by_operators(
     backend: Backend, state: Optimised, step: ResidentStep
-) -> tuple[float, CameraGradients | None]:
-    """The step, by the operators; returns the loss as well."""
+) -> tuple[float, CameraGradients | None, np.ndarray | None]:
+    """The step, by the operators; returns its loss and other gradients."""
     p, first, second, image, adam = (
         state.parameters, state.first, state.second, step.image, step.adam,
     )  # fmt: skip
+    constant, own = p["sh"][:, 0], p["sh"][:, 0].clone()
+    if step.embedding is not None:
+        constant += colour_offsets(p["appearance"], np.array(step.embedding))
+    shown = constant.clone()
     drawn = backend.forward(*(p[name] for name in NAMES), step.camera, step.options)
     color, around, gain = drawn.color, image.surroundings, torch.tensor(image.gain)
     if around is not None:
@@ -128,8 +138,19 @@ def by_operators(
         eps=adam.eps, **decay,
     )  # fmt: skip
     g = backend.backward(
-        drawn, d_color, d_alpha, d_depth, camera=step.camera_gradients, sh_adam=harmonics
-    )
+        drawn, d_color, d_alpha, d_depth, colors=True, camera=step.camera_gradients,
+        sh_adam=harmonics,
+    )  # fmt: skip
+    d_embedding = None
+    if step.embedding is not None:
+        constant[:] = own + (constant - shown)
+        assert g.colors is not None
+        d_embedding, d_appearance = appearance_gradients(
+            p["appearance"], np.array(step.embedding), g.colors
+        )
+        moments = first["appearance"], second["appearance"]
+        dense_adam = DenseAdam(*moments, adam.rates["sh0"], eps=adam.eps, **decay)
+        backend.adam_step(p["appearance"], d_appearance, dense_adam)
     change = g.means2d_abs if step.absolute else g.means2d
     assert change is not None
     state.gradient_sum.add_(torch.hypot(change[:, 0] * WIDTH / 2, change[:, 1] * HEIGHT / 2))
@@ -147,7 +168,7 @@ def by_operators(
         eps = adam.means_eps if name == "means" else adam.eps
         each = DenseAdam(first[name], second[name], adam.rates[name], eps=eps, **decay)
         backend.adam_step(p[name], getattr(g, name), each)
-    return loss.loss, g.camera
+    return loss.loss, g.camera, d_embedding
 
 
 def tensors(state: Optimised) -> dict[str, torch.Tensor]:
@@ -162,29 +183,31 @@ def tensors(state: Optimised) -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("name", STEPS)
 def test_resident_steps_equal_the_operators(name: str) -> None:
     """To the last bit, but for what the operators leave to the CPU: sums of losses and of cameras,
-    and norms of gradients."""
+    norms of gradients, and colours in a photograph."""
     need_gpu()
     backend, step = make_backend("gpu"), STEPS[name]
     training = backend.resident()
     assert training is not None
-    ours, theirs = start(step.adam.frames), start(step.adam.frames)
+    ours, theirs, untouched = (start(step.adam.frames, step.embedding) for _ in range(3))
     training.load(ours)
     for number in (1, 2, 5):
         each = replace(step, adam=replace(step.adam, step=number))
         found = training.step(each)
-        loss, cameras = by_operators(backend, theirs, each)
+        loss, cameras, d_embedding = by_operators(backend, theirs, each)
         assert found.loss == pytest.approx(loss, rel=1e-5)
         assert (found.camera is None) == (cameras is None)
         if found.camera is not None and cameras is not None:
             for part, expected in vars(cameras).items():
                 torch.testing.assert_close(getattr(found.camera, part), expected)
-    untouched = start(step.adam.frames)
+        assert (found.embedding is None) == (d_embedding is None)
+        if d_embedding is not None:
+            np.testing.assert_allclose(found.embedding, d_embedding, rtol=1e-4)
     for key, tensor in tensors(ours).items():
         assert torch.equal(tensor, tensors(untouched)[key]), f"{key} changed before store"
     training.store(ours)
     for key, tensor in tensors(ours).items():
-        if key == "gradient_sum":
-            torch.testing.assert_close(tensor, theirs.gradient_sum)
+        if key == "gradient_sum" or step.embedding is not None:
+            assert relative(tensor, tensors(theirs)[key]) < 1e-5, key
         else:
             assert torch.equal(tensor, tensors(theirs)[key]), key
     assert (ours.seen == 3).any() and (ours.last == 5).any()

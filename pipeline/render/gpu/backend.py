@@ -16,6 +16,8 @@ from pipeline.render.checks import Parameters
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_uniform, frame_uniform, sh_options
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
+from pipeline.render.gpu.loss import LossImage, l1_ssim, layers_uniform, upload_layers
+from pipeline.render.gpu.reduce import camera_gradients
 from pipeline.render.gpu.resident import GpuTraining
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import (
@@ -120,12 +122,15 @@ class GpuBackend(Backend[Projected, Binned]):
         image = rasterise.blend(gpu, Workspace(gpu), projected.projection, lists)
         width, height = projected.projection.size
         pixels = width * height
+
+        def plane(number: int) -> torch.Tensor:
+            found = gpu.read(image.planes, np.float32, pixels, 4 * pixels * number)
+            return torch.from_numpy(found).view(height, width)
+
         color = torch.from_numpy(gpu.read(image.color, np.float32, 3 * pixels))
-        planes = torch.from_numpy(gpu.read(image.planes, np.float32, 3 * pixels))
-        alpha, depth, median = planes.view(3, height, width).unbind()
         return Forward(
-            color.view(height, width, 3), alpha, projected.radii, lists.num_visible,
-            lists.num_dropped, lists.length, lambda: (depth, median),
+            color.view(height, width, 3), plane(0), projected.radii, lists.num_visible,
+            lists.num_dropped, lists.length, lambda: (plane(1), plane(2)),
             State(projected, lists, image),
         )  # fmt: skip
 
@@ -150,12 +155,11 @@ class GpuBackend(Backend[Projected, Binned]):
         for plane, gradient in zip(d_planes, (d_alpha, d_depth), strict=True):
             if gradient is not None:
                 plane[:] = gradient.numpy()
+        space = Workspace(gpu)
         slots = rasterise.blend_backward(
-            gpu, Workspace(gpu), projection, state.lists, state.image,
-            gpu.upload(d_color.numpy()), gpu.upload(d_planes),
+            gpu, space, projection, state.lists, state.image, gpu.upload(d_color.numpy()),
+            gpu.upload(d_planes),
         )  # fmt: skip
-        gradients = gpu.empty(4 * layout.floats(layout.GRADIENTS) * count)
-        moments = {}
         if sh_adam is not None:
             checks.check_sh_adam(sh_adam, sh)
             moments = {
@@ -170,20 +174,10 @@ class GpuBackend(Backend[Projected, Binned]):
         # A copy of the SH coefficients: further views may be rendered from the same projection.
         updated = gpu.empty(4 * sh.numel())
         gpu.copy(scene.sh, 0, updated, 0, 4 * sh.numel())
-        gpu.run(
-            "project_backward",
-            blocks(count),
-            view=projection.view,
-            options=sh_options(Workspace(gpu), sh_adam, camera),
-            geometry=scene.geometry,
-            sh=updated,
-            records=projection.records,
-            tile_counts=projection.tile_counts,
-            slot_of=state.lists.slots,
-            slots=slots,
-            gradients=gradients,
-            **moments,
-        )
+        gradients = rasterise.project_backward(
+            space, replace(scene, sh=updated), projection, state.lists, slots,
+            sh_options(space, sh_adam, camera), **moments,
+        )  # fmt: skip
         if sh_adam is not None:
             self._fetch(updated, sh)
             self._fetch(moments["exp_avg"], sh_adam.exp_avg)
@@ -198,9 +192,7 @@ class GpuBackend(Backend[Projected, Binned]):
             found["means"], found["log_scales"], found["quats"], found["opacity_logits"][:, 0],
             d_sh, found["means2d"], found["means2d_abs"] if means2d_abs else None,
             found["colors"] if colors else None,
-            rasterise.camera_gradients(gpu, Workspace(gpu), moments["d_camera"], count)
-            if camera
-            else None,
+            camera_gradients(gpu, space, moments["d_camera"], count) if camera else None,
         )  # fmt: skip
 
     def l1_ssim(
@@ -214,31 +206,13 @@ class GpuBackend(Backend[Projected, Binned]):
     ) -> LossResult:
         rendered, target, mask = checks.images(rendered, target, mask)
         gpu, (height, width, _) = self.gpu, rendered.shape
-        count = 3 * (height * width - (0 if mask is None else int((mask != 0).sum())))
-        if not count:
-            return LossResult(0.0, 0.0, 1.0, torch.zeros_like(rendered))
-        tiles = layout.tiles_of(width, height)
-        sums = gpu.empty(16 * 3 * tiles[0] * tiles[1])
-        gradient = gpu.empty(4 * rendered.numel())
-        arguments = {
-            "loss": rasterise.loss_uniform(
-                gpu, (width, height), count, ssim_weight, l2_weight,
-                is_bytes=target.dtype == torch.uint8, masked=mask is not None,
-            ),
-            "rendered": gpu.upload(rendered.numpy()),
-            "target_words": gpu.upload(target.numpy()),
-            "derivatives": gpu.empty(12 * rendered.numel()),
-            "gradient": gradient,
-            "sums": sums,
-        }  # fmt: skip
-        if mask is not None:
-            arguments["mask"] = gpu.upload(mask.numpy())
-        gpu.run("loss.forward", (*tiles, 3), **arguments)
-        gpu.run("loss.backward", (*tiles, 3), **arguments)
-        totals = gpu.read(sums, np.float32, 12 * tiles[0] * tiles[1]).reshape(-1, 4)
-        error, ssim = (float(total) / count for total in totals[:, :2].sum(0, dtype=np.float64))
+        space, image = Workspace(gpu), LossImage.upload(gpu, target, mask)
+        found = l1_ssim(
+            gpu, space, gpu.upload(rendered.numpy()), image, (width, height), ssim_weight, l2_weight
+        )
+        error, ssim, _ = found.values(gpu, space)
         loss = (1 - ssim_weight) * error + ssim_weight * (1 - ssim)
-        grad = torch.from_numpy(gpu.read(gradient, np.float32, rendered.numel()))
+        grad = torch.from_numpy(gpu.read(found.gradient, np.float32, rendered.numel()))
         return LossResult(loss, error, ssim, grad.view(rendered.shape))
 
     def compose(
@@ -374,12 +348,12 @@ class GpuBackend(Backend[Projected, Binned]):
         gpu.run(
             kernel,
             blocks(pixels),
-            layers=rasterise.layers_uniform(gpu, around, pixels, loss),
+            layers=layers_uniform(gpu, around, pixels, loss),
             alpha=gpu.upload(alpha.numpy()),
             values=gpu.upload(values.numpy()),
             result=result,
             d_alpha=d_alpha,
-            **rasterise.upload_layers(gpu, around),
+            **upload_layers(gpu, around),
         )
         images = (
             torch.from_numpy(gpu.read(result, np.float32, 3 * pixels)).view(values.shape),

@@ -5,14 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import torch
-from numpy.typing import NDArray
 
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.sort import scan, sort
 from pipeline.render.gpu.workspace import Workspace
-from pipeline.render.types import AlphaChangeLoss, CameraGradients, Surroundings
 from pipeline.runtime.errors import UserError
 
 # Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
@@ -20,7 +17,6 @@ MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
 DEPTH_BITS = 32
 # Of one dispatch: an image of 1024 x 1024 pixels.
 TILES_OF_BAND = 4096
-SUM_ROWS = 1024  # of a workgroup of sum_rows.wgsl
 
 
 @dataclass(frozen=True)
@@ -283,58 +279,35 @@ def _run_in_bands(
         space.run(kernel, band, first_row=gpu.uniform("I", first), **buffers)
 
 
-def loss_uniform(
-    gpu: Gpu,
-    size: tuple[int, int],
-    count: int,
-    ssim_weight: float,
-    l2_weight: float,
-    *,
-    is_bytes: bool,
-    masked: bool,
-    gain: tuple[float, float, float] = (1.0, 1.0, 1.0),
+def project_backward(
+    space: Workspace,
+    scene: Scene,
+    projection: Projection,
+    lists: Lists,
+    slots: Buffer,
+    options: Buffer,
+    **more: Buffer,
 ) -> Buffer:
-    """``Loss`` in loss_images.wgsl; ``count``: the number of unmasked values."""
-    flags = layout.BYTES * is_bytes + layout.MASKED * masked
-    return gpu.uniform(
-        "4I8f", *size, flags, 0, l2_weight, (1 - ssim_weight) / count, -ssim_weight / count, 0.0,
-        *gain, 0.0,
-    )  # fmt: skip
+    """The gradients of the parameters (sections of ``layout.GRADIENTS``), from the slots.
 
-
-def sum_rows(
-    gpu: Gpu, space: Workspace, rows: Buffer, count: int, width: int
-) -> NDArray[np.float64]:
-    """The sum of ``count`` rows of ``width`` float32."""
-    groups = blocks(count, SUM_ROWS)
-    sums = space.get(f"sums of rows of {width}", 4 * width * groups)
-    space.run("sum_rows", groups, size=gpu.uniform("II", count, width), values=rows, sums=sums)
-    found = gpu.read(sums, np.float32, width * groups).reshape(-1, width)
-    return found.sum(0, dtype=np.float64)
-
-
-def camera_gradients(gpu: Gpu, space: Workspace, rows: Buffer, count: int) -> CameraGradients:
-    """The sum of the Gaussians' parts (N, ``CAMERA_PARAMETERS``)."""
-    total = torch.from_numpy(sum_rows(gpu, space, rows, count, layout.CAMERA_PARAMETERS))
-    return CameraGradients(*total.split([3, 3, 2, 2]))
-
-
-def upload_layers(gpu: Gpu, around: Surroundings) -> dict[str, Buffer]:
-    """The images of the surroundings, by the names of compose.wgsl."""
-    layers = {
-        "behind": around.behind,
-        "alpha_before": around.alpha,
-        "front": around.front,
-        "transmittance": around.transmittance,
-        "correction": around.correction,
-    }
-    return {k: gpu.upload(v.numpy()) for k, v in layers.items() if v is not None}
-
-
-def layers_uniform(gpu: Gpu, around: Surroundings, pixels: int, loss: AlphaChangeLoss) -> Buffer:
-    """``Layers`` in compose.wgsl."""
-    flags = layout.FRONT * (around.front is not None)
-    flags |= layout.CORRECTION * (around.correction is not None)
-    return gpu.uniform(
-        "II4f8x", pixels, flags, loss.fade, loss.growth, 2 * loss.weight / pixels, 0.0
+    Args:
+        options: ``Options`` in project_backward.wgsl.
+        more: as the options say: ``d_sh``, or ``exp_avg``, ``exp_avg_sq`` and ``last_step`` of SH
+            coefficients that are updated; ``d_camera``.
+    """
+    gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
+    space.run(
+        "project_backward",
+        blocks(scene.count),
+        view=projection.view,
+        options=options,
+        geometry=scene.geometry,
+        sh=scene.sh,
+        records=projection.records,
+        tile_counts=projection.tile_counts,
+        slot_of=lists.slots,
+        slots=slots,
+        gradients=gradients,
+        **more,
     )
+    return gradients

@@ -11,7 +11,15 @@ import torch
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_uniform, frame_uniform, sh_options
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
+from pipeline.render.gpu.loss import (
+    LossImage,
+    LossSums,
+    l1_ssim,
+    layers_uniform,
+    upload_layers,
+)
 from pipeline.render.gpu.memory import memory_line
+from pipeline.render.gpu.reduce import camera_gradients, sum_rows
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
     GaussianAdam,
@@ -30,16 +38,15 @@ IMAGE_CACHE = 2 << 30
 
 @dataclass(frozen=True)
 class _Image:
-    target: Buffer
-    mask: Buffer | None
-    count: int  # of unmasked values
-    is_bytes: bool
-    layers: dict[str, Buffer]  # of its surroundings
+    """A training image on the device, with the layers of its surroundings."""
+
+    photograph: LossImage
+    layers: dict[str, Buffer]
 
     @property
     def size(self) -> int:
         """Bytes."""
-        planes = [self.target, *self.layers.values(), *([self.mask] if self.mask else [])]
+        planes = [*self.photograph.buffers.values(), *self.layers.values()]
         return sum(int(buffer.size) for buffer in planes)
 
 
@@ -55,14 +62,10 @@ class _Images:
         if image.key is not None and image.key in self._cache:
             self._cache.move_to_end(image.key)
             return self._cache[image.key]
-        mask = image.mask
-        ignored = 0 if mask is None else int((mask != 0).sum())
+        around = image.surroundings
         found = _Image(
-            self.gpu.upload(image.target.contiguous().numpy(), what="a training image"),
-            None if mask is None else self.gpu.upload(mask.contiguous().numpy()),
-            image.target.numel() - 3 * ignored,
-            image.target.dtype == torch.uint8,
-            rasterise.upload_layers(self.gpu, image.surroundings) if image.surroundings else {},
+            LossImage.upload(self.gpu, image.target, image.mask),
+            {} if around is None else upload_layers(self.gpu, around),
         )
         if image.key is not None:
             self._cache[image.key] = found
@@ -101,6 +104,7 @@ class GpuTraining(ResidentTraining):
         self.gpu, self.space, self.images = gpu, Workspace(gpu), _Images(gpu)
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.buffers: dict[str, Buffer] = {}
+        self.appearance_size = 0  # numbers of the parameter
 
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
@@ -112,8 +116,10 @@ class GpuTraining(ResidentTraining):
         self.scene = rasterise.Scene(
             count, sh.shape[1], self._fill("geometry", whole), self._fill("sh", sh.numpy())
         )
+        appearance = parameters.get("appearance")
+        self.appearance_size = 0 if appearance is None else appearance.numel()
         self.buffers = {
-            name: self._fill(name, tensor.numpy()) for name, tensor in _moments(optimised).items()
+            name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
         }
 
     def store(self, optimised: Optimised) -> None:
@@ -123,7 +129,7 @@ class GpuTraining(ResidentTraining):
         )
         for name, (at, size) in layout.offsets(layout.GEOMETRY, count).items():
             parameters[name].view(-1).copy_(torch.from_numpy(whole[at : at + size]))
-        tensors = _moments(optimised) | {"sh": parameters["sh"]}
+        tensors = _others(optimised) | {"sh": parameters["sh"]}
         for name, tensor in tensors.items():
             buffer = self.scene.sh if name == "sh" else self.buffers[name]
             found = self.gpu.read(buffer, tensor.numpy().dtype, tensor.numel())
@@ -134,32 +140,35 @@ class GpuTraining(ResidentTraining):
         size = camera.width, camera.height
         packed = layout.pack_view(camera, step.options, scene.count, scene.coefficients)
         view = space.write_uniform("view", packed.tobytes())
+        appearance = self._appearance(step)
+        if appearance is not None:
+            space.run("appearance.show", blocks(scene.count), **appearance)
         projection = rasterise.project(gpu, space, scene, view, size)
         lists = rasterise.list_pairs(gpu, space, projection, scene.count)
         image = rasterise.blend(gpu, space, projection, lists)
         target = self.images.get(step.image)
         d_planes = space.get("gradients of alpha and depth", 8 * size[0] * size[1])
         gpu.clear(d_planes)
-        d_color, sums = self._loss(step, target, image, d_planes)
+        d_color, loss = self._loss(step, target, image, d_planes)
         self._add_other_losses(step, image, d_planes)
         slots = rasterise.blend_backward(gpu, space, projection, lists, image, d_color, d_planes)
         gradients, d_camera = self._project_backward(step, projection, lists, slots)
+        if appearance is not None:
+            space.run("appearance.hide", blocks(scene.count), **appearance)
+            space.run("appearance.gradient", blocks(scene.count), **appearance)
         self._observe(step, projection, gradients)
         self._optimise(step.adam, gradients)
-        rows = 3 * np.prod(layout.tiles_of(*size))
-        error, ssim, squared, _ = rasterise.sum_rows(gpu, space, sums, int(rows), 4) / max(
-            1, target.count
-        )
-        loss = (1 - step.ssim_weight) * error + step.ssim_weight * (1 - ssim)
+        error, ssim, squared = loss.values(gpu, space)
         return StepResult(
-            float(loss) if target.count else 0.0,
-            float(squared),
-            lists.num_visible,
-            lists.num_dropped,
-            None if d_camera is None else rasterise.camera_gradients(
-                gpu, space, d_camera, scene.count
+            loss=(1 - step.ssim_weight) * error + step.ssim_weight * (1 - ssim),
+            squared_error=squared,
+            num_visible=lists.num_visible,
+            num_dropped=lists.num_dropped,
+            camera=(
+                None if d_camera is None else camera_gradients(gpu, space, d_camera, scene.count)
             ),
-        )  # fmt: skip
+            embedding=self._embedding_gradient(step),
+        )
 
     def _fill(self, name: str, array: np.ndarray) -> Buffer:
         buffer = self.space.get(name, array.nbytes)
@@ -168,45 +177,30 @@ class GpuTraining(ResidentTraining):
 
     def _loss(
         self, step: ResidentStep, target: _Image, image: rasterise.Image, d_planes: Buffer
-    ) -> tuple[Buffer, Buffer]:
-        """The gradient on the colours, and the sums of the loss's workgroups; with surroundings,
-        the gradient on alpha as well, in ``d_planes``."""
+    ) -> tuple[Buffer, LossSums]:
+        """The gradient on the colours, and the loss; with surroundings, the gradient on alpha as
+        well, in ``d_planes``."""
         gpu, space = self.gpu, self.space
         size = step.camera.width, step.camera.height
-        pixels, tiles = size[0] * size[1], layout.tiles_of(*size)
-        around, rendered = step.image.surroundings, image.color
-        d_image = space.get("gradient of the image", 12 * pixels)
-        layers = target.layers
-        if around is not None:
-            rendered = space.get("composed image", 12 * pixels)
-            layers = {**layers, "alpha": image.planes}
-            layers["layers"] = rasterise.layers_uniform(gpu, around, pixels, step.alpha_loss)
-            gpu.run(
-                "compose.compose", blocks(pixels), values=image.color, result=rendered, **layers
-            )
-        arguments = {
-            "loss": rasterise.loss_uniform(
-                gpu, size, max(1, target.count), step.ssim_weight, step.l2_weight,
-                is_bytes=target.is_bytes, masked=target.mask is not None, gain=step.image.gain,
-            ),
-            "rendered": rendered,
-            "target_words": target.target,
-            "derivatives": space.get("derivatives of SSIM", 36 * pixels),
-            "gradient": d_image,
-            "sums": space.get("sums of the loss", 16 * 3 * tiles[0] * tiles[1]),
-        }  # fmt: skip
-        if target.mask is not None:
-            arguments["mask"] = target.mask
-        gpu.run("loss.forward", (*tiles, 3), **arguments)
-        gpu.run("loss.backward", (*tiles, 3), **arguments)
+        pixels, around = size[0] * size[1], step.image.surroundings
+        weights = step.ssim_weight, step.l2_weight, step.image.gain
         if around is None:
-            return d_image, arguments["sums"]
+            loss = l1_ssim(gpu, space, image.color, target.photograph, size, *weights)
+            return loss.gradient, loss
+        layers = {
+            **target.layers,
+            "alpha": image.planes,
+            "layers": layers_uniform(gpu, around, pixels, step.alpha_loss),
+        }
+        composed = space.get("composed image", 12 * pixels)
+        gpu.run("compose.compose", blocks(pixels), values=image.color, result=composed, **layers)
+        loss = l1_ssim(gpu, space, composed, target.photograph, size, *weights)
         d_color = space.get("gradient of the part", 12 * pixels)
         gpu.run(
-            "compose.backward", blocks(pixels), values=d_image, result=d_color, d_alpha=d_planes,
-            **layers,
+            "compose.backward", blocks(pixels), values=loss.gradient, result=d_color,
+            d_alpha=d_planes, **layers,
         )  # fmt: skip
-        return d_color, arguments["sums"]
+        return d_color, loss
 
     def _add_other_losses(
         self, step: ResidentStep, image: rasterise.Image, d_planes: Buffer
@@ -230,34 +224,54 @@ class GpuTraining(ResidentTraining):
         slots: Buffer,
     ) -> tuple[Buffer, Buffer | None]:
         """The gradients of all but SH, which are updated, and those of the camera."""
-        space, scene, adam = self.space, self.scene, step.adam
-        gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
+        space, adam = self.space, step.adam
         nothing = torch.empty(0)
         sh_adam = ShAdam(
             nothing, nothing, nothing, adam.rates["sh0"], adam.rates["shN"], adam.step,
             adam.beta1, adam.beta2, adam.eps,
         )  # fmt: skip
-        d_camera = None
+        more = {
+            "exp_avg": self.buffers["first sh"],
+            "exp_avg_sq": self.buffers["second sh"],
+            "last_step": self.buffers["last"],
+        }
         if step.camera_gradients:
-            d_camera = space.get("camera gradients", 4 * layout.CAMERA_PARAMETERS * scene.count)
-        space.run(
-            "project_backward",
-            blocks(scene.count),
-            view=projection.view,
-            options=sh_options(space, sh_adam, step.camera_gradients),
-            geometry=scene.geometry,
-            sh=scene.sh,
-            records=projection.records,
-            tile_counts=projection.tile_counts,
-            slot_of=lists.slots,
-            slots=slots,
-            gradients=gradients,
-            exp_avg=self.buffers["first sh"],
-            exp_avg_sq=self.buffers["second sh"],
-            last_step=self.buffers["last"],
-            **({} if d_camera is None else {"d_camera": d_camera}),
+            size = 4 * layout.CAMERA_PARAMETERS * self.scene.count
+            more["d_camera"] = space.get("camera gradients", size)
+        options = sh_options(space, sh_adam, step.camera_gradients)
+        gradients = rasterise.project_backward(
+            space, self.scene, projection, lists, slots, options, **more
         )
-        return gradients, d_camera
+        return gradients, more.get("d_camera")
+
+    def _appearance(self, step: ResidentStep) -> dict[str, Buffer] | None:
+        """The buffers of appearance.wgsl, if colours depend on the photograph."""
+        if step.embedding is None:
+            return None
+        space, scene, size = self.space, self.scene, len(step.embedding)
+        colors_at, _ = layout.offsets(layout.GRADIENTS, scene.count)["colors"]
+        sizes = scene.count, size, scene.coefficients, colors_at
+        weights = np.array(step.embedding, np.float32)
+        return {
+            "appearance": space.uniform("sizes of the appearance", "IIII", *sizes),
+            "weights": space.write_uniform("embedding", weights.tobytes()),
+            "values": self.buffers["appearance"],
+            "sh": scene.sh,
+            "colours": space.get("colours", 24 * scene.count),
+            "gradients": self._gradients(),
+            "d_values": space.get("gradients of the appearance", 12 * size * scene.count),
+            "d_weights": space.get("gradients of the embedding", 4 * size * scene.count),
+        }
+
+    def _gradients(self) -> Buffer:
+        return self.space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * self.scene.count)
+
+    def _embedding_gradient(self, step: ResidentStep) -> tuple[float, ...] | None:
+        if step.embedding is None:
+            return None
+        size, count = len(step.embedding), self.scene.count
+        rows = self.space.get("gradients of the embedding", 4 * size * count)
+        return tuple(sum_rows(self.gpu, self.space, rows, count, size).tolist())
 
     def _observe(
         self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
@@ -298,6 +312,8 @@ class GpuTraining(ResidentTraining):
             )
         else:
             dense += ["means", "quats"]
+        if "appearance" in self.buffers:
+            self._step_appearance(adam)
         for name in dense:
             at, numbers = layout.offsets(layout.GEOMETRY, count)[name]
             rows = name in ("means", "quats")
@@ -319,11 +335,32 @@ class GpuTraining(ResidentTraining):
                 exp_avg_sq=self.buffers[f"second {name}"],
             )
 
+    def _step_appearance(self, adam: GaussianAdam) -> None:
+        """At the rate of the constant SH coefficient."""
+        nothing, parameter = torch.empty(0), self.buffers["appearance"]
+        dense = DenseAdam(
+            nothing, nothing, adam.rates["sh0"], adam.step, adam.beta1, adam.beta2, adam.eps
+        )
+        count = self.appearance_size
+        uniform, rates = adam_uniform(self.space, "appearance", dense, count, 1)
+        self.space.run(
+            "adam.elements",
+            blocks(count),
+            adam=uniform,
+            rates=rates,
+            gradient=self.space.get("gradients of the appearance", 4 * count),
+            parameter=parameter,
+            exp_avg=self.buffers["first appearance"],
+            exp_avg_sq=self.buffers["second appearance"],
+        )
 
-def _moments(optimised: Optimised) -> dict[str, torch.Tensor]:
-    """All tensors but the parameters, by the names of their buffers."""
+
+def _others(optimised: Optimised) -> dict[str, torch.Tensor]:
+    """All tensors but the parameters of the rasterizer, by the names of their buffers."""
     tensors = {f"first {name}": tensor for name, tensor in optimised.first.items()}
     tensors |= {f"second {name}": tensor for name, tensor in optimised.second.items()}
+    if (appearance := optimised.parameters.get("appearance")) is not None:
+        tensors["appearance"] = appearance
     return tensors | {
         "last": optimised.last,
         "gradient_sum": optimised.gradient_sum,

@@ -101,6 +101,10 @@ class AppearanceEmbeddings:
             gaussians.appearance, self.embeddings[index], d_colors
         )
         backend.adam_step(gaussians.appearance, d_appearance, dense, threads)
+        self.update(index, d_embedding, rate)
+
+    def update(self, index: int, d_embedding: Array, rate: float) -> None:
+        """Update the embedding (K,) of view ``index`` by its gradient; ``rate`` as of ``step``."""
         self.embeddings[index] += self.adam.step(index, d_embedding, MAX_CHANGE * rate)
 
     def centred(self, gaussians: Gaussians, names: Sequence[str]) -> tuple[Gaussians, Appearance]:

@@ -22,8 +22,8 @@ class DeviceSteps:
     @staticmethod
     def of(backend: Backend, state: TrainState, *, isotropic: bool) -> DeviceSteps | None:
         """None if the backend computes on the CPU, or if the run needs more in a step than devices
-        do: an appearance model, a strategy with its own losses or noise, isotropic Gaussians."""
-        if state.appearance is not None or state.density.statistics is None or isotropic:
+        do: a strategy with its own losses or noise, isotropic Gaussians."""
+        if state.density.statistics is None or isotropic:
             return None
         training = backend.resident()
         return None if training is None else DeviceSteps(training, state)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from dataclasses import dataclass
 
 import numpy as np
 import torch
@@ -44,6 +45,17 @@ PSNR_INTERVAL = 10
 DEPTH_INTERVAL = 4
 
 
+@dataclass(frozen=True)
+class StepView:
+    """The view of a step, at 1 / ``factor`` of its size."""
+
+    index: int
+    factor: int
+    target: Target
+    camera: RasterCamera
+    background: Color
+
+
 class Trainer:
     """The steps of the optimisation; ``step`` changes ``state``."""
 
@@ -79,38 +91,35 @@ class Trainer:
         self.clock.observe(state, self.factor())
         self.raise_sh_degree()
         index, factor = state.next_view(), self.factor()
-        target, camera = self.scene.target(index, factor), self.camera(index, factor)
-        background = self.draw_background()
+        view = StepView(
+            index,
+            factor,
+            self.scene.target(index, factor),
+            self.camera(index, factor),
+            self.draw_background(),
+        )
         run_length = self.clock.run_length(state)
         rates = self.schedule.learning_rates(
             state.clock, run_length, self.rate_unit, warm_up(self.part, state.step)
         )
-        adam_step = AdamStep(state.step, rates, camera.width * camera.height)
+        adam_step = AdamStep(state.step, rates, view.camera.width * view.camera.height)
         if self.device is not None:
-            self.step_on_device(self.device, target, camera, index, factor, background, adam_step)
+            self.step_on_device(self.device, view, adam_step)
         else:
-            self.step_by_operators(target, camera, index, background, adam_step)
+            self.step_by_operators(view, adam_step)
         self.control_density(steps, run_length)
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
 
-    def step_by_operators(
-        self,
-        target: Target,
-        camera: RasterCamera,
-        index: int,
-        background: Color,
-        adam_step: AdamStep,
-    ) -> None:
+    def step_by_operators(self, view: StepView, adam_step: AdamStep) -> None:
         """Render, differentiate and update by the backend's operators."""
-        state = self.state
-        self.leave_device()
+        state, index = self.state, view.index
         appearance = state.appearance
         colours = None if appearance is None else appearance.show(state.gaussians, index)
         rendered = self.backend.forward(
-            *state.gaussians.parameters(), camera, self.options(background)
+            *state.gaussians.parameters(), view.camera, self.options(view.background)
         )
-        d_color, d_alpha = self.color_loss(rendered, target, index, background)
-        by_alpha, d_depth = self.other_losses(rendered, target, index)
+        d_color, d_alpha = self.color_loss(rendered, view)
+        by_alpha, d_depth = self.other_losses(rendered, view)
         gradients = self.backend.backward(
             rendered,
             d_color,
@@ -125,55 +134,51 @@ class Trainer:
             appearance.hide(state.gaussians, colours)
             self.step_appearance(appearance, index, gradients, adam_step)
         if gradients.camera is not None:
-            state.cameras.step(index, camera, gradients.camera, self.camera_rate)
+            state.cameras.step(index, view.camera, gradients.camera, self.camera_rate)
         if self.experiments.isotropic:
             gradients.log_scales[:] = gradients.log_scales.mean(1, keepdim=True)
         state.density.before_step(state.gaussians, rendered, gradients)
         state.adam.step(state.gaussians, gradients, adam_step, self.threads)
 
-    def step_on_device(
-        self,
-        device: DeviceSteps,
-        target: Target,
-        camera: RasterCamera,
-        index: int,
-        factor: int,
-        background: Color,
-        adam_step: AdamStep,
-    ) -> None:
+    def step_on_device(self, device: DeviceSteps, view: StepView, adam_step: AdamStep) -> None:
         """The same in the memory of a device."""
-        state, fixed = self.state, target.alpha is None or self.scene.background != "random"
+        state, index, target = self.state, view.index, view.target
+        appearance = state.appearance
+        fixed = target.alpha is None or self.scene.background != "random"
         gain = None if self.scene.gains is None else self.scene.gains[index].tolist()
         red, green, blue = gain or (1.0, 1.0, 1.0)
         image = ResidentImage(
-            key=(index, factor) if fixed else None,
-            target=target.over(background),
+            key=(index, view.factor) if fixed else None,
+            target=target.over(view.background),
             mask=target.ignored,
             gain=(red, green, blue),
             surroundings=target.surroundings,
         )
 
         def losses(planes: Planes) -> tuple[Tensor | None, Tensor | None]:
-            return self.other_losses(planes, target, index)
+            return self.other_losses(planes, view)
 
         result = device.step(
             ResidentStep(
-                camera=camera,
-                options=self.options(background),
+                camera=view.camera,
+                options=self.options(view.background),
                 image=image,
                 ssim_weight=self.config.ssim_loss_weight,
                 l2_weight=self.experiments.squared_error_loss_weight,
                 absolute=state.density.needs_absolute_gradients,
                 camera_gradients=state.cameras.enabled,
+                embedding=None if appearance is None else tuple(appearance.embeddings[index]),
                 alpha_loss=BLOCK_ALPHA_LOSS,
-                losses=losses if self.has_other_losses(target, index) else None,
+                losses=losses if self.has_other_losses(view) else None,
                 adam=state.adam.resident(adam_step),
             )
         )
         self.check(result.loss, result, index)
         self.add_to_window(result.loss, lambda: psnr_of(result.squared_error))
         if result.camera is not None:
-            state.cameras.step(index, camera, result.camera, self.camera_rate)
+            state.cameras.step(index, view.camera, result.camera, self.camera_rate)
+        if appearance is not None and result.embedding is not None:
+            appearance.update(index, np.array(result.embedding), self.embedding_rate())
 
     def leave_device(self) -> None:
         """Make the state's tensors current, before they are changed."""
@@ -196,18 +201,16 @@ class Trainer:
             state.gaussians,
             gradients.colors,
             state.adam.appearance(adam_step),
-            self.camera_rate(1 / len(self.scene.views)),
+            self.embedding_rate(),
             self.backend,
             self.threads,
         )
 
-    def color_loss(
-        self, rendered: Forward, target: Target, index: int, background: Color
-    ) -> tuple[Tensor, Tensor | None]:
+    def color_loss(self, rendered: Forward, view: StepView) -> tuple[Tensor, Tensor | None]:
         """Gradients of L1, squared error and D-SSIM with respect to the rendered colours and, for a
         block among its surroundings, alpha."""
-        around = target.surroundings
-        image = target.over(background)
+        index, target, around = view.index, view.target, view.target.surroundings
+        image = target.over(view.background)
         gain = None if self.scene.gains is None else self.scene.gains[index]
         color = rendered.color
         if around is not None:
@@ -240,30 +243,29 @@ class Trainer:
             window.psnr += psnr()
             window.samples += 1
 
-    def other_losses(
-        self, rendered: Planes, target: Target, index: int
-    ) -> tuple[Tensor | None, Tensor | None]:
+    def other_losses(self, rendered: Planes, view: StepView) -> tuple[Tensor | None, Tensor | None]:
         """Gradients of the other losses with respect to alpha and depth; None without these
         losses."""
         d_alpha = alpha_gradient(
             rendered.alpha,
-            target,
+            view.target,
             self.config.mask_loss_weight,
             self.experiments.alpha_loss_weight,
             self.experiments.squared_error_loss_weight,
         )
-        weight, known = self.config.depth_loss_weight, self.depths_due(index)
+        weight, known = self.config.depth_loss_weight, self.depths_due(view.index)
         if known is None or weight == "auto":
             return d_alpha, None
-        view = self.scene.views[index]
-        by_depth, d_depth = depth_gradients(rendered, known, view, weight * DEPTH_INTERVAL)
+        full = self.scene.views[view.index]
+        by_depth, d_depth = depth_gradients(rendered, known, full, weight * DEPTH_INTERVAL)
         return _sum(by_depth, d_alpha), d_depth
 
-    def has_other_losses(self, target: Target, index: int) -> bool:
+    def has_other_losses(self, view: StepView) -> bool:
         """Whether ``other_losses`` may return gradients."""
+        target = view.target
         masks = target.ignored is not None and self.config.mask_loss_weight > 0
         alpha = target.alpha is not None and self.experiments.alpha_loss_weight > 0
-        return masks or alpha or self.depths_due(index) is not None
+        return masks or alpha or self.depths_due(view.index) is not None
 
     def depths_due(self, index: int) -> KnownDepths | None:
         """The known depths of a view, if the depth loss is computed in this step."""
@@ -373,6 +375,10 @@ class Trainer:
         """Learning rate of a camera that this share of the steps uses (``Schedule``)."""
         updates = max(1.0, self.clock.run_length(self.state) * share)
         return self.schedule.camera_rate(self.state.clock, updates)
+
+    def embedding_rate(self) -> float:
+        """Learning rate of an appearance embedding, which one view uses."""
+        return self.camera_rate(1 / len(self.scene.views))
 
     def factor(self) -> int:
         """Factor by which images are reduced in this step."""

@@ -19,6 +19,7 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
+from tests.tools import need_gpu
 from tests.training.conftest import WIDTH, Options, TinyScene, killed_in_step, tiny_config
 
 
@@ -142,3 +143,16 @@ def test_training_without_embeddings_renders_as_before(
     monkeypatch.setattr(make_backend(), "backward", watched)
     run(scene, views, tmp_path, tiny_config(3), embeddings=False)
     assert asked == [False] * 3
+
+
+def test_a_gpu_finds_the_same_lights(scene: TinyScene, views: list[View], tmp_path: Path) -> None:
+    need_gpu()
+    cpu, gpu, again = (
+        run(scene, views, tmp_path / name, tiny_config(60, device=device))
+        for name, device in (("a", "cpu"), ("b", "gpu"), ("c", "gpu"))
+    )
+    assert_same(gpu, again)
+    assert gpu.curve.root[-1].psnr == pytest.approx(cpu.curve.root[-1].psnr, abs=0.5)
+    assert cpu.appearance is not None and gpu.appearance is not None
+    for name, values in cpu.appearance.embeddings.items():
+        np.testing.assert_allclose(gpu.appearance.embeddings[name], values, atol=0.1)

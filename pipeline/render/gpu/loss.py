@@ -1,0 +1,115 @@
+"""The loss of an image, and the image of a part of a scene among its surroundings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+
+from pipeline.render.gpu import layout
+from pipeline.render.gpu.device import Buffer, Gpu
+from pipeline.render.gpu.reduce import sum_rows
+from pipeline.render.gpu.workspace import Workspace
+from pipeline.render.types import AlphaChangeLoss, Surroundings
+
+Gain = tuple[float, float, float]
+NO_GAIN: Gain = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True)
+class LossImage:
+    """A photograph on the device.
+
+    Attributes:
+        target, mask: as of ``Backend.l1_ssim``; bytes are padded to words.
+        count: number of unmasked values.
+        is_bytes: the target is uint8.
+    """
+
+    target: Buffer
+    mask: Buffer | None
+    count: int
+    is_bytes: bool
+
+    @staticmethod
+    def upload(gpu: Gpu, target: torch.Tensor, mask: torch.Tensor | None) -> LossImage:
+        ignored = 0 if mask is None else int((mask != 0).sum())
+        return LossImage(
+            gpu.upload(target.contiguous().numpy(), what="a training image"),
+            None if mask is None else gpu.upload(mask.contiguous().numpy()),
+            target.numel() - 3 * ignored,
+            target.dtype == torch.uint8,
+        )
+
+    @property
+    def buffers(self) -> dict[str, Buffer]:
+        """By the names of loss.wgsl."""
+        masked = {} if self.mask is None else {"mask": self.mask}
+        return {"target_words": self.target, **masked}
+
+
+@dataclass(frozen=True)
+class LossSums:
+    """The loss on the device: ``rows`` sums of parts of the image, and the gradient with respect to
+    the rendered image (H, W, 3)."""
+
+    gradient: Buffer
+    sums: Buffer
+    rows: int
+    count: int
+
+    def values(self, gpu: Gpu, space: Workspace) -> tuple[float, float, float]:
+        """The means of the error, of SSIM and of the squared difference; (0, 1, 0) of no pixels."""
+        if not self.count:
+            return 0.0, 1.0, 0.0
+        error, ssim, squared, _ = sum_rows(gpu, space, self.sums, self.rows, 4) / self.count
+        return float(error), float(ssim), float(squared)
+
+
+def l1_ssim(
+    gpu: Gpu,
+    space: Workspace,
+    rendered: Buffer,
+    image: LossImage,
+    size: tuple[int, int],
+    ssim_weight: float,
+    l2_weight: float,
+    gain: Gain = NO_GAIN,
+) -> LossSums:
+    """The loss of ``Backend.l1_ssim``, of the rendered image times ``gain``."""
+    pixels, tiles = size[0] * size[1], layout.tiles_of(*size)
+    rows, count = 3 * tiles[0] * tiles[1], max(1, image.count)
+    flags = layout.BYTES * image.is_bytes + layout.MASKED * (image.mask is not None)
+    scales = (1 - ssim_weight) / count, -ssim_weight / count
+    arguments = {
+        "loss": gpu.uniform("4I8f", *size, flags, 0, l2_weight, *scales, 0.0, *gain, 0.0),
+        "rendered": rendered,
+        "derivatives": space.get("derivatives of SSIM", 36 * pixels),
+        "gradient": space.get("gradient of the image", 12 * pixels),
+        "sums": space.get("sums of the loss", 16 * rows),
+        **image.buffers,
+    }
+    # Not bound once for all steps: the bind groups would keep every image in memory.
+    gpu.run("loss.forward", (*tiles, 3), **arguments)
+    gpu.run("loss.backward", (*tiles, 3), **arguments)
+    return LossSums(arguments["gradient"], arguments["sums"], rows, image.count)
+
+
+def upload_layers(gpu: Gpu, around: Surroundings) -> dict[str, Buffer]:
+    """The images of the surroundings, by the names of compose.wgsl."""
+    layers = {
+        "behind": around.behind,
+        "alpha_before": around.alpha,
+        "front": around.front,
+        "transmittance": around.transmittance,
+        "correction": around.correction,
+    }
+    return {k: gpu.upload(v.numpy()) for k, v in layers.items() if v is not None}
+
+
+def layers_uniform(gpu: Gpu, around: Surroundings, pixels: int, loss: AlphaChangeLoss) -> Buffer:
+    """``Layers`` in compose.wgsl."""
+    flags = layout.FRONT * (around.front is not None)
+    flags |= layout.CORRECTION * (around.correction is not None)
+    factor = 2 * loss.weight / pixels
+    return gpu.uniform("II4f8x", pixels, flags, loss.fade, loss.growth, factor, 0.0)

@@ -10,7 +10,7 @@ from pipeline.plan.record import PlanRecord, read_plan
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from tests.pictures import photos
-from tests.plan.test_plan import plan_of
+from tests.plan.scans import plan_of
 from tests.plans import full_plan
 
 WHOLE = plan_record(full_plan(Config())).model_dump(mode="json")

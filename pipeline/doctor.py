@@ -208,22 +208,22 @@ def _graphics() -> list[Finding]:
 
 
 def _training_devices(has_graphics: bool) -> list[Finding]:
-    if find_spec("wgpu") is None:
-        fix = "pip install 'splatmake[gpu]', to train on a GPU" if has_graphics else None
-        return [Finding("training", "on the processor; wgpu is not installed", "absent", fix)]
     try:
         from pipeline.render.devices import adapters, choose_device
 
+        chosen = choose_device()
+        if find_spec("wgpu") is None:
+            fix = "pip install 'splatmake[gpu]', to train on a GPU" if has_graphics else None
+            return [Finding("training", chosen.detail, "absent", fix)]
         found = adapters()
-        device, reason = choose_device()
     except (ImportError, UserError) as error:
         return [Finding("training", f"on the processor: {error}", "absent")]
-    used = [device == f"gpu:{adapter.number}" for adapter in found]
+    used = [chosen.device == f"gpu:{adapter.number}" for adapter in found]
     listed = [
         Finding(f"gpu:{adapter.number}", f"{adapter}, {adapter.driver}", "used" if it else "there")
         for adapter, it in zip(found, used, strict=True)
     ]
-    return [*listed, Finding("training", reason)]
+    return [*listed, Finding("training", chosen.detail)]
 
 
 def _vulkan_drivers() -> list[str]:

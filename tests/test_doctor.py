@@ -6,6 +6,7 @@ import json
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -13,8 +14,9 @@ import pytest
 from pipeline import doctor
 from pipeline.command.main import main
 from pipeline.render import devices
-from pipeline.render.devices import Adapter
+from pipeline.render.devices import Adapter, DeviceChoice
 from pipeline.runtime import processor
+from pipeline.runtime.isolate import ProcessDied
 from tests.tools import need_package
 
 REPOSITORY = Path(__file__).parents[1]
@@ -115,31 +117,49 @@ def test_graphics_devices_are_shown_as_not_used(bare, tmp_path):
     assert {finding.state for finding in found if finding.topic != "training"} == {"there"}
 
 
-def test_the_device_that_trains_is_shown_with_the_reason(bare, monkeypatch):
+def test_the_device_that_trains_is_shown_with_the_reason(bare, tmp_path, monkeypatch):
     """A GPU if it is faster in the stored measurement; never one in software."""
     need_package("wgpu")
     card = Adapter(1, "Radeon 1", "driver 2", "discrete", "Vulkan")
     software = Adapter(0, "llvmpipe", "Mesa", "software", "Vulkan")
     found = [software]
     monkeypatch.setattr(devices, "adapters", lambda: found)
-    monkeypatch.setattr(devices, "_measured", lambda *_: (0.010, 0.025))
+    times: list[object] = [(0.010, 0.025)]
+
+    def timed(*_: object) -> object:
+        if isinstance(times[0], Exception):
+            raise times[0]
+        return times[0]
+
+    monkeypatch.setattr(devices, "run_isolated", timed)
 
     def shown() -> dict[str, doctor.Finding]:
         return {finding.topic: finding for finding in doctor._graphics()}
 
     assert "llvmpipe, is software" in shown()["training"].text
+    assert devices.choose_device().reason == ""
     found.insert(0, card)
     assert shown()["gpu:1"].state == "used" and shown()["gpu:0"].state == "there"
-    assert "10 ms on Radeon 1 (discrete, Vulkan), 25 without" in shown()["training"].text
-    monkeypatch.setattr(devices, "_measured", lambda *_: (0.025, 0.010))
+    assert "10 ms on Radeon 1 (discrete, Vulkan), 25 on the proc" in shown()["training"].text
+    # Stored for this driver.
+    times[0] = (0.025, 0.010)
+    assert devices.choose_device().device == "gpu:1"
+    found[0] = replace(card, driver="driver 3")
     assert shown()["gpu:1"].state == "there"
-    assert shown()["training"].text.startswith("trained on the processor: ")
+    assert devices.choose_device().reason.startswith("trained on the processor, where a step")
+    times[0] = ProcessDied("died by signal SIGSEGV")
+    found[0] = replace(card, driver="driver 4")
+    assert "fails: died by signal SIGSEGV" in shown()["training"].text
+    times[0] = (0.010, 0.025)
+    assert devices.choose_device().device == "cpu", "not tried again with this driver"
+    (tmp_path / "cache" / devices.RECORD).write_text("{")
+    assert devices.choose_device().device == "gpu:1"
     found.clear()
-    assert devices.choose_device() == (
-        "cpu", "trained on the processor, not on a GPU: none was found"
-    )  # fmt: skip
+    assert "none was found" in shown()["training"].text
     monkeypatch.setattr(devices, "find_spec", lambda _: None)
-    assert devices.choose_device() == ("cpu", "")
+    assert devices.choose_device() == DeviceChoice(
+        "cpu", "", "on the processor; wgpu is not installed"
+    )
 
 
 def test_little_disk_and_memory_are_said(bare, tmp_path, monkeypatch):

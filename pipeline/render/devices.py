@@ -4,55 +4,90 @@ stored for the next time. Importing this module does not import torch."""
 from __future__ import annotations
 
 import json
+from dataclasses import dataclass
 from importlib.util import find_spec
-from pathlib import Path
+from typing import Any
 
 from pipeline.render.gpu.device import Adapter, adapters
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.native import cache_folder
 
-__all__ = ["Adapter", "adapters", "choose_device"]
+__all__ = ["Adapter", "DeviceChoice", "adapters", "choose_device"]
 
 RECORD = "devices.json"
 
 
-def choose_device() -> tuple[str, str]:
-    """The device for ``train.device: auto``, and the sentence that gives it and the reason; the
-    latter is empty if wgpu is not installed."""
+@dataclass(frozen=True)
+class DeviceChoice:
+    """The device for ``train.device: auto``.
+
+    Attributes:
+        device: ``cpu`` or ``gpu:N``.
+        reason: a sentence for plans, the same at every measurement; empty if there is no GPU.
+        detail: a sentence for ``doctor``.
+    """
+
+    device: str
+    reason: str
+    detail: str
+
+
+def choose_device() -> DeviceChoice:
+    """A GPU if a step of a made scene takes less time on it than on the processor; never one in
+    software."""
     if find_spec("wgpu") is None:
-        return "cpu", ""
+        return DeviceChoice("cpu", "", "on the processor; wgpu is not installed")
     found = adapters()
     real = [adapter for adapter in found if adapter.kind != "software"]
     if not real:
         what = f"the only one found, {found[0].name}, is software" if found else "none was found"
-        return "cpu", f"trained on the processor, not on a GPU: {what}"
+        return DeviceChoice("cpu", "", f"on the processor, not on a GPU: {what}")
     adapter = real[0]
-    try:
-        gpu, cpu = _measured(str(adapter), adapter.driver, f"gpu:{adapter.number}")
-    except UserError as error:
-        return "cpu", f"trained on the processor, since the GPU fails: {error.what}"
-    times = f"a step of a made scene takes {1e3 * gpu:.0f} ms on {adapter}, {1e3 * cpu:.0f} without"
+    times = _times_of(adapter)
+    if isinstance(times, str):
+        reason = f"trained on the processor, since {adapter} fails"
+        return DeviceChoice("cpu", reason, f"on the processor; {adapter} fails: {times}")
+    gpu, cpu = times
+    compared = f"a step of a made scene takes {1e3 * gpu:.0f} ms on {adapter}, "
+    compared += f"{1e3 * cpu:.0f} on the processor"
     if gpu < cpu:
-        return f"gpu:{adapter.number}", f"trained on the GPU: {times}"
-    return "cpu", f"trained on the processor: {times}"
+        reason = f"trained on {adapter}, where a step takes less time than on the processor"
+        return DeviceChoice(f"gpu:{adapter.number}", reason, f"on the GPU: {compared}")
+    reason = f"trained on the processor, where a step takes less time than on {adapter}"
+    return DeviceChoice("cpu", reason, f"on the processor: {compared}")
 
 
-def _measured(name: str, driver: str, device: str) -> tuple[float, float]:
-    """Seconds of a step on the GPU and on the processor."""
-    file: Path = cache_folder() / RECORD
-    key = f"{name}, {driver}, {targets.usable()[0].name}"
+def _times_of(adapter: Adapter) -> tuple[float, float] | str:
+    """Seconds of a step on a GPU and on the processor, or why there are none."""
+    file = cache_folder() / RECORD
+    key = f"{adapter}, {adapter.driver}, {targets.usable()[0].name}"
+    known: dict[str, Any] = {}
     try:
-        known = json.loads(file.read_text("utf-8"))
-        gpu, cpu = known[key]
-        return float(gpu), float(cpu)
+        known = dict(json.loads(file.read_text("utf-8")))
+        if isinstance(known[key], str):
+            return str(known[key])
+        gpu, cpu = map(float, known[key])
+        return gpu, cpu
     except (OSError, ValueError, KeyError, TypeError):
-        known = {}
-    # Torch takes seconds to import, and plans do without.
+        pass
+    times: tuple[float, float] | str
+    try:
+        # A process of its own: drivers crash.
+        times = run_isolated(time_steps, f"gpu:{adapter.number}")
+    except UserError as error:
+        times = error.what
+    except RuntimeError as error:
+        times = str(error).strip().splitlines()[-1]
+    write_json(file, {**known, key: times})
+    return times
+
+
+def time_steps(device: str) -> tuple[float, float]:
+    """Seconds of a step on a GPU and on the processor, measured."""
     from pipeline.render.calibration import step_seconds
     from pipeline.render.registry import make_backend
 
-    times = step_seconds(make_backend(device)), step_seconds(make_backend("cpu"))
-    write_json(file, {**(known if isinstance(known, dict) else {}), key: list(times)})
-    return times
+    return step_seconds(make_backend(device)), step_seconds(make_backend("cpu"))

@@ -249,7 +249,8 @@ class SnakemakeProject:
         flow = self._workflow
         if config.train.device != "auto" or flow.non_local_exec or "SLURM_JOB_ID" in os.environ:
             return PROCESSOR
-        return choose_device()
+        chosen = choose_device()
+        return chosen.device, chosen.reason
 
     def _check_results(self, name: str) -> None:
         """Check that the run can have a folder of results: otherwise Snakemake would end with an

@@ -121,7 +121,10 @@ def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Calla
     means, log_scales, quats, opacity_logits, _ = scene.gaussians
     moments = first["means"], second["means"], first["quats"], second["quats"]
     harmonics = ShAdam(first["sh"], second["sh"], state.last, 0.0, 0.0, 1)
-    dense = {name: DenseAdam(first[name], second[name], 0.0, 1) for name in NAMES[1:4:2]}
+    dense = {
+        name: DenseAdam(first[name], second[name], 0.0, 1)
+        for name in ("log_scales", "opacity_logits")
+    }
 
     def step() -> None:
         drawn = backend.forward(*scene.gaussians, scene.camera, RasterOptions())

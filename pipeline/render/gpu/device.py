@@ -26,8 +26,8 @@ NEEDED = {
     "max-compute-workgroup-storage-size": 24 * 1024,
     "max-storage-buffers-per-shader-stage": 12,
 }
-# What is requested as far as the device has it: the size of a scene depends on it.
 OPTIONAL_FEATURES = ("timestamp-query",)
+# What is requested as far as the device has it: the size of a scene depends on it.
 WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
 
 SMALLER = (

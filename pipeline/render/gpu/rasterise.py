@@ -222,11 +222,7 @@ def blend(gpu: Gpu, space: Workspace, projection: Projection, lists: Lists) -> I
         space,
         "blend",
         projection.size,
-        view=projection.view,
-        records=projection.records,
-        gaussian_of=lists.gaussian_of,
-        pairs=lists.pairs,
-        ranges=lists.ranges,
+        **_by_tile(projection, lists),
         color=image.color,
         planes=image.planes,
         ends=image.ends,
@@ -251,11 +247,7 @@ def blend_backward(
         space,
         "blend_backward",
         projection.size,
-        view=projection.view,
-        records=projection.records,
-        gaussian_of=lists.gaussian_of,
-        pairs=lists.pairs,
-        ranges=lists.ranges,
+        **_by_tile(projection, lists),
         ends=image.ends,
         color=image.color,
         planes=image.planes,
@@ -264,6 +256,17 @@ def blend_backward(
         slots=slots,
     )
     return slots
+
+
+def _by_tile(projection: Projection, lists: Lists) -> dict[str, Buffer]:
+    """What the kernels of tiles read: the Gaussians of each tile, front to back."""
+    return {
+        "view": projection.view,
+        "records": projection.records,
+        "gaussian_of": lists.gaussian_of,
+        "pairs": lists.pairs,
+        "ranges": lists.ranges,
+    }
 
 
 def _run_in_bands(

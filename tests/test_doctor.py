@@ -154,6 +154,13 @@ def test_the_device_that_trains_is_shown_with_the_reason(bare, tmp_path, monkeyp
     assert devices.choose_device().device == "cpu", "not tried again with this driver"
     (tmp_path / "cache" / devices.RECORD).write_text("{")
     assert devices.choose_device().device == "gpu:1"
+
+    def read_only(*_: object) -> None:
+        raise PermissionError
+
+    monkeypatch.setattr(devices, "write_json", read_only)
+    found[0] = replace(card, driver="driver 5")
+    assert devices.choose_device().device == "gpu:1", "the record is optional"
     found.clear()
     assert "none was found" in shown()["training"].text
     monkeypatch.setattr(devices, "find_spec", lambda _: None)

@@ -3,6 +3,7 @@ stored for the next time. Importing this module does not import torch."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -81,7 +82,8 @@ def _times_of(adapter: Adapter) -> tuple[float, float] | str:
         times = error.what
     except RuntimeError as error:
         times = str(error).strip().splitlines()[-1]
-    write_json(file, {**known, key: times})
+    with contextlib.suppress(OSError):  # The record is optional: it is measured again.
+        write_json(file, {**known, key: times})
     return times
 
 

@@ -16,7 +16,7 @@ BOX_BYTES = 16  # Box in tile.wgsl
 SLOT_BYTES = 48  # kMoments floats in moments.wgsl
 CAMERA_PARAMETERS = 10  # kCameraParameters in project_backward.wgsl
 ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
-BYTES, MASKED = 1, 2  # flags of Loss in loss_images.wgsl
+BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
 FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
 SH_ADAM, CAMERA = 1, 2  # flags of Options in project_backward.wgsl
 

@@ -8,7 +8,20 @@
 // as the window is symmetric. `forward` writes the three derivatives, `backward` the gradient; a
 // workgroup handles 16 x 16 pixels of one channel.
 #import common
-#import loss_images
+
+struct Loss {
+    size: vec2<u32>,
+    flags: u32,
+    unused0: u32,
+    l2_weight: f32,
+    error_scale: f32,     // (1 - ssim_weight) / count, where count is of the unmasked values
+    ssim_scale: f32,      // -ssim_weight / count
+    unused: f32,
+    gain: vec3<f32>,      // of the rendered image
+    unused2: f32,
+}
+const kBytes = 1u;   // the target is uint8, four values to a word
+const kMasked = 2u;
 
 @group(0) @binding(0) var<uniform> loss: Loss;
 @group(0) @binding(1) var<storage, read> rendered: array<f32>;

@@ -56,6 +56,9 @@ class Backend(ABC, Generic[Projected, Binned]):
         """What determines the rounding of results besides the inputs, by name: instruction set,
         compiler, device. Compiles or loads the backend if necessary."""
 
+    def release_memory(self) -> None:
+        """Return memory that is kept for later calls to the system."""
+
     def resident(self) -> ResidentTraining | None:
         """Training in the memory of the backend's device; None if that is the CPU's."""
         return None

@@ -98,6 +98,9 @@ class CpuBackend(Backend[Projected, Binned]):
         built = build.load()
         return {"instruction_set": built.target, "compiler": built.compiler}
 
+    def release_memory(self) -> None:
+        _ops().release_memory()
+
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:

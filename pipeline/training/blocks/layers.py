@@ -53,7 +53,9 @@ class BlockLayers:
 
     def __call__(self, view: View) -> Layers:
         with self._lock:
-            return self._layers(view)
+            layers = self._layers(view)
+            self.backend.release_memory()
+            return layers
 
     def _layers(self, view: View) -> Layers:
         def layers(visible: Tensor) -> Iterator[Subset]:

@@ -13,7 +13,6 @@ from typing import NamedTuple
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from scipy.spatial import KDTree
 from torch import Tensor
 
 from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
@@ -52,6 +51,8 @@ def camera_path(centres: NDArray[np.float64], depths: NDArray[np.float64]) -> li
         centres: (V, 3) camera centres, world.
         depths: (V,) z up to which each view sees empty space (``floaters.empty_depths``).
     """
+    from scipy.spatial import KDTree  # Here: it takes 20 MB, after the peak of training.
+
     count = min(NEIGHBOURS + 1, len(centres))
     distances, neighbours = KDTree(centres).query(centres, [*range(1, count + 1)])
     segments = {}
@@ -68,6 +69,8 @@ def distances_to_path(
     points: NDArray[np.float64], segments: Sequence[Segment]
 ) -> NDArray[np.float64]:
     """(N,) distance of each point to the path, infinite where no segment reaches it."""
+    from scipy.spatial import KDTree
+
     nearest = np.full(len(points), np.inf)
     finite = np.flatnonzero(np.isfinite(points).all(1))
     if not segments or not len(finite):

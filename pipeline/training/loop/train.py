@@ -91,6 +91,7 @@ def train(
             part=part,
             warn=warn,
         )
+        backend.release_memory()  # That the layers around a block were rendered with.
         steps = Schedule.of(config, experiments).steps
         span = part.of(steps)
         state = initial_state(
@@ -118,6 +119,7 @@ def train(
                 trainer.step()
                 session.after_step(before, trainer.factor())
         state.fetch()
+        backend.release_memory()
         # With a limit of gradients per pixel, Gaussians that are seen may have none.
         if not experiments.gradients_per_pixel:
             state.drop_unseen(len(scene.views), scene.sky)

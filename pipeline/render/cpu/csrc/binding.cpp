@@ -324,6 +324,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) rotation_avg, "
         "Tensor(f!) rotation_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
         "int threads) -> ()");
+    m.def("release_memory() -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
@@ -338,4 +339,9 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("compose_backward", TORCH_BOX(&compose_backward));
     m.impl("adam_step", TORCH_BOX(&adam_step));
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
+}
+
+// It has no tensor that chooses a device.
+STABLE_TORCH_LIBRARY_IMPL(splatmake, CompositeExplicitAutograd, m) {
+    m.impl("release_memory", TORCH_BOX(&splat::release_unused_memory));
 }

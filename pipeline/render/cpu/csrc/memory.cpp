@@ -97,14 +97,22 @@ class Pool {
         sizes_.erase(found);
         // Least recently freed blocks are released first: their sizes are no longer in use.
         const size_t most = most_used_ > earlier_most_ ? most_used_ : earlier_most_;
-        while (used_ + unused_ > most + most / 2) {
-            unused_ -= free_.front().size;
-            free_block(free_.front());
-            free_.erase(free_.begin());
-        }
+        while (used_ + unused_ > most + most / 2) release_one();
+    }
+
+    void release_unused() {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        while (!free_.empty()) release_one();
+        most_used_ = earlier_most_ = used_;
     }
 
   private:
+    void release_one() {
+        unused_ -= free_.front().size;
+        free_block(free_.front());
+        free_.erase(free_.begin());
+    }
+
     std::mutex mutex_;
     std::vector<Block> free_;                  // least recently freed first
     std::unordered_map<void*, size_t> sizes_;  // of the blocks in use
@@ -118,6 +126,8 @@ Pool& pool() {
 }
 
 }  // namespace
+
+void release_unused_memory() { pool().release_unused(); }
 
 #if defined(__SANITIZE_ADDRESS__)
 // Exactly the requested size, so that the sanitizer detects accesses beyond it.

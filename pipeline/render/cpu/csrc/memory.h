@@ -11,6 +11,9 @@ namespace splat {
 void* take_memory(size_t bytes);
 void give_back_memory(void* memory);
 
+// Returns memory that is kept for later calls to the system.
+void release_unused_memory();
+
 // An uninitialised array.
 template <class T>
 class Scratch {

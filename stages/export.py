@@ -1,6 +1,6 @@
 """Files for other programs.
 
-Outputs: Gaussians (``point_cloud.ply``, ``.spz``, ``.splat``, ``.glb``); sparse points
+Outputs: Gaussians (``point_cloud.ply``, ``blocks/``, ``.spz``, ``.splat``, ``.glb``); sparse points
 (``points.ply``); cameras (``sparse/0`` and ``sparse_text``, COLMAP; ``transforms.json``);
 ``frame.json`` with axes, unit and up direction. On demand ``dense_points.ply``, ``dense_maps/``,
 ``renders/``, ``depths/``, ``mesh.ply`` and ``.glb``, ``video`` and ``path.json``.
@@ -11,7 +11,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import DENSE_FORMATS, Export, Split, Train, Views
+from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Train, Views
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -33,6 +33,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.export.write import ExportScene, export_scene
     from pipeline.render.registry import use_device
+    from pipeline.scene.blocks import Partition
     from pipeline.scene.unrounded import Unrounded
     from pipeline.scene.views import load_views
 
@@ -52,6 +53,7 @@ def work(job: Job) -> None:
         given=Unrounded.read(job.inputs["inspect"]),
         folder=job.inputs["train"].parent / job.stage,
         dense=job.inputs.get("dense"),
+        partition=Partition.read(folder) if (folder := job.inputs.get("partition")) else None,
     )
     report = export_scene(
         job.out,
@@ -70,8 +72,13 @@ SPEC = StageSpec(
     work=work,
     decide=decide,
     counters=ExportCounters,
-    inputs=inputs.TRAINED | {"inspect": ("inspect",), "dense": ("dense",)},
-    only_if={"dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats)},
+    inputs=inputs.TRAINED
+    | {"inspect": ("inspect",), "dense": ("dense",), "partition": ("partition",)},
+    only_if={
+        "dense": lambda config: not DENSE_FORMATS.isdisjoint(config.export.formats),
+        "partition": lambda config: BLOCKS_FORMAT in config.export.formats,
+    },
+    optional=("partition",),
     options=("export", "experiments.export", "views", "split", *inputs.DRAWING_OPTIONS),
     packages=("torch", "numpy", "scipy", "scikit-image", "opencv-contrib-python-headless"),
 )

@@ -26,6 +26,7 @@ from pipeline.mvs.maps import DenseCloud, DenseMap, write_dense_cloud, write_map
 from pipeline.plan.given_poses import GivenModel
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.job import Job
+from pipeline.scene.blocks import Block, Partition
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
@@ -86,7 +87,11 @@ def export(scene: Path, antialias: bool = False, **options) -> tuple[Path, Job]:
         scene="NAME",
         key={"seed": 0, "config": config},
         inputs={role: scene / "undistort" for role in ("views", "model", "poses", "inspect")}
-        | {"train": scene / "train", "dense": scene / "dense"},
+        | {
+            name: scene / name
+            for name in ("train", "dense", "partition")
+            if (scene / name).is_dir()
+        },
         out=out,
         scratch=out.parent,
         shared_cache=out.parent,
@@ -134,6 +139,47 @@ def far_scene(scene: Path) -> Path:
     assert georeference is not None
     georeference.write(folder)
     return scene
+
+
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_each_gaussian_is_in_the_file_of_its_block(far_scene, blocks):
+    """Faces of blocks are in the unit of training, the files in that of the given poses."""
+    means = sample(50).means.numpy()
+    face = float(np.median(means[:, 0]))
+    if blocks == 2:
+        divided_at(face).write(far_scene / "partition")
+    out, _ = export(far_scene, formats=["blocks"], min_opacity=0.3)
+    shown = sample(50).opacity_logits.sigmoid().numpy() >= 0.3
+    below = shown & (means[:, 0] < face)
+    expected = [shown] if blocks == 1 else [below, shown & ~below]
+    files = [out / "blocks" / f"block_{number}.ply" for number in range(1, blocks + 1)]
+    assert sorted((out / "blocks").iterdir()) == files
+    for file, rows in zip(files, expected, strict=True):
+        found = np.sort(read_gaussians(file, []).means[:, 0])
+        np.testing.assert_allclose(found, np.sort(1000 * means[rows, 0]), rtol=1e-5)
+
+
+def divided_at(face: float) -> Partition:
+    """Two blocks on both sides of ``x == face``."""
+    common = {
+        "margin_below": (0, 0, 0),
+        "margin_above": (0, 0, 0),
+        "gaussians": 1,
+        "max_gaussians": 1,
+        "steps": 1,
+        "views": (),
+        "overviews": (),
+    }
+    everything = (None, None, None)
+    return Partition(
+        axes=np.eye(3).tolist(),
+        lower=(-1, -1, -1),
+        upper=(1, 1, 1),
+        blocks=(
+            Block(lower=everything, upper=(face, None, None), **common),
+            Block(lower=(face, None, None), upper=everything, **common),
+        ),
+    )
 
 
 def test_cameras_and_points_are_exported_in_the_given_world(far_scene):

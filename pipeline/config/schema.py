@@ -390,6 +390,7 @@ class Evaluate(Section):
 
 ExportFormat = Literal[
     "ply",
+    "blocks",
     "spz",
     "splat",
     "gltf",
@@ -406,6 +407,8 @@ ExportFormat = Literal[
 ]
 # Formats that need multi-view stereo.
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
+# The format that needs the blocks of the scene.
+BLOCKS_FORMAT: ExportFormat = "blocks"
 # Formats that need renders of the views.
 RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mesh", "video"))
 
@@ -415,8 +418,9 @@ class Export(Section):
 
     formats: tuple[ExportFormat, ...] = Field(
         ("ply", "spz", "points", "colmap", "transforms"),
-        description="Gaussians: ply (3DGS's layout, exact), spz (a sixth of the size), splat "
-        "(without SH), gltf (.glb with KHR_gaussian_splatting). points: coloured sparse points. "
+        description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
+        "scene), spz (a sixth of the size), splat (without SH), gltf (.glb with "
+        "KHR_gaussian_splatting). points: coloured sparse points. "
         "Cameras: colmap (with the points), colmap_text (the same as text), transforms "
         "(nerfstudio's transforms.json). Multi-view stereo of the training views: dense_points "
         "(fused point cloud, PLY with normals), dense_maps (depths, float TIFF). Rendered from "

@@ -7,6 +7,7 @@ from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
+from numpy.typing import NDArray
 
 from pipeline.config.experiments import ExportExperiments
 from pipeline.config.schema import Export, Split, Train
@@ -22,6 +23,7 @@ from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
 from pipeline.photos.naming import rename
+from pipeline.scene.blocks import Partition
 from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.normalization import IDENTITY, Normalization
@@ -52,6 +54,7 @@ class ExportScene:
         given: the given poses before rounding; empty for estimated ones.
         folder: final folder of the exported files.
         dense: folder of the dense stage, None if it did not run.
+        partition: the blocks of the scene, None if it has one.
     """
 
     trained: GaussianArrays
@@ -63,6 +66,7 @@ class ExportScene:
     given: Unrounded
     folder: Path
     dense: Path | None = None
+    partition: Partition | None = None
 
     @property
     def normalization(self) -> Normalization:
@@ -86,6 +90,7 @@ class _Files:
     Attributes:
         scene: in the unit of the given poses, with the scene's origin, which suits float32.
         gaussians: those of ``scene``, reduced.
+        blocks: (M,) number of the block of each of ``gaussians``.
         model, views: those of ``scene`` in the given world: formats in double precision.
         antialias: whether the Gaussians were trained with opacity compensation.
         points: name of the file of points, None without one.
@@ -94,6 +99,7 @@ class _Files:
 
     scene: ExportScene
     gaussians: GaussianRows
+    blocks: NDArray[np.intp]
     model: Reconstruction
     views: list[View]
     antialias: bool
@@ -104,6 +110,12 @@ class _Files:
     def moved(self) -> bool:
         """Whether the given world has another origin than the scene's."""
         return bool(self.scene.normalization.origin.any())
+
+    def write_blocks(self, path: Path) -> None:
+        count = 1 if self.scene.partition is None else len(self.scene.partition.blocks)
+        for number in range(1, count + 1):
+            rows = self.gaussians.rows[self.blocks == number]
+            write_splat_ply(path / f"block_{number}.ply", replace(self.gaussians, rows=rows))
 
     def write_points(self, path: Path) -> None:
         points = self.model.points
@@ -132,6 +144,7 @@ class _Files:
 # Format -> name of the file or folder, and its writer.
 WRITERS: dict[str, tuple[str, Callable[[Path, _Files], None]]] = {
     "ply": ("point_cloud.ply", lambda path, f: write_splat_ply(path, f.gaussians)),
+    "blocks": ("blocks", lambda path, f: f.write_blocks(path)),
     "spz": ("point_cloud.spz", lambda path, f: write_spz(path, f.gaussians, antialias=f.antialias)),
     "splat": ("point_cloud.splat", lambda path, f: write_splat(path, f.gaussians)),
     "gltf": ("point_cloud.glb", lambda path, f: write_gltf(path, f.gaussians)),
@@ -162,13 +175,16 @@ def export_scene(
     model = scene.given.model_to_given(scene.model, scene.normalization)
     poses = {name: image.world_to_camera for name, image in model.by_name().items()}
     views = [replace(view, world_to_camera=poses[view.name]) for view in scene.views]
+    means = scene.trained.means
     normalization, scene = scene.normalization, _in_given_unit(scene)
     gaussians = reduce_gaussians(
         scene.trained, config.sh_degree, config.min_opacity, experiments.morton_order
     )
+    # The faces of blocks are in the unit of training.
+    blocks = _blocks_of(means[gaussians.rows], scene.partition)
     has_points = "points" in config.formats and len(scene.model.points) > 0
     points = WRITERS["points"][0] if has_points else None
-    files = _Files(scene, gaussians, model, views, train.antialias, points, normalization)
+    files = _Files(scene, gaussians, blocks, model, views, train.antialias, points, normalization)
     written = []
     for name in (name for name in config.formats if name in WRITERS):
         file, write = WRITERS[name]
@@ -181,6 +197,10 @@ def export_scene(
     if not set(config.formats) <= WRITERS.keys():
         _write_rendered_formats(out, scene, config, train, split, threads, report)
     return report
+
+
+def _blocks_of(means: NDArray[np.float32], partition: Partition | None) -> NDArray[np.intp]:
+    return np.ones(len(means), np.intp) if partition is None else partition.numbers(means)
 
 
 def _in_given_unit(scene: ExportScene) -> ExportScene:

@@ -159,6 +159,13 @@ class Partition(JsonFile, JsonObject):
         upper = [np.inf if bound is None else bound for bound in block.upper]
         return Box(np.array(self.axes), np.array(lower), np.array(upper))
 
+    def numbers(self, points: NDArray[Any]) -> NDArray[np.intp]:
+        """(N,) the number of the block whose box each of (N, 3) points is in."""
+        found = np.zeros(len(points), np.intp)
+        for number in range(1, len(self.blocks) + 1):
+            found[self.box(number).contains(points)] = number
+        return found
+
     def kept(self, number: int) -> Box:
         """The box of block ``number`` within the scene's bounds: where its Gaussians stay in the
         union of the blocks."""

@@ -141,6 +141,16 @@ def test_scenes_of_many_photographs_are_trained_in_blocks(tmp_path, count, block
     assert chosen.config.partition.blocks == 2 and chosen.stages["block"].jobs == 2
 
 
+@pytest.mark.parametrize("blocks", [1, 2])
+def test_only_an_export_by_block_reads_the_partition(tmp_path, blocks):
+    """A scene in one block has none."""
+    scan = many(tmp_path, 40)
+    for formats, reads in ((["ply"], False), (["ply", "blocks"], blocks == 2)):
+        options = {"partition": {"blocks": blocks}, "export": {"formats": formats}}
+        plan = make_plan(scan, Config.model_validate(options))
+        assert ("partition" in plan.stages["export"].inputs) == reads
+
+
 def test_blocks_have_no_appearance_embeddings(tmp_path):
     options = {"train": {"appearance": "embedding"}}
     scan = many(tmp_path, 40)

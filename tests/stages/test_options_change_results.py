@@ -60,7 +60,7 @@ ALL_SMALL = under(poses="keep", experiments__train__gradient__split_scale=10.0)
 DARK = under(poses="keep", experiments__train__sh0_learning_rate=1.0)
 LARGE = under(poses="keep", views__max_long_side_px=200)
 FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_gaussians=320)
-BLOCKS = under(poses="keep", partition__blocks=2)
+BLOCKS = under(poses="keep", partition__blocks=2, export__formats=["ply", "blocks"])
 DENSE = under(poses="keep", init__method="dense", export__formats=["dense_points", "dense_maps"])
 MESH = under(poses="keep", export__formats=["mesh"])
 
@@ -315,11 +315,14 @@ def test_options_of_depth_maps_change_them(outputs, path, value):
 
 def test_a_scene_in_blocks_has_the_same_bits_at_any_number_of_threads(outputs):
     """And each block is a job with an output of its own."""
-    for stage in ("coarse", "partition", "block", "polish", "train", "report"):
+    for stage in ("coarse", "partition", "block", "polish", "train", "export", "report"):
         expected = outputs("blocks", "photos", BLOCKS, stage)
         assert expected, stage
         found = outputs("blocks", "photos", BLOCKS, stage, threads=2, memory_mb=1)
         assert found == expected, stage
     assert {"polish_1/gaussians.npz", "polish_2/gaussians.npz"} <= outputs(
         "blocks", "photos", BLOCKS, "polish"
+    ).keys()
+    assert {"point_cloud.ply", "blocks/block_1.ply", "blocks/block_2.ply"} <= outputs(
+        "blocks", "photos", BLOCKS, "export"
     ).keys()

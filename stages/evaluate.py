@@ -65,8 +65,11 @@ def work(job: Job) -> None:
     if (truth := job.inputs["inspect"] / "truth").is_dir():
         # The truth has the poses of photographs, not of the views of split ones.
         refined = train.refine_poses and all(view.source is None for view in views)
-        model = inputs.trained_model(job) if refined else inputs.input_model(job, "poses")
-        error = pose_error(model, read_model(truth))
+        if refined:
+            model = inputs.trained_model(job, points=False)
+        else:
+            model = inputs.input_model(job, "poses", points=False)
+        error = pose_error(model, read_model(truth, points=False))
         evaluation = evaluation.model_copy(update={"pose_error": error})
     evaluation.write(job.out)
     job.counters = EvaluateCounters.model_validate(evaluation, from_attributes=True)

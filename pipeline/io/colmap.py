@@ -23,10 +23,13 @@ def has_model(folder: Path) -> bool:
     return _suffix(folder) is not None
 
 
-def read_model(folder: Path) -> Reconstruction:
+def read_model(folder: Path, *, points: bool = True) -> Reconstruction:
     """Read ``cameras``, ``images`` and, if it exists, ``points3D`` from ``folder``.
 
     Binary files are preferred to text files, as in COLMAP. Points are sorted by id.
+
+    Args:
+        points: whether to read the points, which take most of the memory and time.
 
     Raises:
         UserError: no model, malformed or truncated files, unknown camera models, poses or
@@ -43,7 +46,7 @@ def read_model(folder: Path) -> Reconstruction:
     cameras = form.read_cameras(folder / f"cameras{suffix}")
     images, keypoints = form.read_images(folder / f"images{suffix}", cameras)
     points_file = folder / f"points3D{suffix}"
-    if not points_file.exists():
+    if not points or not points_file.exists():
         return Reconstruction(cameras, images)
     table = form.read_points(points_file)
     return Reconstruction(cameras, images, _points(points_file, table, keypoints))

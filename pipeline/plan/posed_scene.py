@@ -119,7 +119,7 @@ def _finished(
     if every is not None:
         split = split.model_copy(update={"source": "every", "test_every": every})
     photos = _output(folder, _STAGES_WITH_PHOTOS, "images.json")
-    model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"))
+    model = read_model(_output(folder, STAGES_WITH_MODEL, "sparse/0"), points=False)
     if exported:
         model = results_normalization(folder).without_origin().model_to_given(model)
     _check_pinhole(model, folder)

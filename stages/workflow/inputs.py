@@ -44,8 +44,8 @@ def read_manifest(job: Job, role: str) -> Manifest:
     return Manifest.read(job.inputs[role] / "images.json")
 
 
-def input_model(job: Job, role: str = "model") -> Reconstruction:
-    return read_model(job.inputs[role] / "sparse" / "0")
+def input_model(job: Job, role: str = "model", *, points: bool = True) -> Reconstruction:
+    return read_model(job.inputs[role] / "sparse" / "0", points=points)
 
 
 def georeference(job: Job) -> Georeference | None:
@@ -66,22 +66,26 @@ def copy_georeference(job: Job, role: str) -> None:
         shutil.copy(file, job.out)
 
 
-def trained_model(job: Job) -> Reconstruction:
+def trained_model(job: Job, *, points: bool = True) -> Reconstruction:
     """The model with cameras as refined by training (``train.refine_poses``,
     ``train.refine_intrinsics``)."""
     refined = job.inputs["train"] / "sparse" / "0"
-    return read_model(refined) if has_model(refined) else input_model(job)
+    if not has_model(refined):
+        return input_model(job, points=points)
+    return read_model(refined, points=points)
 
 
-def coarse_model(job: Job) -> Reconstruction:
+def coarse_model(job: Job, *, points: bool = True) -> Reconstruction:
     """The model with cameras as refined by the coarse run, for scenes in blocks."""
     refined = job.inputs["coarse"] / "sparse" / "0"
-    return read_model(refined) if has_model(refined) else input_model(job)
+    if not has_model(refined):
+        return input_model(job, points=points)
+    return read_model(refined, points=points)
 
 
 def coarse_views(job: Job) -> list[View]:
     """All views, with the cameras of ``coarse_model``."""
-    return _views(job, coarse_model(job))
+    return _views(job, coarse_model(job, points=False))
 
 
 def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:
@@ -108,7 +112,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
 
 def input_views(job: Job) -> list[View]:
     """All views, with the cameras before training."""
-    return _views(job, input_model(job))
+    return _views(job, input_model(job, points=False))
 
 
 def training_views(job: Job) -> list[View]:
@@ -141,7 +145,7 @@ def trained_gaussians(job: Job) -> Gaussians:
 
 def trained_views(job: Job) -> list[View]:
     """All views, with the cameras of ``trained_model``."""
-    return _views(job, trained_model(job))
+    return _views(job, trained_model(job, points=False))
 
 
 def _views(job: Job, model: Reconstruction) -> list[View]:

@@ -29,7 +29,7 @@ from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.lock import check_not_locked, lock_run, user_name
 from pipeline.runtime.native import MODULES
-from pipeline.runtime.record import canonical, file_digest, is_current
+from pipeline.runtime.record import STAGE, canonical, file_digest, is_current, read_stage
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.cluster import (
     DEFAULT_CPUS,
@@ -124,6 +124,7 @@ class SnakemakeProject:
         for stages that read the plan."""
 
         def files(wildcards: Any) -> dict[str, str]:
+            self._run_if_outdated(spec, wildcards)
             sources = self._inputs(spec, wildcards.scene)
             found = {role: str(folder / "stage.json") for role, folder in sources.items()}
             if spec.shows_plan:
@@ -131,6 +132,21 @@ class SnakemakeProject:
             return found
 
         return files
+
+    def _run_if_outdated(self, spec: StageSpec, wildcards: Any) -> None:
+        """Run a stage whose record has another key. Snakemake compares keys with records of its
+        own, in .snakemake, which a copied folder of results does not have."""
+        dag = self._workflow.dag
+        folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
+        record = folder / STAGE
+        if dag is None or not record.is_file():
+            return
+        try:
+            current = canonical(read_stage(folder).key) == self.key(spec)(wildcards)
+        except UserError:  # The stage that reads the record has a message.
+            return
+        if not current:
+            dag.forcefiles.add(str(record))
 
     def folders(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""

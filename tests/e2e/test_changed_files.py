@@ -77,6 +77,16 @@ def test_a_camera_moved_in_a_stages_output_is_named_and_the_command_repairs_it(p
     assert metrics(project, "tiny") == metrics(finished, "tiny")
 
 
+def test_copied_results_are_made_again_where_options_have_changed(project):
+    """Without Snakemake's own records, as after copying results to another machine."""
+    shutil.rmtree(project / ".snakemake")
+    unchanged = snakemake(project, "-n", "results/tiny/metrics.json", config=TINY)
+    assert rules_run(unchanged) == set()
+    changed = TINY | {"experiments": {"train": {"scales_learning_rate": 0.004}}}
+    done = snakemake(project, "-n", "results/tiny/metrics.json", config=changed)
+    assert rules_run(done) == {"train", "evaluate", "coverage", "export", "report"}
+
+
 @pytest.mark.parametrize("content", ["", '{"stage": "sfm"}'])
 def test_a_damaged_record_is_one_clear_error(project, content):
     record = project / "results" / "tiny" / "sfm" / "stage.json"

@@ -5,8 +5,8 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,14 +19,14 @@ from pipeline.metrics.evaluation import (
     ProtocolDescription,
     ViewMetrics,
 )
-from pipeline.metrics.image import SSIM_VARIANT, psnr, ssim
-from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, lpips_available
+from pipeline.metrics.image import SSIM_VARIANT
+from pipeline.metrics.lpips import LPIPS_VARIANTS, MIN_SIDE, Lpips, lpips_available
 from pipeline.metrics.protocol import Protocol
-from pipeline.photos.load import load_view
-from pipeline.render.views import render_rgb, to_bytes
+from pipeline.metrics.rendered import Rendered, ViewRenderer
+from pipeline.render.views import to_bytes
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Progress
-from pipeline.scene.appearance import Appearance, fitted_columns
+from pipeline.scene.appearance import Appearance
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -53,43 +53,15 @@ POSES_PROTOCOL = (
 )
 POSES_OF_ALL = "from all photographs, test views included (as usual in the field)"
 POSES_OF_SPLIT = "poses are given; points are given or from the training photographs alone"
-Mask = NDArray[np.bool_]
 
 
-@dataclass(frozen=True)
-class Rendered:
-    """A render and its photograph.
+class _Measured(NamedTuple):
+    """The measures of a view, and its PSNR without the factors of its exposure and without its
+    fitted appearance; None where there are none."""
 
-    Attributes:
-        rgb: (H, W, 3) float32.
-        own: the same in the scene's own colours; None if the appearance was not fitted.
-        photo: (H, W, 3) uint8.
-        mask: (H, W), False for ignored pixels; None if there are none.
-    """
-
-    rgb: NDArray[np.float32]
-    own: NDArray[np.float32] | None
-    photo: NDArray[np.uint8]
-    mask: Mask | None
-
-    @property
-    def columns(self) -> slice:
-        """The measured columns: the right half if the appearance was fitted on the left one."""
-        return slice(0 if self.own is None else fitted_columns(self.photo.shape[1]), None)
-
-    @property
-    def measured_mask(self) -> Mask | None:
-        return None if self.mask is None else self.mask[:, self.columns]
-
-    def psnr(self, image: NDArray[np.uint8]) -> float:
-        """PSNR of an image over the measured columns."""
-        here = self.columns
-        return psnr(image[:, here], self.photo[:, here], self.measured_mask)
-
-    def ssim(self, image: NDArray[np.uint8]) -> float:
-        """SSIM of an image over the measured columns."""
-        here = self.columns
-        return ssim(image[:, here], self.photo[:, here], self.measured_mask)
+    record: ViewMetrics
+    without_gains: float | None
+    without_fit: float | None
 
 
 def evaluate_views(
@@ -119,112 +91,37 @@ def evaluate_views(
     Raises:
         UserError: the masks hide all views.
     """
+    renderer = ViewRenderer(gaussians, protocol, train, gains, appearance, threads)
     lpips, reason = lpips_available(config.lpips_net)
-    fitted = {view.name for view in protocol.views} if appearance else set()
-    if appearance:
-        fitted -= appearance.embeddings.keys()
-    smallest = min(
-        min(
-            view.height,
-            view.width - (fitted_columns(view.width) if view.name in fitted else 0),
-        )
-        for view in protocol.views
-    )
-    if lpips is not None and smallest < MIN_SIDE:
+    if lpips is not None and (smallest := renderer.smallest_side()) < MIN_SIDE:
         lpips, reason = None, f"views of {smallest} px are too small, {MIN_SIDE} px are needed"
     out.mkdir(parents=True, exist_ok=True)
-    per_view: list[ViewMetrics] = []
     progress = Progress("evaluating", len(protocol.views) + len(protocol.training_views), "views")
     warnings: list[str] = []
-    unadjusted: list[float] = []
-    unfitted: list[float] = []
-    options = protocol.options(train, threads)
-
-    def render_and_load(view: View) -> Rendered:
-        pixels = load_view(view)
-        photo, shown, own = pixels.over(protocol.background), gaussians, None
-        if appearance is not None:
-            from pipeline.training.appearance.fit import in_photograph
-
-            shown = in_photograph(gaussians, appearance, view, photo, pixels.mask, options)
-        if train.refine_poses and view.is_test:
-            from pipeline.training.cameras.fit_pose import fit_pose
-
-            gain, weight = gains.of(view.name), train.ssim_loss_weight
-            view = fit_pose(shown, view, photo, pixels.mask, gain, options, protocol.extent, weight)
-        if view.name in fitted:
-            own = render_rgb(gaussians, view, options)
-        return Rendered(render_rgb(shown, view, options), own, photo, pixels.mask)
-
-    def with_exposure(rgb: NDArray[np.float32], view: View) -> NDArray[np.uint8]:
-        gain = gains.of(view.name)
-        return to_bytes(rgb if gain is None else rgb * np.array(gain, np.float32))
-
-    def measure(index: int, found: Rendered) -> tuple[ViewMetrics, float | None, float | None]:
-        view = protocol.views[index]
-        image = with_exposure(found.rgb, view)
-        name = f"{index:04d}.png"
-        Image.fromarray(image).save(out / name, compress_level=PNG_LEVEL)
-        record = ViewMetrics(
-            name=view.name, psnr=found.psnr(image), ssim=found.ssim(image), lpips=None, render=name
-        )
-        without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
-        own = None if found.own is None else found.psnr(to_bytes(found.own))
-        return record, without_gains, own
-
-    def collect(future: Future[tuple[ViewMetrics, float | None, float | None]]) -> None:
-        record, psnr_without_gains, psnr_without_fit = future.result()
-        per_view.append(record)
-        if psnr_without_gains is not None:
-            unadjusted.append(psnr_without_gains)
-        if psnr_without_fit is not None:
-            unfitted.append(psnr_without_fit)
-        progress.advance(note=f"PSNR {record.psnr:.2f} dB")
-
-    # Views are measured while the next ones are rendered. The queue is short: it holds the images.
-    pending: deque[Future[tuple[ViewMetrics, float | None, float | None]]] = deque()
-    distances: list[float] = []
-    with ThreadPoolExecutor(max(threads, 1)) as pool:
-        for index, view in enumerate(protocol.views):
-            found = render_and_load(view)
-            if _hides_all(found.measured_mask):
-                warnings.append(f"{view.name}: its mask leaves no pixel to measure")
-                progress.advance()
-                continue
-            pending.append(pool.submit(measure, index, found))
-            if lpips is not None:
-                here, image = found.columns, with_exposure(found.rgb, view)
-                distances.append(lpips(image[:, here], found.photo[:, here], found.measured_mask))
-            if len(pending) > threads:
-                collect(pending.popleft())
-        while pending:
-            collect(pending.popleft())
-    if lpips is not None:
-        per_view = [
-            record.model_copy(update={"lpips": distance})
-            for record, distance in zip(per_view, distances, strict=True)
-        ]
+    measured = _measure(renderer, lpips, out, threads, progress, warnings)
     training: list[float] = []
     for view in protocol.training_views:
-        found = render_and_load(view)
-        if not _hides_all(found.measured_mask):
-            training.append(found.psnr(with_exposure(found.rgb, view)))
+        found = renderer.render(view)
+        if not found.is_hidden:
+            training.append(found.psnr(renderer.with_exposure(found.rgb, view)))
         progress.advance()
-    if not per_view:
+    if not measured:
         raise UserError("the masks leave no pixel of any view to measure", fix="check masks/")
-    mean_psnr = float(np.mean([v.psnr for v in per_view]))
-    train_psnr = float(np.mean(training)) if training else None
+    per_view = tuple(view.record for view in measured)
+    psnr = float(np.mean([view.psnr for view in per_view]))
+    train_psnr = _mean(training)
     if train_psnr is not None:
-        warnings += diagnose(mean_psnr, train_psnr)
+        warnings += diagnose(psnr, train_psnr)
+    without_fit = _mean([view.without_fit for view in measured])
     return Evaluation(
-        psnr=mean_psnr,
+        psnr=psnr,
         train_psnr=train_psnr,
-        psnr_without_gains=float(np.mean(unadjusted)) if gains else None,
-        psnr_without_fit=float(np.mean(unfitted)) if unfitted else None,
-        ssim=float(np.mean([v.ssim for v in per_view])),
-        lpips=float(np.mean(distances)) if lpips is not None else None,
+        psnr_without_gains=_mean([view.without_gains for view in measured]),
+        psnr_without_fit=without_fit,
+        ssim=float(np.mean([view.ssim for view in per_view])),
+        lpips=_mean([view.lpips for view in per_view]),
         lpips_reason=reason,
-        per_view=tuple(per_view),
+        per_view=per_view,
         protocol=ProtocolDescription(
             resolution=_sizes(protocol.views),
             split=_describe_split(protocol),
@@ -237,12 +134,70 @@ def evaluate_views(
             masks="masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
             background=protocol.background,
             exposure=EXPOSURE_PROTOCOL if gains else None,
-            appearance=APPEARANCE_PROTOCOL if unfitted else None,
+            appearance=APPEARANCE_PROTOCOL if without_fit is not None else None,
             poses=POSES_PROTOCOL if train.refine_poses else None,
         ),
         model=EvaluatedModel(num_gaussians=len(gaussians), sh_degree=gaussians.sh_degree),
         warnings=tuple(warnings),
     )
+
+
+def _measure(
+    renderer: ViewRenderer,
+    lpips: Lpips | None,
+    out: Path,
+    threads: int,
+    progress: Progress,
+    warnings: list[str],
+) -> list[_Measured]:
+    """The measures of the views of the protocol that their masks do not hide; ``warnings`` receives
+    the others."""
+    # Views are measured while the next ones are rendered. The queue is short: it holds the images.
+    pending: deque[Future[_Measured]] = deque()
+    measured: list[_Measured] = []
+
+    def collect() -> None:
+        measured.append(pending.popleft().result())
+        progress.advance(note=f"PSNR {measured[-1].record.psnr:.2f} dB")
+
+    with ThreadPoolExecutor(max(threads, 1)) as pool:
+        for index, view in enumerate(renderer.protocol.views):
+            found = renderer.render(view)
+            if found.is_hidden:
+                warnings.append(f"{view.name}: its mask leaves no pixel to measure")
+                progress.advance()
+                continue
+            file = out / f"{index:04d}.png"
+            image = renderer.with_exposure(found.rgb, view)
+            distance = None if lpips is None else found.distance(image, lpips)
+            pending.append(pool.submit(_compare, found, image, distance, file, renderer.gains))
+            if len(pending) > threads:
+                collect()
+        while pending:
+            collect()
+    return measured
+
+
+def _compare(
+    found: Rendered,
+    image: NDArray[np.uint8],
+    lpips: float | None,
+    file: Path,
+    gains: ExposureGains,
+) -> _Measured:
+    """Write ``image``, the render with the exposure of its photograph, and compare it with that."""
+    Image.fromarray(image).save(file, compress_level=PNG_LEVEL)
+    psnr, ssim = found.psnr(image), found.ssim(image)
+    record = ViewMetrics(name=found.view, psnr=psnr, ssim=ssim, lpips=lpips, render=file.name)
+    without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
+    without_fit = None if found.own is None else found.psnr(to_bytes(found.own))
+    return _Measured(record, without_gains, without_fit)
+
+
+def _mean(values: Sequence[float | None]) -> float | None:
+    """The mean of the values that are known; None without one."""
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
@@ -259,10 +214,6 @@ def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
             f"{train_psnr:.1f} dB): there are too few photographs, or they are too far apart"
         ]
     return []
-
-
-def _hides_all(mask: Mask | None) -> bool:
-    return mask is not None and not mask.any()
 
 
 def _split_photographs(views: Sequence[View]) -> int | None:

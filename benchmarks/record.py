@@ -31,6 +31,7 @@ PROTOCOL = (
     "split",
     "background",
     "exposure",
+    "appearance",
     "masks",
     "poses",
     "published",

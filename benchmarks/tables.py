@@ -75,11 +75,15 @@ def scenes(records: Sequence[Record]) -> str:
 
 
 def headline(records: Sequence[Record]) -> str:
-    """The short table of the README; after a benchmark scene, 3DGS's published values for it."""
+    """The short table of the README, of scenes and of budgets; after a benchmark scene, 3DGS's
+    published values for it."""
     head = ["scene", "training", "test views, pixels", "seeds", "PSNR (dB)", "SSIM", "Gaussians"]
     rows = [[*head, "CPU minutes in all", "where"]]
     published: dict[str, list[str]] = {}
     for record in records:
+        if "runs" not in record:
+            rows += _headline_of_budgets(record)
+            continue
         runs, protocol, scene = record["runs"], record["protocol"], record["scene"]
         rows.append(
             [
@@ -106,6 +110,29 @@ def headline(records: Sequence[Record]) -> str:
                     *("", "", "GPU"),
                 ]
     return markdown.table([*rows, *published.values()])
+
+
+def _headline_of_budgets(record: Record) -> list[list[str]]:
+    """A row for each time budget."""
+    rows = []
+    results = [result for result in record["results"] if result["trainer"] == "splatmake"]
+    for minutes in sorted({result["minutes"] for result in results}):
+        runs = [result for result in results if result["minutes"] == minutes]
+        cpu = [run["cpu_minutes"] + run["other_cpu_minutes"] for run in runs]
+        rows.append(
+            [
+                runs[0]["scene"],
+                f"{minutes:g} min, {runs[0]['threads']} threads",
+                f"{runs[0]['test_views']}, {runs[0]['pixels']}",
+                str(len(runs)),
+                markdown.middle([run["psnr"] for run in runs], "{:.2f}"),
+                markdown.middle([run["ssim"] for run in runs], "{:.3f}"),
+                f"{statistics.median(run['gaussians'] for run in runs) / 1e3:.0f}k",
+                markdown.middle(cpu, "{:.1f}"),
+                f"{record['cores']} cores, {record['instruction_set']}",
+            ]
+        )
+    return rows
 
 
 def sources(records: Sequence[Record]) -> str:

@@ -137,9 +137,10 @@ class SnakemakeProject:
         """Run a stage whose record has another key. Snakemake compares keys with records of its
         own, in .snakemake, which a copied folder of results does not have."""
         dag = self._workflow.dag
+        compared = {trigger.name for trigger in self._workflow.rerun_triggers}
         folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
         record = folder / STAGE
-        if dag is None or not record.is_file():
+        if dag is None or "PARAMS" not in compared or not record.is_file():
             return
         try:
             current = canonical(read_stage(folder).key) == self.key(spec)(wildcards)

@@ -85,6 +85,9 @@ def test_copied_results_are_made_again_where_options_have_changed(project):
     changed = TINY | {"experiments": {"train": {"scales_learning_rate": 0.004}}}
     done = snakemake(project, "-n", "results/tiny/metrics.json", config=changed)
     assert rules_run(done) == {"train", "evaluate", "coverage", "export", "report"}
+    by_time = ("--rerun-triggers", "mtime")
+    done = snakemake(project, "-n", "results/tiny/metrics.json", *by_time, config=changed)
+    assert rules_run(done) == set()
 
 
 @pytest.mark.parametrize("content", ["", '{"stage": "sfm"}'])

@@ -5,13 +5,12 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Sfm
 from pipeline.plan.stage import StageSpec, if_several_jobs
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.sfm.counters import MatchCounters
 from stages.workflow import inputs
+from stages.workflow.matching import matching_scene
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -27,18 +26,14 @@ def work(job: Job) -> None:
     from pipeline.sfm.pair_list import PairList
 
     report = match_chunk(
-        inputs.read_manifest(job, "photos"),
-        job.inputs["features"],
+        matching_scene(job),
         PairList.read(job.inputs["pairs"]),
         job.number,
         job.of_jobs,
-        job.section(Sfm),
         job.out,
-        seed=job.seed,
         cache=job.cache_of("matches"),
         scratch=job.scratch / "pairs",
         threads=job.threads,
-        experiments=job.section(Experiments).matches,
     )
     job.record(report.counters, report.decisions)
     # Not a counter: it depends on earlier runs.

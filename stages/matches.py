@@ -5,13 +5,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Matches, Sfm
+from pipeline.config.schema import Matches
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.sfm.counters import MatchesCounters
 from stages.workflow import inputs
+from stages.workflow.matching import matching_scene
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -28,15 +28,11 @@ def work(job: Job) -> None:
 
     parts = inputs.of_jobs(job, "match")
     report = match_features(
-        inputs.read_manifest(job, "photos"),
-        job.inputs["features"],
+        matching_scene(job),
         job.section(Matches),
-        job.section(Sfm),
         job.out,
         cache=job.shared_cache,
         threads=job.threads,
-        seed=job.seed,
-        experiments=job.section(Experiments).matches,
         chosen=PairList.read(job.inputs["pairs"]) if parts else None,
         parts=parts,
     )

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Matches, Sfm
+from pipeline.config.schema import Matches
 from pipeline.plan.stage import StageSpec, if_several_jobs
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.sfm.counters import PairsCounters
 from stages.workflow import inputs
+from stages.workflow.matching import matching_scene
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -24,14 +24,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.sfm.matching import choose_pairs
 
-    chosen = choose_pairs(
-        inputs.read_manifest(job, "photos"),
-        job.inputs["features"],
-        job.section(Matches),
-        job.section(Sfm),
-        seed=job.seed,
-        experiments=job.section(Experiments).matches,
-    )
+    chosen = choose_pairs(matching_scene(job), job.section(Matches))
     chosen.write(job.out)
     job.record(PairsCounters(num_pairs=len(chosen.pairs)), chosen.decisions)
 

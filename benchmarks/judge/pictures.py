@@ -116,8 +116,8 @@ def _finished(folder: Path, work: Path) -> Matched:
 def _match(
     manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, out: Path, seed: int
 ) -> None:
-    from pipeline.sfm.matching import match_features
+    from pipeline.sfm.matching import MatchingScene, match_features
 
     # No verified pair, which this stage reports. Mapping then finds no model.
     with contextlib.suppress(UserError):
-        match_features(manifest, features, matches, sfm, out, seed=seed)
+        match_features(MatchingScene(manifest, features, sfm, seed), matches, out)

@@ -84,17 +84,14 @@ def our_features(manifest: Manifest, config: Config, folder: Path, threads: int)
 
 def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
     """As in stages/matches.py."""
-    from pipeline.sfm.matching import match_features
+    from pipeline.sfm.matching import MatchingScene, match_features
 
     match_features(
-        manifest,
-        folder / "features",
+        MatchingScene(manifest, folder / "features", config.sfm, config.seed),
         config.matches,
-        config.sfm,
         folder / "matches",
         cache=folder / "cache",
         threads=threads,
-        seed=config.seed,
     )
 
 

@@ -40,6 +40,34 @@ CHUNK_FILE = "pairs.db"
 
 
 @dataclass(frozen=True)
+class MatchingScene:
+    """The photographs that are matched, and how.
+
+    Attributes:
+        features: folder written by ``extract_features``.
+        sharing: options of the sfm stage, of which the camera model and sharing are used.
+        seed: of RANSAC.
+    """
+
+    manifest: Manifest
+    features: Path
+    sharing: schema.Sfm
+    seed: int
+    experiments: MatchesExperiments = DEFAULT.matches
+
+    def cameras_and_images(self) -> tuple[list[pycolmap.Camera], list[tuple[int, str, int]]]:
+        """The cameras, and (image id, name, camera id) in the order of names."""
+        cameras, camera_of = plan_cameras(self.manifest, self.sharing)
+        names = sorted(photo.name for photo in self.manifest.photos)
+        return cameras, [(id, name, camera_of[name]) for id, name in enumerate(names, start=1)]
+
+    @property
+    def settings(self) -> MatchingSettings:
+        experiments = self.experiments
+        return MatchingSettings(experiments.max_ratio, experiments.min_inliers, self.seed)
+
+
+@dataclass(frozen=True)
 class MatchReport:
     """Result of the matches stage.
 
@@ -64,16 +92,12 @@ class ChunkReport:
 
 
 def match_features(
-    manifest: Manifest,
-    features: Path,
+    scene: MatchingScene,
     config: schema.Matches,
-    sharing: schema.Sfm,
     out: Path,
     *,
-    seed: int,
     cache: Path | None = None,
     threads: int = 1,
-    experiments: MatchesExperiments = DEFAULT.matches,
     chosen: PairList | None = None,
     parts: Sequence[Path] = (),
 ) -> MatchReport:
@@ -85,9 +109,7 @@ def match_features(
     number of jobs.
 
     Args:
-        features: folder written by ``extract_features``.
         config: options; ``pairs`` must not be "auto".
-        sharing: options of the sfm stage, of which the camera model and sharing are used.
         cache: folder for results of pairs that outlives the call.
         chosen: result of ``choose_pairs``; None: the pairs are chosen.
         parts: folders of the jobs that have matched them by ``match_chunk``, in order.
@@ -98,11 +120,9 @@ def match_features(
     quiet_colmap()
     out.mkdir(parents=True, exist_ok=True)
     if chosen is None:
-        chosen = choose_pairs(
-            manifest, features, config, sharing, seed=seed, experiments=experiments
-        )
+        chosen = choose_pairs(scene, config)
     pairs = chosen.pairs
-    cameras, images = _cameras_and_images(manifest, sharing)
+    cameras, images = scene.cameras_and_images()
     _set_focals(cameras, chosen.focals)
     names = [name for _, name, _ in images]
     database = out / "database.db"
@@ -110,9 +130,9 @@ def match_features(
         database,
         cameras,
         images,
-        features,
+        scene.features,
         pairs,
-        _settings(experiments, seed),
+        scene.settings,
         cache=cache,
         matched=[
             (part / CHUNK_FILE, chunk(pairs, number, len(parts)))
@@ -120,14 +140,14 @@ def match_features(
         ],
         threads=threads,
     )
-    _write_colors(out / "keypoint_colors.npz", features, names)
+    _write_colors(out / "keypoint_colors.npz", scene.features, names)
 
     verified = verified_inliers(database)
     components, isolated = _components(names, list(verified))
     if not verified:
         raise UserError(
             f"no two of the {len(names)} photographs overlap: {len(pairs)} pairs were matched, and "
-            f"none has a two-view geometry with {experiments.min_inliers} inliers",
+            f"none has a two-view geometry with {scene.settings.min_inliers} inliers",
             fix="photograph a static, textured scene from all sides in constant light, each "
             "photograph overlapping the previous one by two thirds",
         )
@@ -160,22 +180,16 @@ def match_features(
     )
 
 
-def choose_pairs(
-    manifest: Manifest,
-    features: Path,
-    config: schema.Matches,
-    sharing: schema.Sfm,
-    *,
-    seed: int,
-    experiments: MatchesExperiments = DEFAULT.matches,
-) -> PairList:
+def choose_pairs(scene: MatchingScene, config: schema.Matches) -> PairList:
     """Choose the pairs to match, and initial focal lengths by the first of them where cameras need
-    one. Arguments: see ``match_features``."""
+    one."""
     quiet_colmap()
-    pairs, decision = resolve_pairs(manifest, features, config)
-    cameras, images = _cameras_and_images(manifest, sharing)
+    pairs, decision = resolve_pairs(scene.manifest, scene.features, config)
+    cameras, images = scene.cameras_and_images()
     uncalibrated = [camera for camera in cameras if is_uncalibrated(camera)]
-    initial = set_initial_focals(uncalibrated, images, features, pairs, experiments.max_ratio, seed)
+    initial = set_initial_focals(
+        uncalibrated, images, scene.features, pairs, scene.experiments.max_ratio, scene.seed
+    )
     return PairList(
         pairs=pairs,
         focals={camera.camera_id: float(camera.mean_focal_length()) for camera in uncalibrated},
@@ -184,19 +198,15 @@ def choose_pairs(
 
 
 def match_chunk(
-    manifest: Manifest,
-    features: Path,
+    scene: MatchingScene,
     chosen: PairList,
     number: int,
     jobs: int,
-    sharing: schema.Sfm,
     out: Path,
     *,
-    seed: int,
     cache: Path,
     scratch: Path,
     threads: int = 1,
-    experiments: MatchesExperiments = DEFAULT.matches,
 ) -> ChunkReport:
     """Match and verify the pairs of one of several jobs. ``match_features`` gathers them.
 
@@ -207,16 +217,16 @@ def match_chunk(
         scratch: folder that a later call with the same arguments finds if this one is killed.
     """
     quiet_colmap()
-    cameras, images = _cameras_and_images(manifest, sharing)
+    cameras, images = scene.cameras_and_images()
     _set_focals(cameras, chosen.focals)
     pairs = chunk(chosen.pairs, number, jobs)
     num_cached, num_verified = match_pairs(
         out / CHUNK_FILE,
         cameras,
         images,
-        features,
+        scene.features,
         pairs,
-        _settings(experiments, seed),
+        scene.settings,
         cache=cache,
         scratch=scratch,
         threads=threads,
@@ -228,23 +238,10 @@ def match_chunk(
     )
 
 
-def _cameras_and_images(
-    manifest: Manifest, sharing: schema.Sfm
-) -> tuple[list[pycolmap.Camera], list[tuple[int, str, int]]]:
-    """The cameras, and (image id, name, camera id) in the order of names."""
-    cameras, camera_of = plan_cameras(manifest, sharing)
-    names = sorted(photo.name for photo in manifest.photos)
-    return cameras, [(index, name, camera_of[name]) for index, name in enumerate(names, start=1)]
-
-
 def _set_focals(cameras: Sequence[pycolmap.Camera], focals: Mapping[int, float]) -> None:
     for camera in cameras:
         if camera.camera_id in focals:
             set_focal(camera, focals[camera.camera_id])
-
-
-def _settings(experiments: MatchesExperiments, seed: int) -> MatchingSettings:
-    return MatchingSettings(experiments.max_ratio, experiments.min_inliers, seed)
 
 
 def _models(cameras: list[pycolmap.Camera]) -> str:

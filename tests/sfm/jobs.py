@@ -35,49 +35,31 @@ def match(
     threads: int = 2,
     min_inliers: int = 15,
 ) -> dict[str, Any]:
-    from pipeline.sfm.matching import match_features
+    from pipeline.sfm.matching import MatchingScene, match_features
 
+    experiments = MatchesExperiments(min_inliers=min_inliers)
+    scene = MatchingScene(manifest, features, sfm or schema.Sfm(), 0, experiments)
     config = schema.Matches.model_validate({"pairs": pairs})
-    report = match_features(
-        manifest,
-        features,
-        config,
-        sfm or schema.Sfm(),
-        out,
-        cache=out.with_name("cache"),
-        threads=threads,
-        seed=0,
-        experiments=MatchesExperiments(min_inliers=min_inliers),
-    )
-    return flat(report)
+    return flat(match_features(scene, config, out, cache=out.with_name("cache"), threads=threads))
 
 
 def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> dict[str, Any]:
     """As ``match``, by ``count`` jobs besides."""
-    from pipeline.sfm.matching import choose_pairs, match_chunk, match_features
+    from pipeline.sfm.matching import MatchingScene, choose_pairs, match_chunk, match_features
 
-    config, sfm = schema.Matches(pairs="exhaustive"), schema.Sfm()
-    chosen = choose_pairs(manifest, features, config, sfm, seed=0)
+    config = schema.Matches(pairs="exhaustive")
+    scene = MatchingScene(manifest, features, schema.Sfm(), 0)
+    chosen = choose_pairs(scene, config)
     parts = [out.with_name(f"match_{number}") for number in range(1, count + 1)]
     cache = out.with_name("cache")
     pairs = cached = 0
     for number, part in enumerate(parts, start=1):
         scratch = out.with_name(f"scratch_{number}")
         report = match_chunk(
-            *(manifest, features, chosen, number, count, sfm, part),
-            seed=0,
-            cache=cache,
-            scratch=scratch,
-            threads=2,
+            *(scene, chosen, number, count, part), cache=cache, scratch=scratch, threads=2
         )
         pairs, cached = pairs + report.counters.num_pairs, cached + report.num_cached
-    whole = match_features(
-        *(manifest, features, config, sfm, out),
-        seed=0,
-        cache=cache,
-        chosen=chosen,
-        parts=parts,
-    )
+    whole = match_features(scene, config, out, cache=cache, chosen=chosen, parts=parts)
     assert whole.num_cached == pairs == whole.counters.num_pairs, "nothing is left to match"
     return flat(whole) | {"num_cached": cached}
 

@@ -59,6 +59,9 @@ class Backend(ABC, Generic[Projected, Binned]):
     def release_memory(self) -> None:
         """Return memory that is kept for later calls to the system."""
 
+    def save_memory(self, little: bool) -> None:
+        """Whether to keep little memory for later calls, at some cost of time."""
+
     def resident(self) -> ResidentTraining | None:
         """Training in the memory of the backend's device; None if that is the CPU's."""
         return None

@@ -101,6 +101,9 @@ class CpuBackend(Backend[Projected, Binned]):
     def release_memory(self) -> None:
         _ops().release_memory()
 
+    def save_memory(self, little: bool) -> None:
+        _ops().save_memory(little)
+
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:

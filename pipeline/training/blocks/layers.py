@@ -69,13 +69,13 @@ class BlockLayers:
         rendered = self.backend.forward_subsets(
             self.coarse.parameters(), raster_camera(view), self.options, layers
         )
-        # Without what else was rendered with each image.
-        images = [(found.color, found.alpha) for found in rendered]
-        (front, front_alpha), (block, block_alpha), (back, _), (scene, _) = images
-        around = Surroundings(_bytes(back), _bytes(block_alpha))
-        if float(front_alpha.max()) >= MIN_FRONT:
-            transmittance = _bytes(1 - front_alpha)
-            around = replace(around, front=_bytes(front), transmittance=transmittance)
+        # One after the other, without what else was rendered with each image.
+        images = ((found.color, found.alpha) for found in rendered)
+        front, transmittance = _front(*next(images))
+        block, block_alpha = next(images)
+        behind = _bytes(next(images)[0])
+        around = Surroundings(behind, _bytes(block_alpha), front, transmittance)
+        scene = next(images)[0]
         error = scene - self.backend.compose(around, block, block_alpha, self.options.threads)
         correction = (error * 255).round().clamp(-127, 127).to(torch.int8)
         if (gain := self.gains.of(view.name)) is not None:
@@ -136,6 +136,11 @@ class BlockLayers:
     @cached_property
     def _grey(self) -> Gaussians:
         return in_grey(self.coarse)
+
+
+def _front(color: Tensor, alpha: Tensor) -> tuple[Tensor | None, Tensor | None]:
+    """The front's colour and transmittance as in ``Surroundings``."""
+    return (_bytes(color), _bytes(1 - alpha)) if float(alpha.max()) >= MIN_FRONT else (None, None)
 
 
 def _bytes(values: Tensor) -> Tensor:

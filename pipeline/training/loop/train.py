@@ -68,6 +68,7 @@ def train(
             fix="check the split and the initialisation",
         )
     backend = backend or make_backend(config.device)
+    backend.save_memory(part != WHOLE_RUN)  # A scene is divided where memory is short.
     log = on_log or (lambda text: None)
     warnings: list[str] = []
 

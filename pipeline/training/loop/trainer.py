@@ -283,6 +283,8 @@ class Trainer:
                 return
             self.leave_device()
         floaters = self.fade_floaters(steps, run_length)
+        if state.density.is_due(steps):
+            self.backend.release_memory()  # The arrays of all Gaussians are copied.
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
         update = state.density.after_step(
             state.gaussians,

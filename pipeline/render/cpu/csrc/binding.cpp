@@ -325,6 +325,7 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "Tensor(f!) rotation_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
         "int threads) -> ()");
     m.def("release_memory() -> ()");
+    m.def("save_memory(bool little) -> ()");
 }
 
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
@@ -341,7 +342,8 @@ STABLE_TORCH_LIBRARY_IMPL(splatmake, CPU, m) {
     m.impl("frame_adam", TORCH_BOX(&frame_adam));
 }
 
-// It has no tensor that chooses a device.
+// They have no tensor that chooses a device.
 STABLE_TORCH_LIBRARY_IMPL(splatmake, CompositeExplicitAutograd, m) {
     m.impl("release_memory", TORCH_BOX(&splat::release_unused_memory));
+    m.impl("save_memory", TORCH_BOX(&splat::save_memory));
 }

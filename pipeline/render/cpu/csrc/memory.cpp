@@ -1,5 +1,6 @@
 #include "memory.h"
 
+#include <algorithm>
 #include <cstdint>
 #include <mutex>
 #include <new>
@@ -76,6 +77,7 @@ class Pool {
             free_.erase(free_.begin() + best);
             unused_ -= block.size;
         } else {
+            if (little_) limit_unused(size);
             block = new_block(size);
         }
         used_ += block.size;
@@ -95,9 +97,7 @@ class Pool {
         used_ -= found->second;
         unused_ += found->second;
         sizes_.erase(found);
-        // Least recently freed blocks are released first: their sizes are no longer in use.
-        const size_t most = most_used_ > earlier_most_ ? most_used_ : earlier_most_;
-        while (used_ + unused_ > most + most / 2) release_one();
+        limit_unused(0);
     }
 
     void release_unused() {
@@ -106,7 +106,21 @@ class Pool {
         most_used_ = earlier_most_ = used_;
     }
 
+    void save(bool little) {
+        const std::lock_guard<std::mutex> lock(mutex_);
+        little_ = little;
+        limit_unused(0);
+    }
+
   private:
+    // Limits unused memory, with `more` bytes that are about to be used. The least recently freed
+    // blocks are released first: their sizes are no longer in use.
+    void limit_unused(size_t more) {
+        const size_t most = std::max({most_used_, earlier_most_, used_ + more});
+        const size_t kept = most / (little_ ? 8 : 2);
+        while (!free_.empty() && used_ + more + unused_ > most + kept) release_one();
+    }
+
     void release_one() {
         unused_ -= free_.front().size;
         free_block(free_.front());
@@ -117,6 +131,7 @@ class Pool {
     std::vector<Block> free_;                  // least recently freed first
     std::unordered_map<void*, size_t> sizes_;  // of the blocks in use
     size_t used_ = 0, unused_ = 0, most_used_ = 0, earlier_most_ = 0, taken_ = 0;
+    bool little_ = false;
 };
 
 // Never destroyed: tensors may be freed after static objects.
@@ -128,6 +143,7 @@ Pool& pool() {
 }  // namespace
 
 void release_unused_memory() { pool().release_unused(); }
+void save_memory(bool little) { pool().save(little); }
 
 #if defined(__SANITIZE_ADDRESS__)
 // Exactly the requested size, so that the sanitizer detects accesses beyond it.

@@ -13,6 +13,8 @@ void give_back_memory(void* memory);
 
 // Returns memory that is kept for later calls to the system.
 void release_unused_memory();
+// Whether to keep little memory for later calls, at the cost of more page faults.
+void save_memory(bool little);
 
 // An uninitialised array.
 template <class T>

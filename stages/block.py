@@ -21,10 +21,11 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.io.npz import read_npz
+    from pipeline.io.npz import read_gaussian_arrays
     from pipeline.training.blocks.options import FIRST
 
-    blocks.train(job, lambda: read_npz(job.inputs["coarse"] / "gaussians.npz"), FIRST)
+    coarse = job.inputs["coarse"] / "gaussians.npz"
+    blocks.train(job, lambda: read_gaussian_arrays(coarse), FIRST)
 
 
 SPEC = StageSpec(

@@ -13,7 +13,7 @@ from pipeline.scene.blocks import Partition
 from stages.workflow import inputs
 
 if TYPE_CHECKING:
-    from pipeline.splats.gaussians import Gaussians
+    from pipeline.splats.arrays import GaussianSource
     from pipeline.training.blocks.train import SceneInBlocks
     from pipeline.training.blocks.union import Union
     from pipeline.training.loop.schedule import Part
@@ -31,15 +31,8 @@ def read_partition(job: Job) -> Partition:
     return Partition.read(job.inputs["partition"])
 
 
-def union_of(job: Job, role: str) -> Gaussians:
+def union_of(job: Job, role: str) -> Union:
     """The Gaussians of all blocks, each without those outside of its box."""
-    from pipeline.splats.arrays import collect
-    from pipeline.splats.gaussians import Gaussians
-
-    return Gaussians.sharing(collect(_union(job, role)))
-
-
-def _union(job: Job, role: str) -> Union:
     from pipeline.training.blocks.union import Union
 
     partition = read_partition(job)
@@ -47,11 +40,11 @@ def _union(job: Job, role: str) -> Union:
     return Union([job.inputs[f"{role}_{i}"] / "gaussians.npz" for i in numbers], partition)
 
 
-def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None:
+def train(job: Job, open_scene: Callable[[], GaussianSource], part: Part) -> None:
     """Train the job's block and write the result.
 
     Args:
-        read_gaussians: reads those of the whole scene.
+        open_scene: returns the Gaussians of the whole scene.
     """
     from pipeline.training.blocks.train import block_training, with_far_field
     from pipeline.training.scene import run_training
@@ -61,7 +54,7 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
     trained = run_training(
         # Not a local variable here: what it is made from is not held during training.
         *block_training(
-            _scene(job, read_gaussians),
+            _scene(job, open_scene),
             job.number,
             job.section(Train),
             job.section(Experiments).train,
@@ -72,13 +65,15 @@ def train(job: Job, read_gaussians: Callable[[], Gaussians], part: Part) -> None
         part,
     )
     gaussians = with_far_field(
-        trained.result.gaussians, read_gaussians(), read_partition(job), job.number
+        trained.result.gaussians, open_scene(), read_partition(job), job.number
     )
     inputs.write_trained(job, trained, gaussians)
 
 
-def _scene(job: Job, read_gaussians: Callable[[], Gaussians]) -> SceneInBlocks:
+def _scene(job: Job, open_scene: Callable[[], GaussianSource]) -> SceneInBlocks:
     from pipeline.scene.exposure import ExposureGains
+    from pipeline.splats.arrays import collect
+    from pipeline.splats.gaussians import Gaussians
     from pipeline.training.blocks.train import SceneInBlocks
 
     views = inputs.coarse_views(job)
@@ -88,7 +83,7 @@ def _scene(job: Job, read_gaussians: Callable[[], Gaussians]) -> SceneInBlocks:
         model=inputs.coarse_model(job),
         gains=ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
         partition=read_partition(job),
-        read_gaussians=read_gaussians,
+        read_gaussians=lambda: Gaussians.sharing(collect(open_scene())),
     )
 
 
@@ -103,7 +98,7 @@ def unite(job: Job) -> None:
     from pipeline.training.loop.counters import TrainCounters
     from pipeline.training.loop.curve import TrainingCurve
 
-    gaussians = _union(job, "polish")
+    gaussians = union_of(job, "polish")
     write_npz(job.out / "gaussians.npz", gaussians)
     coarse = job.inputs["coarse"]
     if has_model(coarse / "sparse" / "0"):

@@ -20,6 +20,7 @@ from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
+from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianSource
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.training.blocks.layers import BlockLayers
 from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options, corrected_box
@@ -148,16 +149,19 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train, part: Part) -
 
 
 def with_far_field(
-    trained: Gaussians, scene: Gaussians, partition: Partition, number: int
+    trained: Gaussians, scene: GaussianSource, partition: Partition, number: int
 ) -> Gaussians:
     """The trained Gaussians of block ``number``, and those of the scene beyond its bounds that are
     in the block's box, unchanged. All blocks see the far field behind their own Gaussians: none may
     change it while others are trained."""
-    means = scene.means.numpy()
-    far = partition.box(number).contains(means) & ~partition.bounds.contains(means)
-    parts = [trained, scene.select(torch.from_numpy(np.flatnonzero(far)))]
-    degree = max(part.sh_degree for part in parts)
-    return concat([part.with_sh_degree(degree) for part in parts])
+    box, bounds = partition.box(number), partition.bounds
+    degree = max(trained.sh_degree, scene.sh_degree)
+    parts = [trained.with_sh_degree(degree)]
+    for arrays in scene.chunks(*NAMES):
+        far = box.contains(arrays[0]) & ~bounds.contains(arrays[0])
+        found = Gaussians.sharing(GaussianArrays(*(values[far] for values in arrays)))
+        parts.append(found.with_sh_degree(degree))
+    return concat(parts)
 
 
 def _overview(view: View) -> View:

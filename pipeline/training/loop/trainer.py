@@ -73,6 +73,8 @@ class Trainer:
         self.config, self.experiments = config, experiments
         self.schedule = Schedule.of(config, experiments, scene.inputs.seen_share)
         self.part, self.clock = part, Clock(self.schedule.steps, config.budget_minutes, part)
+        # A scene is divided where memory is short.
+        self.saves_memory = len(part) < self.schedule.steps
         self.rate_unit = learning_rate_unit(scene.inputs, experiments)
         self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))
         depths = scene.inputs.empty_depths
@@ -283,7 +285,7 @@ class Trainer:
                 return
             self.leave_device()
         floaters = self.fade_floaters(steps, run_length)
-        if state.density.is_due(steps):
+        if self.saves_memory and state.density.is_due(steps):
             self.backend.release_memory()  # The arrays of all Gaussians are copied.
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
         update = state.density.after_step(

@@ -150,8 +150,8 @@ def _measure(
     progress: Progress,
     warnings: list[str],
 ) -> list[_Measured]:
-    """The measures of the views of the protocol that their masks do not hide; ``warnings`` receives
-    the others."""
+    """Measure the views of the protocol. Views that their masks hide are left out, with a message
+    in ``warnings``."""
     # Views are measured while the next ones are rendered. The queue is short: it holds the images.
     pending: deque[Future[_Measured]] = deque()
     measured: list[_Measured] = []

@@ -57,10 +57,10 @@ class Backend(ABC, Generic[Projected, Binned]):
         compiler, device. Compiles or loads the backend if necessary."""
 
     def release_memory(self) -> None:
-        """Return memory that is kept for later calls to the system."""
+        """Return to the system the memory that is kept for later calls."""
 
     def save_memory(self, little: bool) -> None:
-        """Whether to keep little memory for later calls, at some cost of time."""
+        """Choose whether to keep little memory for later calls, which costs some time."""
 
     def resident(self) -> ResidentTraining | None:
         """Training in the memory of the backend's device; None if that is the CPU's."""

@@ -51,7 +51,7 @@ def camera_path(centres: NDArray[np.float64], depths: NDArray[np.float64]) -> li
         centres: (V, 3) camera centres, world.
         depths: (V,) z up to which each view sees empty space (``floaters.empty_depths``).
     """
-    from scipy.spatial import KDTree  # Here: it takes 20 MB, after the peak of training.
+    from scipy.spatial import KDTree  # Not above: it takes memory during training.
 
     count = min(NEIGHBOURS + 1, len(centres))
     distances, neighbours = KDTree(centres).query(centres, [*range(1, count + 1)])

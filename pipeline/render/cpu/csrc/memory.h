@@ -11,9 +11,9 @@ namespace splat {
 void* take_memory(size_t bytes);
 void give_back_memory(void* memory);
 
-// Returns memory that is kept for later calls to the system.
+// Returns to the system the memory that is kept for later calls.
 void release_unused_memory();
-// Whether to keep little memory for later calls, at the cost of more page faults.
+// Chooses whether to keep little memory for later calls, at the cost of more page faults.
 void save_memory(bool little);
 
 // An uninitialised array.

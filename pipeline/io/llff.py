@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import Camera
 from pipeline.io.arrays import read_array
 from pipeline.io.bounded import MIB, read_bounded
+from pipeline.io.poses.matrices import rotation_fault
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
@@ -57,9 +58,8 @@ def read_poses_bounds(
         with np.errstate(over="ignore", invalid="ignore"):
             error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not error <= 1e-2 or np.linalg.det(rotation) < 0:
-            raise UserError(
-                f"row {i} ({name}): expected a rotation, found another matrix", file=path, fix=_FIX
-            )
+            fault, fix = rotation_fault(rotation)
+            raise UserError(f"row {i} ({name}): {fault}", file=path, fix=fix)
         if min(height, width) < 1 or focal <= 0:
             raise UserError(
                 f"row {i} ({name}): expected positive height, width and focal length, found "

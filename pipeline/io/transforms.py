@@ -29,6 +29,7 @@ from pipeline.io.poses.frames import (
     checked_pose,
     reconstruct,
 )
+from pipeline.io.poses.matrices import pose_matrix
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Reconstruction
@@ -281,7 +282,7 @@ def _frame(
     fields = entry if isinstance(entry, dict) else {}
     path = _file_name(file, f"{source}.file_path", fields.get("file_path"))
     source = f"{source} ({path})"
-    matrix = _matrix(file, f"{source}.transform_matrix", fields.get("transform_matrix"))
+    matrix = pose_matrix(file, f"{source}.transform_matrix", fields.get("transform_matrix"))
     scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
     with np.errstate(over="ignore", invalid="ignore"):
         to_world = np.linalg.inv(applied) @ matrix
@@ -311,31 +312,11 @@ def _file_name(file: Path, where: str, value: Any) -> str:
     return checked_name(file, value, f"{where}: ")
 
 
-def _matrix(file: Path, where: str, value: Any) -> NDArray[np.float64]:
-    """``value`` as a finite 4x4 matrix; a 3x4 matrix gets the last row of the identity."""
-    try:
-        matrix = np.array(value, np.float64)
-    except (TypeError, ValueError, OverflowError):
-        matrix = np.zeros(0)
-    if matrix.shape not in ((4, 4), (3, 4)):
-        raise UserError(f"{where}: expected 4x4 numbers", file=file, fix=_FIX)
-    if not (np.abs(matrix) < 1 / _SMALLEST_SCALE).all():
-        largest = shown(np.abs(matrix).max())
-        raise UserError(
-            f"{where}: expected values below {1 / _SMALLEST_SCALE:g}, found {largest}",
-            file=file,
-            fix=_FIX,
-        )
-    full = np.eye(4)
-    full[:3] = matrix[:3]
-    return full
-
-
 def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.float64]:
     """(4, 4) similarity from COLMAP's world to the file's."""
     applied = np.eye(4)
     if "applied_transform" in content:
-        applied = _matrix(file, "applied_transform", content["applied_transform"])
+        applied = pose_matrix(file, "applied_transform", content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
     if not is_number(scale) or not _SMALLEST_SCALE < scale < 1 / _SMALLEST_SCALE:
         raise UserError(
@@ -416,10 +397,12 @@ def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:
     if angle in frame.fields:
         view = _number(frame, angle, 0.0)
         if not 0 < view < math.pi:
+            degrees = math.pi <= view < 180
             raise UserError(
-                f"{frame.source}: {angle} is {view}, expected radians between 0 and pi",
+                f"{frame.source}: {angle} is {view:g}, expected radians between 0 and pi"
+                + ("; it looks like degrees" if degrees else ""),
                 file=frame.file,
-                fix=_FIX,
+                fix=f"write {math.radians(view):.6g}, or set poses: ignore" if degrees else _FIX,
             )
         return 0.5 * side / math.tan(0.5 * view)
     return None

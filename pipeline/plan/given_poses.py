@@ -252,7 +252,8 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
     if not (_FOCAL_RANGE[0] <= min(relative) and max(relative) <= _FOCAL_RANGE[1]):
         raise UserError(
             f"{photo.name}: its given camera has an impossible focal length of "
-            f"{camera.pinhole[0]:g} pixels at {camera.width}x{camera.height}",
+            f"{camera.pinhole[0]:g} pixels at {camera.width}x{camera.height}"
+            + _other_unit(camera.pinhole[0]),
             file=source,
             fix="give focal lengths in pixels of the images, or set poses: ignore",
         )
@@ -275,6 +276,13 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
             fix="use the photographs that the poses were computed from (stored orientation, not "
             "cropped), or set poses: ignore",
         )
+
+
+def _other_unit(focal: float) -> str:
+    """The unit that an impossibly short focal length looks like."""
+    if focal < 4:
+        return "; it looks like a fraction of the image's side"
+    return "; it looks like millimetres" if focal < 100 else ""
 
 
 def _check_centre(image: PosedImage, source: str) -> None:

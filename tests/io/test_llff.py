@@ -37,7 +37,7 @@ def test_a_known_point_projects_to_its_pixel(tmp_path):
         (np.zeros((1, 16)), "N x 17"),
         (np.zeros((2, 17)), "holds 2 poses, but there are 1"),
         (np.full((1, 17), np.nan), "row 0"),
-        (np.ones((1, 17)), "expected a rotation"),
+        (np.ones((1, 17)), "not a rotation"),
         (llff_row(np.eye(3), np.zeros(3), 300, 400, -1)[None], "positive"),
         (np.array([["text"] * 17]), "not a NumPy array of numbers"),
     ],

@@ -163,7 +163,7 @@ NAN[0, 3] = np.nan
         ({"frames": [frame(), 3]}, r"frames\[1\].file_path"),
         ({"frames": [{"file_path": "a"}]}, r"frames\[0\] \(a\).transform_matrix"),
         ({"frames": [frame(np.eye(3))]}, "4x4"),
-        ({"frames": [frame(2 * np.eye(4))]}, "not a rotation"),
+        ({"frames": [frame(2 * np.eye(4))]}, "last row 0 0 0 1, found 0 0 0 2"),
         ({"frames": [frame(np.diag([1.0, 1, -1, 1]))]}, "not a rotation"),
         ({"frames": [frame(NAN)]}, r"frames\[0\] \(images/a.png\).transform_matrix.*found .nan"),
         ({"frames": [frame()]}, "no focal length"),

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.names import match_names
 from pipeline.io.poses.files import checked_name, malformed, shown
+from pipeline.io.poses.matrices import rotation_fault
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 Array = NDArray[np.float64]
@@ -132,7 +133,8 @@ def checked_rotation(file: Path, where: str, matrix: Array) -> Array:
         nearest: Array = u @ vt
         if np.abs(nearest - matrix).max() < _ROTATION_TOLERANCE and np.linalg.det(nearest) > 0:
             return nearest
-    raise malformed(file, f"{where}: the matrix is not a rotation")
+    fault, fix = rotation_fault(matrix)
+    raise malformed(file, f"{where}: {fault}", fix)
 
 
 def checked_camera(

@@ -21,6 +21,7 @@ from numpy.typing import NDArray
 from pipeline.io.poses.files import checked_name, find_by_head, malformed, number, numbers, shown
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_rotation, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
+from pipeline.io.poses.matrices import pose_matrix
 from pipeline.io.poses.xml import read_xml
 
 Array = NDArray[np.float64]
@@ -92,9 +93,10 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         if sensor not in lenses:
             lenses[sensor] = _lens(file, f"sensor {sensor[:40]}", sensors[sensor])
         text = camera.findtext("transform", "")
-        pose = numbers(file, f"camera {label}: transform", text, 16).reshape(4, 4)
+        where = f"camera {label}: transform"
+        pose = pose_matrix(file, where, numbers(file, where, text, 16))
         # The rotation is made exact first, so that its error does not move the centre.
-        axes = checked_rotation(file, f"camera {label}: transform", pose[:3, :3])
+        axes = checked_rotation(file, where, pose[:3, :3])
         with np.errstate(all="ignore"):
             moved = similarity.scale * similarity.rotation @ pose[:3, 3] + similarity.translation
         rotation = (similarity.rotation @ axes).T

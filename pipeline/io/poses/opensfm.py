@@ -18,6 +18,8 @@ from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_fram
 from pipeline.io.poses.lenses import Brown, brown_camera
 
 _FILES = ("reconstruction.json", "opensfm/reconstruction.json")
+# Rotation vectors of one turn at most, in radians; those of degrees are rarely as short.
+_MAX_ANGLE = 2 * np.pi + 1e-3
 _KINDS = "perspective, simple_radial, radial, brown, fisheye, fisheye_opencv, fisheye62"
 
 
@@ -52,8 +54,14 @@ def frames(file: Path) -> list[PosedFrame]:
         if camera not in lenses:
             lenses[camera] = _lens(file, f"camera {shown(camera)}", largest["cameras"][camera])
         vector = numbers(file, f"{where}: rotation", shot.get("rotation"), 3)
-        if np.abs(vector).max() > 1e6:
-            raise malformed(file, f"{where}: expected a rotation vector in radians")
+        angle = float(np.linalg.norm(vector))
+        if angle > _MAX_ANGLE:
+            raise malformed(
+                file,
+                f"{where}: expected a rotation vector in radians, found an angle of {angle:g}; it "
+                "looks like degrees",
+                fix="multiply the rotation vectors by pi / 180, or set poses: ignore",
+            )
         rotation = rotation_from_vector(vector)
         translation = numbers(file, f"{where}: translation", shot.get("translation"), 3)
         with np.errstate(all="ignore"):

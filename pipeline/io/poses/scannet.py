@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import Camera
 from pipeline.io.poses.files import malformed, numbers, read_text
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_frame
+from pipeline.io.poses.matrices import pose_matrix
 
 _INTRINSICS = ("intrinsic/intrinsic_color.txt", "intrinsic_color.txt", "intrinsic/intrinsic.txt")
 
@@ -47,7 +48,7 @@ def frames(path: Path) -> list[PosedFrame]:
     for file in poses:
         if _is_lost(file):
             continue
-        pose = _matrix(file, (4,))
+        pose = pose_matrix(file, file.name, _matrix(file, (4,)))
         name = f"color/{file.stem}"
         found.append(make_frame(file, name, lens, pose[:3, :3].T, pose[:3, 3], file.name))
     if not found:

@@ -81,21 +81,27 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
         source: the file or folder of the views, for error messages.
 
     Raises:
-        UserError: no view has one of the names.
+        UserError: no view has one of the names, or several have it.
     """
     by_name = {view.name: view for view in views}
     index = NameIndex(by_name)
     chosen = []
     for name in names:
-        found = index.find(name)
-        if found is None:
+        candidates = index.candidates(name)
+        if len(candidates) > 1:
+            raise UserError(
+                f"{name!r} may mean {len(candidates)} views: {', '.join(candidates[:3])}",
+                file=source,
+                fix="write the complete name of one of them",
+            )
+        if not candidates:
             some = ", ".join(list(by_name)[:5])
             raise UserError(
                 f"expected a view named {name!r}, found {len(views)} others ({some}, ...)",
                 file=source,
                 fix="choose one of these names",
             )
-        chosen.append(by_name[found])
+        chosen.append(by_name[candidates[0]])
     return chosen
 
 

@@ -139,7 +139,7 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
     Raises:
         UserError: as ``posed_frames``, and for intrinsics that are missing or impossible.
     """
-    return reconstruct(posed_frames(path), sizes)
+    return reconstruct(posed_frames(path), sizes, path)
 
 
 @dataclass(frozen=True)

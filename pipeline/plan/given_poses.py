@@ -201,11 +201,11 @@ def fit_to_photos(
         source: the pose file, for error messages.
 
     Raises:
-        UserError: a camera with another aspect ratio than its photograph, or with an impossible
-            focal length.
+        UserError: names that are ambiguous, a camera with another aspect ratio than its photograph,
+            or with an impossible focal length.
     """
     matched: dict[str, list[str]] = {}
-    for name, listed in match_names(_names(model), photos).items():
+    for name, listed in match_names(_names(model), photos, source).items():
         matched.setdefault(listed, []).append(name)
     images: dict[int, PosedImage] = {}
     cameras: dict[int, Camera] = {}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Literal
 
-from pipeline.io.names import match_names
+from pipeline.io.names import compare_names
 from pipeline.io.poses.frames import ListedSplit
 
 Part = Literal["train", "test"]
@@ -26,7 +26,9 @@ def listed_split(
     Returns:
         Empty if the scene has no split with training and test views.
     """
-    lists = {photo: splits.get(name) for photo, name in match_names(list(splits), photos).items()}
+    lists = {
+        photo: splits.get(name) for photo, name in compare_names(list(splits), photos).names.items()
+    }
     found = set(lists.values())
     test: ListedSplit = "test" if "test" in found else "val"
     if not {"train", test} <= found:

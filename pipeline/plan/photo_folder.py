@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
-from pipeline.io.names import NameIndex, match_names
+from pipeline.io.names import NameIndex, compare_names
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import GivenPoses, listed_photos
 from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
@@ -139,7 +139,7 @@ def _is_complete(
         return False  # Without w and h, the focal length may refer to the full size.
     if poses is not None and poses.format.names == "order":
         return len(copy.names) == poses.num_images
-    needed = match_names(poses.names, full.names) if poses is not None else full.names
+    needed = compare_names(poses.names, full.names).names if poses is not None else full.names
     in_copy = NameIndex(copy.names)
     return all(in_copy.find(name) for name in needed)
 

@@ -336,7 +336,7 @@ def _check_pose_names(
             )
         return
     prefix = poses.format.prefix(chosen.base)
-    photos = match_names(poses.names, [prefix + name for name in names])
+    photos = match_names(poses.names, [prefix + name for name in names], folder / poses.path)
     matched = set(photos.values())
     missing = [name for name in poses.names if name not in matched]
     if len(missing) == len(poses.names):

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 import numpy as np
 import pytest
 
@@ -65,3 +67,45 @@ def test_a_pose_file_of_other_photographs_is_an_error(tmp_path):
     (tmp_path / "sfm_data.json").write_text(openmvg_json(known_scene(opencv(), names="q{}.jpg")))
     with pytest.raises(UserError, match="none of its 4 images is a photograph"):
         look(tmp_path)
+
+
+def two_flights(tmp_path, groups: tuple[str, str]):
+    """Metashape's cameras of two groups with the same labels, and their photographs in two
+    folders."""
+    known = known_scene(opencv(), names="p{}")
+    for folder in ("front", "back"):
+        for i in range(2):
+            picture(tmp_path / "images" / folder / f"p{i}.jpg", size=SIZE)
+    text = export(known, calibration(known.cameras[1]))
+    text = re.sub(r"</?group[^>]*>", "", text)
+    for i, label in ((2, "p0"), (3, "p1")):
+        text = text.replace(f'label="p{i}"', f'label="{label}"')
+    head, *cameras = text.split("<camera ")
+    last, tail = cameras[3].split("</camera>", 1)
+    cameras[3] = f"{last}</camera>"
+    first, second = ("".join(f"<camera {c}" for c in cameras[i : i + 2]) for i in (0, 2))
+    text = (
+        f'{head}<group id="0" label="{groups[0]}">{first}</group>'
+        f'<group id="1" label="{groups[1]}">{second}</group>{tail}'
+    )
+    (tmp_path / "cameras.xml").write_text(text)
+    return known.by_name()
+
+
+def test_cameras_of_groups_with_equal_labels_are_those_of_their_folders(tmp_path):
+    known = two_flights(tmp_path, ("back", "front"))
+    found = look(tmp_path)
+    images = given_model(found).model.by_name()
+    order = ("back/p0.jpg", "back/p1.jpg", "front/p0.jpg", "front/p1.jpg")
+    assert sorted(images) == sorted(order) and not found.warnings
+    centres = np.stack([images[name].centre for name in order])
+    expected = np.stack([known[f"p{i}"].centre for i in range(4)])
+    np.testing.assert_allclose(np.diff(centres, axis=0), np.diff(expected, axis=0), atol=1e-6)
+
+
+@pytest.mark.parametrize("groups", [("Group 1", "Group 2"), ("front", "front"), ("", "")])
+def test_equal_labels_whose_groups_are_no_folders_are_an_error(tmp_path, groups):
+    two_flights(tmp_path, groups)
+    with pytest.raises(UserError, match="expected one pose for each photograph") as error:
+        look(tmp_path)
+    assert "p0" in str(error.value) and "cameras.xml" in str(error.value)

@@ -25,7 +25,7 @@ from pipeline.io.poses import (
     record3d,
     scannet,
 )
-from pipeline.io.poses.frames import PosedFrame, reconstruct
+from pipeline.io.poses.frames import PosedFrame, distinct_frames, reconstruct
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, posed_frames
 from pipeline.scene.reconstruction import Reconstruction
@@ -90,7 +90,7 @@ def of_frames(
         find=find,
         files=files,
         summarise=lambda path: {**_of_frames(frames(path)), "lost": lost(path)},
-        read=lambda path, sizes, listed: reconstruct(frames(path), sizes),
+        read=lambda path, sizes, listed: reconstruct(frames(path), sizes, path),
         frames=frames,
     )
 
@@ -160,10 +160,11 @@ def _without_points(names: Sequence[str], count: int, models: Sequence[str]) -> 
 
 
 def _of_frames(frames: Sequence[PosedFrame]) -> dict[str, Any]:
-    by_name = {frame.name: frame for frame in reversed(frames)}
+    distinct = distinct_frames(frames)
+    names = [frame.name for frame in distinct]
     models = sorted({frame.lens.model for frame in frames})
-    splits = {frame.name: frame.split for frame in by_name.values() if frame.split is not None}
-    return {**_without_points(list(by_name), len(by_name), models), "splits": splits}
+    splits = {frame.name: frame.split for frame in distinct if frame.split is not None}
+    return {**_without_points(names, len(names), models), "splits": splits}
 
 
 def _of_llff(path: Path) -> dict[str, Any]:

@@ -70,26 +70,49 @@ class PosedFrame:
     mask: str | None = None
     split: ListedSplit | None = None
 
+    def is_repeated(self, other: PosedFrame) -> bool:
+        """Whether the pose is that of ``other``."""
+        return np.array_equal(self.rotation, other.rotation) and np.array_equal(
+            self.translation, other.translation
+        )
+
+
+def distinct_frames(frames: Iterable[PosedFrame]) -> list[PosedFrame]:
+    """The frames without those that repeat the name and pose of an earlier one."""
+    found: dict[str, list[PosedFrame]] = {}
+    distinct = []
+    for frame in frames:
+        same = found.setdefault(frame.name, [])
+        if not any(frame.is_repeated(other) for other in same):
+            same.append(frame)
+            distinct.append(frame)
+    return distinct
+
 
 def reconstruct(
-    frames: Iterable[PosedFrame], sizes: Mapping[str, tuple[int, int]]
+    frames: Iterable[PosedFrame],
+    sizes: Mapping[str, tuple[int, int]],
+    file: str | Path = "poses",
 ) -> Reconstruction:
     """The frames whose photographs exist.
 
     Args:
         sizes: photograph -> width and height in pixels.
+        file: the pose file, for error messages.
 
     Returns:
         Images named by the keys of ``sizes``, one camera for equal intrinsics, no points.
+
+    Raises:
+        UserError: names that are ambiguous (``match_names``).
     """
-    by_name: dict[str, PosedFrame] = {}
-    for frame in frames:
-        by_name.setdefault(frame.name, frame)
+    distinct = distinct_frames(frames)
+    by_name = {frame.name: frame for frame in distinct}
     cameras: dict[tuple[Any, ...], int] = {}
     made: dict[tuple[Lens, int, int], Camera] = {}  # Some lenses are fitted, which takes time.
     by_id: dict[int, Camera] = {}
     images: dict[int, PosedImage] = {}
-    found = match_names(list(by_name), sizes)
+    found = match_names([frame.name for frame in distinct], sizes, file)
     for number, (photo, name) in enumerate(sorted(found.items()), 1):
         frame = by_name[name]
         use = (frame.lens, *sizes[photo])

@@ -18,6 +18,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.names import stem_key
 from pipeline.io.poses.files import checked_name, find_by_head, malformed, number, numbers, shown
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_rotation, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
@@ -83,9 +84,10 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         cameras = [camera for camera in cameras if camera.get("component_id", "") == largest]
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
     lenses: dict[str, Lens] = {}
+    labels = _labels(chunk, cameras)
     found = []
     for camera in cameras:
-        label = checked_name(file, camera.get("label", ""))
+        label = checked_name(file, labels[camera])
         similarity = components.get(camera.get("component_id", "")) or world
         sensor = camera.get("sensor_id", "")
         if sensor not in sensors:
@@ -102,6 +104,18 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         rotation = (similarity.rotation @ axes).T
         found.append(make_frame(file, label, lenses[sensor], rotation, moved, f"camera {label}"))
     return found
+
+
+def _labels(chunk: Element, cameras: list[Element]) -> dict[Element, str]:
+    """The names of cameras: "group/label" for groups, if labels alone do not tell them apart."""
+    labels = {camera: camera.get("label", "") for camera in cameras}
+    if len({stem_key(label) for label in labels.values()}) < len(labels):
+        for group in chunk.iter("group"):
+            name = group.get("label", "").strip("/\\")
+            for camera in group.iter("camera"):
+                if camera in labels and name:
+                    labels[camera] = f"{name}/{labels[camera]}"
+    return labels
 
 
 def _similarity(file: Path, where: str, element: Element | None) -> _Similarity | None:

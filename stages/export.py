@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Train, Views
+from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -23,7 +24,7 @@ if TYPE_CHECKING:
     from pipeline.plan.settle import Settled
 
 # Exported cameras are those of the full-size images, whatever the size of training views.
-FULL_SIZE = Views(max_long_side_px=2**31)
+FULL_SIZE = Views(max_long_side_px=MAX_SIDE_PX)
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:

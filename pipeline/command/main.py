@@ -32,6 +32,8 @@ In a checkout, `python -m pipeline` is the same command, and
 """
 # Commands that pass further options to Snakemake.
 WORKFLOW_COMMANDS = ("run", "plan")
+# The largest whole number that an argument takes.
+_MAX_NUMBER = 1_000_000
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -416,15 +418,19 @@ def _share(text: str) -> float:
 
 
 def _positive(text: str) -> int:
-    if not text.isdecimal() or int(text) == 0:
-        raise argparse.ArgumentTypeError(f"expected a positive whole number, found {text!r}")
-    return int(text)
+    return _whole_number(text, (0,), "a positive whole number")
 
 
 def _every(text: str) -> int:
-    if not text.isdecimal() or int(text) == 1:
-        raise argparse.ArgumentTypeError(f"expected 0, 2 or more, found {text!r}")
-    return int(text)
+    return _whole_number(text, (1,), "0, 2 or more")
+
+
+def _whole_number(text: str, refused: tuple[int, ...], expected: str) -> int:
+    number = int(text) if text.isdecimal() and len(text) <= 10 else -1
+    if not 0 <= number <= _MAX_NUMBER or number in refused:
+        expected += f", at most {_MAX_NUMBER}" if number > _MAX_NUMBER else ""
+        raise argparse.ArgumentTypeError(f"expected {expected}, found {text[:40]!r}")
+    return number
 
 
 if __name__ == "__main__":

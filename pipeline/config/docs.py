@@ -247,7 +247,7 @@ def _words(kind: Any, metadata: Sequence[Any] = ()) -> str:
         return "list of whole numbers"
     words = {int: "whole number", float: "number", bool: "true, false", str: "text"}
     bounds = [
-        f"{sign} {getattr(meta, name):g}"
+        f"{sign} {getattr(meta, name):.10g}"
         for meta in metadata
         for name, sign in (("gt", ">"), ("ge", ">="), ("lt", "<"), ("le", "<="))
         if getattr(meta, name, None) is not None

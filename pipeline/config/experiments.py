@@ -11,7 +11,11 @@ from typing import Annotated, Literal
 from pydantic import Field
 
 from pipeline.config.section import (
+    MAX_FACTOR,
+    MAX_GAUSSIANS,
+    MAX_STEPS,
     Count,
+    GaussianCount,
     LearningRate,
     LossWeight,
     SceneShare,
@@ -22,7 +26,7 @@ from pipeline.config.section import (
 )
 
 PartOfRun = Annotated[float, Field(ge=0, lt=1), Unit("share of the steps")]
-Factor = Annotated[float, Field(gt=0), Unit("factor")]
+Factor = Annotated[float, Field(gt=0, le=MAX_FACTOR), Unit("factor")]
 
 
 class InspectExperiments(Section):
@@ -41,7 +45,7 @@ class MatchesExperiments(Section):
     max_ratio: Share = Field(
         0.8, description="Lowe's ratio test: nearest distance over second nearest."
     )
-    min_inliers: Annotated[int, Field(gt=0), Unit("matches")] = Field(
+    min_inliers: Annotated[int, Field(gt=0, le=1_000_000), Unit("matches")] = Field(
         15, description="Pairs with fewer verified matches are discarded."
     )
 
@@ -52,7 +56,7 @@ class InitExperiments(Section):
     opacity: Share = Field(
         0.3, description="Initial opacity (3DGS: 0.1); at most 0.1 for random Gaussians."
     )
-    num_random: Annotated[int, Field(gt=0), Unit("Gaussians")] = Field(
+    num_random: GaussianCount = Field(
         10_000, description="Number of Gaussians with init.method: random."
     )
 
@@ -60,7 +64,7 @@ class InitExperiments(Section):
 class DensityExperiments(Section):
     """The timeline of density control. Intervals shrink in runs of fewer than 7000 steps."""
 
-    start_step: Annotated[int, Field(ge=0), Unit("steps")] = Field(
+    start_step: Annotated[int, Field(ge=0, le=MAX_STEPS), Unit("steps")] = Field(
         500, description="First step after which Gaussians are densified."
     )
     stop_share: Annotated[float, Field(ge=0, le=1), Unit("share of the steps")] = Field(
@@ -73,7 +77,7 @@ class DensityExperiments(Section):
 class GradientExperiments(DensityExperiments):
     """The strategy ``gradient``."""
 
-    grad_threshold: Annotated[float, Field(ge=0), Unit("per NDC")] = Field(
+    grad_threshold: Annotated[float, Field(ge=0, le=MAX_FACTOR), Unit("per NDC")] = Field(
         1e-5,
         description="Gaussians with a larger mean gradient of their projected centre are split, "
         "the largest gradients first, up to the limit of Gaussians (3DGS: 2e-4).",
@@ -115,7 +119,7 @@ class GradientExperiments(DensityExperiments):
 class McmcExperiments(DensityExperiments):
     """The strategy ``mcmc`` (Kheradmand et al. 2024)."""
 
-    growth_share: Annotated[float, Field(ge=0), Unit("share")] = Field(
+    growth_share: Annotated[float, Field(ge=0, le=MAX_FACTOR), Unit("share")] = Field(
         0.05, description="Growth of the number of Gaussians at each densification."
     )
     noise: bool = Field(True, description="Add noise to the means of transparent Gaussians.")
@@ -150,7 +154,7 @@ class TrainExperiments(Section):
         "raise it pass.",
     )
     isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
-    gradients_per_pixel: Annotated[int, Field(ge=0), Unit("Gaussians")] = Field(
+    gradients_per_pixel: Annotated[int, Field(ge=0, le=MAX_GAUSSIANS), Unit("Gaussians")] = Field(
         0,
         description="Backpropagate only to the first Gaussians along each pixel's ray, up to this "
         "number. 0: to all.",
@@ -176,7 +180,7 @@ class TrainExperiments(Section):
     adam_beta1: Annotated[float, Field(ge=0, lt=1), Unit("factor")] = Field(
         0.8, description="Adam's decay rate of the first moment (3DGS: 0.9)."
     )
-    adam_epsilon: Annotated[float, Field(ge=0), Unit("pixels")] = Field(
+    adam_epsilon: Annotated[float, Field(ge=0, le=MAX_FACTOR), Unit("pixels")] = Field(
         0.03,
         description="Adam's epsilon: Gaussians that change the loss by less than so many pixels do "
         "take smaller steps (3DGS: 0).",
@@ -191,8 +195,10 @@ class TrainExperiments(Section):
     means_learning_rate: LearningRate = Field(
         0.04, description="Initial learning rate of the means (3DGS: 1.6e-4)."
     )
-    means_final_learning_rate: Annotated[float, Field(gt=0), Unit("per step")] = Field(
-        4e-3, description="Final learning rate of the means; log-linear decay (3DGS: 1.6e-6)."
+    means_final_learning_rate: Annotated[float, Field(gt=0, le=MAX_FACTOR), Unit("per step")] = (
+        Field(
+            4e-3, description="Final learning rate of the means; log-linear decay (3DGS: 1.6e-6)."
+        )
     )
     scales_learning_rate: LearningRate = Field(
         5e-3, description="Learning rate of the logarithms of the scales."

@@ -15,10 +15,15 @@ from pydantic import AfterValidator, BeforeValidator, Field
 
 from pipeline.config.experiments import Experiments
 from pipeline.config.section import (
+    MAX_FACTOR,
+    MAX_PHOTOS,
     Count,
+    FilePath,
+    GaussianCount,
     LossWeight,
     Minutes,
     Pixels,
+    Points,
     Section,
     Seed,
     Share,
@@ -26,14 +31,18 @@ from pipeline.config.section import (
     Unit,
 )
 
-Device = Literal["auto", "cpu", "gpu"] | Annotated[str, Field(pattern=r"^gpu:\d+$")]
+#: The largest number of blocks. Each is a job that depends on all others, and Snakemake's time to
+#: plan them grows with the square of their number.
+MAX_BLOCKS = 200
+
+Device = Literal["auto", "cpu", "gpu"] | Annotated[str, Field(pattern=r"^gpu:[0-9]{1,3}$")]
 SHDegree = Annotated[int, Field(ge=0, le=3), Unit("degree")]
 
 
 class Inspect(Section):
     """The scan of the scene folder."""
 
-    image_folder: str = Field(
+    image_folder: FilePath = Field(
         "auto",
         description="Folder of the photographs, relative to the scene folder. auto: images/, else "
         "the scene folder itself or its only subfolder with photographs. Of images/ and "
@@ -72,7 +81,9 @@ class Split(Section):
         "scene, which its folder's name and photographs identify: their test views, image size, "
         "masks and background (instead of the options for these), with the given poses unchanged.",
     )
-    test_every: Annotated[int, Field(ge=0), AfterValidator(_not_all), Unit("views")] = Field(
+    test_every: Annotated[
+        int, Field(ge=0, le=MAX_PHOTOS), AfterValidator(_not_all), Unit("views")
+    ] = Field(
         8,
         description="Every n-th view, sorted by name, is a test view (3DGS: 8). 0: no test views; "
         "evaluation uses the training views, and the protocol in metrics.json says so.",
@@ -101,7 +112,7 @@ class Decode(Section):
 class Video(Section):
     """The frames of videos that are used as photographs."""
 
-    max_frames: Annotated[int, Field(ge=2), Unit("frames")] = Field(
+    max_frames: Annotated[int, Field(ge=2, le=100_000), Unit("frames")] = Field(
         150,
         description="Maximum number of frames of all videos together. One frame is chosen for "
         "each twentieth of the long side that the image moves, for less motion in slow videos, for "
@@ -115,13 +126,15 @@ class Features(Section):
     backend: Literal["opencv", "colmap"] = Field(
         "opencv", description="opencv: OpenCV's SIFT (faster); colmap: COLMAP's extractor."
     )
-    max_features: Annotated[int, Field(gt=0), Unit("per image")] = Field(
+    max_features: Annotated[int, Field(gt=0, le=1_000_000), Unit("per image")] = Field(
         4096, description="Maximum number of features; the strongest are kept."
     )
     max_long_side_px: Pixels = Field(
         1600, description="Larger photographs are reduced to this length before extraction."
     )
-    photos_per_job: Literal["auto"] | Annotated[int, Field(gt=0), Unit("photographs")] = Field(
+    photos_per_job: (
+        Literal["auto"] | Annotated[int, Field(gt=0, le=MAX_PHOTOS), Unit("photographs")]
+    ) = Field(
         "auto",
         description="Maximum number of photographs of a job of feature extraction; pairs are "
         "matched in as many jobs. auto: one job for up to 500 photographs, else one for every 250. "
@@ -138,7 +151,7 @@ class Matches(Section):
         description="auto: exhaustive for up to 40 photographs. For more: spatial if GPS positions "
         "separate them, sequential if times or file names give an order, else retrieval.",
     )
-    neighbours: Annotated[int, Field(gt=0), Unit("per image")] = Field(
+    neighbours: Annotated[int, Field(gt=0, le=10_000), Unit("per image")] = Field(
         16, description="Pairs per image of sequential, spatial and retrieval matching."
     )
 
@@ -220,12 +233,12 @@ class Init(Section):
         "stereo estimates; auto: dense for up to 30 photographs without alpha, masks, depth maps "
         "or a point cloud, else points.",
     )
-    max_points: Annotated[int, Field(gt=0), Unit("points")] = Field(
+    max_points: Points = Field(
         200_000,
         description="More sparse points are thinned to this number, or to half of "
         "train.density.max_gaussians, to leave room for densification.",
     )
-    points_file: str = Field(
+    points_file: FilePath = Field(
         "auto",
         description="Point cloud that the Gaussians are initialised from, relative to the scene "
         "folder: a file (.ply, .las, .laz, .e57, .xyz, .csv, .pts) or a folder of them, in the "
@@ -237,13 +250,15 @@ class Init(Section):
 class DensityControl(Section):
     """Options of every density strategy."""
 
-    pixels_per_gaussian: Literal["auto"] | Annotated[float, Field(gt=0), Unit("pixels")] = Field(
+    pixels_per_gaussian: (
+        Literal["auto"] | Annotated[float, Field(ge=0.001, le=MAX_FACTOR), Unit("pixels")]
+    ) = Field(
         "auto",
         description="Limits the number of Gaussians to the pixels of one view divided by this, "
         "or to fewer with few photographs or a short budget_minutes. auto: 2; 0.5 with "
         "budget_minutes; no such limit for strategy: original.",
     )
-    max_gaussians: Annotated[int, Field(gt=0), Unit("Gaussians")] = Field(
+    max_gaussians: GaussianCount = Field(
         1_000_000, description="Upper limit of the number of Gaussians."
     )
 
@@ -276,7 +291,7 @@ class Original(DensityControl):
     """Adaptive density control as published (Kerbl et al. 2023, section 5.2)."""
 
     strategy: Literal["original"] = "original"
-    max_gaussians: Annotated[int, Field(gt=0), Unit("Gaussians")] = Field(
+    max_gaussians: GaussianCount = Field(
         3_000_000, description="Upper limit of the number of Gaussians."
     )
 
@@ -364,12 +379,12 @@ class Train(Section):
 class Partition(Section):
     """Division of large scenes into blocks that are trained in jobs of their own."""
 
-    blocks: Literal["auto"] | Count = Field(
+    blocks: Literal["auto"] | Annotated[int, Field(gt=0, le=MAX_BLOCKS), Unit("count")] = Field(
         "auto",
-        description="Number of blocks. auto: 1 for up to 1000 photographs, else one for every 250; "
-        "more where `memory_mb` requires it.",
+        description="Number of blocks, at most one for every two photographs. auto: 1 for up to "
+        "1000 photographs, else one for every 250; more where `memory_mb` requires it.",
     )
-    memory_mb: Annotated[int, Field(gt=0), Unit("MB")] | None = Field(
+    memory_mb: Annotated[int, Field(gt=0, le=100_000_000), Unit("MB")] | None = Field(
         None,
         description="Memory that a job may use. A scene whose training would need more is divided "
         "into blocks, or, with `blocks: 1`, gets fewer Gaussians. Training images that do not fit "
@@ -386,6 +401,10 @@ class Evaluate(Section):
     lpips_net: Literal["vgg", "alex", "none"] = Field(
         "vgg", description="Network of LPIPS. Its weights are searched locally, never downloaded."
     )
+
+
+def _once(formats: tuple[str, ...]) -> tuple[str, ...]:
+    return tuple(dict.fromkeys(formats))
 
 
 ExportFormat = Literal[
@@ -405,6 +424,7 @@ ExportFormat = Literal[
     "mesh",
     "video",
 ]
+ExportFormats = Annotated[tuple[ExportFormat, ...], Field(max_length=1000), AfterValidator(_once)]
 # Formats that need multi-view stereo.
 DENSE_FORMATS: frozenset[ExportFormat] = frozenset(("dense_points", "dense_maps"))
 # The format that needs the blocks of the scene.
@@ -416,7 +436,7 @@ RENDERED_FORMATS: frozenset[ExportFormat] = frozenset(("renders", "depths", "mes
 class Export(Section):
     """Files for other programs."""
 
-    formats: tuple[ExportFormat, ...] = Field(
+    formats: ExportFormats = Field(
         ("ply", "spz", "points", "colmap", "transforms"),
         description="Gaussians: ply (3DGS's layout, exact), blocks (a PLY file for each block of a "
         "scene), spz (a sixth of the size), splat (without SH), gltf (.glb with "
@@ -429,7 +449,7 @@ class Export(Section):
     )
     sh_degree: SHDegree = Field(3, description="Maximum degree of the exported SH.")
     min_opacity: Share = Field(0.0, description="Gaussians with a lower opacity are left out.")
-    mesh_voxel: Annotated[float, Field(gt=0), Unit("scene units")] | None = Field(
+    mesh_voxel: Annotated[float, Field(ge=1e-9, le=1e9), Unit("scene units")] | None = Field(
         None,
         description="Voxel size of the mesh. null: 2.5 pixels at the median depth; larger if that "
         "would take over 24 million voxels.",

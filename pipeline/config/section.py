@@ -1,12 +1,19 @@
-"""The base class of all option sections, and the types of options with their units."""
+"""The base class of all option sections, and the types of options with their units and bounds.
+
+Every number has a lower and an upper bound. A bound is far beyond what is of use, but within what
+the arithmetic of the plan can hold."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 from typing import Annotated, Any
 
-from pydantic import BaseModel, ConfigDict, Field, GetCoreSchemaHandler
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, GetCoreSchemaHandler
 from pydantic_core import core_schema
+
+from pipeline.runtime.text import is_plain
+
+_MAX_PATH = 4000
 
 
 class Section(BaseModel):
@@ -19,7 +26,7 @@ class Section(BaseModel):
 class Unit:
     """The unit of a number, for the reference pages. Every number has one.
 
-    As pydantic's annotation, it refuses booleans, and numbers out of the range of 32 bits.
+    As pydantic's annotation, it refuses booleans.
     """
 
     name: str
@@ -27,23 +34,40 @@ class Unit:
     def __get_pydantic_core_schema__(
         self, source: Any, handler: GetCoreSchemaHandler
     ) -> core_schema.CoreSchema:
-        return core_schema.no_info_before_validator_function(_not_wild, handler(source))
+        return core_schema.no_info_before_validator_function(_no_boolean, handler(source))
 
 
-def _not_wild(value: Any) -> Any:
+def _no_boolean(value: Any) -> Any:
     if isinstance(value, bool):
         raise ValueError("Input should be a number, not true or false")
-    if isinstance(value, int | float) and abs(value) > 2**31:
-        raise ValueError("Input should be a number between -2147483648 and 2147483648")
     return value
 
 
+#: The largest number of photographs, frames or views that an option may name.
+MAX_PHOTOS = 1_000_000
+#: The longest side of an image in pixels. As ``views.max_long_side_px`` it means the full size.
+MAX_SIDE_PX = 1_000_000
+#: The largest number of Gaussians, points or steps, and the largest factor.
+MAX_GAUSSIANS, MAX_STEPS, MAX_FACTOR = 100_000_000, 10_000_000, 1_000_000
+
+
+def _plain_path(path: str) -> str:
+    if not path or not is_plain(path):
+        raise ValueError("Input should be a path in UTF-8 without control characters")
+    if len(path) > _MAX_PATH:
+        raise ValueError(f"Input should be a path of at most {_MAX_PATH} characters")
+    return path
+
+
 Seed = Annotated[int, Field(ge=0, lt=2**31), Unit("number")]
-Count = Annotated[int, Field(gt=0), Unit("count")]
-Pixels = Annotated[int, Field(gt=0), Unit("pixels")]
-Steps = Annotated[int, Field(gt=0), Unit("steps")]
-Minutes = Annotated[float, Field(gt=0), Unit("minutes")]
+Count = Annotated[int, Field(gt=0, le=MAX_PHOTOS), Unit("count")]
+Pixels = Annotated[int, Field(gt=0, le=MAX_SIDE_PX), Unit("pixels")]
+Steps = Annotated[int, Field(gt=0, le=MAX_STEPS), Unit("steps")]
+Points = Annotated[int, Field(gt=0, le=MAX_GAUSSIANS), Unit("points")]
+GaussianCount = Annotated[int, Field(gt=0, le=MAX_GAUSSIANS), Unit("Gaussians")]
+Minutes = Annotated[float, Field(ge=0.001, le=100_000), Unit("minutes")]
 Share = Annotated[float, Field(ge=0.0, le=1.0), Unit("share")]
-LossWeight = Annotated[float, Field(ge=0.0), Unit("factor")]
-LearningRate = Annotated[float, Field(ge=0.0), Unit("per step")]
-SceneShare = Annotated[float, Field(ge=0.0), Unit("scene sizes")]
+LossWeight = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("factor")]
+LearningRate = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("per step")]
+SceneShare = Annotated[float, Field(ge=0.0, le=MAX_FACTOR), Unit("scene sizes")]
+FilePath = Annotated[str, AfterValidator(_plain_path)]

@@ -9,6 +9,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.config.schema import Config, Split, Train, Views
+from pipeline.config.section import MAX_SIDE_PX
 from pipeline.io.camera_files import STAGES_WITH_MODEL, results_normalization
 from pipeline.io.colmap import read_model
 from pipeline.plan.given_poses import load_given
@@ -76,7 +77,7 @@ def posed_scene(
     """
     if any((folder / name).exists() for name in _RESULTS):
         return _finished(folder, max_long_side, every, exported)
-    side = Views(max_long_side_px=max_long_side or 2**31)
+    side = Views(max_long_side_px=max_long_side or MAX_SIDE_PX)
     split = Split() if every is None else Split(source="every", test_every=every)
     found = scan(folder, folder.name, Config(views=side, split=split), cache=None)
     if found.poses is None:

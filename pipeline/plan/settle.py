@@ -13,7 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
-from pipeline.config.schema import Config
+from pipeline.config.schema import MAX_BLOCKS, Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget, typical_view
 from pipeline.plan.panoramas import check_panorama_sizes
@@ -35,9 +35,13 @@ FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
 # Scenes of more photographs are trained in blocks, one for so many.
 MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
+# Two photographs are the fewest that show a part of a scene from several sides.
+MIN_PHOTOS_OF_A_BLOCK = 2
 # Features and matches of more photographs are computed in several jobs, one for so many. A job of
 # 250 photographs takes minutes on two cores; to start one takes seconds.
 MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
+# Jobs of matching depend on all jobs of extraction: Snakemake plans more of them for minutes.
+MAX_JOBS = 200
 
 _EARTH_RADIUS_M = 6_371_000.0
 Choice = tuple[str, str]
@@ -65,8 +69,9 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
         device: the machine's, for ``train.device: auto``.
 
     Raises:
-        UserError: ``partition.memory_mb`` is too small, ``split.source: published`` for a scene
-            of no published benchmark, or appearance embeddings for a scene in blocks.
+        UserError: ``partition.memory_mb`` is too small, more ``partition.blocks`` than the
+            photographs allow, ``split.source: published`` for a scene of no published benchmark,
+            or appearance embeddings for a scene in blocks.
     """
     config = as_published(scan, config)
     chosen = {
@@ -256,14 +261,16 @@ def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
     """The number of blocks of the scene, of at most so many Gaussians.
 
     Raises:
-        UserError: ``partition.memory_mb`` is not enough for this number, or for any.
+        UserError: more blocks are configured than there are photographs for, or
+            ``partition.memory_mb`` is not enough for this number, or for any.
     """
     wanted, count, limit = config.partition.blocks, len(scan.planned), config.partition.memory_mb
     blocks, reason = 1, ""
     if wanted != "auto":
+        _check_blocks(wanted, count)
         blocks, reason = wanted, f"{wanted} blocks, as configured" if wanted > 1 else ""
     elif count > MAX_PHOTOS_OF_ONE_BLOCK:
-        blocks = math.ceil(count / PHOTOS_PER_BLOCK)
+        blocks = min(math.ceil(count / PHOTOS_PER_BLOCK), MAX_BLOCKS)
         reason = f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
     # With one block as configured, the number of Gaussians is what fits.
     one_fits = wanted == 1 or MEMORY_MARGIN * memory_mb(0, gaussians) <= (limit or math.inf)
@@ -283,12 +290,23 @@ def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
     return blocks, reason
 
 
+def _check_blocks(wanted: int, count: int) -> None:
+    most = max(1, count // MIN_PHOTOS_OF_A_BLOCK)
+    if wanted > most:
+        raise UserError(
+            f"partition.blocks: expected at most {most} blocks for {count} photographs, found "
+            f"{wanted}: a block needs at least {MIN_PHOTOS_OF_A_BLOCK} photographs",
+            fix="lower it, or leave it out",
+        )
+
+
 def _photos_per_job(scan: Scan, config: Config) -> tuple[int, str]:
     """The maximum number of photographs of a job of extraction, which decides their number."""
     wanted, count = config.features.photos_per_job, len(scan.planned)
     size = PHOTOS_PER_JOB if count > MAX_PHOTOS_OF_ONE_JOB else max(count, 1)
     if wanted != "auto":
         size = wanted
+    size = max(size, math.ceil(count / MAX_JOBS))
     jobs = math.ceil(count / size)
     if jobs > 1:
         return size, f"{jobs} jobs: one for every {size} of {count} photographs"

@@ -156,7 +156,7 @@ def test_every_configuration_of_a_batch_differs_from_the_default(file, base):
 def test_the_option_page_speaks_of_values_not_of_types():
     page = docs.page()
     assert not any(word in page for word in ("typing.", "<class", "FieldInfo"))
-    assert "| `budget_minutes` | number > 0, `null` | minutes | `null` |" in page
+    assert "| `budget_minutes` | number >= 0.001 <= 100000, `null` | minutes | `null` |" in page
 
 
 def test_the_product_has_few_options():

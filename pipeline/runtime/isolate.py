@@ -2,30 +2,61 @@
 
 pycolmap crashes in a process that has loaded torch, or that imports cv2 after pycolmap (both bundle
 libpng and zlib). Functions that use incompatible libraries run in separate processes, and so do
-native readers that crash on damaged files.
+readers of files from others: native ones crash on damaged files, and any of them may take more time
+or memory than there is (``Limits``).
 """
 
 from __future__ import annotations
 
+import ctypes
 import multiprocessing
 import os
+import pickle
 import signal
 import sys
 import threading
 import traceback
 from collections.abc import Callable
+from dataclasses import dataclass
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any, TypeVar
 
 from pipeline.runtime import progress
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.memory import limit_address_space, share_heap
 
 T = TypeVar("T")
+
+# Flags of unshare(2).
+_NEW_USER, _NEW_NETWORK = 0x10000000, 0x40000000
+
+
+@dataclass(frozen=True)
+class Limits:
+    """What a function in a process of its own may use.
+
+    Attributes:
+        seconds: The time until the process is ended, or None.
+        memory: The bytes of address space beyond those of the idle process, or None (Linux).
+        network: Whether it may use the network. Where the kernel does not let a process give up its
+            network, it keeps it.
+    """
+
+    seconds: float | None = None
+    memory: int | None = None
+    network: bool = True
+
+
+_UNLIMITED = Limits()
 
 
 class ProcessDied(RuntimeError):
     """The process of a function ended without a result: a crash of native code."""
+
+
+class OverLimitError(ProcessDied):
+    """The function needed more time or memory than its ``Limits``; the message says which."""
 
 
 def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
@@ -40,21 +71,38 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
         RuntimeError: the function raised another exception; the message has its traceback.
         ProcessDied: the process died.
     """
+    return run_limited(_UNLIMITED, function, *args, **kwargs)
+
+
+def run_limited(limits: Limits, function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
+    """``run_isolated`` with limits of time, memory and network.
+
+    Raises:
+        OverLimitError: the function exceeded a limit. Its process has ended.
+        UserError, RuntimeError, ProcessDied: as ``run_isolated``.
+    """
     context = multiprocessing.get_context("spawn")
     receiver, sender = context.Pipe(duplex=False)
     # The operating system closes the parent's end of this pipe when the parent ends.
     parent_alive, held_by_parent = context.Pipe(duplex=False)
+    # The call is unpickled, which imports its module, after the process has given up its network:
+    # a process that has threads cannot.
+    call = pickle.dumps((function, args, kwargs))
     process = context.Process(
-        target=_child, args=(sender, parent_alive, progress._file, function, args, kwargs)
+        target=_child, args=(sender, parent_alive, progress._file, limits, call)
     )
     process.start()
     sender.close()
     parent_alive.close()
+    name = function.__qualname__
     try:
+        if not receiver.poll(limits.seconds):
+            process.kill()
+            raise OverLimitError(f"{name} took longer than {limits.seconds:.0f} s")
         status, value = receiver.recv()
     except EOFError:
         process.join()
-        raise ProcessDied(f"{function.__qualname__} {_death(process.exitcode)}") from None
+        raise ProcessDied(f"{name} {_death(process.exitcode)}") from None
     finally:
         if sys.exc_info()[0] is KeyboardInterrupt:
             process.terminate()
@@ -63,8 +111,10 @@ def run_isolated(function: Callable[..., T], /, *args: Any, **kwargs: Any) -> T:
         receiver.close()
     if status == "user error":
         raise UserError(value["what"], file=value["file"], fix=value["fix"])
-    if status == "error":
-        raise RuntimeError(f"{function.__qualname__} failed:\n{value}")
+    if status == "memory" and limits.memory is not None:
+        raise OverLimitError(f"{name} needed more than {limits.memory >> 20} MiB of memory")
+    if status != "value":
+        raise RuntimeError(f"{name} failed:\n{value}")
     result: T = value
     return result
 
@@ -73,18 +123,25 @@ def _child(
     results: Connection,
     parent_alive: Connection,
     progress_file: Path | None,
-    function: Callable[..., Any],
-    args: tuple[Any, ...],
-    kwargs: dict[str, Any],
+    limits: Limits,
+    call: bytes,
 ) -> None:
+    if not limits.network:
+        _give_up_network()
     threading.Thread(target=_exit_with_parent, args=(parent_alive,), daemon=True).start()
     progress.write_progress_to(progress_file)
     if progress_file is not None:
         sys.stderr = progress.Console(sys.stderr, None)  # type: ignore[assignment]
     try:
+        function, args, kwargs = pickle.loads(call)
+        if limits.memory is not None:
+            share_heap()  # Heaps of threads take address space that they do not use.
+            limit_address_space(limits.memory)
         results.send(("value", function(*args, **kwargs)))
     except UserError as error:
         results.send(("user error", {"what": error.what, "file": error.file, "fix": error.fix}))
+    except MemoryError:
+        results.send(("memory", traceback.format_exc()))
     except Exception:
         results.send(("error", traceback.format_exc()))
     if isinstance(sys.stderr, progress.Console):
@@ -93,6 +150,14 @@ def _child(
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
+
+
+def _give_up_network() -> None:
+    """Move this process to a network without interfaces, where the kernel allows it (Linux)."""
+    libc = ctypes.CDLL(None)
+    if sys.platform == "linux" and hasattr(libc, "unshare") and libc.unshare(_NEW_NETWORK) != 0:
+        # Without privileges, only in a user namespace.
+        libc.unshare(_NEW_USER | _NEW_NETWORK)
 
 
 def _exit_with_parent(parent_alive: Connection) -> None:

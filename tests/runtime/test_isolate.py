@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import multiprocessing
 import os
+import socket
+import sys
 import time
 from collections.abc import Iterator
 from multiprocessing.context import SpawnContext
@@ -11,7 +13,7 @@ from multiprocessing.context import SpawnContext
 import pytest
 
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.isolate import run_isolated
+from pipeline.runtime.isolate import Limits, OverLimitError, run_isolated, run_limited
 from tests.forked import spawning
 from tests.sfm import jobs
 
@@ -44,6 +46,31 @@ def test_other_exceptions_show_their_traceback():
 def test_a_killed_process_raises_with_the_name_of_the_signal():
     with pytest.raises(RuntimeError, match="SIGKILL"):
         run_isolated(jobs.die)
+
+
+def test_a_function_that_takes_too_long_is_ended():
+    start = time.monotonic()
+    with pytest.raises(OverLimitError, match="sleep took longer than 2 s"):
+        run_limited(Limits(seconds=2), jobs.sleep, 600)
+    assert time.monotonic() - start < 60
+    assert run_limited(Limits(seconds=60), jobs.returned, 1) == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="not run: the kernel has no such limit")
+def test_a_function_that_takes_too_much_memory_is_ended():
+    limits = Limits(memory=256 << 20)
+    assert run_limited(limits, jobs.allocate, 128 << 20) == 128 << 20
+    with pytest.raises(OverLimitError, match="allocate needed more than 256 MiB"):
+        run_limited(limits, jobs.allocate, 512 << 20)
+
+
+def test_a_function_without_network_reaches_nothing():
+    if sys.platform != "linux" or not run_isolated(jobs.may_have_no_network):
+        pytest.skip("not run: this kernel does not let a process give up its network")
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        assert run_limited(Limits(), jobs.connects, port)
+        assert not run_limited(Limits(network=False), jobs.connects, port)
 
 
 def test_the_process_ends_with_its_parent(tmp_path):

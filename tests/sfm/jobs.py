@@ -130,3 +130,32 @@ def wait_for_sleeper(started: Path) -> None:
     from pipeline.runtime.isolate import run_isolated
 
     run_isolated(sleep_long, started)
+
+
+def sleep(seconds: float) -> None:
+    import time
+
+    time.sleep(seconds)
+
+
+def allocate(size: int) -> int:
+    return len(bytearray(size))
+
+
+def connects(port: int) -> bool:
+    """Whether a server on this machine can be reached."""
+    import socket
+
+    try:
+        socket.create_connection(("127.0.0.1", port), timeout=5).close()
+    except OSError:
+        return False
+    return True
+
+
+def may_have_no_network() -> bool:
+    """Whether the kernel lets this process give up its network."""
+    import ctypes
+
+    unshare = ctypes.CDLL(None).unshare
+    return unshare(0x40000000) == 0 or unshare(0x50000000) == 0

@@ -34,7 +34,6 @@ NEEDED = {
 }
 OPTIONAL = {
     "pillow-heif": "HEIC and HEIF photographs",
-    "pye57": "point clouds in E57 files",
     "viser": "python -m pipeline view",
     "tensorboard": "python -m pipeline tensorboard",
 }

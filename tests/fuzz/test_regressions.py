@@ -10,12 +10,11 @@ import numpy as np
 import pytest
 
 from pipeline.io.arrays import read_archive, read_array
-from pipeline.io.clouds.e57_points import read_e57
 from pipeline.io.ply import read_splat_ply
 from pipeline.photos.load import read_picture
 from pipeline.runtime.errors import UserError
 from tests.fuzz.campaign import content
-from tests.fuzz.clouds import e57_seeds, las_seeds, pack_e57, read_las_points, unpack_e57
+from tests.fuzz.clouds import las_seeds, read_las_points
 from tests.fuzz.readers import READERS
 
 
@@ -93,18 +92,3 @@ def test_a_las_file_that_ends_in_a_record(tmp_path) -> None:
         file.write_bytes(content[:end])
         with contextlib.suppress(UserError):
             read_las_points(file)
-
-
-def test_an_e57_file_that_claims_more_points_than_it_has_bits(tmp_path) -> None:
-    """Coordinates with equal limits take no bytes: the library made up any number of points."""
-    pytest.importorskip("pye57")
-    data = unpack_e57(e57_seeds()[0]["points.e57"])
-    start, end = data.index(b"<?xml"), data.index(b"</e57Root>") + len(b"</e57Root>\n")
-    text = data[start:end].replace(b'recordCount="20"', b'recordCount="1000000000000"')
-    whole = bytearray(data[:start] + text)
-    whole[32:40] = len(text).to_bytes(8, "little")
-    whole[16:24] = len(pack_e57(bytes(whole))).to_bytes(8, "little")
-    file = tmp_path / "points.e57"
-    file.write_bytes(pack_e57(bytes(whole)))
-    with pytest.raises(UserError, match="found a header of 1000000000000 in 4096 bytes"):
-        list(read_e57(file))

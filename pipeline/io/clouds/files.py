@@ -7,14 +7,13 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.io.clouds.e57_points import read_e57
+from pipeline.io.clouds.e57_points import count_e57, read_e57
 from pipeline.io.clouds.las_points import count_las, read_las
 from pipeline.io.clouds.ply_points import count_ply, read_ply
 from pipeline.io.clouds.sampling import VoxelSampler, thinned
 from pipeline.io.clouds.text_points import read_text
 from pipeline.io.clouds.values import Chunks, PointCloud, damaged
-from pipeline.runtime.isolate import ProcessDied, run_isolated
-from pipeline.runtime.memory import limit_address_space
+from pipeline.runtime.isolate import Limits, OverLimitError, ProcessDied, run_limited
 
 _READERS: dict[str, Callable[[Path], Chunks]] = {
     ".ply": read_ply,
@@ -26,9 +25,10 @@ _READERS: dict[str, Callable[[Path], Chunks]] = {
     ".pts": read_text,
 }
 CLOUD_SUFFIXES = tuple(_READERS)
-# Native readers crash on damaged files, and allocate what headers claim.
-_NATIVE = (".las", ".laz", ".e57")
-_NATIVE_BYTES = 6 << 30
+# Bytes of memory; a tenth of them suffices for files of any size.
+_MEMORY = 2 << 30
+# The least time of a file, and the slowest that its bytes are read: a tenth of the usual speed.
+_SECONDS, _BYTES_PER_SECOND = 60, 1 << 20
 # Points that are kept of all files together: 27 bytes each.
 MAX_POINTS = 1_000_000
 
@@ -48,6 +48,8 @@ def count_points(path: Path) -> int | None:
     try:
         if suffix == ".ply":
             return count_ply(path)
+        if suffix == ".e57":
+            return count_e57(path)
         return count_las(path) if suffix in (".las", ".laz") else None
     except OSError as error:
         raise damaged(path, f"cannot be read: {error.strerror}") from None
@@ -56,10 +58,12 @@ def count_points(path: Path) -> int | None:
 def read_clouds(paths: Sequence[Path], limit: int = MAX_POINTS) -> PointCloud:
     """The points of some files, at most ``limit`` of them, one a voxel.
 
-    Memory is proportional to ``limit``, not to the files.
+    Memory is proportional to ``limit``, not to the files. Each file is read in a process of its
+    own, with limits of time and memory and without network: native readers crash on damaged files,
+    and allocate what headers claim.
 
     Raises:
-        UserError: a file that is damaged or has no point, or pye57 is needed and missing.
+        UserError: a file that is damaged or has no point.
     """
     clouds = [_read(path, limit) for path in paths]
     xyz = np.concatenate([cloud.xyz for cloud in clouds])
@@ -74,17 +78,16 @@ def read_clouds(paths: Sequence[Path], limit: int = MAX_POINTS) -> PointCloud:
 
 
 def _read(path: Path, limit: int) -> PointCloud:
-    if path.suffix.lower() not in _NATIVE:
-        return _sampled(path, limit)
     try:
-        return run_isolated(_sampled_natively, path, limit)
+        seconds = _SECONDS + path.stat().st_size / _BYTES_PER_SECOND
+        return run_limited(Limits(seconds, _MEMORY, network=False), _sampled, path, limit)
+    except OSError as error:
+        raise damaged(path, f"cannot be read: {error.strerror or error}") from None
+    except OverLimitError as error:
+        what = str(error).partition(" ")[2]
+        raise damaged(path, f"reading it {what}: it is damaged, or made to do so") from None
     except ProcessDied:
         raise damaged(path, "its reader crashed: the file is damaged") from None
-
-
-def _sampled_natively(path: Path, limit: int) -> PointCloud:
-    limit_address_space(_NATIVE_BYTES)
-    return _sampled(path, limit)
 
 
 def _sampled(path: Path, limit: int) -> PointCloud:
@@ -94,8 +97,6 @@ def _sampled(path: Path, limit: int) -> PointCloud:
             sampler.add(chunk)
     except OSError as error:
         raise damaged(path, f"cannot be read: {error.strerror or error}") from None
-    except MemoryError:
-        raise damaged(path, "needs more memory than such a file should: it is damaged") from None
     cloud = sampler.result()
     if not len(cloud):
         what = f"expected points, found none with finite coordinates (of {cloud.num_read})"

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
+from pipeline.io.bounded import opened_regular
 from pipeline.io.clouds.values import CHUNK_POINTS, Chunk, Chunks, damaged, stacked
 
 # Compression to a fraction of a byte a point happens in artificial files only.
@@ -29,7 +30,7 @@ def count_las(path: Path) -> int:
     Raises:
         UserError: not a LAS or LAZ file, or more points than the file can hold.
     """
-    with open(path, "rb") as file:
+    with opened_regular(path) as file:
         header = file.read(_HEADER)
         size = file.seek(0, 2)
     if header[:4] != b"LASF" or len(header) < 227:

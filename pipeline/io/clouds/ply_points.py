@@ -9,6 +9,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.bounded import opened_regular
 from pipeline.io.clouds.text_points import parsed, text_blocks
 from pipeline.io.clouds.values import CHUNK_POINTS, Chunk, Chunks, damaged, stacked
 from pipeline.io.ply_header import PlyHeader, read_header
@@ -23,7 +24,7 @@ _CHUNK_BYTES = 1 << 26
 
 def count_ply(path: Path) -> int:
     """Number of points according to the header."""
-    with open(path, "rb") as file:
+    with opened_regular(path) as file:
         return read_header(file, path).count
 
 
@@ -33,7 +34,7 @@ def read_ply(path: Path) -> Chunks:
     Raises:
         UserError: the header has no x, y and z, or the file is shorter than it says.
     """
-    with open(path, "rb") as file:
+    with opened_regular(path) as file:
         header = read_header(file, path)
         if missing := [name for name in _POSITION if name not in header.fields]:
             raise damaged(path, f"expected points with x, y and z, found no {missing[0]}")

@@ -15,6 +15,7 @@ from typing import BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.bounded import opened_regular
 from pipeline.io.clouds.values import Chunk, Chunks, damaged, stacked
 from pipeline.runtime.errors import UserError
 
@@ -52,7 +53,7 @@ def read_text(path: Path) -> Chunks:
     pts = path.suffix.lower() == ".pts"
     columns: _Columns | None = None
     named: list[str] = []
-    with open(path, "rb") as file:
+    with opened_regular(path) as file:
         for block in text_blocks(file, path):
             lines = []
             for line in block:

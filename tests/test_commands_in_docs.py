@@ -51,7 +51,7 @@ def test_snakemake(command):
 def check_snakemake(words: list[str]) -> None:
     """Options are Snakemake's, values the schema's, and targets those of the rules."""
     found = get_argument_parser().parse_args(words)
-    assert found.targets or found.unlock
+    assert found.targets
     assert all(TARGETS.fullmatch(target) for target in found.targets)
     load_project(parse_config(found.config or []))
     if found.workflow_profile:

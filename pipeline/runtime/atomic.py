@@ -13,7 +13,11 @@ from typing import Any, BinaryIO
 
 @contextmanager
 def written(path: Path) -> Iterator[BinaryIO]:
-    """A new file under a temporary name beside ``path``, which is renamed when it is complete."""
+    """A new file under a temporary name beside ``path``, which is renamed when it is complete.
+
+    Raises:
+        OSError: with the file's name, also where writing fails because the disk is full.
+    """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")
     try:
@@ -22,6 +26,9 @@ def written(path: Path) -> Iterator[BinaryIO]:
             file.flush()
             os.fsync(file.fileno())
         os.replace(temporary, path)
+    except OSError as error:
+        error.filename = error.filename or str(path)
+        raise
     finally:
         temporary.unlink(missing_ok=True)
 

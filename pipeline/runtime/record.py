@@ -206,6 +206,20 @@ def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
     return canonical(record.key) == key and record.inputs == digests
 
 
+def missing_output(folder: Path) -> Path | None:
+    """A file that a finished stage with this folder must have and that does not exist; the folder
+    itself if it does not exist; None if all exist, or if the record cannot be read."""
+    if not folder.is_dir():
+        return folder
+    if not (folder / STAGE).is_file():
+        return folder / STAGE
+    try:
+        names = read_stage(folder).outputs
+    except UserError:
+        return None
+    return next((folder / name for name in names if not (folder / name).exists()), None)
+
+
 # --- checking ---------------------------------------------------------------------------------
 
 

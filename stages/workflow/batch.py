@@ -17,9 +17,9 @@ from pipeline.reporting.data import ranked
 from pipeline.reporting.index import Batch, Thumbnail, index_html, thumbnail
 from pipeline.reporting.metrics import read_metrics, read_runs, with_times
 from pipeline.runtime.atomic import write_json, write_text
-from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.record import read_run
 from pipeline.scene.manifest import Manifest
+from stages.workflow.failures import reporting_errors
 from stages.workflow.registry import STAGES
 
 
@@ -88,8 +88,5 @@ if __name__ == "__main__":
     parser.add_argument("--outcomes", required=True, help="how each run ended (JSON), or - (stdin)")
     args = parser.parse_args()
     text = sys.stdin.read() if args.outcomes == "-" else args.outcomes
-    try:
+    with reporting_errors("the batch's tables"):
         write_batch(json.loads(text)["outcomes"], args.results)
-    except UserError as error:
-        print(f"error in the batch's tables: {error}", file=sys.stderr)
-        sys.exit(EXIT_USER_ERROR)

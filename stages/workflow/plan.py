@@ -9,6 +9,7 @@ from pathlib import Path
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.dag import plan_svg
 from pipeline.runtime.atomic import write_json, write_text
+from stages.workflow.failures import reporting_errors
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser("stages.workflow.plan", description=__doc__)
@@ -17,5 +18,6 @@ if __name__ == "__main__":
     parser.add_argument("--plan", required=True, help="the plan as JSON")
     args = parser.parse_args()
     plan = PlanRecord.model_validate_json(args.plan)
-    write_json(args.out, plan.model_dump(mode="json"))
-    write_text(args.picture, plan_svg(plan))
+    with reporting_errors(f"the plan of {plan.scene}"):
+        write_json(args.out, plan.model_dump(mode="json"))
+        write_text(args.picture, plan_svg(plan))

@@ -29,7 +29,14 @@ from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.lock import check_not_locked, lock_run, user_name
 from pipeline.runtime.native import MODULES
-from pipeline.runtime.record import STAGE, canonical, file_digest, is_current, read_stage
+from pipeline.runtime.record import (
+    STAGE,
+    canonical,
+    file_digest,
+    is_current,
+    missing_output,
+    read_stage,
+)
 from pipeline.runtime.source import stage_source_hash
 from stages.workflow.cluster import (
     DEFAULT_CPUS,
@@ -41,6 +48,8 @@ from stages.workflow.cluster import (
     wait_for_earlier_jobs,
     watch_jobs,
 )
+from stages.workflow.failures import reporting_errors
+from stages.workflow.locks import prepare_folder, use_locks_of_runs
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
@@ -83,6 +92,7 @@ class SnakemakeProject:
         os.environ.setdefault("LOGNAME", user_name())
         try:
             _check_working_directory()
+            use_locks_of_runs()
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
@@ -92,6 +102,7 @@ class SnakemakeProject:
                 print(f"warning: scenes.{name}: no such folder in data_root", file=sys.stderr)
         self._make_plan = cache(self._scan_and_plan)
         self._described: dict[str, str] = {}
+        self._lost: set[Path] = set()
         # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
@@ -134,20 +145,32 @@ class SnakemakeProject:
         return files
 
     def _run_if_outdated(self, spec: StageSpec, wildcards: Any) -> None:
-        """Run a stage whose record has another key. Snakemake compares keys with records of its
-        own, in .snakemake, which a copied folder of results does not have."""
+        """Run a stage whose output is missing, or whose record has another key.
+
+        Snakemake does not make an intermediate file again if the results that follow from it
+        exist. It compares keys with records of its own, in .snakemake, which a copied folder of
+        results does not have.
+        """
         dag = self._workflow.dag
-        compared = {trigger.name for trigger in self._workflow.rerun_triggers}
+        if dag is None or self._workflow.remote_exec:
+            return
         folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
-        record = folder / STAGE
-        if dag is None or "PARAMS" not in compared or not record.is_file():
+        if lost := missing_output(folder):
+            dag.forcefiles.add(str(folder / STAGE))
+            # Of a run that was not finished, all that is missing has not been made yet.
+            if folder not in self._lost and (folder.parent / "metrics.json").is_file():
+                self._lost.add(folder)
+                print(f"{lost} is missing: {folder.name} runs again", file=sys.stderr)
+            return
+        compared = {trigger.name for trigger in self._workflow.rerun_triggers}
+        if "PARAMS" not in compared:
             return
         try:
             current = canonical(read_stage(folder).key) == self.key(spec)(wildcards)
         except UserError:  # The stage that reads the record has a message.
             return
         if not current:
-            dag.forcefiles.add(str(record))
+            dag.forcefiles.add(str(folder / STAGE))
 
     def folders(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""
@@ -235,8 +258,7 @@ class SnakemakeProject:
     def _plan(self, name: str) -> Plan:
         """The run's plan; a UserError ends Snakemake."""
         try:
-            # Before Snakemake's own lock, whose message does not name the other run, and before
-            # the permission to write is checked.
+            # Before the permission to write is checked.
             if self._writes_results():
                 check_not_locked(RESULTS / name)
             return self._make_plan(name)
@@ -341,15 +363,17 @@ class SnakemakeProject:
         nodes may have none."""
         workflow = self._workflow
         needed = list(workflow.dag.needrun_jobs())
-        names = {getattr(job.wildcards, "scene", None) for job in needed}
-        for name in sorted(filter(None, names)):
+        # The tables of a batch are in the folder of all results.
+        written = {RESULTS / getattr(job.wildcards, "scene", "") for job in needed if job.output}
+        for folder in sorted(written):
             try:
-                _check_writable(RESULTS / name)
-                lock_run(RESULTS / name)
+                _check_writable(folder)
+                lock_run(folder)
             except UserError as error:
                 _exit(error)
             except OSError as error:
-                _exit(as_user_error(error) or UserError(f"{error}", file=RESULTS / name))
+                error.filename = error.filename or str(folder)
+                _exit(as_user_error(error) or UserError(f"{error}", file=folder))
         if workflow.non_local_exec:
             interval = workflow.remote_execution_settings.seconds_between_status_checks
             for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
@@ -379,7 +403,8 @@ class SnakemakeProject:
             text = canonical({"outcomes": outcomes})
             subprocess.run([*command, "--outcomes", "-"], input=text, text=True, check=False)
             lost = [outcome for outcome in outcomes if outcome["status"] != "ok"]
-            write_json(FAILURES, {"at": self._started, "lost": lost})
+            with reporting_errors("the batch's tables"):
+                write_json(FAILURES, {"at": self._started, "lost": lost})
             said = f"\n{len(lost)} of {len(runs)} runs have no result: see {RESULTS}/index.html"
             print(said, file=sys.stderr)
 
@@ -432,9 +457,11 @@ def _check_working_directory() -> None:
     own = Path(".snakemake").absolute()
     folders = [own, *filter(Path.is_dir, own.iterdir())] if own.exists() else [own.parent]
     for folder in folders:
-        if not os.access(folder, os.W_OK | os.X_OK):
+        # Another Snakemake may have removed one in between.
+        if not os.access(folder, os.W_OK | os.X_OK) and folder.exists():
             fix = "make it writable, or run in another folder (snakemake --directory)"
             raise UserError("Snakemake cannot write to this folder", file=folder, fix=fix)
+    prepare_folder(own)
 
 
 def _exit(error: UserError) -> NoReturn:

@@ -36,7 +36,6 @@ from tests.e2e.harness import (
     metrics,
     model_digests,
     snakemake,
-    unlock,
 )
 from tests.tools import need, need_package, unsupported
 
@@ -295,7 +294,6 @@ def abandoned(
 
     run.process.send_signal(signal.SIGKILL)
     run.process.wait()
-    unlock(project)
     second = Running(project, TRAINING, *SLURM, config=BLOCKS)
     until(lambda: "jobs of an earlier run" in second.text(), "the message about the old job")
     queued = jobs.of(project)

@@ -210,14 +210,6 @@ def start_and_kill(
     run.wait()
 
 
-def unlock(project: Path) -> None:
-    """What ``snakemake --unlock`` does, in no time."""
-    locks = list((project / ".snakemake" / "locks").iterdir())
-    assert locks
-    for lock in locks:
-        lock.unlink()
-
-
 def metrics(project: Path, scene: str) -> dict:
     """``metrics.json``: the same for the same work."""
     return json.loads((project / "results" / scene / "metrics.json").read_text())

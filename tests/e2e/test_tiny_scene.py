@@ -33,7 +33,6 @@ from tests.e2e.harness import (
     snakemake,
     start_and_kill,
     start_snakemake,
-    unlock,
 )
 
 pytestmark = pytest.mark.slow
@@ -194,7 +193,7 @@ def planned_commands() -> dict[str, list[str]]:
 # finished batch.
 NOT_PLANNED = {
     *('sfm={"georeference": "gcp"}', 'split={"source": "published"}', "profiles/slurm"),
-    *("--report", "--unlock"),
+    "--report",
 }
 
 
@@ -230,7 +229,6 @@ def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
         start_and_kill(project, TARGET, ready, config=TINY, cores=1)
         assert list(project.glob(ready))
         assert not (folder / stage / "stage.json").exists()
-        unlock(project)
     snakemake(project, TARGET, config=TINY, cores=1)
     assert "resuming at" in (folder / "logs/train.log").read_text()
     assert not (project / scratch / "train").exists()
@@ -245,7 +243,6 @@ def test_an_orphaned_job_and_a_new_run_do_not_meet(project, finished):
     (folder / "metrics.json").unlink()
     ready = "results/tiny/.scratch/train/*/out"
     start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=True)
-    snakemake(project, "--unlock", config=TINY)
     snakemake(project, TARGET, config=TINY)
     log = (folder / "logs/train.log").read_text()
     assert "another run is at work" in log or "up to date" in log
@@ -253,7 +250,7 @@ def test_an_orphaned_job_and_a_new_run_do_not_meet(project, finished):
 
 
 def test_two_runs_at_once_on_one_scene(project, finished):
-    """Snakemake's own lock turns the second away; the first one's result is whole."""
+    """The second is refused, or finds the work done; the first one's result is whole."""
     shutil.rmtree(project / "results/tiny/export")
     (project / TARGET).unlink()
     with open(os.devnull, "w") as nothing:

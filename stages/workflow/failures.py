@@ -1,0 +1,26 @@
+"""Errors of the workflow's own jobs, which are not stages."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+
+from pipeline.runtime.errors import EXIT_USER_ERROR, UserError, as_user_error
+
+
+@contextmanager
+def reporting_errors(job: str) -> Iterator[None]:
+    """End the process with one message and exit code 2 if the user can correct the error.
+
+    Args:
+        job: the job's name in the message.
+    """
+    try:
+        yield
+    except (UserError, OSError) as error:
+        known = error if isinstance(error, UserError) else as_user_error(error)
+        if known is None:
+            raise
+        print(f"error in {job}: {known}", file=sys.stderr, flush=True)
+        sys.exit(EXIT_USER_ERROR)

@@ -1,0 +1,68 @@
+"""Two scenes that are started at once in one folder, many times.
+
+``python -m tests.e2e.starts --pairs 100`` prints the starts that failed and ends with their number.
+"""
+
+from __future__ import annotations
+
+import argparse
+import shutil
+import sys
+import tempfile
+from pathlib import Path
+
+from tests.e2e.forking import Fork
+from tests.e2e.harness import make_project, start_snakemake
+from tests.pictures import photos
+
+SCENES = ("garden", "patio")
+
+
+def two_scenes(folder: Path) -> Path:
+    """A project with two scenes of three photographs."""
+    project = make_project(folder)
+    for scene in SCENES:
+        photos(project / "data" / scene / "images", 3)
+    return project
+
+
+def start_pairs(project: Path, pairs: int) -> list[str]:
+    """Start both scenes at once, for a result that takes no time; return what failed starts say.
+
+    In every second pair they also create Snakemake's own folder at once.
+    """
+    failed = []
+    for pair in range(pairs):
+        shutil.rmtree(project / "results", ignore_errors=True)
+        if pair % 2 == 0:
+            shutil.rmtree(project / ".snakemake", ignore_errors=True)
+        runs = {scene: _start(project, scene) for scene in SCENES}
+        for scene, run in runs.items():
+            target, code = _target(scene), run.wait()
+            said = _output(project, scene).read_text()
+            if code or "Traceback" in said or not (project / target).exists():
+                failed.append(f"pair {pair}, {target} ended with {code}:\n{said}")
+    return failed
+
+
+def _target(scene: str) -> str:
+    return f"results/{scene}/plan.json"
+
+
+def _output(project: Path, scene: str) -> Path:
+    return project / f"{scene}.log"
+
+
+def _start(project: Path, scene: str) -> Fork:
+    with open(_output(project, scene), "w") as output:
+        return start_snakemake(project, _target(scene), output=output.fileno(), config={}, cores=1)
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser("tests.e2e.starts", description=__doc__)
+    parser.add_argument("--pairs", type=int, default=100)
+    wanted = parser.parse_args().pairs
+    with tempfile.TemporaryDirectory() as place:
+        lost = start_pairs(two_scenes(Path(place) / "project"), wanted)
+    print(*lost, f"{len(lost)} of {2 * wanted} starts failed", sep="\n")
+    sys.exit(bool(lost))

@@ -15,7 +15,13 @@ from PIL import Image
 from pipeline.config.schema import Evaluate
 from pipeline.io.camera_files import choose_views, read_cameras
 from pipeline.io.photofile import MAX_PIXELS
-from pipeline.io.splat_files import check_suffix, is_exported, read_gaussians, write_gaussians
+from pipeline.io.splat_files import (
+    check_suffix,
+    is_antialiased,
+    is_exported,
+    read_gaussians,
+    write_gaussians,
+)
 from pipeline.metrics.evaluate import evaluate_views
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.metrics.protocol import choose_protocol
@@ -60,7 +66,7 @@ def convert(
 
     Args:
         sh_degree, min_opacity, morton_order: see ``splats.reduce.reduce_gaussians``.
-        warnings: warnings are added to this list.
+        warnings: warnings are added to this list, also of what ``target`` does not hold.
 
     Returns:
         Messages.
@@ -71,7 +77,7 @@ def convert(
     check_suffix(target)
     found = read_gaussians(source, warnings)
     made = reduce_gaussians(found.as_arrays(), sh_degree, min_opacity, morton_order)
-    write_gaussians(target, made)
+    warnings += write_gaussians(target, made, antialias=is_antialiased(source))
     size = target.stat().st_size / 1e6
     before = f"{len(found)} Gaussians of SH degree {found.sh_degree}"
     return [f"{source}: {before}", f"{target}: {len(made)} written, {size:.1f} MB"]

@@ -203,12 +203,13 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
 
 
 def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
-    """Write Gaussians in the format of the file's suffix.
+    """Write Gaussians in the format of the file's suffix; what the format does not hold is a
+    warning.
 
     Raises:
         UserError: an unknown suffix, or Gaussians that the format cannot hold.
     """
-    splat_files.write_gaussians(Path(file), gaussians)
+    _warn(splat_files.write_gaussians(Path(file), gaussians))
 
 
 def _warn(messages: Sequence[str]) -> None:

@@ -150,7 +150,9 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
         expected, _ = wrong.setdefault(path, ([], quoted(problem["input"])))
         expected.append(_shortened(problem["msg"].removeprefix("Value error, ")))
     for path, (expected, found) in wrong.items():
-        lines.append(f"{path}: {', or '.join(dict.fromkeys(expected))}, found {found}")
+        first, *others = dict.fromkeys(expected)
+        alternatives = [text.removeprefix("Input should be ") for text in others]
+        lines.append(f"{path}: {', or '.join([first, *alternatives])}, found {found}")
     lines = [f"{prefix}{line}" for line in dict.fromkeys(lines)]
     if len(problems) > _MAX_ERRORS:
         lines.append(f"and {len(problems) - _MAX_ERRORS} further errors")

@@ -18,7 +18,8 @@ from pipeline.io.frame_json import RenderSettings, describe_frame
 from pipeline.io.gltf import write_gltf
 from pipeline.io.ply import write_points_ply, write_splat_ply
 from pipeline.io.splat import write_splat
-from pipeline.io.spz import count_out_of_range, write_spz
+from pipeline.io.splat_losses import losses, unmarked
+from pipeline.io.spz import write_spz
 from pipeline.io.transforms import write_transforms
 from pipeline.metrics.protocol import choose_protocol
 from pipeline.mvs.maps import read_dense_cloud, read_map
@@ -34,10 +35,8 @@ from pipeline.splats.arrays import GaussianArrays, GaussianRows
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.reduce import reduce_gaussians
 
-# A warning is given if a larger share of the Gaussians cannot be represented in a format.
-TOLERATED_SHARE = 0.05
-# Formats that cannot record that the Gaussians were trained with opacity compensation.
-WITHOUT_ANTIALIAS = ("ply", "splat", "gltf")
+# Formats of one file with the Gaussians.
+GAUSSIAN_FORMATS = ("ply", "spz", "splat", "gltf")
 
 
 @dataclass(frozen=True)
@@ -218,23 +217,10 @@ def _in_given_unit(scene: ExportScene) -> ExportScene:
 
 
 def _warnings(files: _Files, config: Export) -> list[str]:
-    warnings = []
-    lost = count_out_of_range(files.gaussians) if "spz" in config.formats else 0
-    if lost > TOLERATED_SHARE * len(files.gaussians):
-        warnings.append(
-            f"point_cloud.spz: {lost} of {len(files.gaussians)} Gaussians are too small or too "
-            "large for the number format of SPZ in the unit of the poses. Use point_cloud.ply, or "
-            "give the poses in a unit in which the size of the scene is about 1 to 100"
-        )
-    unmarked = [WRITERS[name][0] for name in WITHOUT_ANTIALIAS if name in config.formats]
-    if files.antialias and unmarked:
-        warnings.append(
-            f"{' and '.join(unmarked)} cannot record that the Gaussians were trained with "
-            "train.antialias, and viewers without Mip-Splatting's opacity compensation render them "
-            "too thick. Enable it in the viewer, use point_cloud.spz, which records it, or train "
-            "with train.antialias: false"
-        )
-    return warnings
+    """What is lost in the files of Gaussians."""
+    names = [WRITERS[name][0] for name in GAUSSIAN_FORMATS if name in config.formats]
+    warnings = [text for name in names for text in losses(Path(name), files.gaussians)]
+    return [*warnings, *(unmarked(names) if files.antialias else [])]
 
 
 def _write_frame(out: Path, files: _Files, written: list[str], train: Train, split: Split) -> None:

@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
+from pipeline.io.frame_json import Frame
 from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
 from pipeline.io.ply import read_splat_ply, write_splat_ply
 from pipeline.io.splat import read_splat, write_splat
-from pipeline.io.spz import read_spz, write_spz
+from pipeline.io.splat_losses import losses, unmarked
+from pipeline.io.spz import read_antialias, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
 from pipeline.splats.gaussians import Gaussians
@@ -77,13 +80,35 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     return gaussians
 
 
-def write_gaussians(path: Path, gaussians: GaussianSource) -> None:
+def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = False) -> list[str]:
     """Write Gaussians atomically, in the format of the suffix.
+
+    Args:
+        antialias: whether the Gaussians were trained with Mip-Splatting's opacity compensation.
+
+    Returns:
+        A sentence for everything that the format does not hold (``splat_losses``).
 
     Raises:
         UserError: an unknown suffix, or Gaussians that the format cannot hold.
     """
-    _by_suffix(_WRITERS, path)(path, gaussians)
+    write = _by_suffix(_WRITERS, path)
+    if write is write_spz:
+        write_spz(path, gaussians, antialias=antialias)
+    else:
+        write(path, gaussians)
+    return [*losses(path, gaussians), *(unmarked([path.name]) if antialias else [])]
+
+
+def is_antialiased(path: Path) -> bool:
+    """Whether a file of Gaussians, or the ``frame.json`` of the export that it belongs to, records
+    that they were trained with Mip-Splatting's opacity compensation."""
+    if path.suffix.lower() == ".spz":
+        return read_antialias(path)
+    # Another program's file of this name describes none of our exports.
+    with contextlib.suppress(UserError, OSError):
+        return is_exported(path) and Frame.read(path.parent).render.antialias
+    return False
 
 
 def check_suffix(path: Path) -> None:

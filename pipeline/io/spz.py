@@ -17,6 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.bounded import opened_regular
 from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
@@ -59,6 +60,19 @@ def read_spz(path: Path) -> Gaussians:
         UserError: the file cannot be read or is not a valid SPZ file.
     """
     return decode_spz(read_file(path, "an SPZ file"), file=path)
+
+
+def read_antialias(path: Path) -> bool:
+    """Whether an SPZ file records that the Gaussians were trained with opacity compensation; False
+    for a file that cannot be read."""
+    try:
+        with opened_regular(path) as file:
+            start = file.read(4096)
+        head = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, _HEADER.size)
+        magic, *_, flags, _reserved = _HEADER.unpack(head)
+    except (OSError, zlib.error, struct.error):
+        return False
+    return bool(magic == _MAGIC and flags & _ANTIALIASED)
 
 
 def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:

@@ -9,14 +9,14 @@ from dataclasses import dataclass
 from importlib.util import find_spec
 from typing import Any
 
-from pipeline.render.gpu.device import Adapter, adapters
+from pipeline.render.gpu.device import NO_GPU, Adapter, adapters
 from pipeline.runtime import targets
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.native import cache_folder
 
-__all__ = ["Adapter", "DeviceChoice", "adapters", "choose_device"]
+__all__ = ["Adapter", "DeviceChoice", "adapters", "check_device", "choose_device"]
 
 RECORD = "devices.json"
 
@@ -59,6 +59,25 @@ def choose_device() -> DeviceChoice:
         return DeviceChoice(f"gpu:{adapter.number}", reason, f"on the GPU: {compared}")
     reason = f"trained on the processor, where a step takes less time than on {adapter}"
     return DeviceChoice("cpu", reason, f"on the processor: {compared}")
+
+
+def check_device(device: str) -> None:
+    """Check that this machine has the device that ``train.device`` names: ``gpu`` or ``gpu:N``.
+
+    Raises:
+        UserError: the package wgpu is not installed, or there is no such GPU.
+    """
+    kind, _, number = device.partition(":")
+    if kind != "gpu":
+        return
+    found = adapters()
+    if int(number or 0) >= len(found):
+        there = "; ".join(f"gpu:{adapter.number} is {adapter}" for adapter in found)
+        raise UserError(
+            f"train.device: {device}: this machine has no such GPU"
+            + (f"; {there}" if found else ", and no other one"),
+            fix="name one of them, or set train.device: cpu" if found else NO_GPU,
+        )
 
 
 def _times_of(adapter: Adapter) -> tuple[float, float] | str:

@@ -22,7 +22,7 @@ from pipeline.plan.scan import scan
 from pipeline.plan.settle import PROCESSOR, Choice
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan
-from pipeline.render.devices import choose_device
+from pipeline.render.devices import check_device, choose_device
 from pipeline.reporting.batch import PUBLISHED
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error
@@ -284,9 +284,13 @@ class SnakemakeProject:
 
     def _device(self, config: Config) -> Choice:
         """The device for ``train.device: auto``. On a cluster, a plan must be the same on every
-        node: there, a GPU is used only if the option names it."""
+        node: there, a GPU is used only if the option names it, and the job that trains checks that
+        its node has it."""
         flow = self._workflow
-        if config.train.device != "auto" or flow.non_local_exec or "SLURM_JOB_ID" in os.environ:
+        if flow.remote_exec or flow.non_local_exec or "SLURM_JOB_ID" in os.environ:
+            return PROCESSOR
+        if config.train.device != "auto":
+            check_device(config.train.device)
             return PROCESSOR
         chosen = choose_device()
         return chosen.device, chosen.reason

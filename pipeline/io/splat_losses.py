@@ -1,0 +1,54 @@
+"""What is lost when Gaussians are written in a format: the same sentences for the export stage, the
+command ``convert`` and the Python interface."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+from pipeline.io.spz import count_out_of_range
+from pipeline.splats.arrays import GaussianSource
+
+# A smaller share of Gaussians that a format cannot represent is no loss that can be seen.
+TOLERATED_SHARE = 0.05
+#: Suffixes of formats that record whether the Gaussians were trained with opacity compensation.
+WITH_ANTIALIAS = (".spz",)
+#: Suffixes of formats without spherical harmonics above degree 0.
+WITHOUT_HARMONICS = (".splat",)
+
+
+def losses(path: Path, gaussians: GaussianSource) -> list[str]:
+    """A sentence for everything of the Gaussians that the file at ``path`` does not hold.
+
+    The suffix is the format's.
+    """
+    suffix, found = path.suffix.lower(), []
+    if suffix == ".spz":
+        lost = count_out_of_range(gaussians)
+        if lost > TOLERATED_SHARE * len(gaussians):
+            found.append(
+                f"{path.name}: {lost} of {len(gaussians)} Gaussians are too small or too large for "
+                "the number format of SPZ in the unit of the poses. Use a PLY file, or give the "
+                "poses in a unit in which the size of the scene is about 1 to 100"
+            )
+    if suffix in WITHOUT_HARMONICS and gaussians.sh_degree > 0:
+        found.append(
+            f"{path.name}: the format holds no spherical harmonics: colours that depend on the "
+            f"direction of view (degree {gaussians.sh_degree}) are left out. Use a PLY or SPZ file "
+            "to keep them"
+        )
+    return found
+
+
+def unmarked(files: Sequence[str]) -> list[str]:
+    """The warning about ``files`` of Gaussians that were trained with opacity compensation; empty
+    if all of their formats record it."""
+    names = [name for name in files if Path(name).suffix.lower() not in WITH_ANTIALIAS]
+    if not names:
+        return []
+    return [
+        f"{' and '.join(names)} cannot record that the Gaussians were trained with "
+        "train.antialias, and viewers without Mip-Splatting's opacity compensation render them too "
+        "thick. Enable it in the viewer, use an SPZ file, which records it, or train with "
+        "train.antialias: false"
+    ]

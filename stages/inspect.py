@@ -34,7 +34,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def work(job: Job) -> None:
     from pipeline.io.clouds.stored import write_cloud
     from pipeline.io.colmap import read_model, write_model
-    from pipeline.io.gcp import GCP_FILE, read_ground_control
+    from pipeline.io.gcp import GCP_FILE
     from pipeline.photos.verify import verify_manifest
     from pipeline.plan.given_poses import load_given
     from pipeline.plan.point_cloud import read_point_cloud
@@ -70,8 +70,6 @@ def work(job: Job) -> None:
         photos=count, left_out=len(found.listed) - count, videos=videos, **given_counts
     )
     if found.ground_control is not None and found.poses is None:
-        # A malformed file is reported before the hours of later stages.
-        read_ground_control(found.ground_control, [photo.name for photo in manifest.photos])
         write_bytes(job.out / GCP_FILE, found.ground_control.read_bytes())
     if found.truth is not None:
         write_model(job.out / "truth", read_model(found.truth))

@@ -29,9 +29,14 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 def _frame(scan: Scan, config: Config) -> str:
     wanted, control = config.sfm.georeference, scan.ground_control is not None
     if wanted in ("auto", "gcp") and control:
-        return "georeferenced by the ground control points in gcp_list.txt"
+        return f"georeferenced by the ground control points in {scan.ground_control_text}"
     if wanted in ("auto", "gps") and scan.num_gps:
-        return f"georeferenced by GPS positions of {scan.num_gps} photographs, if these suffice"
+        level = sum(photo.gps is not None and photo.gps[2] is None for photo in scan.photos)
+        unknown = f" ({level} without an altitude)" if level else ""
+        return (
+            f"georeferenced by GPS positions of {scan.num_gps} photographs{unknown}, if these "
+            "suffice"
+        )
     why = "as configured" if wanted == "none" else "no GPS or ground control points"
     return f"not georeferenced ({why}): the scene is levelled and scaled to unit size"
 
@@ -60,6 +65,6 @@ SPEC = StageSpec(
     counters=SfmCounters,
     inputs={"photos": inputs.PHOTOS, "matches": ("matches",), "inspect": ("inspect",)},
     options=("sfm",),
-    packages=("pycolmap", "numpy", "scipy"),
+    packages=("pycolmap", "numpy", "scipy", "pyproj"),
     seeded=True,
 )

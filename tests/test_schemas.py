@@ -37,7 +37,7 @@ GPS = Georeference(
     scale=2.5,
     rotation=np.eye(3).tolist(),
     translation=(1.0, 2.0, 3.0),
-    residuals_m=summary(RESIDUALS),
+    residuals_m=summary(RESIDUALS, 9, 2),
     residuals=RESIDUALS,
 )
 RENDER = RenderSettings(background=(0.0, 0.0, 0.0), near=0.01, antialias=True)

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -31,45 +34,87 @@ class Similarity:
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
 
 
+@dataclass(frozen=True)
+class Noise:
+    """What is known of the errors of measurements before a fit.
+
+    Few measurements fit with residuals near 0 whatever their errors are. The estimate of the
+    standard deviation therefore counts the expected one as a number of further residuals.
+
+    Attributes:
+        sigma: expected standard deviation along a horizontal axis, in the target's unit.
+        count: the number of residuals that the expectation counts as; 0 if nothing is expected.
+        floor: lower bound of the estimate.
+    """
+
+    sigma: float
+    count: float = 4.0
+    floor: float = 0.0
+
+    def estimate(self, squares: float, freedoms: float) -> float:
+        """The standard deviation, from the sum of squared residuals and its degrees of freedom."""
+        count = self.count + max(freedoms, 0.0)
+        total = self.count * self.sigma**2 + squares
+        return max(float(np.sqrt(total / count)) if count > 0 else 0.0, self.floor)
+
+
+class Uncertainty(NamedTuple):
+    """Standard deviations of a fitted similarity.
+
+    Attributes:
+        scale: relative to the scale.
+        heading: radians, about the vertical axis.
+        tilt: radians, about the horizontal axis that is determined worst.
+    """
+
+    scale: float
+    heading: float
+    tilt: float
+
+
 class RobustFit(NamedTuple):
     """A similarity estimated in the presence of outliers.
 
     Attributes:
         similarity: maps source points to target points.
         inliers: (N,) bool, the points that it was fitted to.
-        sigma: standard deviation of the weighted residuals along one axis of the ground plane,
-            from their median; in the target's unit.
+        sigma: standard deviation of the weighted residuals along one axis of the ground plane, in
+            the target's unit.
+        observations: the number of measured coordinates of the inliers.
+        freedoms: the number of observations less the number of fitted parameters.
+        uncertainty: of the similarity, from its covariance.
     """
 
     similarity: Similarity
     inliers: NDArray[np.bool_]
     sigma: float
+    observations: int
+    freedoms: int
+    uncertainty: Uncertainty
 
 
 def robust_similarity(
-    source: Array, target: Array, weight: Array, min_sigma: float
+    source: Array, target: Array, weight: Array, noise: Noise
 ) -> RobustFit | None:
     """Least median of squares over triples of points (Rousseeuw 1984), then iterated least squares
     on the inliers.
 
     Args:
         source, target: (N, 3) corresponding points, N >= 3.
-        weight: (3,) factors of the residuals along the target's axes.
-        min_sigma: lower bound of ``RobustFit.sigma``, in the target's unit. Points with residuals
-            above ``OUTLIER_SIGMAS`` times sigma are outliers.
+        weight: (3,) or (N, 3) factors of the residuals along the target's axes; 0 for a coordinate
+            that was not measured.
+        noise: the expected errors. Points with residuals above ``OUTLIER_SIGMAS`` times the
+            estimated standard deviation are outliers.
 
     Returns:
         None if the source points are collinear or no triple determines a similarity.
     """
-    count = len(source)
-    spread = np.linalg.svd(_centred(source), compute_uv=False)
-    if spread[1] < 1e-6 * max(float(spread[0]), 1e-300):
+    weight = np.broadcast_to(weight, source.shape)
+    complete = np.flatnonzero((weight > 0).all(axis=1))
+    if len(complete) < 3 or _collinear(source[complete]):
         return None
-    rng = np.random.default_rng(0)
     best: tuple[float, Similarity] | None = None
-    triples = [np.arange(3)] if count == 3 else None
-    for k in range(NUM_HYPOTHESES if triples is None else 1):
-        chosen = rng.choice(count, 3, replace=False) if triples is None else triples[k]
+    for chosen in _triples(complete):
         proposal = Similarity(*umeyama(source[chosen], target[chosen]))
         if proposal.scale <= 0:
             continue
@@ -80,21 +125,85 @@ def robust_similarity(
     if best is None:
         return None
     similarity = best[1]
-    inliers = np.ones(count, bool)
-    sigma = min_sigma
+    inliers = np.ones(len(source), bool)
     for _ in range(10):
         residuals = np.linalg.norm((similarity(source) - target) * weight, axis=1)
-        # 1.1774 is the median of a Rayleigh distribution with sigma 1.
-        sigma = max(float(np.median(residuals)) / 1.1774, min_sigma)
-        near = residuals <= OUTLIER_SIGMAS * sigma
-        if near.sum() < 3:
+        near = residuals <= OUTLIER_SIGMAS * spread_of(residuals, weight, noise, 7)
+        if near.sum() < 3 or (weight[near] > 0).sum() < 7:
             break
         inliers = near
-        refined = _least_squares(source[inliers], target[inliers], weight, similarity)
+        refined = _least_squares(source[inliers], target[inliers], weight[inliers], similarity)
         if np.allclose(refined(source), similarity(source), rtol=0, atol=1e-9):
             break
         similarity = refined
-    return RobustFit(similarity, inliers, sigma)
+    weighted = (similarity(source[inliers]) - target[inliers]) * weight[inliers]
+    observations = int((weight[inliers] > 0).sum())
+    sigma = noise.estimate(float((weighted**2).sum()), observations - 7)
+    uncertainty = _uncertainty(source[inliers], weight[inliers], similarity, sigma)
+    return RobustFit(similarity, inliers, sigma, observations, observations - 7, uncertainty)
+
+
+def spread_of(residuals: Array, weight: Array, noise: Noise, parameters: int) -> float:
+    """Robust standard deviation of the weighted residuals along one axis.
+
+    Args:
+        residuals: (N,) lengths.
+        weight: (N, 3), 0 for a coordinate that was not measured.
+        parameters: the number of fitted parameters.
+    """
+    # 1.1774 is the median of a Rayleigh distribution with sigma 1.
+    robust = float(np.median(residuals)) / 1.1774
+    freedoms = max(int((weight > 0).sum()) - parameters, 0)
+    return noise.estimate(freedoms * robust**2, freedoms)
+
+
+def _triples(points: NDArray[np.intp]) -> Iterator[NDArray[np.intp]]:
+    """All triples of few points, ``NUM_HYPOTHESES`` random ones of many."""
+    if math.comb(len(points), 3) <= NUM_HYPOTHESES:
+        for triple in itertools.combinations(points.tolist(), 3):
+            yield np.array(triple)
+        return
+    rng = np.random.default_rng(0)
+    for _ in range(NUM_HYPOTHESES):
+        yield points[rng.choice(len(points), 3, replace=False)]
+
+
+def _collinear(points: Array) -> bool:
+    spread = np.linalg.svd(centred(points), compute_uv=False)
+    return bool(spread[1] < 1e-6 * max(float(spread[0]), 1e-300))
+
+
+def _jacobian(rotated: Array) -> Array:
+    """(N, 3, 7) derivatives by rotation vector, log scale and translation of points
+    ``rotated`` = s R x."""
+    # d(exp([w]_x) y) / dw = -[y]_x at w = 0, for y = s R x.
+    x, y, z = rotated.T
+    zero = np.zeros_like(x)
+    by_rotation = np.stack(
+        [
+            np.stack([zero, z, -y], -1),
+            np.stack([-z, zero, x], -1),
+            np.stack([y, -x, zero], -1),
+        ],
+        axis=1,
+    )
+    by_translation = np.broadcast_to(np.eye(3), (len(x), 3, 3))
+    return np.concatenate([by_rotation, rotated[:, :, None], by_translation], axis=2)
+
+
+def _uncertainty(source: Array, weight: Array, similarity: Similarity, sigma: float) -> Uncertainty:
+    """Standard deviations from the covariance of the least squares solution."""
+    rotated = similarity.scale * centred(source) @ similarity.rotation.T
+    jacobian = (_jacobian(rotated) * weight[:, :, None]).reshape(-1, 7)
+    # In units of the extent, so that the eigenvalues of all parameters compare.
+    extent = max(float(np.abs(rotated).max()), 1e-300)
+    jacobian = jacobian / np.array([extent] * 4 + [1.0] * 3)
+    values, vectors = np.linalg.eigh(jacobian.T @ jacobian)
+    values = np.maximum(values, 1e-12)
+    covariance = (vectors / values) @ vectors.T * (sigma / extent) ** 2
+    tilt = float(np.linalg.eigvalsh(covariance[:2, :2])[-1])
+    scale, heading = covariance[3, 3], covariance[2, 2]
+    return Uncertainty(*(float(np.sqrt(max(v, 0.0))) for v in (scale, heading, tilt)))
 
 
 def _least_squares(source: Array, target: Array, weight: Array, start: Similarity) -> Similarity:
@@ -107,20 +216,7 @@ def _least_squares(source: Array, target: Array, weight: Array, start: Similarit
     for _ in range(20):
         rotated = scale * source @ rotation.T
         residual = (rotated + translation - target) * weight
-        # d(exp([w]_x) y) / dw = -[y]_x at w = 0, for y = s R x.
-        x, y, z = rotated.T
-        zero = np.zeros_like(x)
-        by_rotation = np.stack(
-            [
-                np.stack([zero, z, -y], -1),
-                np.stack([-z, zero, x], -1),
-                np.stack([y, -x, zero], -1),
-            ],
-            axis=1,
-        )
-        by_translation = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-        jacobian = np.concatenate([by_rotation, rotated[:, :, None], by_translation], axis=2)
-        jacobian = jacobian * weight[:, None]
+        jacobian = _jacobian(rotated) * weight[:, :, None]
         step = np.linalg.lstsq(jacobian.reshape(-1, 7), -residual.ravel(), rcond=1e-12)[0]
         rotation = Rotation.from_rotvec(step[:3]).as_matrix() @ rotation
         scale *= float(np.exp(np.clip(step[3], -1, 1)))
@@ -130,8 +226,9 @@ def _least_squares(source: Array, target: Array, weight: Array, start: Similarit
     return Similarity(scale, rotation, translation)
 
 
-def _centred(points: Array) -> Array:
-    return points - points.mean(0)
+def centred(points: Array) -> Array:
+    """The points less their mean."""
+    return np.asarray(points - points.mean(0))
 
 
 def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:

@@ -1,26 +1,37 @@
 """Ground control points: OpenDroneMap's ``gcp_list.txt``.
 
 The first line names the projection. Every other line is ``x y z px py image [name]``: the point's
-coordinates, its position in a photograph (stored pixels, the first pixel's centre is 0) and the
-photograph's name. Source: docs.opendronemap.org/gcp.
+coordinates (easting and northing, or longitude and latitude), its position in a photograph (stored
+pixels, the first pixel's centre is 0) and the photograph's name. Source: docs.opendronemap.org/gcp.
 """
 
 from __future__ import annotations
 
 import math
 import re
-from collections.abc import Collection
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
+from pipeline.io.bounded import MIB, read_bounded
 from pipeline.io.names import NameIndex
+from pipeline.io.projection import FIX, MAX_DISTORTION, Projection, read_projection, shortened
 from pipeline.runtime.errors import UserError
 
 GCP_FILE = "gcp_list.txt"
-_FIX = (
-    "write the projection on the first line (WGS84 UTM 32N, EPSG:32632 or a +proj string) and "
-    "'x y z px py image' on every other line"
+MAX_BYTES, MAX_LINES = 32 * MIB, 200_000
+_FIX = f"{FIX}; and 'x y z px py image [name]' on every other line, separated by spaces or tabs"
+_ORDER_FIX = (
+    "write longitude before latitude, easting before northing, whatever the order of the "
+    "projection's definition is"
 )
+# Degrees around a projection's area of use in which it is used nevertheless: a UTM zone.
+_AREA_MARGIN = 6.0
+# Pixel positions up to this far outside of the photograph are on its border.
+_PIXEL_MARGIN = 1.0
 
 
 @dataclass(frozen=True)
@@ -29,13 +40,14 @@ class GroundPoint:
 
     Attributes:
         name: from the file, else "gcp1" and so on in the file's order.
-        position: x, y, z in the file's projection (longitude, latitude, height if geographic).
+        position: x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
+            z in metres.
         pixels: photograph's name -> pixel, COLMAP's convention (the first pixel's centre is 0.5).
     """
 
     name: str
     position: tuple[float, float, float]
-    pixels: dict[str, tuple[float, float]]
+    pixels: Mapping[str, tuple[float, float]]
 
 
 @dataclass(frozen=True)
@@ -43,61 +55,293 @@ class GroundControl:
     """The content of a ``gcp_list.txt``.
 
     Attributes:
-        projection: the file's first line.
-        geographic: whether coordinates are longitude and latitude in degrees, height in metres.
+        projection: of the file; ``points`` are in metres or degrees of it.
+        points: those that a photograph of the scene shows.
         unknown: names of photographs that are not in the scene.
+        warnings: sentences for the user.
     """
 
-    projection: str
-    geographic: bool
+    projection: Projection
     points: tuple[GroundPoint, ...]
     unknown: tuple[str, ...]
+    warnings: tuple[str, ...] = ()
+
+    @property
+    def geographic(self) -> bool:
+        """Whether coordinates are longitude and latitude in degrees, height in metres."""
+        return self.projection.geographic
 
 
-def read_ground_control(path: Path, photographs: Collection[str]) -> GroundControl:
+def ground_control_file(folder: Path) -> Path | None:
+    """The folder's ``gcp_list.txt`` in any case; None without one.
+
+    Raises:
+        UserError: there are two.
+    """
+    found = sorted(
+        path for path in folder.iterdir() if path.name.casefold() == GCP_FILE and path.is_file()
+    )
+    if len(found) > 1:
+        raise UserError(
+            f"expected one file of ground control points, found {found[0].name} and "
+            f"{found[1].name}",
+            file=folder,
+            fix="remove all but one of them",
+        )
+    return found[0] if found else None
+
+
+@dataclass(frozen=True)
+class _Row:
+    """A line of the file: its number, the coordinates as written, the pixel, and the words after
+    them."""
+
+    line: int
+    position: tuple[float, float, float]
+    pixel: tuple[float, float]
+    words: tuple[str, ...]
+
+
+def read_ground_control(
+    path: Path, sizes: Mapping[str, tuple[int, int]], *, complete: bool = True
+) -> GroundControl:
     """Read ``gcp_list.txt``.
 
     Args:
-        photographs: names in the scene, which the file's names match with or without folder and
-            suffix.
+        sizes: photographs of the scene -> width and height. Names match as in ``NameIndex``.
+        complete: whether these are all photographs; False if frames of videos will follow.
 
     Raises:
-        UserError: the file is unreadable, has no projection or a malformed line.
+        UserError: the file is unreadable, has no projection, a malformed line, coordinates that the
+            projection does not have, a name that may mean several photographs or none of the
+            scene's, or a pixel outside of a photograph.
     """
-    try:
-        lines = path.read_text(encoding="utf-8-sig").splitlines()
-    except (OSError, UnicodeDecodeError) as error:
-        raise UserError(f"cannot be read: {error}", file=path, fix=_FIX) from None
-    rows = [(n, line.strip()) for n, line in enumerate(lines, start=1)]
-    rows = [(n, line) for n, line in rows if line and not line.startswith("#")]
-    if not rows or not re.match(r"(WGS84|EPSG:\d+|\+proj)", rows[0][1], re.IGNORECASE):
+    lines = _lines(path)
+    if not lines:
         raise UserError("expected a projection on the first line", file=path, fix=_FIX)
-    projection = rows[0][1]
-    index = NameIndex(photographs)
-    by_file_name = {name.rsplit("/", 1)[-1]: name for name in photographs}
-    file_name_index = NameIndex(by_file_name)
-    pixels: dict[tuple[float, float, float], dict[str, tuple[float, float]]] = {}
+    try:
+        projection = read_projection(lines[0][1])
+    except ValueError as error:
+        raise UserError(f"line {lines[0][0]}: {error}", file=path, fix=_FIX) from None
+    rows = [_row(path, number, line) for number, line in lines[1:]]
+    if rows:
+        _check_coordinates(path, projection, rows)
+    warnings: list[str] = []
+    seen: dict[tuple[float, float, float], dict[str, tuple[float, float]]] = {}
     names: dict[tuple[float, float, float], str] = {}
-    unknown = set()
-    for number, line in rows[1:]:
-        fields = line.split()
-        try:
-            x, y, z, px, py = (float(value) for value in fields[:5])
-            image = fields[5]
-        except (ValueError, IndexError):
-            raise UserError(f"line {number} is malformed: {line}", file=path, fix=_FIX) from None
-        if not all(math.isfinite(value) for value in (x, y, z, px, py)):
-            raise UserError(f"line {number} is not finite: {line}", file=path, fix=_FIX)
-        found = index.find(image)
-        if found is None and (file_name := file_name_index.find(image)) is not None:
-            found = by_file_name[file_name]
-        if found is None:
-            unknown.add(image)
+    unknown: dict[str, None] = {}
+    repeated, outside = [], []
+    index = NameIndex(sizes)
+    for row in rows:
+        image, label = _image(path, row, index)
+        if image is None:
+            unknown[row.words[0]] = None
             continue
-        position = (x, y, z)
+        width, height = sizes[image]
         # OpenDroneMap's pixel centres are integers.
-        pixels.setdefault(position, {})[found] = (px + 0.5, py + 0.5)
-        names.setdefault(position, fields[6] if len(fields) > 6 else f"gcp{len(names) + 1}")
-    points = tuple(GroundPoint(names[at], at, pixels[at]) for at in pixels)
-    geographic = bool(re.search(r"EPSG:4326|EPSG:4979|\+proj=longlat", projection, re.IGNORECASE))
-    return GroundControl(projection, geographic, points, tuple(sorted(unknown)))
+        px, py = row.pixel[0] + 0.5, row.pixel[1] + 0.5
+        margin = _PIXEL_MARGIN
+        if not (-margin <= px <= width + margin and -margin <= py <= height + margin):
+            outside.append((row, image))
+        pixels = seen.setdefault(row.position, {})
+        if image in pixels and pixels[image] != (px, py):
+            repeated.append(row.line)
+        pixels[image] = (px, py)
+        names.setdefault(row.position, label or f"gcp{len(names) + 1}")
+    if outside:
+        _outside(path, outside, sizes)
+    if repeated:
+        warnings.append(
+            f"{path.name}: {len(repeated)} lines repeat a point in the same photograph; the last "
+            f"position is used (first: line {repeated[0]})"
+        )
+    if unknown and complete:
+        first = shortened(next(iter(unknown)))
+        if not seen:
+            raise UserError(
+                f"none of its {len(unknown)} photographs is in the scene (first: {first})",
+                file=path,
+                fix="write the photographs' file names, or set sfm.georeference: gps or none",
+            )
+        warnings.append(
+            f"{path.name} names {len(unknown)} photographs that are not in the scene "
+            f"(first: {first})"
+        )
+    twice = _repeated_names(names.values())
+    if twice:
+        warnings.append(
+            f"{path.name}: {len(twice)} names of points have several positions, which are separate "
+            f"points (first: {shortened(twice[0])})"
+        )
+    positions = _positions(projection, list(seen))
+    points = tuple(
+        GroundPoint(names[at], position, seen[at])
+        for at, position in zip(seen, positions, strict=True)
+    )
+    if points and not projection.contains(np.array(list(seen)), _AREA_MARGIN):
+        warnings.append(
+            f"{path.name}: its points are outside of the area where {projection.name} is used: "
+            "check the projection"
+        )
+    return GroundControl(projection, points, tuple(sorted(unknown)), tuple(warnings))
+
+
+def _lines(path: Path) -> list[tuple[int, str]]:
+    """Numbers and texts of the lines that are neither empty nor comments."""
+    data = read_bounded(path, MAX_BYTES, fix=_FIX)
+    try:
+        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
+        text = data.decode("utf-16" if wide else "utf-8-sig")
+    except UnicodeDecodeError:
+        raise UserError("expected text in UTF-8", file=path, fix=_FIX) from None
+    # Of the characters that ``splitlines`` takes for ends of lines, only these are.
+    lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
+    if len(lines) > MAX_LINES:
+        raise UserError(
+            f"expected at most {MAX_LINES} lines, found {len(lines)}",
+            file=path,
+            fix="remove the points that no photograph of the scene shows",
+        )
+    numbered = [(number, line.strip()) for number, line in enumerate(lines, start=1)]
+    return [(number, line) for number, line in numbered if line and not line.startswith("#")]
+
+
+def _row(path: Path, number: int, line: str) -> _Row:
+    # Names may have spaces; in files with tabs between all fields, tabs alone separate.
+    by_tab = [field.strip() for field in line.split("\t")]
+    fields = by_tab if len(by_tab) >= 6 and all(by_tab[:6]) else line.split()
+    try:
+        x, y, z, px, py = (float(value) for value in fields[:5])
+        words = tuple(fields[5:])
+        if not words:
+            raise ValueError
+    except ValueError:
+        why = "malformed"
+        if re.match(r"[^\s,;]+\s*[,;]", line):
+            why = "separated by commas or has decimal commas; expected spaces or tabs and points"
+        raise UserError(f"line {number} is {why}: {shortened(line)}", file=path, fix=_FIX) from None
+    if not all(math.isfinite(value) for value in (x, y, z, px, py)):
+        raise UserError(f"line {number} is not finite: {shortened(line)}", file=path, fix=_FIX)
+    return _Row(number, (x, y, z), (px, py), words)
+
+
+def _image(path: Path, row: _Row, index: NameIndex) -> tuple[str | None, str]:
+    """The photograph of a line and the point's name; None and "" if it is not in the scene.
+
+    A photograph's name may have spaces: as many words as are needed belong to it.
+
+    Raises:
+        UserError: the name may mean several photographs.
+    """
+    for count in range(1, min(len(row.words), 8) + 1):
+        listed = " ".join(row.words[:count])
+        found = index.candidates(listed)
+        if len(found) > 1:
+            raise UserError(
+                f"line {row.line}: {shortened(listed)} may mean {len(found)} photographs: "
+                f"{found[0]}, {found[1]}{', ...' if len(found) > 2 else ''}",
+                file=path,
+                fix="write the name with its folder, as in "
+                f"'{found[0]}', or give the photographs different names",
+            )
+        if found:
+            rest = row.words[count:]
+            return found[0], rest[0] if rest else ""
+    return None, ""
+
+
+def _outside(
+    path: Path, rows: list[tuple[_Row, str]], sizes: Mapping[str, tuple[int, int]]
+) -> None:
+    row, image = rows[0]
+    width, height = sizes[image]
+    raise UserError(
+        f"{len(rows)} pixel positions are outside of their photograph (first: line {row.line}, "
+        f"{row.pixel[0]:g} {row.pixel[1]:g} in {image} of {width}x{height} pixels)",
+        file=path,
+        fix="write positions in the stored pixels of these files (EXIF orientation not applied), "
+        "not in those of photographs of another size",
+    )
+
+
+def _repeated_names(names: Iterable[str]) -> list[str]:
+    listed = sorted(name for name in names if not re.fullmatch(r"[-+.\d]+", name))
+    return sorted({a for a, b in pairwise(listed) if a == b})
+
+
+def _positions(
+    projection: Projection, written: list[tuple[float, float, float]]
+) -> list[tuple[float, float, float]]:
+    """Coordinates as written -> ``GroundPoint.position``."""
+    if not written:
+        return []
+    coordinates = np.array(written)
+    found = projection.metres(coordinates)
+    if projection.geographic and projection.text.upper() not in ("EPSG:4326", "EPSG:4979"):
+        found[:, :2] = projection.longitude_latitude(coordinates)
+    return [(x, y, z) for x, y, z in found.tolist()]
+
+
+def _check_coordinates(path: Path, projection: Projection, rows: list[_Row]) -> None:
+    """Check that the coordinates are possible in the projection.
+
+    Raises:
+        UserError: they are not, with the order if they are in the other one.
+    """
+    written = np.array([row.position for row in rows])
+    swapped = written[:, [1, 0, 2]]
+    row = rows[0]
+    shown = f"line {row.line}: {row.position[0]:.10g} {row.position[1]:.10g}"
+    if projection.geographic:
+        degrees = written[:, :2] * projection.horizontal
+        if not _on_earth(degrees):
+            if _on_earth(degrees[:, ::-1]):
+                raise UserError(
+                    "the coordinates are in the order latitude, longitude; expected longitude, "
+                    f"latitude ({shown})",
+                    file=path,
+                    fix="exchange the first two columns",
+                )
+            bad = rows[int(np.argmax((np.abs(degrees) > [360, 90]).any(axis=1)))]
+            raise UserError(
+                f"{projection.name} has longitude and latitude in {projection.unit}s, and line "
+                f"{bad.line} has {bad.position[0]:.10g} {bad.position[1]:.10g}",
+                file=path,
+                fix="write the projection that the coordinates are in on the first line, as "
+                "WGS84 UTM 32N",
+            )
+    if projection.contains(written, _AREA_MARGIN):
+        _check_lengths(path, projection, written)
+        return
+    if projection.contains(swapped, _AREA_MARGIN / 6):
+        order = (
+            "latitude, longitude; expected longitude, latitude"
+            if projection.geographic
+            else "northing, easting; expected easting, northing"
+        )
+        raise UserError(
+            f"the coordinates are in the order {order}: as written they are outside of the area "
+            f"where {projection.name} is used ({shown})",
+            file=path,
+            fix=f"exchange the first two columns; {_ORDER_FIX}",
+        )
+    if not np.isfinite(projection.longitude_latitude(written)).all():
+        raise UserError(
+            f"the coordinates are impossible in {projection.name} ({shown})",
+            file=path,
+            fix="check the projection on the first line and the columns",
+        )
+
+
+def _check_lengths(path: Path, projection: Projection, written: np.ndarray) -> None:
+    distortion = projection.distortion(written)
+    if distortion > MAX_DISTORTION:
+        raise UserError(
+            f"lengths in {projection.name} differ from true lengths by {distortion:.0%} here",
+            file=path,
+            fix="convert the points to the UTM zone of the site, or to longitude and latitude",
+        )
+
+
+def _on_earth(degrees: np.ndarray) -> bool:
+    return bool((np.abs(degrees[:, 0]) <= 360).all() and (np.abs(degrees[:, 1]) <= 90).all())

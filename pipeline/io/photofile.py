@@ -16,6 +16,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import exr, pillow_formats
+from pipeline.io.gps import Fault, Position, read_gps
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.panorama import Panorama, panorama_of
 from pipeline.io.recorded import digest_of
@@ -31,7 +32,7 @@ MAX_BYTES = 4 << 30
 # run other programs.
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
-_BASE, _GPS, _IFD = ExifTags.Base, ExifTags.GPS, ExifTags.IFD
+_BASE, _IFD = ExifTags.Base, ExifTags.IFD
 FULL_FRAME_DIAGONAL_MM = 43.27
 # Accepted focal lengths divided by the longer side: from a 180 degree lens to a 35 mm equivalent
 # of 700 mm.
@@ -45,7 +46,10 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 
 
 class FileFacts(BaseModel):
-    """Metadata of an image file; see ``manifest.Photo`` for the fields."""
+    """Metadata of an image file; see ``manifest.Photo`` for the fields.
+
+    ``gps_fault`` is the reason why a GPS position in the metadata is not used.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -60,7 +64,8 @@ class FileFacts(BaseModel):
     lens: str = ""
     focal_mm: float | None = None
     focal_px: float | None = None
-    gps: tuple[float, float, float] | None = None
+    gps: Position | None = None
+    gps_fault: Fault | None = None
     taken: str | None = None
     panorama: Panorama = "no"
 
@@ -92,14 +97,15 @@ def read_facts(path: Path) -> FileFacts:
             width, height = image.size
             if _bits(image) > 16:
                 raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
-            exif = _exif_facts(_exif_of(lambda: _header_exif(image)), width, height)
+            xmp = _xmp(image)
+            exif = _exif_facts(_exif_of(lambda: _header_exif(image)), width, height, xmp)
             return FileFacts(
                 digest=digest,
                 width=width,
                 height=height,
                 alpha=_has_transparency(image),
                 bits=_bits(image),
-                panorama=panorama_of(_xmp(image), exif["body"], width, height),
+                panorama=panorama_of(xmp, exif["body"], width, height),
                 **exif,
             )
     except UnidentifiedImageError:
@@ -253,17 +259,21 @@ def _exif_of(load: Any) -> Mapping[int, Any]:
     return tags
 
 
-def _exif_facts(tags: Mapping[int, Any], width: int, height: int) -> dict[str, Any]:
+def _exif_facts(
+    tags: Mapping[int, Any], width: int, height: int, xmp: bytes = b""
+) -> dict[str, Any]:
     orientation = tags.get(_BASE.Orientation, 1)
     make, model = _text(tags.get(_BASE.Make)), _text(tags.get(_BASE.Model))
     focal_mm = _float(tags.get(_BASE.FocalLength))
+    gps = read_gps(tags.get(_IFD.GPSInfo) or {}, xmp)
     return {
         "orientation": orientation if orientation in range(1, 9) else 1,
         "body": _body(make, model),
         "lens": _text(tags.get(_BASE.LensModel)),
         "focal_mm": focal_mm if _plausible(focal_mm) else None,
         "focal_px": focal_pixels(tags, width, height),
-        "gps": _gps(tags.get(_IFD.GPSInfo) or {}),
+        "gps": gps.position,
+        "gps_fault": gps.fault,
         "taken": _taken(tags),
     }
 
@@ -332,22 +342,3 @@ def _taken(tags: Mapping[int, Any]) -> str | None:
         fraction = f".{digits[:6]}" if digits.isascii() and digits.isdecimal() else ""
         return moment.isoformat() + fraction
     return None
-
-
-def _gps(tags: Mapping[int, Any]) -> tuple[float, float, float] | None:
-    def degrees(value: Any, reference: Any, negative: str) -> float:
-        if not isinstance(value, tuple | list) or len(value) != 3:
-            return math.nan
-        d, m, s = (_float(part) for part in value)
-        # Some programs write 0/0 for the seconds.
-        total = d + (m if math.isfinite(m) else 0.0) / 60 + (s if math.isfinite(s) else 0.0) / 3600
-        return -total if _text(reference).upper().startswith(negative) else total
-
-    latitude = degrees(tags.get(_GPS.GPSLatitude), tags.get(_GPS.GPSLatitudeRef), "S")
-    longitude = degrees(tags.get(_GPS.GPSLongitude), tags.get(_GPS.GPSLongitudeRef), "W")
-    if not (abs(latitude) <= 90 and abs(longitude) <= 180) or latitude == longitude == 0:
-        return None
-    altitude = _float(tags.get(_GPS.GPSAltitude))
-    below = tags.get(_GPS.GPSAltitudeRef) in (1, b"\x01")
-    altitude = altitude if math.isfinite(altitude) else 0.0
-    return latitude, longitude, -altitude if below else altitude

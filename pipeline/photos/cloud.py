@@ -47,10 +47,10 @@ def placed_points(
     """
     xyz, frame = cloud.xyz, IN_POSES
     if georeference is not None and georeference.method != "given":
-        origin = georeference.projected_origin
-        if origin is None:
+        placed = georeference.from_projection(xyz)
+        if placed is None:
             return None
-        xyz, frame = xyz - origin, IN_PROJECTION
+        xyz, frame = placed, IN_PROJECTION
     points = points_of_cloud(cloud, xyz, views, config.max_points)
     if len(points) < min(MIN_POINTS, config.max_points):
         raise UserError(

@@ -18,7 +18,7 @@ from pydantic import BaseModel, ConfigDict
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, companions
-from pipeline.io.gcp import GCP_FILE
+from pipeline.io.gps import fault_warnings
 from pipeline.io.names import LINEAR_SUFFIXES, match_names, stem_key, suffix_of
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import (
@@ -29,6 +29,7 @@ from pipeline.io.posefiles import (
     truth_folder,
 )
 from pipeline.io.recorded import digest_of
+from pipeline.plan.ground_control import find_ground_control
 from pipeline.plan.listed_split import Part, listed_split
 from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all, uses_masks
@@ -57,6 +58,7 @@ class Scan(BaseModel):
         poses: None without given poses, or if they are ignored (``poses: ignore``).
         ordered: the reason to treat the photographs as a sequence, or None.
         ground_control: the scene's ``gcp_list.txt``, if any.
+        ground_control_text: what it holds.
         cloud: the point cloud that the Gaussians are initialised from, or None.
         truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
         fingerprint: digest of the names and contents of photographs, videos, masks, depth maps,
@@ -79,6 +81,7 @@ class Scan(BaseModel):
     truth: Path | None
     truth_digest: str | None
     fingerprint: str
+    ground_control_text: str = ""
     frames: tuple[Photo, ...] = ()
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
     maybe_panoramas: tuple[str, ...] = ()
@@ -234,9 +237,13 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     ]
     if poses is None:
         warnings += partial_panoramas(facts)
+    if poses is None and config.sfm.georeference != "none":
+        warnings += fault_warnings(facts)
     truth = truth_folder(folder)
-    control = folder / GCP_FILE if (folder / GCP_FILE).is_file() else None
-    cloud = find_point_cloud(folder, config, poses, control is not None, facts_cache, warnings)
+    control = find_ground_control(
+        folder, config, photos, warnings, posed=poses is not None, complete=not videos
+    )
+    cloud = find_point_cloud(folder, config, poses, control.path is not None, facts_cache, warnings)
     manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
     result = Scan(
         folder=folder,
@@ -247,7 +254,8 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         listed=tuple(chosen.names),
         poses=poses,
         ordered=why_ordered(photos, len(videos)),
-        ground_control=control,
+        ground_control=control.path,
+        ground_control_text=control.text,
         cloud=cloud,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
@@ -259,7 +267,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
             manifest,
             [*sorted(chosen.names), *listed_videos],
             poses,
-            control,
+            control.path,
             [folder / file for file in cloud.files] if cloud else [],
             facts_cache,
         ),

@@ -38,20 +38,29 @@ def definitions(values: Mapping[str, Any]) -> str:
 
 def georeference(placed: Mapping[str, Any]) -> str:
     """Method, origin and residuals of the georeferencing."""
-    left = placed.get("residuals_m") or {}
+    left, known = placed.get("residuals_m") or {}, placed.get("uncertainty") or {}
     values = {
         "method": {"gps": "GPS", "gcp": "ground control points"}.get(placed["method"]),
         **(placed.get("origin") or {}),
         "positions used": left.get("used"),
         "rejected as outliers": left.get("left_out"),
+        "observations, degrees of freedom": _joined(left, "observations", "freedoms"),
         "horizontal residual, median and largest, m": _pair(left, "horizontal"),
         "vertical residual, median and largest, m": _pair(left, "vertical"),
+        "standard deviation of the scale (relative)": known.get("scale"),
+        "standard deviation of heading and tilt, degrees": _joined(
+            known, "heading_deg", "tilt_deg"
+        ),
     }
     return definitions({name: value for name, value in values.items() if value is not None})
 
 
+def _joined(values: Mapping[str, Any], first: str, second: str) -> str | None:
+    return f"{values[first]:g}, {values[second]:g}" if first in values else None
+
+
 def _pair(left: Mapping[str, Any], axis: str) -> str | None:
-    if f"{axis}_median" not in left:
+    if left.get(f"{axis}_median") is None:
         return None
     return f"{left[f'{axis}_median']:.3f}, {left[f'{axis}_max']:.3f}"
 

@@ -27,12 +27,15 @@ class GeographicOrigin(JsonObject):
 
     latitude: float = Field(description="Degrees north.")
     longitude: float = Field(description="Degrees east.")
-    altitude: float = Field(description="Metres, as measured: not reduced to a geoid.")
+    altitude: float | None = Field(
+        description="Metres, as measured: not reduced to a geoid. null if no altitude is known; "
+        "heights are then relative to the median camera."
+    )
 
 
 class CartesianOrigin(JsonObject):
-    """An origin in the projection of the ground control points (metres), or in the world and unit
-    of the given poses."""
+    """An origin in the projection of the ground control points, in metres whatever the projection's
+    unit is, or in the world and unit of the given poses."""
 
     x: float = Field(description="East in a projection.")
     y: float = Field(description="North in a projection.")
@@ -52,7 +55,9 @@ class Residual(JsonObject):
 
     name: str = Field(description="Of the photograph or the point.")
     horizontal_m: float = Field(description="Distance in the plane of x and y, metres.")
-    vertical_m: float = Field(description="Model minus measurement along z, metres.")
+    vertical_m: float | None = Field(
+        description="Model minus measurement along z, metres; null without a measured altitude."
+    )
     used: bool = Field(description="Whether it is an inlier, which the fit uses.")
 
 
@@ -61,10 +66,32 @@ class ResidualSummary(JsonObject):
 
     used: int = Field(ge=1, description="Number of inliers.")
     left_out: int = Field(ge=0, description="Number of outliers.")
+    observations: int = Field(ge=1, description="Number of measured coordinates of the inliers.")
+    freedoms: int = Field(
+        ge=0,
+        description="Degrees of freedom: `observations` less the number of fitted parameters. With "
+        "few, residuals are small whatever the errors are.",
+    )
     horizontal_median: float = Field(description="Metres.")
     horizontal_max: float = Field(description="Metres.")
-    vertical_median: float = Field(description="Of the absolute values, metres.")
-    vertical_max: float = Field(description="Of the absolute values, metres.")
+    vertical_median: float | None = Field(
+        description="Of the absolute values, metres; null without measured altitudes."
+    )
+    vertical_max: float | None = Field(description="As `vertical_median`.")
+
+
+class FrameUncertainty(JsonObject):
+    """Standard deviations of a georeferenced frame, from the covariance of the fit and the errors
+    that such measurements usually have."""
+
+    scale: float = Field(ge=0, description="Relative to the scale.")
+    heading_deg: float = Field(ge=0, description="Rotation about the vertical axis, degrees.")
+    tilt_deg: float = Field(ge=0, description="Rotation about a horizontal axis, degrees.")
+    tilt_from: Literal["positions", "cameras"] = Field(
+        description="positions: from the fit. cameras: the positions do not determine the tilt, "
+        "and it is estimated from the orientation of the photographs; `tilt_deg` is then a usual "
+        "value."
+    )
 
 
 class GeoreferenceSummary(JsonObject):
@@ -77,6 +104,7 @@ class GeoreferenceSummary(JsonObject):
     residuals_m: ResidualSummary | None = Field(
         description="null where nothing was measured: level frames, given poses."
     )
+    uncertainty: FrameUncertainty | None = Field(None, description="As `residuals_m`.")
 
 
 class Georeference(JsonFile, GeoreferenceSummary):
@@ -89,6 +117,11 @@ class Georeference(JsonFile, GeoreferenceSummary):
     unit: str = Field(description="Unit of length.")
     projection: str | None = Field(
         description="First line of `gcp_list.txt`; null without ground control points."
+    )
+    projection_units_m: tuple[float, float] | None = Field(
+        None,
+        description="Metres per unit of the projection, for x and y and for z: coordinates in the "
+        "projection are (origin + x) / unit. null where the frame is not in a projection.",
     )
     scale: float = Field(
         gt=0,
@@ -113,11 +146,20 @@ class Georeference(JsonFile, GeoreferenceSummary):
 
     @property
     def projected_origin(self) -> NDArray[np.float64] | None:
-        """(3,) the frame's origin in the projection of the ground control points; None for other
-        frames."""
+        """(3,) the frame's origin in the projection of the ground control points, metres; None for
+        other frames."""
         if self.method != "gcp" or not isinstance(self.origin, CartesianOrigin):
             return None
         return self.origin.array
+
+    def from_projection(self, xyz: NDArray[np.float64]) -> NDArray[np.float64] | None:
+        """(N, 3) coordinates in the projection of the ground control points, in its units, to the
+        frame; None for other frames."""
+        origin = self.projected_origin
+        if origin is None:
+            return None
+        horizontal, vertical = self.projection_units_m or (1.0, 1.0)
+        return np.asarray(xyz * [horizontal, horizontal, vertical] - origin)
 
     def in_given_unit(self) -> Georeference | None:
         """Of exported Gaussians: the given poses' unit, the scene's origin. None if that is the
@@ -135,5 +177,8 @@ class Georeference(JsonFile, GeoreferenceSummary):
 
     def summary(self) -> GeoreferenceSummary:
         return GeoreferenceSummary(
-            method=self.method, origin=self.origin, residuals_m=self.residuals_m
+            method=self.method,
+            origin=self.origin,
+            residuals_m=self.residuals_m,
+            uncertainty=self.uncertainty,
         )

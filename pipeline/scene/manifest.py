@@ -56,8 +56,8 @@ class Photo(BaseModel):
     """Whether it is an equirectangular panorama of 360 by 180 degrees."""
     source: str | None = None
     """Name of the photograph of which this is a part; null for a whole photograph."""
-    gps: tuple[float, float, float] | None = None
-    """Latitude and longitude in degrees, altitude in metres."""
+    gps: tuple[float, float, float | None] | None = None
+    """Latitude and longitude in degrees, altitude in metres; null for an unknown altitude."""
     taken: str | None = None
     """Time of exposure from EXIF, ISO 8601."""
     split: Literal["train", "test"] | None = None

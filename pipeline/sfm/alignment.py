@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 
 from pipeline.geometry.similarity import Similarity
-from pipeline.geometry.up_direction import up_direction
+from pipeline.geometry.up_direction import image_directions, up_direction
 from pipeline.io.gcp import GCP_FILE, read_ground_control
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.bearings import camera_rays
-from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
+from pipeline.sfm.frame_comparison import contradictions
+from pipeline.sfm.gcp_frame import Triangulated, from_gcp
+from pipeline.sfm.georeference import Cameras, WorldFrame, level
+from pipeline.sfm.gps_frame import from_gps
 
 Georeference = Literal["auto", "gps", "gcp", "none"]
 
@@ -35,15 +38,18 @@ def align_model(
         control: the scene's ``gcp_list.txt``, None without one.
 
     Raises:
-        UserError: ``gcp_list.txt`` is malformed, or ``method`` is "gcp" and there is none.
+        UserError: ``gcp_list.txt`` is malformed or its coordinates are in another order or unit
+            than its projection's; or ``method`` is "gcp" and there is none.
     """
     photos = {photo.name: photo for photo in manifest.photos}
     images = sorted((model.image(i) for i in model.reg_image_ids()), key=lambda image: image.name)
     rotations = np.stack([image.cam_from_world().rotation.matrix() for image in images])
+    orientations = [photos[image.name].orientation for image in images]
     cameras = Cameras(
         names=[image.name for image in images],
         centres=np.stack([image.projection_center() for image in images]),
-        up=up_direction(rotations, [photos[image.name].orientation for image in images]),
+        up=up_direction(rotations, orientations),
+        directions=image_directions(rotations, orientations),
     )
     fallbacks: list[str] = []
     frame: WorldFrame | str | None = None
@@ -53,12 +59,15 @@ def align_model(
             file=GCP_FILE,
             fix="put the file into the scene folder, or set sfm.georeference: auto",
         )
+    positions = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
     if method in ("auto", "gcp") and control is not None:
-        points = read_ground_control(control, photos)
-        frame = from_gcp(points, partial(_triangulate, model))
+        sizes = {name: (photo.width, photo.height) for name, photo in photos.items()}
+        points = read_ground_control(control, sizes)
+        frame = from_gcp(points, partial(_triangulate, model), cameras, control)
         if isinstance(frame, str):
             fallbacks.append(f"not georeferenced by ground control points: {frame}")
-    positions = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
+        elif positions:
+            frame.warnings.extend(contradictions(frame, cameras, positions))
     if not isinstance(frame, WorldFrame) and method != "none" and (positions or method == "gps"):
         frame = from_gps(cameras, positions)
         if isinstance(frame, str):
@@ -79,26 +88,36 @@ def transform_model(model: pycolmap.Reconstruction, similarity: Similarity) -> N
 
 
 def _triangulate(
-    model: pycolmap.Reconstruction, seen: dict[str, tuple[float, float]]
-) -> NDArray[np.float64] | None:
-    """(3,) point closest to the rays through pixels of photographs (name -> pixel), by least
+    model: pycolmap.Reconstruction, seen: Mapping[str, tuple[float, float]]
+) -> Triangulated | None:
+    """The point closest to the rays through pixels of photographs (name -> pixel), by least
     squares; None if fewer than two are registered or the rays are nearly parallel."""
     by_name = {model.image(i).name: model.image(i) for i in model.reg_image_ids()}
-    centres, rays = [], []
+    centres, rays, focal = [], [], []
     for name, pixel in sorted(seen.items()):
         if name not in by_name:
             continue
         image = by_name[name]
-        local = camera_rays(model.camera(image.camera_id), np.array([pixel], np.float64))[0]
+        camera = model.camera(image.camera_id)
+        local = camera_rays(camera, np.array([pixel], np.float64))[0]
         if not np.isfinite(local).all():
             continue
         ray = image.cam_from_world().rotation.matrix().T @ local
         centres.append(image.projection_center())
         rays.append(ray / np.linalg.norm(ray))
+        focal.append(_pixels_per_radian(camera))
     if len(rays) < 2:
         return None
     d, c = np.array(rays), np.array(centres)
     if (d @ d.T).min() > np.cos(np.radians(MIN_RAY_ANGLE_DEG)):
         return None
     across = np.eye(3) - d[:, :, None] * d[:, None, :]
-    return np.asarray(np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, c)))
+    point = np.asarray(np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, c)))
+    distances = np.linalg.norm(c - point, axis=1)
+    return Triangulated(point, float(np.median(distances / focal)))
+
+
+def _pixels_per_radian(camera: pycolmap.Camera) -> float:
+    if "EQUIRECTANGULAR" in camera.model_name:
+        return float(camera.width / (2 * np.pi))
+    return float(camera.mean_focal_length())

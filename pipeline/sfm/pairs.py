@@ -53,14 +53,16 @@ def sequential_pairs(count: int, overlap: int) -> list[Pair]:
     return [(i, i + step) for i in range(count) for step in sorted(steps) if i + step < count]
 
 
-def spatial_pairs(gps: Sequence[tuple[float, float, float] | None], neighbours: int) -> list[Pair]:
+def spatial_pairs(
+    gps: Sequence[tuple[float, float, float | None] | None], neighbours: int
+) -> list[Pair]:
     """Each photograph with its ``neighbours`` nearest ones by horizontal distance.
 
     Altitudes are ignored: GPS measures them inaccurately. Photographs without a position are in no
     pair.
 
     Args:
-        gps: latitude and longitude in degrees, altitude in metres; None without a position.
+        gps: latitude and longitude in degrees, altitude in metres or None; None without a position.
     """
     known = [i for i, position in enumerate(gps) if position is not None]
     if len(known) < 2:

@@ -42,6 +42,7 @@ PHOTOS = tuple(
     Photo(name=f"p{i}.jpg", path=f"p{i}.jpg", width=64, height=48, digest="") for i in range(4)
 )
 NAMES = [photo.name for photo in PHOTOS]
+SIZES = {photo.name: (photo.width, photo.height) for photo in PHOTOS}
 
 
 def model(kinds: Sequence[str]) -> Reconstruction:
@@ -297,7 +298,7 @@ READERS: dict[str, Reader] = {
     "llff": Reader(llff_seeds, read_llff),
     **POSES,
     **CLOUDS,
-    "gcp": Reader(gcp_seeds, lambda folder: read_ground_control(folder / "gcp_list.txt", NAMES)),
+    "gcp": Reader(gcp_seeds, lambda folder: read_ground_control(folder / "gcp_list.txt", SIZES)),
     "ply": Reader(gaussian_seeds(".ply"), read_any_gaussians),
     "ply-ascii": Reader(ascii_ply, read_any_gaussians),
     "spz": Reader(gaussian_seeds(".spz"), read_any_gaussians, gzip.decompress, pack_gzip),

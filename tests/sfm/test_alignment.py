@@ -6,12 +6,13 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from pyproj import Transformer
 
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import run_isolated
 from pipeline.scene.manifest import Manifest, Photo
 from tests.sfm import corner
-from tests.sfm.test_georeference import geodetic
+from tests.sfm.test_georeference import ORIGIN, geodetic
 
 COUNT = 8
 # From the frame of ``corner`` (y down) to metres east, north, up, forty times as large.
@@ -71,8 +72,9 @@ def test_gps_aligns_a_model_to_metres():
 def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
     rng = np.random.default_rng(0)
     lines = ["WGS84 UTM 32N"]
+    place = Transformer.from_crs(4326, 32632, always_xy=True).transform(ORIGIN[1], ORIGIN[0])
     for xyz in rng.uniform(0.1, 0.8, (6, 3)) * (1, -1, -1):
-        east, north, up = TO_ENU @ xyz + (465000, 5246000, 400)
+        east, north, up = TO_ENU @ xyz + (*place, 400)
         for i in (1, 4, 6):
             rotation, shift = corner.poses(COUNT)[i]
             x, y, z = rotation @ xyz + shift

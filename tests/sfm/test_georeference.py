@@ -12,7 +12,9 @@ from pipeline.geometry.similarity import Similarity
 from pipeline.io.gcp import GroundControl, read_ground_control
 from pipeline.runtime.errors import UserError
 from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Georeference
-from pipeline.sfm.georeference import Cameras, WorldFrame, from_gcp, from_gps, level
+from pipeline.sfm.gcp_frame import Triangulated, from_gcp
+from pipeline.sfm.georeference import Cameras, WorldFrame, level
+from pipeline.sfm.gps_frame import from_gps
 
 ORIGIN = np.array([47.37, 8.54, 410.0])
 METRES_PER_DEGREE = 111_194.0
@@ -107,7 +109,7 @@ def test_gps_on_a_line_uses_the_up_direction_of_the_cameras():
     cameras, back = scene(true)
     frame = from_gps(cameras, positions(cameras, measured))
     assert isinstance(frame, WorldFrame)
-    assert any("on a line" in text for text in frame.warnings)
+    assert any("lie on a line" in text for text in frame.warnings)
     assert frame.similarity.scale == pytest.approx(back.scale, rel=0.1)
     up = frame.similarity.rotation @ cameras.up
     np.testing.assert_allclose(up, [0, 0, 1], atol=1e-6)
@@ -173,8 +175,8 @@ GCP = """WGS84 UTM 32N
 def test_ground_control_file(tmp_path):
     path = tmp_path / "gcp_list.txt"
     path.write_text(GCP)
-    control = read_ground_control(path, ["a.jpg", "sub/b.jpg"])
-    assert control.projection == "WGS84 UTM 32N" and not control.geographic
+    control = read_ground_control(path, {"a.jpg": (640, 480), "sub/b.jpg": (640, 480)})
+    assert control.projection.text == "WGS84 UTM 32N" and not control.geographic
     assert [p.name for p in control.points] == ["one", "two"] and control.unknown == (
         "missing.jpg",
     )
@@ -197,7 +199,7 @@ def test_malformed_ground_control_is_an_error(tmp_path, text, what):
     path = tmp_path / "gcp_list.txt"
     path.write_text(text)
     with pytest.raises(UserError, match=what) as error:
-        read_ground_control(path, ["a.jpg"])
+        read_ground_control(path, {"a.jpg": (640, 480)})
     assert error.value.fix
 
 
@@ -206,7 +208,12 @@ def control_of(places: np.ndarray, tmp_path) -> GroundControl:
     lines += [f"{x!r} {y!r} {z!r} {i} 0 a.jpg p{i}" for i, (x, y, z) in enumerate(places.tolist())]
     path = tmp_path / "gcp_list.txt"
     path.write_text("\n".join(lines))
-    return read_ground_control(path, ["a.jpg"])
+    return read_ground_control(path, {"a.jpg": (640, 480)})
+
+
+def seen_at(places: np.ndarray):
+    """Triangulation of points whose column in a.jpg is their number."""
+    return lambda seen: Triangulated(places[round(seen["a.jpg"][0] - 0.5)], 1e-4)
 
 
 def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
@@ -219,11 +226,8 @@ def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
     given_[4] += (0, 6.0, 0)
     control = control_of(given_, tmp_path)
 
-    def triangulate(seen):
-        return ours[round(seen["a.jpg"][0] - 0.5)]
-
-    frame = from_gcp(control, triangulate)
-    assert isinstance(frame, WorldFrame) and frame.projection == "EPSG:32632"
+    frame = from_gcp(control, seen_at(ours))
+    assert isinstance(frame, WorldFrame) and frame.projection.text == "EPSG:32632"
     assert isinstance(frame.origin, CartesianOrigin)
     origin = np.array([frame.origin.x, frame.origin.y, frame.origin.z])
     moved = frame.similarity(ours)
@@ -239,6 +243,6 @@ def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
 def test_ground_control_on_a_line_or_unobserved_is_rejected(tmp_path):
     line = np.linspace(0, 1, 6)[:, None] * [30.0, 40.0, 1.0]
     control = control_of(line, tmp_path)
-    reason = from_gcp(control, lambda seen: line[round(seen["a.jpg"][0] - 0.5)])
+    reason = from_gcp(control, seen_at(line))
     assert isinstance(reason, str) and "line" in reason
     assert "only 0 of 6" in str(from_gcp(control, lambda seen: None))

@@ -1,0 +1,115 @@
+"""Similarity transforms of points whose vertical axis is known: rotation about it only."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.similarity import (
+    OUTLIER_SIGMAS,
+    Noise,
+    RobustFit,
+    Similarity,
+    Uncertainty,
+    centred,
+    spread_of,
+)
+
+Array = NDArray[np.float64]
+# Up to this many points, all pairs are tried; of more points, each with at most 30 others.
+_ALL_PAIRS = 60
+
+
+def upright_similarity(
+    source: Array, target: Array, weight: Array, noise: Noise, tilt: float
+) -> RobustFit | None:
+    """A similarity of points with a common vertical axis (z), in the presence of outliers.
+
+    Heading, scale and horizontal translation follow from the horizontal coordinates: pairs of
+    points with the least median residual, then least squares on the inliers. The vertical
+    translation is the median of the measured heights' differences.
+
+    Args:
+        source, target: (N, 3) corresponding points, N >= 2.
+        weight: (N, 3) factors of the residuals along the target's axes; 0 for a height that was not
+            measured.
+        noise: the expected errors.
+        tilt: standard deviation of the vertical axis, radians.
+
+    Returns:
+        None if the source points lie above each other.
+    """
+    known = weight[:, 2] > 0
+    flat = source * [1.0, 1.0, 0.0]
+    extent = float(np.linalg.norm(centred(flat), axis=1).max())
+    if extent < 1e-9 * max(float(np.abs(source).max()), 1e-300):
+        return None
+    best: tuple[float, Similarity] | None = None
+    for pair in _pairs(len(flat)):
+        proposal = _with_height(_least_squares(flat[pair], target[pair]), source, target, known)
+        score = float(np.median(_residuals(proposal, source, target, weight)))
+        if best is None or score < best[0]:
+            best = (score, proposal)
+    assert best is not None
+    similarity = best[1]
+    parameters = 5 if known.any() else 4
+    inliers = np.ones(len(source), bool)
+    for _ in range(10):
+        residuals = _residuals(similarity, source, target, weight)
+        near = residuals <= OUTLIER_SIGMAS * spread_of(residuals, weight, noise, parameters)
+        if near.sum() < 2 or (near == inliers).all():
+            break
+        inliers = near
+        similarity = _fitted(source, target, inliers, known)
+    similarity = _fitted(source, target, inliers, known)
+    weighted = (similarity(source[inliers]) - target[inliers]) * weight[inliers]
+    observations = int((weight[inliers] > 0).sum())
+    sigma = noise.estimate(float((weighted**2).sum()), observations - parameters)
+    size = similarity.scale * float(np.linalg.norm(centred(flat[inliers])))
+    turn = sigma / max(size, 1e-300)
+    return RobustFit(
+        similarity,
+        inliers,
+        sigma,
+        observations,
+        observations - parameters,
+        Uncertainty(turn, turn, tilt),
+    )
+
+
+def _pairs(count: int) -> list[list[int]]:
+    step = 1 if count <= _ALL_PAIRS else count // 30
+    return [[i, j] for i in range(count) for j in range(i + 1, count, step)]
+
+
+def _residuals(similarity: Similarity, source: Array, target: Array, weight: Array) -> Array:
+    return np.asarray(np.linalg.norm((similarity(source) - target) * weight, axis=1))
+
+
+def _fitted(
+    source: Array, target: Array, inliers: NDArray[np.bool_], known: NDArray[np.bool_]
+) -> Similarity:
+    flat = source * [1.0, 1.0, 0.0]
+    return _with_height(
+        _least_squares(flat[inliers], target[inliers]), source, target, known & inliers
+    )
+
+
+def _with_height(
+    flat: Similarity, source: Array, target: Array, known: NDArray[np.bool_]
+) -> Similarity:
+    """The similarity with the vertical translation of the points of known height; 0 without any."""
+    heights = target[known, 2] - flat.scale * source[known, 2]
+    shift = float(np.median(heights)) if known.any() else 0.0
+    return Similarity(flat.scale, flat.rotation, np.append(flat.translation[:2], shift))
+
+
+def _least_squares(source: Array, target: Array) -> Similarity:
+    """Least squares similarity of the ground plane that rotates about z only."""
+    a, b = centred(source)[:, :2], centred(target)[:, :2]
+    dot, cross = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
+    size = np.hypot(dot, cross)
+    c, s = (dot / size, cross / size) if size > 0 else (1.0, 0.0)
+    scale = float(size / max(float((a**2).sum()), 1e-300))
+    rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
+    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))

@@ -1,0 +1,286 @@
+"""World frame from ground control points, and what a wrong frame is caused by.
+
+Coordinates in another order, with another sign or in another unit fit a model worse than correct
+ones, or turn it upside down; three points or points on a plane fit as well when they are mirrored,
+so that only the orientation of the photographs shows it. Each likely mistake is undone and fitted
+again: a mistake that explains the misfit is named.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.geodesy import to_enu
+from pipeline.geometry.similarity import (
+    OUTLIER_SIGMAS,
+    Noise,
+    RobustFit,
+    Similarity,
+    robust_similarity,
+)
+from pipeline.io.gcp import GCP_FILE, GroundControl
+from pipeline.io.projection import shortened
+from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Origin
+from pipeline.sfm.georeference import (
+    MIN_POSITIONS,
+    WARN_SCALE,
+    Cameras,
+    WorldFrame,
+    fit_text,
+    residual_records,
+    summary,
+    uncertainty,
+    undetermined,
+)
+
+Array = NDArray[np.float64]
+Pixels = Mapping[str, tuple[float, float]]
+
+
+class Triangulated(NamedTuple):
+    """A point seen in photographs: its position (3,) in the mapper's world, and the size of a pixel
+    at it."""
+
+    position: Array
+    pixel: float
+
+
+# Errors of surveyed points, metres, and of their positions in photographs, pixels.
+SURVEY_SIGMA_M, MARK_SIGMA_PX = 0.03, 1.5
+# Largest standard deviation of the tilt, radians.
+MAX_TILT_RAD = float(np.radians(5.0))
+# A mistake explains a misfit if undoing it reduces the residuals by this factor.
+EXPLAINS = 3.0
+FOOT_M = 0.3048
+_UP = np.array([0.0, 0.0, 1.0])
+
+
+def from_gcp(
+    control: GroundControl,
+    triangulate: Callable[[Pixels], Triangulated | None],
+    cameras: Cameras | None = None,
+    path: Path | None = None,
+) -> WorldFrame | str:
+    """Frame of the ground control points, or the reason why there is none.
+
+    Args:
+        triangulate: photograph name -> pixel to the point in the mapper's world, None if it cannot
+            be triangulated.
+        cameras: the photographs' orientations show whether the frame is upside down.
+        path: of the file, for messages.
+
+    Raises:
+        UserError: the coordinates are in another order or unit than the projection's, or mirrored.
+    """
+    path = path or Path(GCP_FILE)
+    found = [(point, triangulate(point.pixels)) for point in control.points]
+    placed = [(point, at) for point, at in found if at is not None]
+    if len(placed) < MIN_POSITIONS:
+        return (
+            f"only {len(placed)} of {len(control.points)} ground control points are seen by two "
+            f"photographs with a pose; {MIN_POSITIONS} are needed"
+        )
+    places = np.array([point.position for point, _ in placed], np.float64)
+    source = np.array([at.position for _, at in placed])
+    pixel = float(np.median([at.pixel for _, at in placed]))
+    target, origin = _local(control, places)
+    noise = _noise(source, target, pixel)
+    fit = robust_similarity(source, target, np.ones(3), noise)
+    if fit is None:
+        return "the ground control points lie on a line"
+    fit = robust_similarity(source, target, np.ones(3), _noise(source, target, pixel, fit)) or fit
+    contradiction = _contradiction(cameras, fit.similarity)
+    mistake = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
+    if mistake is not None:
+        raise UserError(
+            f"{mistake.found}: {mistake.evidence}",
+            file=path,
+            fix=f"{mistake.fix}, or set sfm.georeference: gps or none",
+        )
+    if contradiction == "upside down":
+        raise UserError(
+            "the photographs would be upside down in the frame of the ground control points",
+            file=path,
+            fix="check the order and the signs of the coordinates, or set sfm.georeference: gps or "
+            "none",
+        )
+    if (reason := undetermined(fit)) is not None:
+        return f"of the ground control points, {reason}"
+    if fit.uncertainty.tilt > MAX_TILT_RAD:
+        return (
+            "the ground control points lie on a line: they determine the tilt about it to "
+            f"{min(np.degrees(fit.uncertainty.tilt), 180.0):.0f} degrees only"
+        )
+    names_used = [point.name for point, _ in placed]
+    records = residual_records(names_used, fit.similarity(source) - target, fit.inliers)
+    totals = summary(records, fit.observations, fit.freedoms)
+    accuracy = uncertainty(fit, "positions")
+    warnings = []
+    if contradiction is not None:
+        warnings.append(
+            "in the frame of the ground control points the photographs are "
+            f"{contradiction}: check the coordinates"
+        )
+    if totals.left_out:
+        outliers = [shortened(record.name, 40) for record in records if not record.used]
+        warnings.append(
+            f"{totals.left_out} ground control points are outliers and are left out: "
+            f"{', '.join(outliers[:5])}"
+        )
+    if accuracy.scale > WARN_SCALE:
+        warnings.append(
+            f"the ground control points determine the scale to {accuracy.scale:.0%} only (standard "
+            "deviation): lengths in metres are as inaccurate"
+        )
+    warnings += control.warnings
+    name = shortened(control.projection.text)
+    return WorldFrame(
+        "gcp",
+        fit.similarity,
+        origin=origin,
+        projection=control.projection,
+        residuals=records,
+        fit=fit,
+        decisions=[
+            f"georeferenced by {totals.used} ground control points ({name}): "
+            f"{fit_text(totals, accuracy, 3)}"
+        ],
+        warnings=warnings,
+    )
+
+
+def _local(control: GroundControl, places: Array) -> tuple[Array, Origin]:
+    """(N, 3) metres around an origin, and the origin."""
+    if control.geographic:
+        longitudes = (places[:, 0] - places[0, 0] + 180) % 360 - 180 + places[0, 0]
+        places = np.column_stack([longitudes, places[:, 1:]])
+        latitude, longitude, altitude = np.median(places, axis=0)[[1, 0, 2]].tolist()
+        target = to_enu(places[:, [1, 0, 2]], np.array([latitude, longitude, altitude]))
+        longitude = (longitude + 180) % 360 - 180
+        return target, GeographicOrigin(latitude=latitude, longitude=longitude, altitude=altitude)
+    # Whole metres: adding the origin to coordinates is exact.
+    origin = np.round(np.median(places, axis=0))
+    x, y, z = origin.tolist()
+    return places - origin, CartesianOrigin(x=x, y=y, z=z)
+
+
+def _noise(source: Array, target: Array, pixel: float, fit: RobustFit | None = None) -> Noise:
+    """The expected errors, metres. Without a fit, the scale is that of the median distances."""
+    if fit is None:
+        sizes = [
+            float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
+            for p in (source, target)
+        ]
+        scale = sizes[1] / max(sizes[0], 1e-300)
+    else:
+        scale = fit.similarity.scale
+    return Noise(float(np.hypot(SURVEY_SIGMA_M, MARK_SIGMA_PX * pixel * scale)))
+
+
+def _contradiction(cameras: Cameras | None, similarity: Similarity) -> str | None:
+    if cameras is None or cameras.directions is None:
+        return None
+    return cameras.directions.contradiction(similarity.rotation.T @ _UP)
+
+
+# --- likely mistakes ----------------------------------------------------------------------
+
+
+class _Mistake(NamedTuple):
+    """A likely mistake: what is found, the evidence, and what to do."""
+
+    found: str
+    evidence: str
+    fix: str
+
+
+def _mistake(
+    control: GroundControl,
+    places: Array,
+    source: Array,
+    pixel: float,
+    cameras: Cameras | None,
+    given: tuple[RobustFit, str | None],
+) -> _Mistake | None:
+    """The mistake that explains a bad fit or photographs that are upside down; None if none does.
+
+    Args:
+        given: the fit of the coordinates as they are, and its contradiction.
+    """
+    fit, contradiction = given
+    target = _local(control, places)[0]
+    first = np.linalg.norm(fit.similarity(source) - target, axis=1)
+    best: tuple[tuple[bool, float, int], _Mistake] | None = None
+    for number, (undone, what, fix) in enumerate(_undone(control, places)):
+        other_target = _local(control, undone)[0]
+        noise = _noise(source, other_target, pixel, fit)
+        other = robust_similarity(source, other_target, np.ones(3), noise)
+        if other is None or undetermined(other) is not None:
+            continue
+        other_contradiction = _contradiction(cameras, other.similarity)
+        second = np.linalg.norm(other.similarity(source) - other_target, axis=1)
+        before, after = _misfits(first, second, other.sigma)
+        explains = (
+            int(other.inliers.sum()) >= max(4, int(fit.inliers.sum()))
+            and other.freedoms > 2
+            and before > EXPLAINS * after
+            and before > EXPLAINS * noise.sigma / 2
+        )
+        turns = (
+            contradiction == "upside down"
+            and other_contradiction is None
+            and after <= max(2 * before, 3 * noise.sigma)
+        )
+        if not (turns or (explains and other_contradiction != "upside down")):
+            continue
+        evidence = (
+            f"as written, the points fit the photographs to {before:.3g} m, otherwise to "
+            f"{after:.3g} m"
+        )
+        if turns:
+            evidence = "as written, the photographs are upside down; " + evidence
+        rank = (other_contradiction is not None, round(float(np.log2(after + 1e-9)), 0), number)
+        if best is None or rank < best[0]:
+            best = rank, _Mistake(what, evidence, fix)
+    return best[1] if best else None
+
+
+def _misfits(first: Array, second: Array, sigma: float) -> tuple[float, float]:
+    """Root mean squares of two fits' residuals; both without as many of the largest ones as the
+    second has outliers."""
+    kept = max(int((second <= OUTLIER_SIGMAS * sigma).sum()), MIN_POSITIONS)
+    squares = [np.sort(residuals)[:kept] ** 2 for residuals in (first, second)]
+    return float(np.sqrt(squares[0].mean())), float(np.sqrt(squares[1].mean()))
+
+
+def _undone(control: GroundControl, places: Array) -> Iterator[tuple[Array, str, str]]:
+    """Coordinates with a likely mistake undone, the mistake, and what to do; likely ones first."""
+    projection = control.projection
+    swapped = places[:, [1, 0, 2]]
+    if projection.geographic:
+        if (np.abs(swapped[:, 1]) <= 90).all():
+            what = "the coordinates seem to be in the order latitude, longitude"
+            yield swapped, what, "exchange the first two columns"
+    else:
+        yield (
+            swapped,
+            "the coordinates seem to be in the order northing, easting (or one of the two is "
+            "counted in the opposite direction)",
+            "exchange the first two columns",
+        )
+    yield places * [1, 1, -1], "z seems to be counted downwards", "change the sign of z"
+    in_feet = places * [1, 1, FOOT_M]
+    yield in_feet, "z seems to be in feet", "convert z to metres"
+    if projection.vertical != 1.0:
+        as_metres = places / [1, 1, projection.vertical]
+        fix = "convert z, or write a projection with heights in metres (EPSG:n+5703)"
+        yield as_metres, f"z seems to be in metres, not in {projection.unit} units", fix
+    if projection.geographic:
+        yield places * [-1, 1, 1], "longitudes seem to have the wrong sign", "change their sign"
+        yield places * [1, -1, 1], "latitudes seem to have the wrong sign", "change their sign"

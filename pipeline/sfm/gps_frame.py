@@ -1,0 +1,238 @@
+"""World frame from the photographs' GPS positions.
+
+Positions that cover an area determine all seven parameters. Positions on a line, and positions
+without altitudes, leave the tilt undetermined; it is taken from the orientation of the cameras.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipeline.geometry.geodesy import to_enu
+from pipeline.geometry.similarity import Noise, RobustFit, Similarity, centred, robust_similarity
+from pipeline.geometry.upright_similarity import upright_similarity
+from pipeline.scene.georeference import GeographicOrigin
+from pipeline.sfm.georeference import (
+    CAMERA_TILT_RAD,
+    MIN_POSITIONS,
+    WARN_SCALE,
+    Cameras,
+    WorldFrame,
+    fit_text,
+    residual_records,
+    rotation_between,
+    summary,
+    uncertainty,
+    undetermined,
+)
+
+Array = NDArray[np.float64]
+Positions = Mapping[str, tuple[float, float, float | None]]
+"""Photograph's name -> latitude, longitude (degrees), altitude (metres, None if unknown)."""
+
+# Errors of consumer GPS, metres, and the ratio of vertical to horizontal errors.
+GPS_NOISE = Noise(3.0)
+ALTITUDE_RATIO = 3.0
+# Angle at which the up direction of positions contradicts that of the cameras, and how much larger
+# horizontal residuals may be with that of the cameras.
+MAX_ANGLE_RAD, MUCH_WORSE = float(np.radians(20.0)), 2.0
+# The view downwards as up direction replaces that of the images' tops if it fits so much better.
+BETTER_FIT = 0.5
+# Positions within this angle of the vertical do not determine the heading.
+_MIN_SLOPE = float(np.sin(np.radians(60.0)))
+
+
+class _Measured(NamedTuple):
+    """Positions: local metres (N, 3) with 0 for unknown heights, weights (N, 3), and the origin."""
+
+    enu: Array
+    weight: Array
+    origin: GeographicOrigin
+
+
+def from_gps(cameras: Cameras, positions: Positions) -> WorldFrame | str:
+    """Frame east, north, up around the positions' median, or the reason why there is none."""
+    known = [i for i, name in enumerate(cameras.names) if name in positions]
+    if len(known) < MIN_POSITIONS:
+        return (
+            f"only {len(known)} photographs with a pose have a GPS position; "
+            f"{MIN_POSITIONS} are needed"
+        )
+    measured = _local([positions[cameras.names[i]] for i in known])
+    centres = cameras.centres[known]
+    found = _fitted(centres, measured, cameras)
+    if isinstance(found, str):
+        return found
+    fit, tilt_from, warnings = found
+    if (reason := undetermined(fit)) is not None:
+        size = float(np.sqrt((centred(measured.enu[fit.inliers, :2]) ** 2).sum(1).mean()))
+        return f"the GPS positions spread over {size:.1f} m: {reason}"
+    up = fit.similarity.rotation.T @ [0.0, 0.0, 1.0]
+    contradiction = cameras.directions and cameras.directions.contradiction(up)
+    if contradiction == "upside down":
+        return (
+            "the photographs would be upside down. The positions are mirrored: check the "
+            "hemispheres (N, S, E, W) and the signs of latitude and longitude"
+        )
+    if contradiction is not None:
+        warnings.append(
+            f"in the frame of the GPS positions the photographs are {contradiction}: check that "
+            "the scene is upright, or set sfm.georeference: none"
+        )
+    residual = fit.similarity(centres) - measured.enu
+    residual[measured.weight[:, 2] == 0, 2] = np.nan
+    records = residual_records([cameras.names[i] for i in known], residual, fit.inliers)
+    totals = summary(records, fit.observations, fit.freedoms)
+    accuracy = uncertainty(fit, tilt_from)
+    left_out = [record.name for record in records if not record.used]
+    if left_out:
+        warnings.append(
+            f"{len(left_out)} GPS positions are outliers and are left out (first: {left_out[0]})"
+        )
+    if accuracy.scale > WARN_SCALE:
+        warnings.append(
+            f"the GPS positions determine the scale to {accuracy.scale:.0%} only (standard "
+            "deviation): lengths in metres are as inaccurate"
+        )
+    return WorldFrame(
+        "gps",
+        fit.similarity,
+        origin=measured.origin,
+        residuals=records,
+        fit=fit,
+        tilt_from=tilt_from,
+        decisions=[
+            f"georeferenced by {totals.used} GPS positions of {len(cameras.names)} photographs: "
+            f"metres east, north and up of {measured.origin.latitude:.6f}, "
+            f"{measured.origin.longitude:.6f}; {fit_text(totals, accuracy, 2)}"
+        ],
+        warnings=warnings,
+    )
+
+
+def local_metres(degrees: Array, origin: Array) -> Array:
+    """(N, 2) metres east and north of ``origin`` (latitude, longitude, height) for (N, 2) latitudes
+    and longitudes, for comparison."""
+    geodetic = np.column_stack([degrees, np.full(len(degrees), origin[2])])
+    return to_enu(geodetic, origin)[:, :2]
+
+
+def _local(positions: list[tuple[float, float, float | None]]) -> _Measured:
+    geodetic = np.array([[np.nan if v is None else v for v in p] for p in positions], np.float64)
+    # Longitudes relative to the first: the scene may span the date line.
+    geodetic[:, 1] = geodetic[0, 1] + (geodetic[:, 1] - geodetic[0, 1] + 180) % 360 - 180
+    measured = np.isfinite(geodetic[:, 2])
+    altitude = float(np.median(geodetic[measured, 2])) if measured.any() else None
+    geodetic[~measured, 2] = altitude or 0.0
+    origin = np.median(geodetic, axis=0)
+    enu = to_enu(geodetic, origin)
+    weight = np.tile([1.0, 1.0, 1.0 / ALTITUDE_RATIO], (len(geodetic), 1))
+    weight[~measured, 2] = 0.0
+    longitude = (float(origin[1]) + 180) % 360 - 180
+    return _Measured(
+        enu,
+        weight,
+        GeographicOrigin(latitude=float(origin[0]), longitude=longitude, altitude=altitude),
+    )
+
+
+def _fitted(
+    centres: Array, measured: _Measured, cameras: Cameras
+) -> tuple[RobustFit, Literal["positions", "cameras"], list[str]] | str:
+    """The fit, what determines its tilt, and warnings; or the reason why there is none."""
+    enu, weight, _ = measured
+    fit = robust_similarity(centres, enu, weight, GPS_NOISE)
+    if fit is not None and fit.uncertainty.tilt <= CAMERA_TILT_RAD:
+        upright = _instead(fit, centres, measured, cameras)
+        if upright is None:
+            return fit, "positions", []
+        angle = np.degrees(np.arccos(np.clip(_up_of(fit) @ cameras.up, -1, 1)))
+        text = (
+            f"the altitudes of the GPS positions contradict the orientation of the cameras by "
+            f"{angle:.0f} degrees: the tilt is estimated from the cameras"
+        )
+        return upright, "cameras", [text]
+    found: list[tuple[RobustFit, bool]] = []
+    vertical = False
+    for up, downwards in _up_candidates(cameras):
+        levelled = _upright(up, centres, measured)
+        vertical = vertical or levelled is None
+        if levelled is not None:
+            found.append((levelled, downwards))
+    if not found:
+        line = " along the up direction of the cameras" if vertical else ""
+        return f"the GPS positions lie on a line{line}"
+    best, downwards = found[0]
+    if len(found) > 1 and _misfit(found[1][0]) < BETTER_FIT * _misfit(best):
+        best, downwards = found[1]
+    # The tilt is taken from the cameras where they determine it better than the positions.
+    why = "lie on a line, or are too few or too narrow, and leave the tilt undetermined"
+    if not weight[:, 2].any():
+        why = "have no altitude and leave the tilt undetermined"
+    assumed = ", as if they looked straight down" if downwards else ""
+    text = f"the GPS positions {why}: it is estimated from the orientation of the cameras{assumed}"
+    return best, "cameras", [text]
+
+
+def _upright(up: Array, centres: Array, measured: _Measured) -> RobustFit | None:
+    """The fit with an up direction; None if the positions lie along it."""
+    turn = rotation_between(up, np.array([0.0, 0.0, 1.0]))
+    along = np.linalg.svd(centred(centres @ turn.T))[2][0]
+    if abs(along[2]) > _MIN_SLOPE:
+        return None
+    fit = upright_similarity(
+        centres @ turn.T, measured.enu, measured.weight, GPS_NOISE, CAMERA_TILT_RAD
+    )
+    if fit is None:
+        return None
+    scale, rotation, translation = (
+        fit.similarity.scale,
+        fit.similarity.rotation @ turn,
+        fit.similarity.translation,
+    )
+    return fit._replace(similarity=Similarity(scale, rotation, translation))
+
+
+def _instead(
+    fit: RobustFit, centres: Array, measured: _Measured, cameras: Cameras
+) -> RobustFit | None:
+    """The fit with the cameras' up direction, if that of ``fit`` differs from it by more than its
+    standard deviation explains, and the horizontal positions fit nearly as well: altitudes, which
+    drift, are then what is wrong."""
+    angle = float(np.arccos(np.clip(_up_of(fit) @ cameras.up, -1, 1)))
+    if angle < max(MAX_ANGLE_RAD, 3 * float(np.hypot(fit.uncertainty.tilt, CAMERA_TILT_RAD))):
+        return None
+    upright = _upright(cameras.up, centres, measured)
+    if upright is None:
+        return None
+    errors = [
+        float(np.median(np.linalg.norm((f.similarity(centres) - measured.enu)[:, :2], axis=1)))
+        for f in (fit, upright)
+    ]
+    return upright if errors[1] <= max(MUCH_WORSE * errors[0], GPS_NOISE.sigma) else None
+
+
+def _up_of(fit: RobustFit) -> Array:
+    """(3,) up direction in the mapper's world."""
+    return np.asarray(fit.similarity.rotation[2])
+
+
+def _misfit(fit: RobustFit) -> float:
+    """The standard deviation of the residuals, if outliers had as large ones as the fit allows."""
+    return fit.sigma * len(fit.inliers) / max(int(fit.inliers.sum()), 1)
+
+
+def _up_candidates(cameras: Cameras) -> list[tuple[Array, bool]]:
+    """Up directions from the orientations: that of the images' tops; and the opposite of the
+    viewing direction where all cameras look the same way and may look straight down."""
+    found = [(cameras.up, False)]
+    if cameras.directions is not None:
+        ahead = cameras.directions.ahead.mean(0)
+        length = float(np.linalg.norm(ahead))
+        if length > 0.8 and float(-ahead @ cameras.up) / length < np.cos(np.radians(30)):
+            found.append((-ahead / length, True))
+    return found

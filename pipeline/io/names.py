@@ -14,7 +14,8 @@ from pipeline.io import pillow_formats
 from pipeline.io.exr import EXR_SUFFIXES
 from pipeline.runtime.errors import UserError
 
-PICTURE_SUFFIXES = frozenset({".jpg", ".jpeg", ".png", ".tif", ".tiff", ".bmp", ".webp"})
+JPEG_SUFFIXES = frozenset({".jpg", ".jpeg", ".jpe", ".jfif"})
+PICTURE_SUFFIXES = JPEG_SUFFIXES | {".png", ".tif", ".tiff", ".bmp", ".webp"}
 # RAW formats that LibRaw reads.
 RAW_SUFFIXES = frozenset(
     """
@@ -26,9 +27,11 @@ RAW_SUFFIXES = frozenset(
 LINEAR_SUFFIXES = RAW_SUFFIXES | EXR_SUFFIXES
 # Image formats that cannot be read; they are reported in a warning.
 UNREAD_SUFFIXES = (
-    pillow_formats.HEIF_SUFFIXES | {".jxl", ".jp2", ".gif", ".hdr"}
+    pillow_formats.HEIF_SUFFIXES | {".jxl", ".jp2", ".j2k", ".gif", ".hdr", ".insp", ".psd"}
 ) - pillow_formats.SUFFIXES
-VIDEO_SUFFIXES = frozenset({".mp4", ".mov", ".mkv", ".avi", ".m4v", ".webm"})
+VIDEO_SUFFIXES = frozenset(
+    ".mp4 .mov .mkv .avi .m4v .webm .mts .m2ts .mpg .mpeg .3gp .3g2 .wmv .ogv".split()  # noqa: SIM905
+)
 PHOTO_SUFFIXES = PICTURE_SUFFIXES | LINEAR_SUFFIXES | pillow_formats.SUFFIXES
 # Folders above this many parts do not tell photographs apart.
 _MAX_TAIL = 8
@@ -179,17 +182,20 @@ class Ambiguity:
     def text(self) -> str:
         if len(self.listed) == 1:
             return (
-                f"{_quoted(self.listed)} may mean {len(self.photos)} photographs: "
-                f"{_quoted(self.photos)}"
+                f"{first_names(self.listed)} may mean {len(self.photos)} photographs: "
+                f"{first_names(self.photos)}"
             )
         if len(set(self.listed)) == 1:
-            return f"{_quoted(self.listed[:1])} is listed {len(self.listed)} times"
-        return f"{len(self.listed)} names may mean {self.photos[0]}: {_quoted(self.listed)}"
+            return f"{first_names(self.listed[:1])} is listed {len(self.listed)} times"
+        return f"{len(self.listed)} names may mean {self.photos[0]}: {first_names(self.listed)}"
 
 
-def _quoted(names: Sequence[str]) -> str:
-    more = f" and {len(names) - 3} more" if len(names) > 3 else ""
-    return ", ".join(name if len(name) < 100 else f"{name[:97]}..." for name in names[:3]) + more
+def first_names(names: Sequence[str], count: int = 3) -> str:
+    """The first names and the number of the others, in words."""
+    more = f" and {len(names) - count} more" if len(names) > count else ""
+    return (
+        ", ".join(name if len(name) < 100 else f"{name[:97]}..." for name in names[:count]) + more
+    )
 
 
 @dataclass(frozen=True)
@@ -205,7 +211,9 @@ class Matches:
     ambiguous: tuple[Ambiguity, ...] = ()
 
 
-def compare_names(listed: Sequence[str], photos: Iterable[str]) -> Matches:
+def compare_names(
+    listed: Sequence[str], photos: Iterable[str], *, same_positions: bool = True
+) -> Matches:
     """Match the names of a file with photographs; each name and photograph belongs to one.
 
     The names are those of ``NameIndex``; better rules come first. The last parts of names are
@@ -218,13 +226,14 @@ def compare_names(listed: Sequence[str], photos: Iterable[str]) -> Matches:
     Args:
         listed: the names in the file.
         photos: the photographs' names.
+        same_positions: whether names may be those of photographs in several folders.
     """
     index = NameIndex(photos)
     equal = {name: index.equal(name) for name in listed}
     if any(found for _, found in equal.values()):
         return _matched(listed, equal)
     tails = {name: found for name in listed if (found := index.same_tail(name))}
-    several = _same_positions(listed, tails)
+    several = _same_positions(listed, tails) if same_positions else {}
     if several:
         return Matches(several)
     return _matched(listed, {name: (0, found) for name, found in tails.items()})

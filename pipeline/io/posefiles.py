@@ -3,17 +3,18 @@
 from __future__ import annotations
 
 import os
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path, PurePosixPath
 
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.io.colmap import has_model
+from pipeline.io.colmap_models import find_models, model_folders
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
 from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, suffix_of
 from pipeline.io.poses.formats import (
-    COLMAP_FOLDERS,
     FORMATS,
     MIN_IMAGES_PER_CAMERA,
     PoseFormat,
@@ -53,9 +54,13 @@ class PoseSummary(BaseModel):
     @property
     def label(self) -> str:
         """Kind, place and number of the poses, in words."""
+        return f"{POSE_LABELS[self.kind]} {self.source}, {self.num_images} cameras"
+
+    @property
+    def source(self) -> str:
+        """The pose file or folder, in words."""
         several = self.kind == "transforms" and self.path == "."
-        where = "transforms*.json" if several else self.path
-        return f"{POSE_LABELS[self.kind]} {where}, {self.num_images} cameras"
+        return "transforms*.json" if several else self.path
 
 
 class GivenPoses(PoseSummary):
@@ -93,10 +98,34 @@ def incomplete_models(folder: Path) -> list[str]:
     """A warning for each COLMAP folder that has cameras or images but not both."""
     return [
         f"{path}: not used: expected a COLMAP model with cameras and images, found only one of them"
-        for path in COLMAP_FOLDERS
+        for path in model_folders(folder)
         if not has_model(folder / path)
         and any((folder / path / f"{stem}.{end}").is_file() for stem, end in _MODEL_FILES)
     ]
+
+
+def other_models(folder: Path, poses: GivenPoses | None) -> list[str]:
+    """A warning if the scene has COLMAP models beside the one that is used."""
+    models = find_models(folder)
+    if poses is None or poses.kind != "colmap" or len(models) < 2:
+        return []
+    others = ", ".join(f"{path} ({count} images)" for path, count in models[1:4])
+    more = f" and {len(models) - 4} more" if len(models) > 4 else ""
+    return [
+        f"of {len(models)} COLMAP models, {poses.path} is used, which has the most images "
+        f"({models[0][1]}); not used: {others}{more}; remove {poses.path} to use another"
+    ]
+
+
+def other_pose_files(folder: Path, poses: GivenPoses | None) -> list[Path]:
+    """The pose files that are not used, because those of ``poses`` come first."""
+    used = set(pose_files(folder / poses.path, poses.kind)) if poses is not None else set()
+    found: list[Path] = []
+    for entry in FORMATS:
+        path = entry.find(folder) if entry.kind != "colmap" else None
+        if path is not None:
+            found += [file for file in entry.files(folder / path) if file not in used]
+    return found
 
 
 def pose_files(path: Path, kind: PoseKind) -> list[Path]:
@@ -165,16 +194,34 @@ def _existing(
         if suffix_of(name) in PHOTO_SUFFIXES and name[0] != "."
     ]
     index = NameIndex(existing)
-    found = {match: frame for name, frame in frames.items() if (match := index.find(name))}
+    # All that a name may mean: the names are compared again without unused files of pairs.
+    found = {match: frame for name, frame in frames.items() for match in index.equal(name)[1]}
     if not found:
         return None
     base = os.path.commonpath([os.path.dirname(name) or "." for name in found]) or "."
-    masks = {os.path.relpath(name, base): frame.mask for name, frame in found.items()}
-    named = {name: mask for name, mask in masks.items() if mask is not None}
-    usable = {name: mask for name, mask in named.items() if _is_inside(folder, mask)}
-    lost = sorted(set(named.values()) - set(usable.values()))
-    warnings += _frame_warnings(source, repeated, lost)
-    return PhotoFolder(base, base, f"the photographs that {source} lists", sorted(masks), usable)
+    relative = {os.path.relpath(name, base): frame for name, frame in found.items()}
+    masks, lost = _named_files(folder, {name: f.mask for name, f in relative.items()})
+    warnings += _frame_warnings(source, repeated, "masks", lost)
+    depths, lost = _named_files(folder, {name: f.depth for name, f in relative.items()})
+    warnings += _frame_warnings(source, [], "depth maps", lost)
+    reason = f"the photographs that {source} lists"
+    return PhotoFolder(base, base, reason, sorted(relative), masks, depths)
+
+
+def _named_files(folder: Path, named: Mapping[str, str | None]) -> tuple[dict[str, str], list[str]]:
+    """Photograph -> its mask or depth map that the pose file names; the names that are missing,
+    or outside of the scene folder."""
+    found: dict[str, str] = {}
+    lost: list[str] = []
+    for photo, name in named.items():
+        if name is None:
+            continue
+        file = next((n for n in (name, f"{name}.png") if _is_inside(folder, n)), None)
+        if file is None:
+            lost.append(name)
+        else:
+            found[photo] = file
+    return found, sorted(lost)
 
 
 def _is_inside(folder: Path, name: str) -> bool:
@@ -182,17 +229,17 @@ def _is_inside(folder: Path, name: str) -> bool:
     return not name.startswith(("/", "../")) and (folder / name).is_file()
 
 
-def _frame_warnings(source: str, repeated: list[str], lost_masks: list[str]) -> list[str]:
+def _frame_warnings(source: str, repeated: list[str], noun: str, lost: list[str]) -> list[str]:
     warnings = []
     if repeated:
         warnings.append(
             f"{len(repeated)} frames of {source} name the file of an earlier frame and are "
             f"left out (first: {repeated[0]})"
         )
-    if lost_masks:
+    if lost:
         warnings.append(
-            f"{len(lost_masks)} masks that {source} lists are not used: they are missing, "
-            f"or outside of the scene folder (first: {lost_masks[0]})"
+            f"{len(lost)} {noun} that {source} lists are not used: they are missing, "
+            f"or outside of the scene folder (first: {lost[0]})"
         )
     return warnings
 

@@ -43,6 +43,11 @@ _SCALES = (1e-12, 1e12)
 _LISTS = tuple(f"{name}_filenames" for name in SPLITS)
 # Units farther apart are a mistake, and overflow where they are multiplied.
 _SMALLEST_SCALE = 1e-15
+# The fields of a frame's mask and depth map, of nerfstudio and of others.
+_COMPANIONS = (
+    ("mask_path", "mask_file_path"),
+    ("depth_file_path", "depth_path"),
+)
 
 
 @dataclass(frozen=True)
@@ -51,7 +56,8 @@ class Frame:
 
     Attributes:
         path: photograph, relative to the folder of the json, often without suffix.
-        mask: likewise, or None.
+        mask: file of its mask, likewise, or None.
+        depth: file of its depth map, likewise, or None.
         rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
         fields: the file's fields, overridden by the frame's.
         split: the list of the scene's own split that it is in, or None: transforms_train.json and
@@ -62,6 +68,7 @@ class Frame:
 
     path: str
     mask: str | None
+    depth: str | None
     rotation: NDArray[np.float64]
     translation: NDArray[np.float64]
     fields: Mapping[str, Any]
@@ -119,6 +126,7 @@ def posed_frames(path: Path) -> list[PosedFrame]:
             frame.translation,
             frame.mask,
             frame.split,
+            frame.depth,
         )
         for frame in read_frames(path)
     ]
@@ -290,12 +298,11 @@ def _frame(
     axes = to_world[:3, :3] * scale
     where = f"{source}.transform_matrix"
     pose = checked_pose(file, where, FLIP_YZ @ axes.T, to_world[:3, 3])
-    mask = fields.get("mask_path") or None
-    if mask is not None:
-        mask = _file_name(file, f"{source}.mask_path", mask)
+    mask, depth = (_optional_file(file, source, fields, names) for names in _COMPANIONS)
     return Frame(
         path=path,
         mask=mask,
+        depth=depth,
         rotation=pose[0],
         translation=pose[1],
         fields={**shared, **fields},
@@ -303,6 +310,14 @@ def _frame(
         file=file,
         source=source,
     )
+
+
+def _optional_file(
+    file: Path, source: str, fields: Mapping[str, Any], names: Sequence[str]
+) -> str | None:
+    """The file that the first of the fields ``names`` has, or None."""
+    name = next((name for name in names if fields.get(name)), None)
+    return None if name is None else _file_name(file, f"{source}.{name}", fields[name])
 
 
 def _file_name(file: Path, where: str, value: Any) -> str:

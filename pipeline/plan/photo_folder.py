@@ -51,28 +51,22 @@ def choose_photo_folder(
     if listed is not None and configured in ("auto", listed.path):
         return listed
     if configured not in ("auto", "."):
-        names = pictures_in(folder, configured, warnings)
+        names = pictures_in(folder / configured)
         base = "images" if re.fullmatch(r"images_[248]", configured) else configured
         return PhotoFolder(configured, base, "as configured", names)
     copies = [f"images{suffix}" for suffix in _COPY_SUFFIXES]
     copies = [name for name in copies if (folder / name).is_dir()]
     if configured == "auto" and copies:
-        return _choose_copy(folder, copies, config, poses, cache, warnings)
-    return _scene_folder(folder, warnings)
+        return _choose_copy(folder, copies, config, poses, cache)
+    return _scene_folder(folder)
 
 
-def _scene_folder(folder: Path, warnings: list[str]) -> PhotoFolder:
+def _scene_folder(folder: Path) -> PhotoFolder:
     """The photographs in the scene folder itself, else those in its subfolders."""
-    top = pictures_in(folder, ".", warnings, recursive=False)
+    top = pictures_in(folder, recursive=False)
     if top:
-        below = [name for name in relative_folders(folder) if pictures_in(folder, name, [])]
-        if below:
-            warnings.append(
-                f"photographs in {', '.join(below)} are not used, because there are photographs in "
-                "the scene folder itself (inspect.image_folder)"
-            )
         return PhotoFolder(".", ".", "no images/; photographs are in the scene folder", top)
-    names = pictures_in(folder, ".", warnings)
+    names = pictures_in(folder)
     parents = [posixpath.dirname(name) for name in names]
     base = posixpath.commonpath(parents) if parents else ""
     names = [posixpath.relpath(name, base or ".") for name in names]
@@ -86,7 +80,6 @@ def _choose_copy(
     config: Config,
     poses: GivenPoses | None,
     cache: FactCache,
-    warnings: list[str],
 ) -> PhotoFolder:
     """The smallest of images/ and its reduced copies that is not smaller than training and feature
     extraction need; for scenes of Mip-NeRF 360 the copy that papers use."""
@@ -95,7 +88,7 @@ def _choose_copy(
         needed = max(needed, config.features.max_long_side_px)
     found: list[tuple[int, PhotoFolder]] = []
     for path in copies:
-        names = pictures_in(folder, path, warnings)
+        names = pictures_in(folder / path)
         if names:
             facts = read_all(folder, path, names[:1], cache, [])
             longest = max((max(f.width, f.height) for f in facts.values()), default=0)

@@ -6,10 +6,8 @@ builds the DAG, so facts about files are cached.
 
 from __future__ import annotations
 
-import hashlib
 from collections import Counter
-from collections.abc import Mapping, Sequence
-from functools import partial
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -17,23 +15,25 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
-from pipeline.io.folders import PhotoFolder, companions
+from pipeline.io.gcp import ground_control_file
 from pipeline.io.gps import fault_warnings
-from pipeline.io.names import LINEAR_SUFFIXES, match_names, stem_key, suffix_of
-from pipeline.io.photofile import FileFacts, read_facts
+from pipeline.io.photofile import FileFacts
 from pipeline.io.posefiles import (
     GivenPoses,
     find_poses,
     incomplete_models,
+    other_models,
     pose_files,
     truth_folder,
 )
-from pipeline.io.recorded import digest_of
+from pipeline.plan.companion_files import depths_of, masks_of, without_companions
+from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
 from pipeline.plan.ground_control import find_ground_control
-from pipeline.plan.listed_split import Part, listed_split
+from pipeline.plan.inventory import Inventory
 from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all, uses_masks
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
+from pipeline.plan.pose_names import check_pose_names, split_of, without_linear_pairs
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
 from pipeline.runtime.errors import ChangedFileError, UserError
@@ -86,6 +86,8 @@ class Scan(BaseModel):
     """Placeholders for the frames that may be chosen of the videos (``with_frames``)."""
     maybe_panoramas: tuple[str, ...] = ()
     """Photographs of which only the aspect ratio is that of a panorama."""
+    unused: tuple[str, ...] = ()
+    """Warnings of files that are not used (``Inventory``). They change no result."""
 
     def with_frames(self, max_frames: int) -> Scan:
         """The scan with placeholders for up to ``max_frames`` frames of the videos."""
@@ -106,7 +108,7 @@ class Scan(BaseModel):
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        return self.manifest.warnings
+        return (*self.unused, *self.manifest.warnings)
 
     def check_unchanged(self, fingerprint: str, folder: Path) -> None:
         """Compare with the fingerprint of an earlier scan.
@@ -195,14 +197,17 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     poses = None
     if config.poses != "ignore":
         poses = find_poses(folder, facts_cache)
-        warnings += incomplete_models(folder)
+        warnings += [*incomplete_models(folder), *other_models(folder, poses)]
 
     chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
+    chosen = without_companions(chosen, poses, warnings)
+    photographs = [folder / chosen.path / name for name in chosen.names]
     facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
-    facts = {name: facts[name] for name in _without_linear_pairs(sorted(facts), poses, warnings)}
+    facts = {name: facts[name] for name in without_linear_pairs(sorted(facts), poses, warnings)}
     listed_videos = find_videos(
         folder, chosen.path, recursive=not chosen.names and chosen.path == "."
     )
+    found_videos = listed_videos
     if poses is not None and listed_videos:
         warnings.append(
             f"{len(listed_videos)} videos are not used, because poses are given (first: "
@@ -210,9 +215,13 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         )
         listed_videos = []
     videos = read_videos(folder, listed_videos, facts, facts_cache, warnings)
-    if not facts and not videos:
-        _no_photographs(folder, [*chosen.names, *listed_videos], warnings)
-    if not videos and len(facts) < config.inspect.min_images:
+    if not videos and len(facts) < max(config.inspect.min_images, 1):
+        given = [file] if (file := ground_control_file(folder)) is not None else []
+        given += pose_files(folder / poses.path, poses.kind) if poses is not None else []
+        named = [*photographs, *given, *(folder / name for name in found_videos)]
+        warnings += Inventory(folder, chosen, poses, named, _ignored(config)).unused()
+        if not facts:
+            _no_photographs(folder, [*chosen.names, *listed_videos], warnings)
         raise UserError(
             f"only {len(facts)} readable photographs, at least {config.inspect.min_images} are "
             "needed" + "".join(f"\n  {line}" for line in warnings),
@@ -220,15 +229,12 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
             fix="add photographs, or lower inspect.min_images",
         )
     if poses is not None:
-        _check_pose_names(folder, poses, chosen, sorted(facts), warnings)
-    split = _listed_split(poses, chosen, sorted(facts), config, warnings)
+        check_pose_names(folder, poses, chosen, sorted(facts), warnings)
+    split = split_of(poses, chosen, sorted(facts), config, warnings)
     facts = {name: found for name, found in facts.items() if not split or split[name]}
 
-    suffix = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
-    masks = _masks(folder, suffix, config, chosen, facts, facts_cache)
-    if masks and len(masks) < len(facts):
-        warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
-    depths = companions(folder, [f"depths{suffix}", "depths"], sorted(facts))
+    masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
+    depths = depths_of(folder, chosen, facts)
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
@@ -245,6 +251,13 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     )
     cloud = find_point_cloud(folder, config, poses, control.path is not None, facts_cache, warnings)
     manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
+    used = [*photographs, *masks.values(), *depths.values()]
+    used += [folder / name for name in found_videos]
+    used += pose_files(folder / poses.path, poses.kind) if poses is not None else []
+    used += [control.path] if control.path is not None else []
+    used += [folder / name for name in cloud.files] if cloud is not None else []
+    used += pose_files(truth, "colmap") if truth is not None else []
+    inventory = Inventory(folder, chosen, poses, used, _ignored(config))
     result = Scan(
         folder=folder,
         manifest=manifest,
@@ -257,12 +270,13 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ground_control=control.path,
         ground_control_text=control.text,
         cloud=cloud,
+        unused=tuple(inventory.unused()),
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
-        truth_digest=_digest_files(folder, pose_files(truth, "colmap"), facts_cache)
+        truth_digest=digest_of_files(folder, pose_files(truth, "colmap"), facts_cache)
         if truth
         else None,
-        fingerprint=_fingerprint(
+        fingerprint=fingerprint_of(
             folder,
             manifest,
             [*sorted(chosen.names), *listed_videos],
@@ -294,139 +308,27 @@ def _check_folder(folder: Path) -> None:
     )
 
 
+def _ignored(config: Config) -> frozenset[str]:
+    """The kinds of files that the configuration leaves out."""
+    ignored = set()
+    if config.poses == "ignore":
+        ignored |= {"poses", "models"}
+    if not uses_masks(config):
+        ignored.add("masks")
+    if config.init.points_file == "none":
+        ignored.add("clouds")
+    return frozenset(ignored)
+
+
 def _no_photographs(folder: Path, listed: Sequence[str], warnings: Sequence[str]) -> NoReturn:
+    details = "".join(f"\n  {line}" for line in warnings)
     if not listed:
-        raise UserError("no photograph and no video found", file=folder, fix=_ADD_PHOTOS)
+        raise UserError(f"no photograph and no video found{details}", file=folder, fix=_ADD_PHOTOS)
     raise UserError(
-        f"none of the {len(listed)} photographs and videos can be read"
-        + "".join(f"\n  {line}" for line in warnings),
+        f"none of the {len(listed)} photographs and videos can be read{details}",
         file=folder,
         fix="replace the files by intact copies, or convert them to a supported format",
     )
-
-
-def _without_linear_pairs(
-    names: Sequence[str], poses: GivenPoses | None, warnings: list[str]
-) -> list[str]:
-    """If a photograph exists both as RAW or EXR and as another file, keep the former, unless the
-    poses name the other one."""
-    posed = set(poses.names) if poses is not None else set()
-    linear = {stem_key(name): name for name in names if suffix_of(name) in LINEAR_SUFFIXES}
-    dropped = set()
-    for name in names:
-        other = linear.get(stem_key(name))
-        if other is not None and suffix_of(name) not in LINEAR_SUFFIXES:
-            dropped.add(other if name in posed else name)
-    if dropped:
-        first = sorted(dropped)[0]
-        warnings.append(
-            f"{len(dropped)} photographs exist both as RAW or EXR and as another file; one of each "
-            f"pair is left out (first: {first})"
-        )
-    return [name for name in names if name not in dropped]
-
-
-def _check_pose_names(
-    folder: Path,
-    poses: GivenPoses,
-    chosen: PhotoFolder,
-    names: Sequence[str],
-    warnings: list[str],
-) -> None:
-    """Check that poses and photographs belong together; warn of those without a counterpart."""
-    if poses.format.names == "order":
-        if len(chosen.names) != poses.num_images:
-            raise UserError(
-                f"expected as many poses as photographs, found {poses.num_images} poses and "
-                f"{len(chosen.names)} photographs in {chosen.path}/",
-                file=folder / poses.path,
-                fix="restore the missing photographs, or set poses: ignore",
-            )
-        return
-    prefix = poses.format.prefix(chosen.base)
-    photos = match_names(poses.names, [prefix + name for name in names], folder / poses.path)
-    matched = set(photos.values())
-    missing = [name for name in poses.names if name not in matched]
-    if len(missing) == len(poses.names):
-        raise UserError(
-            f"none of its {len(poses.names)} images is a photograph in "
-            f"{folder / chosen.path} (first: {poses.names[0]})"
-            if missing
-            else "expected camera poses, found none",
-            file=folder / poses.path,
-            fix="rename the photographs to the names in the pose file, or set poses: ignore",
-        )
-    if missing:
-        warnings.append(
-            f"{len(missing)} of {len(poses.names)} poses have no photograph and are left out "
-            f"(first: {missing[0]})"
-        )
-    if poses.lost:
-        warnings.append(
-            f"{len(poses.lost)} photographs are not used, because their pose is not finite "
-            f"(tracking was lost; first: {poses.lost[0]})"
-        )
-    if len(photos) > len(matched):
-        warnings.append(
-            f"the poses name no folder: each is used for the {len(photos) // len(matched)} "
-            f"photographs of its name in different folders (first: {min(photos)})"
-        )
-    without = sorted({prefix + name for name in names} - photos.keys())
-    if without:
-        warnings.append(
-            f"{len(without)} of {len(names)} photographs have no given pose and are not used "
-            f"(first: {without[0]})"
-        )
-
-
-def _listed_split(
-    poses: GivenPoses | None,
-    chosen: PhotoFolder,
-    names: Sequence[str],
-    config: Config,
-    warnings: list[str],
-) -> dict[str, Part | None]:
-    """Photograph -> its part of the scene's own split; empty where that is not used."""
-    if poses is None or not poses.splits or config.split.source == "every":
-        return {}
-    prefix = poses.format.prefix(chosen.base)
-    found = listed_split(poses.splits, [prefix + name for name in names], warnings)
-    return {name.removeprefix(prefix): part for name, part in found.items()}
-
-
-# --- masks and photographs ----------------------------------------------------------------
-
-
-def _masks(
-    folder: Path,
-    suffix: str,
-    config: Config,
-    chosen: PhotoFolder,
-    facts: Mapping[str, FileFacts],
-    cache: FactCache,
-) -> dict[str, Path]:
-    if not uses_masks(config):
-        return {}
-    masks = companions(folder, [f"masks{suffix}", "masks"], sorted(facts))
-    for name, listed in chosen.masks.items():
-        if name in facts and (folder / listed).is_file():
-            masks.setdefault(name, folder / listed)
-    for name, path in masks.items():
-        mask = _read_mask(path, cache)
-        photo = facts[name]
-        if (mask.width, mask.height) != (photo.width, photo.height):
-            raise UserError(
-                f"the mask is {mask.width}x{mask.height}, its photograph {name} is "
-                f"{photo.width}x{photo.height} pixels",
-                file=path,
-                fix="make the mask at the photograph's stored size (EXIF orientation not "
-                "applied), or set views.masks: ignore",
-            )
-    return masks
-
-
-def _read_mask(path: Path, cache: FactCache) -> FileFacts:
-    return cache.get(path, "mask", FileFacts, partial(read_facts, path))
 
 
 def _photo(
@@ -449,49 +351,12 @@ def _photo(
         bits=facts.bits,
         orientation=facts.orientation,
         mask=str(mask) if mask else None,
-        mask_digest=_digest(mask, cache) if mask else None,
+        mask_digest=cached_digest(mask, cache) if mask else None,
         depth=str(depth) if depth else None,
-        depth_digest=_digest(depth, cache) if depth else None,
+        depth_digest=cached_digest(depth, cache) if depth else None,
         focal_px=facts.focal_px,
         camera_group=facts.camera_group,
         panorama=facts.panorama == "full",
         gps=facts.gps,
         taken=facts.taken,
     )
-
-
-# --- fingerprint --------------------------------------------------------------------------
-
-
-def _digest_files(folder: Path, files: Sequence[Path], cache: FactCache) -> str:
-    lines = []
-    for path in files:
-        lines.append(f"{path.relative_to(folder).as_posix()}\0{_digest(path, cache)}")
-    return hashlib.blake2b("\n".join(sorted(lines)).encode(), digest_size=16).hexdigest()
-
-
-def _digest(path: Path, cache: FactCache) -> str:
-    return cache.get(path, "digest", str, partial(digest_of, path))
-
-
-def _fingerprint(
-    folder: Path,
-    manifest: Manifest,
-    listed: Sequence[str],
-    poses: GivenPoses | None,
-    control: Path | None,
-    clouds: Sequence[Path],
-    cache: FactCache,
-) -> str:
-    photos = manifest.photos
-    files: list[Photo | VideoFile] = [*photos, *manifest.videos]
-    others = [Path(p) for photo in photos for p in (photo.mask, photo.depth) if p is not None]
-    if poses is not None:
-        others += pose_files(folder / poses.path, poses.kind)
-    if control is not None:
-        others.append(control)
-    others += clouds
-    lines = [f"{Path(p.path).relative_to(folder).as_posix()}\0{p.digest}" for p in files]
-    # Unreadable files are included by name, because warnings mention them.
-    lines += [*listed, _digest_files(folder, others, cache)]
-    return hashlib.blake2b("\n".join(lines).encode(), digest_size=16).hexdigest()

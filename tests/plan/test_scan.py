@@ -79,7 +79,7 @@ def test_images_folder_with_subfolders(tmp_path):
     picture(tmp_path / "images" / "b" / "x.PNG")
     picture(tmp_path / "images" / "a.jpeg")
     picture(tmp_path / "images" / ".hidden.jpg")
-    (tmp_path / "images" / "notes.txt").write_text("no picture")
+    (tmp_path / "images" / "notes.md").write_text("no picture")
     for preview in ("@eaDir", "Thumbnails", ".thumbs", "__MACOSX"):
         picture(tmp_path / "images" / preview / "a.jpeg")
     for side_car in ("a.xmp", "a.jpeg.pp3", "a.thm", "._a.jpeg"):
@@ -610,7 +610,7 @@ def test_scans_are_equal_with_a_missing_or_damaged_cache(scene, tmp_path):
 
 def test_cached_scans_open_no_photograph(scene, tmp_path, monkeypatch):
     look(scene, cache=tmp_path / "cache.json")
-    for module in ("scan", "photo_folder"):
+    for module in ("companion_files", "photo_folder"):
         name = f"pipeline.plan.{module}.read_facts"
         monkeypatch.setattr(name, lambda path: pytest.fail(f"{path}"))
     look(scene, cache=tmp_path / "cache.json")

@@ -111,7 +111,7 @@ def test_given_poses_leave_videos_out(tmp_path):
 
 def test_the_fingerprint_is_of_the_video(tmp_path):
     clip(tmp_path / "walk.mp4")
-    cache = tmp_path / "facts.json"
+    cache = tmp_path / ".facts.json"
     one = look(tmp_path, cache=cache)
     assert look(tmp_path, cache=cache) == one
     clip(tmp_path / "walk.mp4", seed=1)

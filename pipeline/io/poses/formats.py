@@ -11,7 +11,8 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.colmap import has_model, read_model
+from pipeline.io.colmap import read_model
+from pipeline.io.colmap_models import find_models
 from pipeline.io.llff import read_poses_bounds, read_rows
 from pipeline.io.poses import (
     bundler,
@@ -30,7 +31,6 @@ from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, posed_frames
 from pipeline.scene.reconstruction import Reconstruction
 
-COLMAP_FOLDERS = ("sparse/0", "sparse", "colmap/sparse/0")
 _LLFF_FILE = "poses_bounds.npy"
 # A camera with fewer images determines no more than a focal length and one radial coefficient.
 MIN_IMAGES_PER_CAMERA = 5
@@ -105,7 +105,8 @@ def colmap_files(path: Path) -> list[Path]:
 
 
 def _find_colmap(folder: Path) -> str | None:
-    return next((path for path in COLMAP_FOLDERS if has_model(folder / path)), None)
+    models = find_models(folder)
+    return models[0][0] if models else None
 
 
 def _find_transforms(folder: Path) -> str | None:

@@ -60,6 +60,7 @@ class PosedFrame:
         lens: its intrinsics.
         rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
         mask: file of its mask, relative to the scene folder, or None.
+        depth: file of its depth map, likewise.
         split: the list of the scene's own split that it is in; None if the scene has no split.
     """
 
@@ -69,6 +70,7 @@ class PosedFrame:
     translation: Array
     mask: str | None = None
     split: ListedSplit | None = None
+    depth: str | None = None
 
     def is_repeated(self, other: PosedFrame) -> bool:
         """Whether the pose is that of ``other``."""

@@ -1,0 +1,106 @@
+"""The masks and depth maps of a scene's photographs."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from functools import partial
+from pathlib import Path
+
+from pipeline.config.schema import Config
+from pipeline.io.companions import DEPTHS, MASKS, CompanionKind, beside_photographs, find_companions
+from pipeline.io.fact_cache import FactCache
+from pipeline.io.folders import PhotoFolder
+from pipeline.io.photofile import FileFacts, read_facts
+from pipeline.io.posefiles import GivenPoses
+from pipeline.plan.photo_folder import uses_masks
+from pipeline.runtime.errors import UserError
+
+
+def without_companions(
+    chosen: PhotoFolder, poses: GivenPoses | None, warnings: list[str]
+) -> PhotoFolder:
+    """The folder's photographs without the masks and depth maps that lie beside them.
+
+    Files that the poses name, or count, are photographs.
+    """
+    if poses is not None and poses.format.names != "photos":
+        return chosen
+    posed = set(poses.names) if poses is not None else set()
+    found: dict[str, dict[str, str]] = {}
+    for kind in (MASKS, DEPTHS):
+        beside = beside_photographs(kind, chosen.names)
+        beside = {photo: name for photo, name in beside.items() if name not in posed}
+        found[kind.noun] = {
+            photo: (Path(chosen.path) / name).as_posix() for photo, name in beside.items()
+        }
+        if beside:
+            warnings.append(
+                f"{len(beside)} images beside the photographs are used as {kind.noun}s, for their "
+                f"names (first: {min(beside.values())}); rename them if they are photographs"
+            )
+    taken = {name for files in found.values() for name in files.values()}
+    names = [name for name in chosen.names if (Path(chosen.path) / name).as_posix() not in taken]
+    return replace(
+        chosen,
+        names=names,
+        masks={**found[MASKS.noun], **chosen.masks},
+        depths={**found[DEPTHS.noun], **chosen.depths},
+    )
+
+
+def masks_of(
+    folder: Path,
+    config: Config,
+    chosen: PhotoFolder,
+    facts: Mapping[str, FileFacts],
+    cache: FactCache,
+    warnings: list[str],
+) -> dict[str, Path]:
+    """Photograph -> its mask.
+
+    Raises:
+        UserError: a mask of another size than its photograph, or a name that is ambiguous.
+    """
+    if not uses_masks(config):
+        return {}
+    masks = _files_of(MASKS, folder, chosen, chosen.masks, facts)
+    for name, path in masks.items():
+        mask = cache.get(path, "mask", FileFacts, partial(read_facts, path))
+        photo = facts[name]
+        if (mask.width, mask.height) != (photo.width, photo.height):
+            raise UserError(
+                f"the mask is {mask.width}x{mask.height}, its photograph {name} is "
+                f"{photo.width}x{photo.height} pixels",
+                file=path,
+                fix="make the mask at the photograph's stored size (EXIF orientation not "
+                "applied), or set views.masks: ignore",
+            )
+    if masks and len(masks) < len(facts):
+        warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
+    return masks
+
+
+def depths_of(folder: Path, chosen: PhotoFolder, facts: Mapping[str, FileFacts]) -> dict[str, Path]:
+    """Photograph -> its depth map.
+
+    Raises:
+        UserError: a name that is ambiguous.
+    """
+    return _files_of(DEPTHS, folder, chosen, chosen.depths, facts)
+
+
+def _files_of(
+    kind: CompanionKind,
+    folder: Path,
+    chosen: PhotoFolder,
+    listed: Mapping[str, str],
+    facts: Mapping[str, FileFacts],
+) -> dict[str, Path]:
+    """Those that ``listed`` names, or that lie beside the photographs; else those in folders."""
+    copy = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
+    named = {name: folder / listed[name] for name in sorted(facts) if name in listed}
+    others = [name for name in sorted(facts) if name not in named]
+    if not others:
+        return named
+    return named | find_companions(kind, folder, kind.places(chosen.path, copy), others)

@@ -1,0 +1,371 @@
+"""Every file of a scene folder is used, or named with the reason."""
+
+from __future__ import annotations
+
+import shutil
+import time
+from pathlib import Path, PurePosixPath
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, example, given, settings
+from hypothesis import strategies as st
+
+from pipeline.io import walk as walks
+from pipeline.io.names import first_names, suffix_of
+from pipeline.plan.inventory import _SIDE_CARS, _TEXTS
+from pipeline.runtime.errors import UserError
+from tests.io.test_transforms import frame, write
+from tests.pictures import photos, picture
+from tests.plan.test_scan import config, look, names, write_sparse
+
+SIZE = (64, 48)
+
+
+@pytest.fixture(scope="module")
+def small_scene(tmp_path_factory) -> Path:
+    folder = tmp_path_factory.mktemp("inventory")
+    photos(folder / "images", 3)
+    for i in range(2):
+        picture(folder / "masks" / f"p0{i}.png", mode="L")
+    write_sparse(folder / "sparse" / "0", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    return folder
+
+
+FOLDERS = st.sampled_from(
+    [
+        "images",
+        "images/a",
+        "masks",
+        "masks/b",
+        "depths",
+        "mask",
+        "segmentation",
+        "sparse",
+        "sparse/0",
+        "sparse/1",
+        "orig",
+        "input",
+        "images_2",
+        "videos",
+        "points",
+        "distorted/sparse/0",
+        "keyframes",
+        "color",
+        "Masken",
+        "Köln",
+        "a/b/c",
+        ".",
+    ]
+)
+STEMS = st.one_of(
+    st.sampled_from(
+        [
+            "p00",
+            "p01",
+            "p00_mask",
+            "p01.jpg",
+            "x",
+            "transform",
+            "transforms",
+            "cameras",
+            "geo",
+            "gcp",
+            "points",
+            "metadata",
+            "bundle.out",
+            "readme2",
+            "images",
+            "points3D",
+        ]
+    ),
+    st.text(st.characters(codec="utf-8", exclude_characters="/.\\", exclude_categories=["C"])),
+)
+ENDINGS = st.sampled_from(
+    [
+        ".png",
+        ".jpg",
+        ".JPEG",
+        ".heic",
+        ".jfif",
+        ".xml",
+        ".json",
+        ".txt",
+        ".csv",
+        ".mp4",
+        ".mts",
+        ".ply",
+        ".las",
+        ".npy",
+        ".bin",
+        ".zip",
+        ".insp",
+        ".bak",
+        ".gif",
+        ".exr",
+        ".yaml",
+        ".pdf",
+        "",
+    ]
+)
+
+
+@settings(
+    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+)
+@example("distorted/sparse/0", "cameras", ".bin")
+@example("Köln", "transforms", ".json.bak")
+@example("masks", "p00_mask", ".png")
+@given(FOLDERS, STEMS, ENDINGS)
+def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, ending):
+    name = f"{stem[:40]}{ending}".strip() or "x"
+    if name.startswith(".") or suffix_of(name) in _SIDE_CARS or PurePosixPath(name).stem in _TEXTS:
+        return
+    scene = tmp_path_factory.mktemp("any") / "scene"
+    shutil.copytree(small_scene, scene)
+    before = look(scene)
+    path = scene / folder / name
+    if path.exists():
+        return
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if ending in (".png", ".jpg", ".JPEG", ".jfif"):
+        picture(path.with_suffix(".png"), mode="L")
+        path.with_suffix(".png").rename(path)
+    else:
+        path.write_bytes(b"some content that no reader expects")
+    try:
+        after = look(scene)
+    except UserError as error:
+        # Refused with its own name, its folder's, or that of what it contradicts.
+        assert name in str(error) or path.parent.name in str(error)
+        return
+    finally:
+        shutil.rmtree(scene.parent)
+    named = any(name in line or path.parent.name in line for line in after.warnings)
+    used = after.fingerprint != before.fingerprint
+    known = path.parent.name == "0" and stem in ("cameras", "images", "points3D")
+    copy = folder == "images_2" and ending in (".png", ".jpg", ".JPEG", ".jfif", ".exr")
+    assert named or used or known or copy, after.warnings
+
+
+def test_each_kind_is_named_with_its_reason(tmp_path):
+    photos(tmp_path / "images", 3)
+    write(tmp_path, {"fl_x": 50, "frames": [frame(path=f"images/p0{i}.jpg") for i in range(2)]})
+    for name in (
+        "geo.txt", "gcp.txt", "camera.xml.bak", "transform.json", "images/pano.insp",
+        "distorted/sparse/0/cameras.bin", "notes.pdf", "old/walk.mp4", "scan.ply",
+    ):  # fmt: skip
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / name).write_bytes(b"content")
+    picture(tmp_path / "Masks_old" / "p00.png", mode="L")
+    picture(tmp_path / "orig" / "p00.png")
+    warnings = look(tmp_path).warnings
+    expected = {
+        "geo.txt": "positions are read from EXIF",
+        "gcp.txt": "positions are read from EXIF",
+        "camera.xml.bak": "no pose file has this name",
+        "transform.json": "no pose file has this name",
+        "images/pano.insp": "convert them",
+        "distorted/sparse/0/cameras.bin": "COLMAP model",
+        "notes.pdf": "no input has this name",
+        "old/walk.mp4": "videos are read from",
+        "scan.ply": "init.points_file",
+        "Masks_old/p00.png": "masks belong into masks/",
+        "orig/p00.png": "the photographs of images/ are used",
+        "images/p02.jpg": "transforms.json lists other photographs only",
+    }
+    for name, reason in expected.items():
+        (line,) = (line for line in warnings if name in line)
+        assert reason in line, line
+
+
+def test_files_that_are_not_for_reconstruction_are_no_warning(tmp_path):
+    photos(tmp_path / "images", 3)
+    photos(tmp_path / "images_2", 3)
+    for name in ("README.txt", "LICENSE", "SOURCE.md", ".DS_Store", "Thumbs.db", "images/p00.xmp"):
+        (tmp_path / name).write_text("text")
+    assert look(tmp_path).warnings == ()
+
+
+def test_stray_files_change_no_result(tmp_path):
+    photos(tmp_path / "images", 3)
+    before = look(tmp_path)
+    (tmp_path / "notes.pdf").write_bytes(b"")
+    after = look(tmp_path)
+    assert before.fingerprint == after.fingerprint and before.manifest == after.manifest
+    assert "notes.pdf is not used" in after.warnings[0]
+
+
+def test_many_stray_files_are_one_short_line(tmp_path):
+    photos(tmp_path / "images", 2)
+    (tmp_path / "cache").mkdir()
+    for i in range(5000):
+        (tmp_path / "cache" / f"{i:05d}.dat").touch()
+    start = time.monotonic()
+    (line,) = look(tmp_path).warnings
+    assert line.startswith("5000 files are not used (first: cache/00000.dat") and len(line) < 300
+    assert time.monotonic() - start < 20
+
+
+def test_links_to_folders_above_are_not_followed(tmp_path):
+    photos(tmp_path / "scene" / "images", 2)
+    (tmp_path / "scene" / "images" / "root").symlink_to("/")
+    found = look(tmp_path / "scene")
+    assert names(found) == ["p00.jpg", "p01.jpg"]
+    assert "images/root/ is not used: it is a link to /" in found.warnings[0]
+
+
+def test_links_to_too_many_files_are_an_error_that_names_the_link(tmp_path, monkeypatch):
+    photos(tmp_path / "scene" / "images", 2)
+    (tmp_path / "many").mkdir()
+    for i in range(50):
+        (tmp_path / "many" / f"{i}.txt").touch()
+    (tmp_path / "scene" / "images" / "more").symlink_to(tmp_path / "many")
+    monkeypatch.setattr(walks, "MAX_ENTRIES", 40)
+    with pytest.raises(UserError, match="at most 40 files below, found more by this link") as error:
+        look(tmp_path / "scene")
+    assert error.value.file == tmp_path / "scene" / "images" / "more"
+
+
+def test_a_scene_of_links_is_used(tmp_path):
+    photos(tmp_path / "shared", 3)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "images").symlink_to(tmp_path / "shared")
+    found = look(tmp_path / "scene")
+    assert names(found) == ["p00.jpg", "p01.jpg", "p02.jpg"] and not found.warnings
+
+
+# --- masks and depth maps -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize("folder", ["masks", "mask", "Masks", "images/masks"])
+@pytest.mark.parametrize(
+    "pattern",
+    [
+        "{}.png",
+        "{}.JPG",
+        "{}.jpg.png",
+        "{}_mask.png",
+        "{}.mask.png",
+        "{}-mask.png",
+        "mask_{}.png",
+        "{}.jpg.mask.png",
+        "{}_MASK.PNG",
+        "dynamic_mask_{}.png",
+    ],
+)
+def test_masks_by_every_habit_of_naming(tmp_path, folder, pattern):
+    photos(tmp_path / "images", 2)
+    for i in range(2):
+        picture(tmp_path / folder / pattern.format(f"p0{i}"), mode="L")
+    found = look(tmp_path)
+    expected = [str(tmp_path / folder / pattern.format(f"p0{i}")) for i in range(2)]
+    assert [photo.mask for photo in found.photos] == expected and not found.warnings
+
+
+@pytest.mark.parametrize("folder", ["depths", "depth"])
+@pytest.mark.parametrize(
+    "pattern", ["{}.npy", "{}_depth.npy", "{}.depth.npy", "depth_{}.npy", "{}.jpg.npy"]
+)
+def test_depth_maps_by_every_habit_of_naming(tmp_path, folder, pattern):
+    photos(tmp_path / "images", 2)
+    (tmp_path / folder).mkdir()
+    for i in range(2):
+        np.save(tmp_path / folder / pattern.format(f"p0{i}"), np.ones((48, 64)))
+    found = look(tmp_path)
+    expected = [str(tmp_path / folder / pattern.format(f"p0{i}")) for i in range(2)]
+    assert [photo.depth for photo in found.photos] == expected and not found.warnings
+
+
+@pytest.mark.parametrize("pattern", ["{}_mask.png", "{}.jpg.mask.png", "dynamic_mask_{}.png"])
+def test_masks_beside_photographs_are_no_photographs(tmp_path, pattern):
+    photos(tmp_path / "images", 2)
+    for i in range(2):
+        picture(tmp_path / "images" / pattern.format(f"p0{i}"), mode="L")
+    found = look(tmp_path)
+    assert names(found) == ["p00.jpg", "p01.jpg"] and found.num_masks == 2
+    assert "2 images beside the photographs are used as masks" in found.warnings[0]
+
+
+def test_depth_maps_and_masks_that_transforms_list(tmp_path):
+    photos(tmp_path / "images", 2)
+    (tmp_path / "d").mkdir()
+    frames = []
+    for i in range(2):
+        np.save(tmp_path / "d" / f"{i}.npy", np.ones((48, 64)))
+        picture(tmp_path / "m" / f"{i}.png", mode="L")
+        more = {"depth_file_path": f"d/{i}.npy", "mask_path": f"m/{i}.png"}
+        frames.append(frame(path=f"images/p0{i}.jpg") | more)
+    write(tmp_path, {"fl_x": 50, "frames": frames})
+    found = look(tmp_path)
+    assert [photo.depth for photo in found.photos] == [str(tmp_path / f"d/{i}.npy") for i in (0, 1)]
+    assert found.num_masks == 2 and not found.warnings
+    (tmp_path / "d" / "1.npy").unlink()
+    assert "1 depth maps that transforms*.json lists are not used" in look(tmp_path).warnings[0]
+
+
+@pytest.mark.parametrize(
+    "files, named",
+    [
+        (["P00.png", "P00.PNG"], ["p00.jpg", "P00.png", "P00.PNG"]),
+        (["p00_mask.png", "p00-mask.png"], ["p00_mask.png", "p00-mask.png"]),
+    ],
+)
+def test_two_masks_of_one_photograph_are_an_error_that_names_both(tmp_path, files, named):
+    photos(tmp_path / "images", 2)
+    for name in files:
+        picture(tmp_path / "masks" / name, mode="L")
+    with pytest.raises(UserError, match="expected one mask for each photograph") as error:
+        look(tmp_path)
+    assert all(name in str(error.value) for name in named)
+    assert look(tmp_path, config(views={"masks": "ignore"})).num_masks == 0
+
+
+def test_a_mask_of_photographs_in_two_folders_is_an_error(tmp_path):
+    photos(tmp_path / "images" / "left", 1)
+    photos(tmp_path / "images" / "right", 1)
+    picture(tmp_path / "masks" / "p00.png", mode="L")
+    with pytest.raises(UserError, match=r"p00.png may belong to left/p00.jpg, right/p00.jpg"):
+        look(tmp_path)
+
+
+def test_photographs_and_masks_that_differ_in_case(tmp_path):
+    for name in ("x.jpg", "X.jpg"):
+        picture(tmp_path / "images" / name)
+        picture(tmp_path / "masks" / name.replace("jpg", "png"), mode="L")
+    found = look(tmp_path)
+    assert [Path(photo.mask).stem for photo in found.photos] == ["X", "x"]
+
+
+# --- models -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_of_several_models_the_one_of_the_most_images_is_used(tmp_path, text):
+    from pipeline.io.colmap import read_model, write_model
+
+    photos(tmp_path / "images", 4)
+    write_sparse(tmp_path / "sparse" / "0", ["p00.jpg"], SIZE)
+    write_sparse(tmp_path / "sparse" / "1", [f"p0{i}.jpg" for i in range(1, 4)], SIZE)
+    for name in ("0", "1"):
+        folder = tmp_path / "sparse" / name
+        write_model(folder, read_model(folder), text=text)
+    found = look(tmp_path)
+    assert found.poses is not None and found.poses.path == "sparse/1"
+    (line,) = (line for line in found.warnings if "of 2 COLMAP models" in line)
+    assert "sparse/1 is used, which has the most images (3); not used: sparse/0 (1 images)" in line
+
+
+def test_the_model_before_undistortion_is_used_with_its_photographs(tmp_path):
+    photos(tmp_path / "input", 3)
+    write_sparse(tmp_path / "distorted/sparse/0", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    found = look(tmp_path)
+    assert found.poses is not None and found.poses.path == "distorted/sparse/0"
+    (tmp_path / "input").rename(tmp_path / "images")
+    found = look(tmp_path)
+    assert found.poses is None
+    assert any("distorted/sparse/0/images" in line for line in found.warnings)
+
+
+def test_first_names():
+    assert first_names(["a"], 2) == "a" and first_names(["a", "b", "c"], 2) == "a, b and 1 more"

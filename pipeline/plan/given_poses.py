@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.distortion import unproject
-from pipeline.io.colmap import write_model
+from pipeline.io.colmap import read_model, write_model
 from pipeline.io.names import NameIndex, match_names
 from pipeline.io.poses.formats import format_of
 from pipeline.io.poses.kinds import PoseKind
@@ -140,19 +140,41 @@ def load_given(
         UserError: malformed pose files; a camera with another aspect ratio than its photograph,
             or with an impossible focal length.
     """
+    return GivenModel.of(read_fitted(path, kind, photos, listed, base_folder), path)
+
+
+def read_fitted(
+    path: Path,
+    kind: PoseKind,
+    photos: Sequence[Photo],
+    listed: Sequence[str] = (),
+    base_folder: str = ".",
+    *,
+    points: bool = True,
+) -> Reconstruction:
+    """The model of ``load_given`` in the given world, or only its cameras and images.
+
+    Args:
+        points: whether the points of a COLMAP model are read, which takes longest.
+
+    Raises:
+        UserError: as ``load_given``.
+    """
     by_name = {photo.name: photo for photo in photos}
     entry = format_of(kind)
     prefix = entry.prefix(base_folder)
     sizes = {prefix + photo.name: (photo.width, photo.height) for photo in photos}
-    model = entry.read(path, sizes, listed)
+    if kind == "colmap" and not points:
+        model = read_model(path, points=False)
+    else:
+        model = entry.read(path, sizes, listed)
     if prefix:
         images = {
             i: replace(image, name=image.name.removeprefix(prefix))
             for i, image in model.images.items()
         }
         model = replace(model, images=images)
-    fitted = fit_to_photos(model, by_name, str(path))
-    return GivenModel.of(fitted, path)
+    return fit_to_photos(model, by_name, str(path))
 
 
 def _frame(model: Reconstruction, path: Path) -> tuple[Normalization, Rounding]:
@@ -269,6 +291,14 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
     # Either side of a reduced copy may be rounded by one pixel.
     tolerance = _ASPECT_TOLERANCE + 1 / min(photo.width, photo.height)
     if abs(found / expected - 1) > tolerance:
+        if abs(found * expected - 1) <= tolerance:
+            raise UserError(
+                f"{photo.name} is {photo.width}x{photo.height}, its given camera "
+                f"{camera.width}x{camera.height}: width and height (w and h) are swapped",
+                file=source,
+                fix="exchange them in the file; if the poses were computed from turned "
+                "photographs, use those (stored orientation), or set poses: ignore",
+            )
         raise UserError(
             f"{photo.name} is {photo.width}x{photo.height}, its given camera "
             f"{camera.width}x{camera.height}: the aspect ratios differ",

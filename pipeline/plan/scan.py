@@ -27,7 +27,9 @@ from pipeline.io.posefiles import (
     truth_folder,
 )
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
+from pipeline.plan.depth_maps import check_depth_maps
 from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
+from pipeline.plan.given_cameras import GivenFiles, check_given
 from pipeline.plan.ground_control import find_ground_control
 from pipeline.plan.inventory import Inventory
 from pipeline.plan.panoramas import partial_panoramas
@@ -235,6 +237,8 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
 
     masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
     depths = depths_of(folder, chosen, facts)
+    if config.train.depth_loss_weight != 0:
+        check_depth_maps(depths, facts, facts_cache)
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
@@ -243,6 +247,12 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     ]
     if poses is None:
         warnings += partial_panoramas(facts)
+    else:
+        check_given(
+            GivenFiles(folder / poses.path, poses.kind, tuple(chosen.names), chosen.base),
+            photos,
+            facts_cache,
+        )
     if poses is None and config.sfm.georeference != "none":
         warnings += fault_warnings(facts)
     truth = truth_folder(folder)

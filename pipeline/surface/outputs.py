@@ -19,6 +19,7 @@ from pipeline.surface.depth import DepthMaps, RenderCache, write_depths, write_r
 from pipeline.surface.files import write_mesh_glb, write_mesh_ply
 from pipeline.surface.mesh import build_mesh
 from pipeline.surface.path import FPS, camera_path, describe_path
+from pipeline.surface.tsdf import BLOCK
 from pipeline.surface.video import write_video
 
 #: Number of views from which the typical depth is measured.
@@ -82,7 +83,13 @@ def _write_mesh(
 ) -> None:
     mesh, grid = build_mesh(depths, voxel, threads)
     if mesh is None or grid is None:
-        messages.warnings.append("no mesh: the depth maps of the views contain no common surface")
+        why = "the depth maps of the views contain no common surface"
+        if voxel is not None and grid is not None and voxel * BLOCK > grid.far:
+            why = (
+                f"export.mesh_voxel: voxels of {voxel:.4g} are too large for a scene whose "
+                f"surfaces are up to {grid.far:.4g} away; lower it, or leave it out"
+            )
+        messages.warnings.append(f"no mesh: {why}")
         return
     write_mesh_ply(out / "mesh.ply", mesh)
     write_mesh_glb(out / "mesh.glb", mesh, up)
@@ -92,7 +99,8 @@ def _write_mesh(
     )
     if voxel is not None and grid.voxel > voxel:
         messages.warnings.append(
-            f"export.mesh_voxel: voxels of {voxel:.4g} need too much memory; used {grid.voxel:.4g}"
+            f"export.mesh_voxel: voxels of {voxel:.4g} need too much memory, or are far smaller "
+            f"than a pixel of the views; used {grid.voxel:.4g}"
         )
 
 

@@ -84,7 +84,7 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
     Args:
         depths: iterated several times.
         voxel: side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
-            is enlarged if ``MAX_VOXELS`` would be exceeded.
+            is enlarged if ``MAX_VOXELS`` would be exceeded, or if blocks are narrower than a pixel.
 
     Returns:
         None if no map has a depth.
@@ -93,7 +93,8 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
     if median == 0:
         return None
     far = FAR * median
-    side = voxel or PIXELS_PER_VOXEL * width
+    # A block narrower than a pixel would leave gaps between the pixels' blocks.
+    side = PIXELS_PER_VOXEL * width if voxel is None else max(voxel, width / BLOCK)
     while True:
         # Blocks are searched again for each size: their number depends on the surface.
         keys = np.zeros(0, np.int64)

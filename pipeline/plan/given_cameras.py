@@ -1,0 +1,47 @@
+"""Checks of given cameras against the photographs' headers, before any job starts."""
+
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+
+from pipeline.io.fact_cache import FactCache
+from pipeline.io.posefiles import pose_files
+from pipeline.io.poses.kinds import PoseKind
+from pipeline.io.recorded import digest_of
+from pipeline.plan.given_poses import read_fitted
+from pipeline.scene.manifest import Photo
+
+
+@dataclass(frozen=True)
+class GivenFiles:
+    """The pose files of a scene; see ``load_given``."""
+
+    path: Path
+    kind: PoseKind
+    listed: tuple[str, ...]
+    base_folder: str
+
+
+def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) -> None:
+    """Check the given cameras of the photographs: sizes, focal lengths, principal points and
+    distortion. The result is cached, since large models take seconds to read.
+
+    Raises:
+        UserError: as ``load_given``.
+    """
+    sizes = "\n".join(f"{photo.name}\0{photo.width}x{photo.height}" for photo in photos)
+    state = [hashlib.blake2b(sizes.encode(), digest_size=16).hexdigest(), files.base_folder]
+    for file in pose_files(files.path, files.kind):
+        state += [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
+
+    def number_of_images() -> int:
+        model = read_fitted(
+            files.path, files.kind, photos, files.listed, files.base_folder, points=False
+        )
+        return len(model.images)
+
+    cache.get_for_state(f"cameras:{files.path}", state, int, number_of_images)

@@ -1,0 +1,131 @@
+"""What headers can tell is an error of the scan, not of a stage hours later."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import cv2
+import numpy as np
+import pytest
+
+from pipeline.runtime.errors import UserError
+from tests.pictures import photos
+from tests.plan.scans import look, posed
+
+
+def depth(folder: Path, name: str, write: Callable[[Path], Any]) -> Path:
+    """A scene of which the second photograph has the depth map ``name``."""
+    photos(folder / "images", 3)
+    (folder / "depths").mkdir()
+    write(folder / "depths" / name)
+    return folder
+
+
+def saved(shape: tuple[int, ...], dtype: Any = np.float32) -> Callable[[Path], Any]:
+    values = np.zeros(shape, dtype)
+    if dtype is object:
+        return lambda path: np.save(path, values, allow_pickle=True)
+    return lambda path: np.save(path, values)
+
+
+def image(shape: tuple[int, ...], dtype: Any = np.uint16) -> Callable[[Path], Any]:
+    return lambda path: cv2.imwrite(str(path), np.zeros(shape, dtype))
+
+
+WRONG_DEPTHS = {
+    "npy-size": ("p01.npy", saved((48, 48)), "48x48 pixels, another aspect ratio"),
+    "npy-turned": ("p01.npy", saved((64, 48)), "width and height are swapped"),
+    "npy-channels": ("p01.npy", saved((48, 64, 3)), "with 3 channels"),
+    "npy-cube": ("p01.npy", saved((1, 48, 64, 2)), "one channel"),
+    "npy-line": ("p01.npy", saved((64,)), "one channel"),
+    "npy-complex": ("p01.npy", saved((48, 64), np.complex64), "values that are no numbers"),
+    "npy-objects": ("p01.npy", saved((2, 3), object), "values that are no numbers"),
+    "npz": ("p01.npz", lambda p: np.savez(p, d=np.zeros((9, 64))), "another aspect ratio"),
+    "png-colours": ("p01.png", image((48, 64, 3)), "with 3 channels"),
+    "png-size": ("p01.png", image((48, 48)), "another aspect ratio"),
+    "tiff-size": ("p01.tif", image((30, 64), np.float32), "another aspect ratio"),
+    "pfm": ("p01.pfm", lambda p: p.write_bytes(b"Pf\n48 48\n-1.0\n"), "another aspect ratio"),
+    "pfm-colours": ("p01.pfm", lambda p: p.write_bytes(b"PF\n64 48\n-1.0\n"), "with 3 channels"),
+    "exr": ("p01.exr", lambda p: p.write_bytes(b"v/1\x01"), "cannot be read: EXR"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_DEPTHS)
+def test_a_depth_map_of_a_wrong_form_is_an_error_of_the_scan(tmp_path: Path, case: str) -> None:
+    name, write, said = WRONG_DEPTHS[case]
+    scene = depth(tmp_path / "s", name, write)
+    with pytest.raises(UserError, match=said) as caught:
+        look(scene)
+    assert str(caught.value.file).endswith(name)
+    look(scene, train={"depth_loss_weight": 0})
+
+
+RIGHT_DEPTHS = {
+    "npy": ("p01.npy", saved((48, 64))),
+    "npy-channel": ("p01.npy", saved((48, 64, 1))),
+    "npy-reduced": ("p01.npy", saved((12, 16), np.float64)),
+    "npz": ("p01.npz", lambda path: np.savez(path, d=np.zeros((48, 64)))),
+    "png": ("p01.png", image((48, 64))),
+    "tiff": ("p01.tif", image((24, 32), np.float32)),
+    "pfm": ("p01.pfm", lambda path: path.write_bytes(b"Pf\n64 48\n-1.0\n" + bytes(64 * 48 * 4))),
+}
+
+
+@pytest.mark.parametrize("case", RIGHT_DEPTHS)
+def test_a_depth_map_of_the_right_form_is_accepted(tmp_path: Path, case: str) -> None:
+    assert look(depth(tmp_path / "s", *RIGHT_DEPTHS[case])).num_depths == 1
+
+
+def transforms(folder: Path, **fields: Any) -> Path:
+    paths = photos(folder / "images", 4)
+    frames = [
+        {"file_path": f"images/{path.name}", "transform_matrix": np.eye(4).tolist()}
+        for path in paths
+    ]
+    for number, frame in enumerate(frames):
+        frame["transform_matrix"][0][3] = number
+    content = {"w": 64, "h": 48, "fl_x": 60, "fl_y": 60} | fields
+    content = {key: value for key, value in content.items() if value is not None}
+    (folder / "transforms.json").write_text(json.dumps(content | {"frames": frames}))
+    return folder
+
+
+WRONG_CAMERAS = {
+    "text": ({"w": "64"}, "w is '64'"),
+    "focal-text": ({"fl_x": "60"}, "fl_x is '60'"),
+    "swapped": ({"w": 48, "h": 64}, r"64x48, its given camera 48x64: .* are swapped"),
+    "size": ({"w": 100, "h": 100}, "the aspect ratios differ"),
+    "no-focal": ({"fl_x": None, "fl_y": None}, "no focal length"),
+    "focal-in-mm": ({"fl_x": 0.035, "fl_y": 0.035}, "impossible focal length"),
+    "focal-negative": ({"fl_x": -60}, "expected a positive number"),
+    "centre": ({"cx": 1e6}, "impossible principal point"),
+    "angle-in-degrees": ({"fl_x": None, "fl_y": None, "camera_angle_x": 60}, "camera_angle_x"),
+    "distortion": ({"k1": -1e9}, "impossible lens distortion"),
+    "no-size": ({"w": 0, "h": 0}, "impossible image size"),
+}
+
+
+@pytest.mark.parametrize("case", WRONG_CAMERAS)
+def test_an_impossible_camera_is_an_error_of_the_scan(tmp_path: Path, case: str) -> None:
+    fields, said = WRONG_CAMERAS[case]
+    with pytest.raises(UserError, match=said):
+        look(transforms(tmp_path / "s", **fields))
+    look(transforms(tmp_path / "s", **fields), poses="ignore")
+
+
+def test_possible_cameras_are_accepted(tmp_path: Path) -> None:
+    for fields in ({}, {"w": 640, "h": 480, "fl_x": 600, "fl_y": 600}, {"w": None, "h": None}):
+        assert look(transforms(tmp_path / "s", **fields)).poses is not None
+
+
+@pytest.mark.parametrize(
+    ("size", "said"), [((48, 64), "are swapped"), ((64, 20), "aspect ratios differ")]
+)
+def test_cameras_of_a_model_are_compared_with_the_photographs(
+    tmp_path: Path, size: tuple[int, int], said: str
+) -> None:
+    with pytest.raises(UserError, match=said):
+        look(posed(tmp_path / "s", tracks=3, size=size))

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,6 +16,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.io.photofile import check_size
 from pipeline.io.recorded import digest_of
+from pipeline.io.video_tracks import ChosenTrack, PatchedFile, choose_track
 from pipeline.runtime.errors import UserError
 
 if TYPE_CHECKING:
@@ -25,6 +26,13 @@ if TYPE_CHECKING:
 # playlist of that suffix to other files or the network; its messages do not name the file.
 os.environ.setdefault("OPENCV_FFMPEG_CAPTURE_OPTIONS", "protocol_whitelist;file")
 os.environ.setdefault("OPENCV_FFMPEG_LOGLEVEL", "-8")
+# OpenCV takes a video for ended after 4096 packets of sound without a frame, or 64 frames that
+# cannot be decoded. The file's own end is the limit.
+os.environ.setdefault("OPENCV_FFMPEG_READ_ATTEMPTS", str(2**31 - 1))
+os.environ.setdefault("OPENCV_FFMPEG_DECODE_ATTEMPTS", str(2**31 - 1))
+# Milliseconds for opening a file and for reading a frame: OpenCV's 30 s are too few for a large
+# file on a slow network.
+TIMEOUT_MS = 600_000
 
 FIX = "convert the video to H.264 in an MP4 file, or remove it from the folder"
 
@@ -38,6 +46,11 @@ class VideoFacts(BaseModel):
             ratio of the header applied.
         frames: number of frames according to the header, 0 if it has none. Headers may be wrong.
         fps: frames per second according to the header, 0 if it has none.
+        counted: whether ``frames`` is the number of stored frames. Else it is estimated from the
+            length, and pauses are no missing frames.
+        truncated: whether the file is shorter than its header says.
+        others: width and height of the video streams that are not used.
+        alike: number of streams of the same size as the one that is used, with it.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -47,6 +60,10 @@ class VideoFacts(BaseModel):
     height: int
     frames: int
     fps: float
+    counted: bool = False
+    truncated: bool = False
+    others: tuple[tuple[int, int], ...] = ()
+    alike: int = 1
 
 
 def read_video_facts(path: Path) -> VideoFacts:
@@ -58,7 +75,9 @@ def read_video_facts(path: Path) -> VideoFacts:
     if not stat.S_ISREG(os.stat(path).st_mode):
         raise UserError("cannot be read as a video: not a regular file", file=path, fix=FIX)
     digest = digest_of(path)
-    with opened_video(path) as capture:
+    chosen = choose_track(path)
+    stored = chosen.track.frames if chosen.track is not None else None
+    with _opened(path, chosen, 1) as capture:
         import cv2  # Slow to import.
 
         width = int(capture.get(cv2.CAP_PROP_FRAME_WIDTH))
@@ -78,12 +97,18 @@ def read_video_facts(path: Path) -> VideoFacts:
         raise UserError(f"cannot be read as a video: {error}", file=path, fix=FIX) from None
     # The values of damaged headers may be negative, infinite or NaN.
     known = 0 < frames < 2**31
+    if stored:
+        known, frames = True, stored
     return VideoFacts(
         digest=digest,
         width=width,
         height=height,
         frames=int(frames) if known else 0,
         fps=float(fps) if 0 < fps < 1e6 else 0.0,
+        counted=bool(stored),
+        truncated=chosen.truncated,
+        others=tuple((track.width, track.height) for track in chosen.others),
+        alike=chosen.alike,
     )
 
 
@@ -98,25 +123,37 @@ def _pixel_aspect(capture: cv2.VideoCapture) -> float:
 
 @contextmanager
 def opened_video(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
-    """An open video, whose frames are rotated as the header says.
+    """The largest video stream of a file, whose frames are rotated as the header says.
 
     Args:
         threads: number of threads of the decoder.
 
     Raises:
-        UserError: the file is not a video in a supported format.
+        UserError: the file is not a video in a supported format, or cannot be read to its end.
     """
+    with _opened(path, choose_track(path), threads) as capture:
+        yield capture
+
+
+@contextmanager
+def _opened(path: Path, chosen: ChosenTrack, threads: int) -> Iterator[cv2.VideoCapture]:
     import cv2  # Slow to import.
 
-    level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
-    try:
+    options = [cv2.CAP_PROP_N_THREADS, max(threads, 1)]
+    options += [cv2.CAP_PROP_OPEN_TIMEOUT_MSEC, TIMEOUT_MS]
+    options += [cv2.CAP_PROP_READ_TIMEOUT_MSEC, TIMEOUT_MS]
+    with ExitStack() as stack:
+        patched = None
+        if chosen.patches:
+            patched = PatchedFile(stack.enter_context(open(path, "rb")), chosen.patches)
         # An absolute path, because FFmpeg takes the part before a colon for a protocol.
-        capture = cv2.VideoCapture(
-            str(path.absolute()), cv2.CAP_FFMPEG, [cv2.CAP_PROP_N_THREADS, max(threads, 1)]
-        )
-    finally:
-        cv2.utils.logging.setLogLevel(level)
-    try:
+        source = str(path.absolute()) if patched is None else patched
+        level = cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_ERROR)
+        try:
+            capture = cv2.VideoCapture(source, cv2.CAP_FFMPEG, options)  # type: ignore[arg-type]
+        finally:
+            cv2.utils.logging.setLogLevel(level)
+        stack.callback(capture.release)
         if not capture.isOpened():
             raise UserError(
                 "cannot be read as a video: its format is not supported, or its header is damaged",
@@ -125,5 +162,5 @@ def opened_video(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
             )
         capture.set(cv2.CAP_PROP_ORIENTATION_AUTO, 1)
         yield capture
-    finally:
-        capture.release()
+        if patched is not None and patched.error is not None:
+            raise patched.error

@@ -57,8 +57,7 @@ TRACKED_SHARE, JUMP = 1 / 3, 0.25
 MAX_CORNERS, MIN_CORNERS = 100, 12
 # Corners that are not found again at their place, in pixels, when they are tracked back.
 MAX_BACKWARD_ERROR = 1.0
-# A file in which fewer frames than this share of the header's number can be decoded may be damaged.
-# Edited videos have headers that count frames which are not shown.
+# A file in which fewer frames than this share of the stored ones can be decoded is damaged.
 COMPLETE = 0.8
 
 
@@ -130,10 +129,11 @@ def extract_frames(
             f"{step:.1%} of its long side that the image moves, {found.motion[-1]:.1f} times the "
             "long side in all" + (INTERLACED if found.interlaced else "")
         )
-        if total < COMPLETE * video.frames:
+        if video.counted and total < COMPLETE * video.frames:
+            cause = "the end of the file is missing" if video.truncated else "the file is damaged"
             warnings.append(
                 f"{Path(video.path).name}: {total} frames can be decoded, its header says "
-                f"{video.frames}: if the end is missing, the file is damaged; copy it again"
+                f"{video.frames}: {cause}; copy it again"
             )
     if len(photos) < min_photos:
         raise UserError(

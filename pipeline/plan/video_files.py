@@ -13,6 +13,8 @@ from pipeline.scene.manifest import Photo, VideoFile
 
 # A folder of videos beside images/.
 VIDEO_FOLDER = "videos"
+# Streams that are not used and named in the plan.
+SHOWN_STREAMS = 4
 
 
 def find_videos(folder: Path, image_folder: str, *, recursive: bool) -> list[str]:
@@ -51,6 +53,7 @@ def read_videos(
             warnings.append(f"{name}: left out: {facts}")
         else:
             found[name] = facts
+            warnings += [f"{name}: {text}" for text in _doubts(facts)]
     taken = {str(parent) for photo in photos for parent in PurePosixPath(photo).parents}
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
     count = Counter(stems.values())
@@ -62,6 +65,19 @@ def read_videos(
         )
         for name, stem in stems.items()
     )
+
+
+def _doubts(facts: VideoFacts) -> list[str]:
+    """What makes a video that can be read less useful."""
+    found = []
+    if facts.truncated:
+        found.append("its end is missing: the file is shorter than its header says; copy it again")
+    if facts.alike > 1:
+        found.append(
+            f"{facts.alike} video streams of the same size, of which one is used; if they are of "
+            "several lenses, export each as a video of its own"
+        )
+    return found
 
 
 def contents(photos: int, videos: int) -> str:
@@ -76,7 +92,14 @@ def description(video: VideoFile) -> str:
     """The number of frames, size and length of a video by its header, in words."""
     count = video.frames or "an unknown number of"
     length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
-    return f"{video.name}: {count} frames of {video.width}x{video.height}{length}"
+    largest = ""
+    if video.others:
+        sizes = ", ".join(f"{width}x{height}" for width, height in video.others[:SHOWN_STREAMS])
+        more = ", ..." if len(video.others) > SHOWN_STREAMS else ""
+        largest = (
+            f"; the largest of {len(video.others) + 1} video streams (not used: {sizes}{more})"
+        )
+    return f"{video.name}: {count} frames of {video.width}x{video.height}{length}{largest}"
 
 
 def planned_frames(videos: Sequence[VideoFile], max_frames: int) -> tuple[Photo, ...]:

@@ -89,6 +89,14 @@ class VideoFile(BaseModel):
     """Frames per second according to the header; 0 if unknown."""
     digest: str
     """Hex digest of the file's bytes."""
+    counted: bool = False
+    """Whether ``frames`` is the number of stored frames and not estimated from the length."""
+    truncated: bool = False
+    """Whether the file is shorter than its header says."""
+    others: tuple[tuple[int, int], ...] = ()
+    """Width and height of the video streams of the file that are not used."""
+    alike: int = 1
+    """Number of streams of the same size as the one that is used, with it."""
 
     @property
     def camera_group(self) -> str:

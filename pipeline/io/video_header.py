@@ -1,0 +1,45 @@
+"""What the header of a video file says of its tracks."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+# Elements that are read: as many as six hours of sound and pictures have.
+MAX_ELEMENTS = 2_000_000
+
+
+@dataclass(frozen=True)
+class Track:
+    """A video track, or a picture that FFmpeg takes for one.
+
+    Attributes:
+        width, height: pixels as stored.
+        frames: the number of stored frames that are shown; None if the header does not say it.
+        place: offset of the bytes that declare the track, in the order of the header.
+        hidden: the bytes in their place that make FFmpeg ignore the track.
+    """
+
+    width: int
+    height: int
+    frames: int | None
+    place: int
+    hidden: bytes
+
+    @property
+    def pixels(self) -> int:
+        return self.width * self.height
+
+
+@dataclass(frozen=True)
+class Header:
+    """The header of a video file.
+
+    Attributes:
+        tracks: the video tracks, in the order of FFmpeg's streams.
+        pictures: cover pictures among them, which FFmpeg takes for video tracks.
+        truncated: whether the file is shorter than the header says.
+    """
+
+    tracks: tuple[Track, ...]
+    pictures: tuple[Track, ...] = ()
+    truncated: bool = False

@@ -11,6 +11,7 @@ from io import BufferedReader
 from pathlib import Path
 
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.machine import usable_memory
 
 MIB = 1 << 20
 
@@ -48,3 +49,15 @@ def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=fix) from None
     what = f"expected at most {limit // MIB} MiB, found {size // MIB} MiB"
     raise UserError(what, file=path, fix=fix)
+
+
+def memory_share() -> int:
+    """Largest size in bytes of a file that is read as a whole: half of the memory."""
+    return usable_memory() // 2
+
+
+def too_large(path: Path, size: int) -> UserError:
+    """The error for a file that does not fit into the memory."""
+    what = f"expected a file of at most half of the memory ({memory_share() // MIB} MiB)"
+    fix = "use a machine with more memory, or a smaller file"
+    return UserError(f"{what}, found {size // MIB} MiB", file=path, fix=fix)

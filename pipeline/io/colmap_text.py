@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rotations import rotation_to_quat
+from pipeline.io.bounded import MIB, read_bounded
 from pipeline.io.colmap_records import (
     REMEDY,
     Keypoints,
@@ -24,11 +25,14 @@ from pipeline.io.colmap_records import (
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
+# A thousand photographs take about 300 MiB; larger models are binary.
+_MAX_BYTES = 2048 * MIB
+
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments; an empty line is an image without keypoints."""
     try:
-        text = file.read_bytes().decode()
+        text = read_bounded(file, _MAX_BYTES, fix=REMEDY).decode()
     except UnicodeDecodeError as error:
         raise UserError(f"expected UTF-8 text: {error}", file=file, fix=REMEDY) from None
     for number, line in enumerate(text.split("\n"), 1):

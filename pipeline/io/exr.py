@@ -11,6 +11,9 @@ from numpy.typing import NDArray
 EXR_SUFFIXES = frozenset({".exr"})
 # Larger images are refused before their pixels are decoded.
 _MAX_PIXELS = 2**28
+# Bytes of all channels in single precision, and of the colours and alpha that are made of them.
+_MAX_DECODED = 3 << 30
+_COLOUR_BYTES = 16
 
 
 @dataclass(frozen=True)
@@ -40,6 +43,14 @@ def read_header(file: IO[bytes]) -> ExrHeader:
         raise ValueError("its data window is not its display window: a crop of a larger image")
     if width <= 0 or height <= 0 or width * height > _MAX_PIXELS:
         raise ValueError(f"impossible size {width}x{height}")
+    if "deep" in str(header.get("type", "")):
+        raise ValueError("expected one colour a pixel, found several (deep data)")
+    needed = width * height * (4 * len(header["channels"]) + _COLOUR_BYTES)
+    if needed > _MAX_DECODED:
+        raise ValueError(
+            f"{width}x{height} pixels of {len(header['channels'])} channels take {needed >> 20} MiB"
+            f", more than {_MAX_DECODED >> 20}; reduce it, or leave out channels"
+        )
     return ExrHeader(width, height, "A" in names)
 
 

@@ -26,6 +26,9 @@ from pipeline.runtime.errors import UserError
 Image.MAX_IMAGE_PIXELS = None
 MAX_PIXELS = 1 << 29
 """Largest number of pixels of a photograph or of a video's frame: 1.5 GiB when it is decoded."""
+# Decoders that hold several copies of the pixels, and the bytes that they take for each.
+_DECODER_BYTES = {"WEBP": 24, "AVIF": 16, "HEIF": 16}
+_MAX_DECODED = 3 << 30
 MAX_BYTES = 4 << 30
 """Largest file of a photograph: ``MAX_PIXELS`` of 16-bit RGB and alpha."""
 # The formats of the supported suffixes. PIL recognises a file by its content, and has decoders that
@@ -139,6 +142,7 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
     image = Image.open(file, formats=_formats(name))
     try:
         check_size(*image.size)
+        _check_decoded(image)
     except ValueError:
         image.close()
         raise
@@ -150,6 +154,17 @@ def check_size(width: int, height: int) -> None:
     if width * height > MAX_PIXELS:
         raise ValueError(
             f"{width}x{height} pixels are more than {MAX_PIXELS // 10**6} megapixels; reduce it"
+        )
+
+
+def _check_decoded(image: Image.Image) -> None:
+    """Check the memory that decoding takes, which some decoders need several times."""
+    width, height = image.size
+    per_pixel = _DECODER_BYTES.get(image.format or "", 0)
+    if width * height * per_pixel > _MAX_DECODED:
+        raise ValueError(
+            f"{width}x{height} pixels of {image.format} take more than {_MAX_DECODED >> 20} MiB to "
+            "decode; reduce it, or save it as JPEG"
         )
 
 

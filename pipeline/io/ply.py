@@ -9,6 +9,7 @@ reorder properties, so they are read by name.
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -17,6 +18,7 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.bounded import memory_share, opened_regular, too_large
 from pipeline.io.ply_header import PlyHeader, read_header, wrong
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
@@ -104,7 +106,9 @@ def read_splat_ply(path: Path) -> Gaussians:
             implies.
     """
     try:
-        with open(path, "rb") as file:
+        with opened_regular(path) as file:
+            if (size := os.fstat(file.fileno()).st_size) > memory_share():
+                raise too_large(path, size)
             header = read_header(file, path)
             rest = sorted(n for n in header.fields if n.startswith("f_rest_"))
             missing = [name for name in _REQUIRED if name not in header.fields]

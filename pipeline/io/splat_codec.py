@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import os
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.io.bounded import memory_share, opened_regular, too_large
 from pipeline.runtime.errors import UserError
 
 
@@ -18,16 +20,20 @@ def read_file(path: Path, kind: str) -> bytes:
         kind: what the error message expects ("an SPZ file").
 
     Raises:
-        UserError: the file cannot be read.
+        UserError: the file cannot be read, or is larger than half of the memory.
     """
     try:
-        return path.read_bytes()
+        with opened_regular(path) as file:
+            size = os.fstat(file.fileno()).st_size
+            if size <= memory_share():
+                return file.read(size)
     except OSError as error:
         raise UserError(
             f"expected {kind}, could not read it: {error.strerror}",
             file=path,
             fix="check the path and its permissions",
         ) from error
+    raise too_large(path, size)
 
 
 def to_uint8(values: NDArray[Any]) -> NDArray[np.uint8]:

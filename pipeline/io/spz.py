@@ -44,6 +44,8 @@ _OUTLIER_DISTANCE = 512.0
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
 _QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller components are at most 1 / sqrt(2).
 # The limit of Niantic's reader.
+# Measured values compress less.
+_MAX_EXPANSION = 200
 MAX_GAUSSIANS = 10_000_000
 _FIX = "write the file again as SPZ version 3, or get an intact copy of it"
 
@@ -174,6 +176,11 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
         higher = _HIGHER[degree]
         widths = (9, 1, 3, 3, 3 if version == 2 else 4, 3 * higher)
         expected = count * sum(widths)
+        if expected > _MAX_EXPANSION * len(data):
+            raise wrong(
+                f"expected Gaussians of at most {_MAX_EXPANSION} times the file's size, found "
+                f"{expected} bytes of them"
+            )
         # At most one byte more than expected, so that a malicious file cannot exhaust the memory.
         body = stream.decompress(stream.unconsumed_tail, expected + 1)
     except zlib.error as error:

@@ -38,6 +38,7 @@ class PairCache:
         self._connection = sqlite3.connect(path)
         if not self._connection.execute("SELECT count(*) FROM sqlite_master").fetchone()[0]:
             pycolmap.Database.open(path).close()
+        _check_schema(self._connection)
         self._columns = {
             table: [
                 row[1]
@@ -105,6 +106,23 @@ class PairCache:
             self._connection.rollback()
             run("DROP TABLE IF EXISTS renamed")
             run("DETACH DATABASE other")
+
+
+def _check_schema(connection: sqlite3.Connection) -> None:
+    """Raise a ``sqlite3.DatabaseError`` unless the database has the tables of pairs, with matrices
+    of their sizes, and neither views nor triggers."""
+    connection.execute("PRAGMA trusted_schema = OFF")
+    kinds = dict(connection.execute("SELECT name, type FROM sqlite_master").fetchall())
+    if any(kinds.get(table) != "table" for table in _PAIR_TABLES):
+        raise sqlite3.DatabaseError("expected the tables of pairs")
+    if {"view", "trigger"} & set(kinds.values()):
+        raise sqlite3.DatabaseError("expected tables, found views or triggers")
+    for table in _PAIR_TABLES:
+        wrong = connection.execute(
+            f"SELECT count(*) FROM {table} WHERE rows * cols * 4 != coalesce(length(data), 0)"
+        ).fetchone()[0]
+        if wrong:
+            raise sqlite3.DatabaseError(f"expected whole matrices, found {wrong} others")
 
 
 def _by_pair_id(keys: Mapping[tuple[int, int], int]) -> list[tuple[int, int]]:

@@ -18,8 +18,11 @@ from pipeline.io.bounded import read_bounded
 from pipeline.runtime.errors import UserError
 
 FIX = "export the file again, or set poses: ignore"
-# Larger files are no list of cameras.
-MAX_BYTES = 512 * 2**20
+# Larger files are no list of cameras: 100,000 photographs take about 100 MiB.
+MAX_BYTES = 256 * 2**20
+# Bytes of memory that a JSON file's objects, lists and values take at least, by what begins them.
+_JSON_BYTES = {"{": 240, "[": 90, ",": 40}
+_MAX_JSON_MEMORY = 2 << 30
 _MAX_NAME = 1000
 _HEAD_BYTES = 4096
 
@@ -56,8 +59,13 @@ def read_text(file: Path) -> str:
 
 def read_json(file: Path) -> Any:
     """The content of a JSON file; integers beyond 64 bits become floats."""
+    text = read_text(file)
+    if sum(text.count(mark) * size for mark, size in _JSON_BYTES.items()) > _MAX_JSON_MEMORY:
+        raise malformed(
+            file, f"expected JSON that takes at most {_MAX_JSON_MEMORY >> 20} MiB of memory"
+        )
     try:
-        return json.loads(read_text(file), parse_int=_integer)
+        return json.loads(text, parse_int=_integer)
     except json.JSONDecodeError as error:
         where = f"line {error.lineno}, column {error.colno}"
         raise malformed(file, f"{where}: not valid JSON ({error.msg})") from None
@@ -110,5 +118,8 @@ def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> 
 
 def shown(value: Any) -> str:
     """``value`` in a message."""
-    text = str(value.tolist() if isinstance(value, np.ndarray) else value)
+    try:
+        text = str(value.tolist() if isinstance(value, np.ndarray) else value)
+    except ValueError:  # Python does not print integers of thousands of digits.
+        text = "a number of thousands of digits"
     return repr(text[:60].encode(errors="replace").decode())

@@ -111,7 +111,14 @@ def _load(path: Path) -> Checkpoint | None:
     payload, digest = memoryview(data)[:-32], data[-32:]
     if len(data) < 32 or hashlib.sha256(payload).digest() != digest:
         return None
-    with np.load(io.BytesIO(payload)) as archive:
-        arrays = {name: archive[name] for name in archive.files}
-    header = json.loads(arrays.pop("__header__").tobytes())
-    return Checkpoint(header["step"], header["identity"], arrays, header["values"])
+    # A right digest of a file that another program wrote: numpy raises exceptions of many types.
+    try:
+        with np.load(io.BytesIO(payload)) as archive:
+            arrays = {name: archive[name] for name in archive.files}
+        header = json.loads(arrays.pop("__header__").tobytes())
+        step, identity, values = (header[name] for name in ("step", "identity", "values"))
+    except Exception:
+        return None
+    if not (type(step) is int and step >= 0 and isinstance(identity, str)):
+        return None
+    return Checkpoint(step, identity, arrays, values) if isinstance(values, dict) else None

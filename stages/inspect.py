@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from pipeline.config.schema import Config
 from pipeline.photos.counters import InspectCounters
+from pipeline.plan.colours import converted_colours
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan
 from pipeline.plan.video_files import contents
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
     reason = contents(len(scan.photos), len(scan.videos))
-    return StagePlan(run=True, reason=reason, decisions=[scan.image_folder_reason])
+    decisions = [scan.image_folder_reason, *converted_colours(scan.photos)]
+    return StagePlan(run=True, reason=reason, decisions=decisions)
 
 
 def work(job: Job) -> None:

@@ -16,6 +16,7 @@ from PIL import ExifTags, Image, UnidentifiedImageError
 from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import exr, pillow_formats
+from pipeline.io.colour import Colours, colours_of
 from pipeline.io.gps import Fault, Position, read_gps
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.panorama import Panorama, panorama_of
@@ -35,6 +36,7 @@ MAX_BYTES = 4 << 30
 # run other programs.
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")
 
+_TIFF_WIDTH, _TIFF_HEIGHT = 256, 257
 _BASE, _IFD = ExifTags.Base, ExifTags.IFD
 FULL_FRAME_DIAGONAL_MM = 43.27
 # Accepted focal lengths divided by the longer side: from a 180 degree lens to a 35 mm equivalent
@@ -51,7 +53,10 @@ _MM_PER_UNIT = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 class FileFacts(BaseModel):
     """Metadata of an image file; see ``manifest.Photo`` for the fields.
 
-    ``gps_fault`` is the reason why a GPS position in the metadata is not used.
+    Attributes:
+        gps_fault: The reason why a GPS position in the metadata is not used.
+        colours_fault: why its colours are used as sRGB although the file says something else; empty
+            otherwise.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -71,6 +76,8 @@ class FileFacts(BaseModel):
     gps_fault: Fault | None = None
     taken: str | None = None
     panorama: Panorama = "no"
+    colours: str = ""
+    colours_fault: str = ""
 
     @property
     def camera_group(self) -> str:
@@ -97,11 +104,12 @@ def read_facts(path: Path) -> FileFacts:
         if suffix in exr.EXR_SUFFIXES:
             return _exr_facts(path, digest)
         with _quiet(), opened_image(path, path.name) as image:
-            width, height = image.size
+            width, height = _stored_size(image)
             if _bits(image) > 16:
                 raise ValueError("more than 16 bits a channel; convert it to 8 or 16")
             xmp = _xmp(image)
-            exif = _exif_facts(_exif_of(lambda: _header_exif(image)), width, height, xmp)
+            tags = _exif_of(lambda: _header_exif(image))
+            exif, colours = _exif_facts(tags, width, height, xmp), colours_of(image, tags)
             return FileFacts(
                 digest=digest,
                 width=width,
@@ -109,6 +117,8 @@ def read_facts(path: Path) -> FileFacts:
                 alpha=_has_transparency(image),
                 bits=_bits(image),
                 panorama=panorama_of(xmp, exif["body"], width, height),
+                colours=colours.name,
+                colours_fault=colours.fault,
                 **exif,
             )
     except UnidentifiedImageError:
@@ -147,6 +157,20 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
         image.close()
         raise
     return image
+
+
+def colours_of_file(image: Image.Image) -> Colours:
+    """The colours of an image that was opened by ``opened_image``."""
+    with _quiet():
+        return colours_of(image, _exif_of(lambda: _header_exif(image)))
+
+
+def _stored_size(image: Image.Image) -> tuple[int, int]:
+    """Width and height of the stored pixels; PIL's are those of a TIFF after its orientation."""
+    tags = getattr(image, "tag_v2", None)
+    if image.format != "TIFF" or tags is None:
+        return image.size
+    return int(tags[_TIFF_WIDTH]), int(tags[_TIFF_HEIGHT])
 
 
 def check_size(width: int, height: int) -> None:
@@ -271,6 +295,7 @@ def _exif_of(load: Any) -> Mapping[int, Any]:
         tags.update(exif)
         tags.update(exif.get_ifd(_IFD.Exif))
         tags[_IFD.GPSInfo] = dict(exif.get_ifd(_IFD.GPSInfo))
+        tags[_IFD.Interop] = dict(exif.get_ifd(_IFD.Interop))
     return tags
 
 

@@ -104,6 +104,7 @@ def _write(photo: Photo, name: str, developed: Developed, out: Path) -> Photo:
             "digest": digest_of(path),
             "linear": False,
             "alpha": alpha is not None,
+            "colours": "",
             "bits": 8 * rgb.itemsize,
             "focal_px": focal,
         }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from pipeline.config.schema import Decode
 from pipeline.io import exr
+from pipeline.io.colour import srgb_curve
 from pipeline.io.recorded import read_recorded
 from pipeline.scene.manifest import Photo
 
@@ -47,12 +48,6 @@ def develop_exr(photo: Photo, config: Decode) -> Developed:
     values = _quantized(rgb if config.linear else srgb_curve(rgb), depth)
     opaque = alpha is None or bool((alpha >= 1).all())
     return Developed(values, None if opaque or alpha is None else _quantized(alpha, depth))
-
-
-def srgb_curve(light: NDArray[np.float32]) -> NDArray[np.float32]:
-    """sRGB's transfer function (IEC 61966-2-1) of linear light in [0, 1]."""
-    curved = 1.055 * np.maximum(light, 0.0031308) ** (1 / 2.4) - 0.055
-    return np.where(light <= 0.0031308, 12.92 * light, curved).astype(np.float32)
 
 
 def _quantized(values: NDArray[np.float32], depth: type[np.unsignedinteger[Any]]) -> NDArray[Any]:

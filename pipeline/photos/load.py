@@ -1,34 +1,31 @@
-"""Load images, masks and depth maps, as stored: EXIF orientation is never applied.
+"""Load images, masks and depth maps, as stored: no orientation is ever applied
+(``pipeline.io.pictures``).
 
 If a recorded digest is given, the bytes that are decoded are the ones whose digest is compared: the
 file is read once.
-
-cv2's decoders silently fill the missing part of a truncated file with grey. Truncation is therefore
-detected from the file formats' own structure.
 """
 
 from __future__ import annotations
 
-import contextlib
 import io
-import struct
-import zlib
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io import pillow_formats
 from pipeline.io.arrays import read_archive, read_array
-from pipeline.io.names import suffix_of
+from pipeline.io.masks import MaskPixels
+from pipeline.io.pictures import decode_depth, decode_mask, decode_photograph
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import Crop, View
 
 Picture = NDArray[Any]
+T = TypeVar("T")
 FIX = "Replace the file by an undamaged one, or remove it from the folder."
 # Largest relative difference of aspect ratios: sizes of downscaled images are rounded.
 ASPECT_TOLERANCE = 0.02
@@ -83,12 +80,21 @@ def load_rgba(
 
 
 def load_mask(path: str | Path, digest: str | None = None) -> NDArray[np.bool_]:
-    """Read a mask as (H, W) bool: True if any colour channel is not zero.
+    """Read a mask as (H, W) bool, True for the pixels that count (``masks.valid_pixels``).
 
     Raises:
         UserError: as ``load_rgb``.
     """
-    return np.asarray(load_rgb(path, digest).any(axis=2))
+    return read_mask(path, digest).valid
+
+
+def read_mask(path: str | Path, digest: str | None = None) -> MaskPixels:
+    """Read a mask, with what was found of its values.
+
+    Raises:
+        UserError: as ``load_rgb``.
+    """
+    return _decoded(path, digest, decode_mask)
 
 
 def read_depth(path: str | Path, digest: str | None = None) -> Picture:
@@ -105,7 +111,7 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
         elif path.suffix == ".npz":
             depth = next(iter(read_archive(io.BytesIO(data)).values()), None)
         else:
-            depth = _decode(data)
+            depth = decode_depth(data)
     except ValueError:
         depth = None
     if depth is None:
@@ -217,46 +223,21 @@ def to_8bit(values: Picture) -> NDArray[np.uint8]:
 
 
 def read_picture(path: str | Path, digest: str | None = None) -> Picture:
-    """Read an image in OpenCV's layout: (H, W) grey, (H, W, 2) grey and alpha, (H, W, 3) BGR or
-    (H, W, 4) BGRA; uint8 or uint16.
+    """Read a photograph in OpenCV's layout, in sRGB (``pictures.decode_photograph``).
 
     Raises:
         UserError: as ``load_rgb``.
     """
+    return _decoded(path, digest, decode_photograph)
+
+
+def _decoded(path: str | Path, digest: str | None, decode: Callable[[bytes, str], T]) -> T:
     path = Path(path)
     data = read_recorded(path, digest)
-    if _is_truncated(data):
-        raise UserError("the image is truncated or damaged", file=path, fix=FIX)
-    picture: Picture | None = None
-    suffix = suffix_of(path.name)
-    if suffix in pillow_formats.SUFFIXES:
-        # PIL raises exceptions of many types on damaged files.
-        with contextlib.suppress(Exception):
-            picture = pillow_formats.read_pixels(io.BytesIO(data), suffix)
-    else:
-        picture = _decode(data)
-    if picture is None:
-        raise UserError(
-            "not a readable image (expected JPEG, PNG, TIFF, WebP or AVIF)", file=path, fix=FIX
-        )
-    if picture.dtype not in (np.uint8, np.uint16):
-        raise UserError(
-            f"pixels of type {picture.dtype} (expected 8 or 16 bits)",
-            file=path,
-            fix="Convert the image to 8-bit or 16-bit PNG.",
-        )
-    return picture
-
-
-def _decode(data: bytes) -> Picture | None:
-    """Decode an image file's bytes with OpenCV; None if OpenCV cannot read them."""
-    if not data:
-        return None
     try:
-        # None for an unknown format, contrary to OpenCV's type annotations.
-        return cv2.imdecode(np.frombuffer(data, np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        return None
+        return decode(data, path.name)
+    except ValueError as error:
+        raise UserError(str(error), file=path, fix=FIX) from None
 
 
 def _split(picture: Picture) -> tuple[Picture, Picture | None]:
@@ -281,48 +262,3 @@ def _check_shape(picture: Picture, width: int, height: int, path: Path) -> None:
             file=path,
             fix="Use the image that the camera belongs to, neither rotated nor cropped.",
         )
-
-
-def _is_truncated(data: bytes) -> bool:
-    """Whether a JPEG, PNG or WebP file is incomplete according to its format."""
-    if data[:2] == b"\xff\xd8":
-        return not _jpeg_is_complete(data)
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
-        return not _png_is_complete(data)
-    if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
-        return len(data) < 8 + int(struct.unpack("<I", data[4:8])[0])
-    return False
-
-
-def _jpeg_is_complete(data: bytes) -> bool:
-    """Whether an end-of-image marker follows the first scan (ITU T.81, annex B).
-
-    The search starts at the scan: the EXIF preview has its own end-of-image marker.
-    """
-    at = 2
-    while at + 4 <= len(data) and data[at] == 0xFF:
-        marker = data[at + 1]
-        if marker == 0xFF:  # fill byte
-            at += 1
-            continue
-        if marker == 0xDA:
-            return data.find(b"\xff\xd9", at) >= 0
-        at += 2 + int.from_bytes(data[at + 2 : at + 4], "big")
-    return False
-
-
-def _png_is_complete(data: bytes) -> bool:
-    """Whether every chunk up to IEND is present with a correct checksum (PNG specification,
-    section 5)."""
-    at = 8
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        end = at + 8 + length
-        if end + 4 > len(data):
-            return False
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return False
-        if data[at + 4 : at + 8] == b"IEND":
-            return True
-        at = end + 4
-    return False

@@ -126,6 +126,7 @@ def write_view(
             "height": height,
             "digest": digest_of(path),
             "alpha": alpha is not None,
+            "colours": "",
             "bits": 8 if path.suffix == ".jpg" or picture.dtype == np.uint8 else 16,
             "mask": None if mask_path is None else str(mask_path),
             "mask_digest": None if mask_path is None else digest_of(mask_path),

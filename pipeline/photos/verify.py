@@ -13,6 +13,7 @@ from pipeline.io import exr
 from pipeline.io.names import suffix_of
 from pipeline.io.photofile import opened_image
 from pipeline.io.recorded import read_recorded
+from pipeline.io.tiff import is_tiff, without_orientation
 from pipeline.io.videofile import FIX as FIX_VIDEO
 from pipeline.io.videofile import opened_video
 from pipeline.photos.duplicates import Signature, find_duplicates, signature
@@ -170,7 +171,8 @@ def _check(photo: Photo) -> _Check:
 
 
 def _decode(photo: Photo) -> Signature | None:
-    data = io.BytesIO(read_recorded(photo.path, photo.digest))
+    content = read_recorded(photo.path, photo.digest)
+    data = io.BytesIO(without_orientation(content) if is_tiff(content) else content)
     suffix = suffix_of(photo.path)
     if suffix in exr.EXR_SUFFIXES:
         exr.read_pixels(data)

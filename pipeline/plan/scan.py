@@ -26,6 +26,7 @@ from pipeline.io.posefiles import (
     pose_files,
     truth_folder,
 )
+from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
 from pipeline.plan.depth_maps import check_depth_maps
 from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
@@ -245,6 +246,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ).model_copy(update={"split": split.get(name)})
         for name in sorted(facts)
     ]
+    warnings += unread_colours(facts)
     if poses is None:
         warnings += partial_panoramas(facts)
     else:
@@ -360,6 +362,7 @@ def _photo(
         alpha=facts.alpha,
         bits=facts.bits,
         orientation=facts.orientation,
+        colours=facts.colours,
         mask=str(mask) if mask else None,
         mask_digest=cached_digest(mask, cache) if mask else None,
         depth=str(depth) if depth else None,

@@ -15,9 +15,9 @@ from pipeline.runtime.record import read_record
 class Photo(BaseModel):
     """A photograph and its metadata, read without decoding pixels.
 
-    Sizes and coordinates refer to the stored pixels. As in COLMAP, the EXIF orientation is not
-    applied to them (cv2 needs ``IMREAD_IGNORE_ORIENTATION``); it only decides how the report
-    displays photographs.
+    Sizes and coordinates refer to the stored pixels. As in COLMAP, the orientation that EXIF or
+    TIFF gives is not applied to them (``pipeline.io.pictures`` decodes all files); it decides how
+    the report displays photographs and where up is.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True, use_attribute_docstrings=True)
@@ -40,8 +40,11 @@ class Photo(BaseModel):
     """Bits per channel of the file."""
     orientation: int = 1
     """EXIF orientation, 1 to 8."""
+    colours: str = ""
+    """Name of the colour space that is converted to sRGB when the file is decoded; empty for sRGB,
+    and for files that name none."""
     mask: str | None = None
-    """Mask file; pixels with mask value 0 are ignored."""
+    """Mask file; pixels that are dark or transparent in it are ignored (``pipeline.io.masks``)."""
     mask_digest: str | None = None
     """As ``digest``, of the mask."""
     depth: str | None = None

@@ -25,7 +25,7 @@ from pipeline.sfm.counters import FeaturesCounters
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 
 # Part of the cache key: increase it when a change of the code changes keypoints.
-ALGORITHM_VERSION = 2
+ALGORITHM_VERSION = 3
 
 # Peak memory per pixel of a photograph while it is decoded, and of the image that SIFT is detected
 # in: its scale space begins with twice the size.

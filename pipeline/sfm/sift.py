@@ -6,7 +6,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.photos.load import read_picture
+from pipeline.photos.load import load_mask, read_picture
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.sfm.keypoints import Keypoints, root_sift
@@ -128,12 +128,9 @@ def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
 
 
 def _read_mask(photo: Photo, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """(h, w) uint8: 1 for non-zero pixels of the photograph's mask."""
+    """(h, w) uint8: 1 for the pixels that the photograph's mask keeps."""
     assert photo.mask is not None
-    mask = read_picture(photo.mask, photo.mask_digest)
-    if mask.ndim == 3:
-        mask = mask[..., :3].max(axis=2)
-    usable = (mask > 0).astype(np.uint8)
-    if (mask.shape[1], mask.shape[0]) != size:
+    usable = load_mask(photo.mask, photo.mask_digest).astype(np.uint8)
+    if (usable.shape[1], usable.shape[0]) != size:
         usable = cv2.resize(usable, size, interpolation=cv2.INTER_NEAREST).astype(np.uint8)
     return usable

@@ -62,6 +62,7 @@ class _Measured(NamedTuple):
     record: ViewMetrics
     without_gains: float | None
     without_fit: float | None
+    is_masked: bool
 
 
 def evaluate_views(
@@ -131,7 +132,7 @@ def evaluate_views(
             psnr="mean over the views of PSNR in dB, 8-bit renders, peak 1",
             ssim=SSIM_VARIANT,
             lpips=LPIPS_VARIANTS[config.lpips_net] if lpips is not None else reason,
-            masks="masked pixels are excluded" if any(v.mask for v in protocol.views) else None,
+            masks=_describe_masks(protocol, measured),
             background=protocol.background,
             exposure=EXPOSURE_PROTOCOL if gains else None,
             appearance=APPEARANCE_PROTOCOL if without_fit is not None else None,
@@ -191,7 +192,7 @@ def _compare(
     record = ViewMetrics(name=found.view, psnr=psnr, ssim=ssim, lpips=lpips, render=file.name)
     without_gains = found.psnr(to_bytes(found.rgb)) if gains else None
     without_fit = None if found.own is None else found.psnr(to_bytes(found.own))
-    return _Measured(record, without_gains, without_fit)
+    return _Measured(record, without_gains, without_fit, found.is_masked)
 
 
 def _mean(values: Sequence[float | None]) -> float | None:
@@ -214,6 +215,15 @@ def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
             f"{train_psnr:.1f} dB): there are too few photographs, or they are too far apart"
         ]
     return []
+
+
+def _describe_masks(protocol: Protocol, measured: Sequence[_Measured]) -> str | None:
+    if all(view.mask is None for view in protocol.views):
+        return None
+    # A view that its mask hides is not measured.
+    if len(measured) < len(protocol.views) or any(view.is_masked for view in measured):
+        return "masked pixels are excluded"
+    return "the masks exclude no pixel of the measured views"
 
 
 def _split_photographs(views: Sequence[View]) -> int | None:

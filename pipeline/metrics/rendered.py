@@ -55,6 +55,11 @@ class Rendered:
         """Whether the mask leaves no measured pixel."""
         return self.measured_mask is not None and not self.measured_mask.any()
 
+    @property
+    def is_masked(self) -> bool:
+        """Whether the mask excludes a measured pixel."""
+        return self.measured_mask is not None and not self.measured_mask.all()
+
     def psnr(self, image: NDArray[np.uint8]) -> float:
         """PSNR of an image over the measured columns."""
         here = self.columns

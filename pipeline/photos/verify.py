@@ -17,6 +17,7 @@ from pipeline.io.tiff import is_tiff, without_orientation
 from pipeline.io.videofile import FIX as FIX_VIDEO
 from pipeline.io.videofile import opened_video
 from pipeline.photos.duplicates import Signature, find_duplicates, signature
+from pipeline.photos.verify_masks import verify_masks
 from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import track
@@ -29,7 +30,7 @@ _PHOTO_BYTES = 7.0
 def verify_manifest(
     manifest: Manifest, *, threads: int, min_photos: int, keep_duplicates: bool
 ) -> tuple[Manifest, list[str]]:
-    """``verify_videos``, then ``verify_photos``.
+    """``verify_videos``, ``verify_photos``, then ``verify_masks``.
 
     Args:
         min_photos: smallest number of photographs; 0 if there are videos, which add frames.
@@ -39,7 +40,8 @@ def verify_manifest(
     manifest, left_out = verify_photos(
         manifest, threads=threads, min_photos=least, keep_duplicates=keep_duplicates
     )
-    return manifest, [*warnings, *left_out]
+    manifest, of_masks = verify_masks(manifest, threads=threads)
+    return manifest, [*warnings, *left_out, *of_masks]
 
 
 def verify_photos(

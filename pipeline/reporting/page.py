@@ -183,7 +183,7 @@ def _pictures(views: Iterable[Comparison]) -> str:
     views = list(views)
     if not views:
         return _nothing("No view was recorded for comparison.")
-    grey = "<b></b>masked" if any(v.mask is not None for v in views) else ""
+    grey = "<b></b>masked" if any(v.mask is not None and not v.mask.all() for v in views) else ""
     parts = [
         '<div class="bar-top">'
         + _choice("pictures", "sliding", "Side by side", "Slider")

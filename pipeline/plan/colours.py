@@ -1,4 +1,4 @@
-"""What the plan says of the photographs' colour spaces."""
+"""The plan's sentences about the colour spaces of photographs."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What the header of a video file says of its tracks."""
+"""What the header of a video file reports about its tracks."""
 
 from __future__ import annotations
 

@@ -238,8 +238,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
 
     masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
     depths = depths_of(folder, chosen, facts)
-    if config.train.depth_loss_weight != 0:
-        check_depth_maps(depths, facts, facts_cache)
+    check_depth_maps(depths, facts, facts_cache)
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache

@@ -18,8 +18,8 @@ _OPTIONAL_HEADER = cast("type[DepthHeader | None]", DepthHeader | None)
 # maps causes less.
 _ASPECT_TOLERANCE = 0.02
 _FIX = (
-    "save depths of the whole photograph as 16-bit grey PNG, float TIFF or .npy, or remove the file "
-    "from the folder"
+    "save depths of the whole photograph as 16-bit grey PNG, float TIFF or .npy, or remove "
+    "the file from the folder"
 )
 
 

@@ -44,7 +44,7 @@ def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
         with opened_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
             if size <= limit:
-                return file.read(limit)
+                return file.read(size)
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=fix) from None
     what = f"expected at most {limit // MIB} MiB, found {size // MIB} MiB"

@@ -19,6 +19,7 @@ WORKFLOW = SimpleNamespace(
     is_main_process=True,
     executor_plugin=None,
     non_local_exec=False,
+    remote_exec=False,
 )
 NAMES = ("<x>", "{x}", "ab" * 20, "n" * 250, "a\nb", "\udcff")
 
@@ -110,8 +111,8 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     results = data.parent / "results" / "good"
     results.mkdir(parents=True)
     (results / "metrics.json").write_text("{}")
-    job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"))
-    batch = SimpleNamespace(wildcards=SimpleNamespace())
+    job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"), output=["x"])
+    batch = SimpleNamespace(wildcards=SimpleNamespace(), output=["x"])
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
     flow = SimpleNamespace(**vars(WORKFLOW), dag=dag)
     project = SnakemakeProject({}, flow)

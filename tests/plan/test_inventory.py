@@ -141,6 +141,7 @@ def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, 
         return
     finally:
         shutil.rmtree(scene.parent)
+    name = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
     named = any(name in line or path.parent.name in line for line in after.warnings)
     used = after.fingerprint != before.fingerprint
     known = path.parent.name == "0" and stem in ("cameras", "images", "points3D")

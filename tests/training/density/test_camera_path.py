@@ -116,7 +116,7 @@ def test_training_removes_them_at_its_end(scene: TinyScene, tmp_path: Path) -> N
     depths = np.full(len(scene.views), EMPTY)
     inputs = Inputs(scene.views, between(scene), scene.extent, empty_depths=depths)
     for remove in (True, False):
-        config = tiny_config(4, **still, density={"grad_threshold": 1e9, "remove_floaters": remove})
+        config = tiny_config(4, **still, density={"grad_threshold": 1e6, "remove_floaters": remove})
         folder = tmp_path / str(remove)
         result = train(inputs, *config, seed=3, threads=1, checkpoint_dir=folder)
         assert result.counters["floaters"] == remove

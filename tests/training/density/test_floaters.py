@@ -111,13 +111,13 @@ def nearest(scene: TinyScene, result: TrainResult) -> float:
 
 
 def test_training_removes_floaters(scene: TinyScene, tmp_path: Path) -> None:
-    still = {"learning_rate_factor": 1e-9, "density": {"grad_threshold": 1e9}}
+    still = {"learning_rate_factor": 1e-9, "density": {"grad_threshold": 1e6}}
     first = with_close(scene, 0.4)
     result = run(scene, tmp_path / "a", tiny_config(60, **still), first)
     assert result.counters["floaters"] == 1
     assert nearest(scene, result) > EMPTY
     kept = tiny_config(
-        60, **{**still, "density": {"grad_threshold": 1e9, "remove_floaters": False}}
+        60, **{**still, "density": {"grad_threshold": 1e6, "remove_floaters": False}}
     )
     result = run(scene, tmp_path / "b", kept, first)
     assert result.counters["floaters"] == 0

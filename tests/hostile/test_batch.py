@@ -112,7 +112,7 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     results.mkdir(parents=True)
     (results / "metrics.json").write_text("{}")
     job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"), output=["x"])
-    batch = SimpleNamespace(wildcards=SimpleNamespace(), output=["x"])
+    batch = SimpleNamespace(wildcards=SimpleNamespace(), output=[])
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
     flow = SimpleNamespace(**vars(WORKFLOW), dag=dag)
     project = SnakemakeProject({}, flow)

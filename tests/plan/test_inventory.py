@@ -12,7 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.io import walk as walks
-from pipeline.io.names import first_names, suffix_of
+from pipeline.io.names import PHOTO_SUFFIXES, first_names, suffix_of
 from pipeline.plan.inventory import _SIDE_CARS, _TEXTS
 from pipeline.runtime.errors import UserError
 from tests.io.test_transforms import frame, write
@@ -145,7 +145,7 @@ def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, 
     named = any(name in line or path.parent.name in line for line in after.warnings)
     used = after.fingerprint != before.fingerprint
     known = path.parent.name == "0" and stem in ("cameras", "images", "points3D")
-    copy = folder == "images_2" and ending in (".png", ".jpg", ".JPEG", ".jfif", ".exr")
+    copy = folder == "images_2" and suffix_of(name) in PHOTO_SUFFIXES
     assert named or used or known or copy, after.warnings
 
 

@@ -82,7 +82,7 @@ class RobustFit(NamedTuple):
             the target's unit.
         observations: the number of measured coordinates of the inliers.
         freedoms: the number of observations less the number of fitted parameters.
-        uncertainty: of the similarity, from its covariance.
+        uncertainty: The uncertainty of the similarity, from its covariance.
     """
 
     similarity: Similarity

@@ -30,8 +30,8 @@ class ImageDirections:
     """Directions of photographs in the world, unit vectors (N, 3).
 
     Attributes:
-        top: from the centre to the top of the upright image.
-        right: to its right.
+        top: The direction from the centre to the top of the upright image.
+        right: The direction from the centre to the right of the upright image.
         ahead: along the optical axis.
     """
 

@@ -55,7 +55,7 @@ class GroundControl:
     """The content of a ``gcp_list.txt``.
 
     Attributes:
-        projection: of the file; ``points`` are in metres or degrees of it.
+        projection: The file's projection; ``points`` are in its metres or degrees.
         points: those that a photograph of the scene shows.
         unknown: names of photographs that are not in the scene.
         warnings: sentences for the user.

@@ -39,7 +39,7 @@ class _Stored:
     """Pixels as stored.
 
     Attributes:
-        picture: in OpenCV's layout; (H, W, 4) CMYK if ``cmyk``.
+        picture: The pixels in OpenCV's layout; (H, W, 4) CMYK if ``cmyk``.
         colours: what the file says about them.
     """
 

@@ -36,9 +36,9 @@ class Projection:
     longitude, latitude or easting, northing whatever the system's own order is.
 
     Attributes:
-        text: as the user wrote it.
+        text: The projection as the user wrote it.
         name: PROJ's name; ``text`` where it has none.
-        kind: of the coordinates.
+        kind: The kind of the coordinates.
         unit: name of the horizontal coordinates' unit.
         horizontal: metres per unit of a projected system; degrees per unit of a geographic one.
         vertical: metres per unit of heights.

@@ -28,7 +28,7 @@ class _Found:
     Attributes:
         file: the mask.
         kept: share of the pixels that it keeps.
-        darkest: as of ``masks.MaskPixels``.
+        darkest: The field of the same name of ``masks.MaskPixels``.
     """
 
     file: Path

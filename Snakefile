@@ -85,11 +85,13 @@ rule plan:
             caption=project.packaged("pipeline/reporting/captions/plan.rst"),
             category="{scene}",
         ),
+    log:
+        "results/{scene}/logs/plan.log",
     params:
         plan=project.plan,
     shell:
         "python -m stages.workflow.plan --out {output.plan:q} --picture {output.picture:q}"
-        " --plan {params.plan:q}"
+        " --plan {params.plan:q} --log {log:q}"
 
 
 # One rule per stage: inputs, key and outputs follow from its declaration.

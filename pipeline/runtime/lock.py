@@ -118,12 +118,14 @@ def logging_to(path: Path | None, name: str) -> Iterator[None]:
         # The stage will fail for the same reason, with a complete message.
         yield
         return
-    with log:
-        console = Console(terminal, log, f"{name}: ")
-        sys.stderr = console  # type: ignore[assignment]
-        try:
-            yield
-        finally:
-            console.clear()
-            console.flush()
-            sys.stderr = terminal
+    console = Console(terminal, log, f"{name}: ")
+    sys.stderr = console  # type: ignore[assignment]
+    try:
+        yield
+    finally:
+        console.clear()
+        console.flush()
+        sys.stderr = terminal
+        # Closing writes what a full disk has refused before.
+        with contextlib.suppress(OSError):
+            log.close()

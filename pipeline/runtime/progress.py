@@ -59,7 +59,8 @@ class Console:
     """Replacement of stderr in a stage, which writes to the terminal and to a log.
 
     On an interactive terminal the progress is a single line that is updated in place; otherwise
-    (no terminal, or CI) it is only written to the log. Errors of a closed terminal are ignored.
+    (no terminal, or CI) it is only written to the log. A terminal that was closed and a log that
+    cannot be written, as on a full disk, are given up: the stage goes on without them.
 
     Args:
         terminal: the original stderr.
@@ -76,17 +77,15 @@ class Console:
         self._last = 0.0
 
     def write(self, text: str) -> int:
-        if self._log is not None:
-            self._log.write(text)
+        self._to_log(text)
         self.clear()
         self._to_terminal(text)
         return len(text)
 
     def progress(self, line: str, *, keep: bool) -> None:
         """Show ``line`` instead of the last one; with ``keep``, append it to the log."""
-        if keep and self._log is not None:
-            self._log.write(f"{line}\n")
-            self._log.flush()
+        if keep:
+            self._to_log(f"{line}\n")
         now = time.monotonic()
         if self._live and now - self._last >= LIVE_SECONDS:
             self._last = now
@@ -102,8 +101,6 @@ class Console:
             self._to_terminal(_ERASE)
 
     def flush(self) -> None:
-        if self._log is not None:
-            self._log.flush()
         if self._terminal is not None:
             try:
                 self._terminal.flush()
@@ -112,6 +109,14 @@ class Console:
 
     def isatty(self) -> bool:
         return self._terminal is not None and self._terminal.isatty()
+
+    def _to_log(self, text: str) -> None:
+        if self._log is not None:
+            try:
+                self._log.write(text)
+                self._log.flush()
+            except OSError:
+                self._log = None
 
     def _to_terminal(self, text: str) -> None:
         if self._terminal is not None:

@@ -51,6 +51,7 @@ from stages.workflow.cluster import (
 from stages.workflow.failures import reporting_errors
 from stages.workflow.locks import prepare_folder, use_locks_of_runs
 from stages.workflow.registry import STAGES
+from stages.workflow.terminal import shorten_failures
 
 RESULTS = Path("results")
 # Written when runs of a batch failed. From then on it is an input of the tables, so that these are
@@ -93,6 +94,7 @@ class SnakemakeProject:
         try:
             _check_working_directory()
             use_locks_of_runs()
+            shorten_failures()
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)

@@ -30,6 +30,15 @@ def write_splat(path: Path, gaussians: GaussianSource) -> None:
     write_pieces(path, (_rows(*chunk).tobytes() for chunk in gaussians.chunks(*NAMES)))
 
 
+def share_of_clamped_colours(gaussians: GaussianSource) -> float:
+    """The share of Gaussians with a colour outside of [0, 1] by more than a step of 8 bits."""
+    clamped = 0
+    for (sh,) in gaussians.chunks("sh"):
+        distance = np.abs(SH_C0 * sh[:, 0].astype(np.float64))
+        clamped += int((distance > 0.5 + 1 / 255).any(axis=1).sum())
+    return clamped / max(1, len(gaussians))
+
+
 def _rows(means: Array, log_scales: Array, quats: Array, logits: Array, sh: Array) -> NDArray[Any]:
     norm = np.linalg.norm(quats, axis=1, keepdims=True)
     table = np.zeros(len(means), _ROW)

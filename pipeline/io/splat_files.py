@@ -13,7 +13,7 @@ from pipeline.io.gltf import read_gltf, write_gltf
 from pipeline.io.npz import read_npz, write_npz
 from pipeline.io.ply import read_splat_ply, write_splat_ply
 from pipeline.io.splat import read_splat, write_splat
-from pipeline.io.splat_losses import losses, unmarked
+from pipeline.io.splat_losses import losses, losses_of_reading, unmarked
 from pipeline.io.spz import read_antialias, read_spz, write_spz
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
@@ -49,12 +49,14 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     """Read Gaussians from a file in any supported format, ready for rendering.
 
     Infinite log scales (flat Gaussians) and opacity logits (full opacity) are made finite.
-    Gaussians with NaN values or a zero quaternion are omitted with a warning.
+    Gaussians with NaN values or a zero quaternion are omitted with a warning, and so is what is
+    not read of the format (``splat_losses``).
 
     Raises:
         UserError: an unknown suffix, a file that cannot be read, or no valid Gaussians.
     """
     gaussians = _by_suffix(_READERS, path)(path)
+    warnings += losses_of_reading(path)
     finite = {
         name: tensor.nan_to_num(nan=math.nan, posinf=_LARGE, neginf=-_LARGE)
         for name, tensor in gaussians.tensors().items()

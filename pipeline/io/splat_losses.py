@@ -1,12 +1,13 @@
-"""What is lost when Gaussians are written in a format: the same sentences for the export stage, the
-command ``convert`` and the Python interface."""
+"""What is lost when Gaussians are written in a format or read from one: the same sentences for the
+export stage, the command ``convert`` and the Python interface."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
 
-from pipeline.io.spz import count_out_of_range
+from pipeline.io.splat import share_of_clamped_colours
+from pipeline.io.spz import count_out_of_range, ignored_content, share_of_clamped_harmonics
 from pipeline.splats.arrays import GaussianSource
 
 # A smaller share of Gaussians that a format cannot represent is no loss that can be seen.
@@ -31,6 +32,19 @@ def losses(path: Path, gaussians: GaussianSource) -> list[str]:
                 "the number format of SPZ in the unit of the poses. Use a PLY file, or give the "
                 "poses in a unit in which the size of the scene is about 1 to 100"
             )
+        clamped = share_of_clamped_harmonics(gaussians)
+        if clamped > TOLERATED_SHARE:
+            found.append(
+                f"{path.name}: {clamped:.0%} of the Gaussians have colours or spherical harmonics "
+                "outside of the range of SPZ, which are clamped. Use a PLY file to keep them"
+            )
+    if suffix == ".splat":
+        clamped = share_of_clamped_colours(gaussians)
+        if clamped > TOLERATED_SHARE:
+            found.append(
+                f"{path.name}: {clamped:.0%} of the Gaussians have colours outside of [0, 1], "
+                "which are clamped. Use a PLY or SPZ file to keep them"
+            )
     if suffix in WITHOUT_HARMONICS and gaussians.sh_degree > 0:
         found.append(
             f"{path.name}: the format holds no spherical harmonics: colours that depend on the "
@@ -38,6 +52,12 @@ def losses(path: Path, gaussians: GaussianSource) -> list[str]:
             "to keep them"
         )
     return found
+
+
+def losses_of_reading(path: Path) -> list[str]:
+    """A sentence for everything in a file of Gaussians that is not read."""
+    ignored = ignored_content(path) if path.suffix.lower() == ".spz" else []
+    return [f"{path}: {' and '.join(ignored)} are left out"] if ignored else []
 
 
 def unmarked(files: Sequence[str]) -> list[str]:

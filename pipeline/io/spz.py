@@ -12,7 +12,7 @@ import struct
 import zlib
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -43,9 +43,9 @@ _OUTLIER_DISTANCE = 512.0
 # The range of log scales: 8 bits in steps of 1/16.
 _LOG_SCALES = (-10.0, 255 / 16 - 10)
 _QUAT_STEPS = 511 * np.sqrt(2.0)  # The three smaller components are at most 1 / sqrt(2).
-# The limit of Niantic's reader.
-# Measured values compress less.
+# Limit of the expansion by gzip; measured values compress less.
 _MAX_EXPANSION = 200
+# The limit of Niantic's reader.
 MAX_GAUSSIANS = 10_000_000
 _FIX = "write the file again as SPZ version 3, or get an intact copy of it"
 
@@ -67,14 +67,37 @@ def read_spz(path: Path) -> Gaussians:
 def read_antialias(path: Path) -> bool:
     """Whether an SPZ file records that the Gaussians were trained with opacity compensation; False
     for a file that cannot be read."""
+    found = _read_header(path)
+    return found is not None and bool(found.flags & _ANTIALIASED)
+
+
+def ignored_content(path: Path) -> list[str]:
+    """What ``read_spz`` leaves out of an SPZ file, in words."""
+    found, ignored = _read_header(path), []
+    if found is not None and found.degree == len(_HIGHER) - 1:
+        ignored.append("spherical harmonics of degree 4 (3 is the highest that is rendered)")
+    if found is not None and found.flags & _HAS_EXTENSIONS:
+        ignored.append("extensions of the format")
+    return ignored
+
+
+class _Header(NamedTuple):
+    """What an SPZ file says of its content."""
+
+    degree: int
+    flags: int
+
+
+def _read_header(path: Path) -> _Header | None:
+    """The header of an SPZ file; None for a file that cannot be read."""
     try:
         with opened_regular(path) as file:
             start = file.read(4096)
         head = zlib.decompressobj(wbits=zlib.MAX_WBITS | 16).decompress(start, _HEADER.size)
-        magic, *_, flags, _reserved = _HEADER.unpack(head)
+        magic, _version, _count, degree, _bits, flags, _reserved = _HEADER.unpack(head)
     except (OSError, zlib.error, struct.error):
-        return False
-    return bool(magic == _MAGIC and flags & _ANTIALIASED)
+        return None
+    return _Header(degree, flags) if magic == _MAGIC else None
 
 
 def encode_spz(gaussians: GaussianSource, *, antialias: bool = False) -> bytes:
@@ -138,6 +161,16 @@ def count_out_of_range(gaussians: GaussianSource) -> int:
         longest = log_scales.max(axis=1, initial=-np.inf) + np.log(_shrink(means, bits)[:, 0])
         count += int(((longest < least) | (longest > _LOG_SCALES[1])).sum())
     return count
+
+
+def share_of_clamped_harmonics(gaussians: GaussianSource) -> float:
+    """The share of Gaussians with a spherical harmonic that SPZ's 8 bits cannot hold: one above
+    degree 0 outside of [-1, 1], or a colour far outside of [0, 1]."""
+    clamped = 0
+    for (sh,) in gaussians.chunks("sh"):
+        dc = (np.abs(sh[:, :1]) > (127.5 + 0.5) / _DC_STEPS).any(axis=(1, 2))
+        clamped += int((dc | (np.abs(sh[:, 1:]) > 1).any(axis=(1, 2))).sum())
+    return clamped / max(1, len(gaussians))
 
 
 def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import gzip
+import struct
 from pathlib import Path
 
 import pytest
@@ -46,6 +48,47 @@ def test_gaussians_out_of_range_are_counted_on_every_path(tmp_path: Path, way: s
 def test_dropped_harmonics_are_said_on_every_path(tmp_path: Path, way: str) -> None:
     (said,) = through(way, tmp_path, tmp_path / "a.splat", sample(40, 2))
     assert "(degree 2) are left out" in said
+
+
+@pytest.mark.parametrize("way", ["function", "python", "convert"])
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_clamped_colours_are_said_on_every_path_or_kept(
+    tmp_path: Path, way: str, suffix: str
+) -> None:
+    gaussians, target = sample(40, 0), tmp_path / f"a{suffix}"
+    gaussians.sh[:10] = 7.0  # SH_C0 * 7 is about 2.
+    if suffix in (".spz", ".splat"):
+        (said,) = through(way, tmp_path, target, gaussians)
+        assert "a" + suffix in said and "25%" in said and "clamped" in said
+    else:
+        assert write_gaussians(target, gaussians) == []
+        assert (read_gaussians(target, []).sh - gaussians.sh).abs().max() < 1e-5
+
+
+def test_clamped_harmonics_of_spz_are_said(tmp_path: Path) -> None:
+    gaussians = sample(40, 1)
+    gaussians.sh[:, 1:] = 0.9
+    assert write_gaussians(tmp_path / "a.spz", gaussians) == []
+    gaussians.sh[:20, 2] = -1.3
+    (said,) = write_gaussians(tmp_path / "a.spz", gaussians)
+    assert "50%" in said and "clamped" in said
+
+
+def degree_four(flags: int) -> bytes:
+    """An SPZ file, version 3, of one Gaussian with the harmonics of degree 4."""
+    body = bytes(9) + b"\xff" + b"\x80" * 3 + b"\x80" * 3 + bytes(4) + b"\x80" * 72
+    header = struct.pack("<IIIBBBB", 0x5053474E, 3, 1, 4, 12, flags, 0)
+    return gzip.compress(header + body)
+
+
+@pytest.mark.parametrize("flags", [0, 2])
+def test_what_is_not_read_of_an_spz_file_is_said(tmp_path: Path, flags: int) -> None:
+    source, warnings = tmp_path / "s.spz", []
+    source.write_bytes(degree_four(flags))
+    convert(source, tmp_path / "a.ply", 3, 0.0, False, warnings)
+    (said,) = warnings
+    assert "s.spz: spherical harmonics of degree 4" in said
+    assert ("extensions" in said) == bool(flags)
 
 
 @pytest.mark.parametrize("suffix", SUFFIXES)

@@ -14,6 +14,7 @@ from pipeline.config.experiments import Experiments
 from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Train, Views
 from pipeline.config.section import MAX_SIDE_PX
 from pipeline.export.counters import ExportCounters
+from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -28,7 +29,9 @@ FULL_SIZE = Views(max_long_side_px=MAX_SIDE_PX)
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    return StagePlan(run=True, reason=", ".join(settled.config.export.formats) or "no format")
+    config = settled.config
+    reason = ", ".join(config.export.formats) or "no format"
+    return StagePlan(run=True, reason=reason, decisions=check_mesh_voxel(scan, config))
 
 
 def work(job: Job) -> None:

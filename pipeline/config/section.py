@@ -49,6 +49,8 @@ MAX_PHOTOS = 1_000_000
 MAX_SIDE_PX = 1_000_000
 #: The largest number of Gaussians, points or steps, and the largest factor.
 MAX_GAUSSIANS, MAX_STEPS, MAX_FACTOR = 100_000_000, 10_000_000, 1_000_000
+#: The largest number of voxels of a mesh (8 bytes each); larger voxels are used if it needs more.
+MAX_MESH_VOXELS = 24_000_000
 
 
 def _plain_path(path: str) -> str:

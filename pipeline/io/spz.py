@@ -82,7 +82,7 @@ def ignored_content(path: Path) -> list[str]:
 
 
 class _Header(NamedTuple):
-    """What an SPZ file says of its content."""
+    """The part of an SPZ header that decides what is read."""
 
     degree: int
     flags: int

@@ -8,6 +8,8 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
+import numpy as np
+
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.posefiles import pose_files
 from pipeline.io.poses.kinds import PoseKind
@@ -26,9 +28,12 @@ class GivenFiles:
     base_folder: str
 
 
-def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) -> None:
+def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) -> float:
     """Check the given cameras of the photographs: sizes, focal lengths, principal points and
     distortion. The result is cached, since large models take seconds to read.
+
+    Returns:
+        The extent of the cameras in the given unit: the longest side of the box around them.
 
     Raises:
         UserError: as ``load_given``.
@@ -38,10 +43,11 @@ def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) ->
     for file in pose_files(files.path, files.kind):
         state += [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
 
-    def number_of_images() -> int:
+    def extent() -> float:
         model = read_fitted(
             files.path, files.kind, photos, files.listed, files.base_folder, points=False
         )
-        return len(model.images)
+        centres = [image.centre for image in model.images.values()]
+        return float(np.ptp(centres, axis=0).max()) if centres else 0.0
 
-    cache.get_for_state(f"cameras:{files.path}", state, int, number_of_images)
+    return cache.get_for_state(f"cameras:{files.path}", state, float, extent)

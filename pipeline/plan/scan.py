@@ -91,6 +91,8 @@ class Scan(BaseModel):
     """Photographs of which only the aspect ratio is that of a panorama."""
     unused: tuple[str, ...] = ()
     """Warnings of files that are not used (``Inventory``). They change no result."""
+    given_extent: float | None = None
+    """The extent of the given cameras (``check_given``); None without given poses."""
 
     def with_frames(self, max_frames: int) -> Scan:
         """The scan with placeholders for up to ``max_frames`` frames of the videos."""
@@ -246,10 +248,11 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         for name in sorted(facts)
     ]
     warnings += unread_colours(facts)
+    extent = None
     if poses is None:
         warnings += partial_panoramas(facts)
     else:
-        check_given(
+        extent = check_given(
             GivenFiles(folder / poses.path, poses.kind, tuple(chosen.names), chosen.base),
             photos,
             facts_cache,
@@ -282,6 +285,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ground_control_text=control.text,
         cloud=cloud,
         unused=tuple(inventory.unused()),
+        given_extent=extent,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
         truth_digest=digest_of_files(folder, pose_files(truth, "colmap"), facts_cache)

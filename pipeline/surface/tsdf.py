@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from pipeline.config.section import MAX_MESH_VOXELS
 from pipeline.scene.views import View
 from pipeline.surface.depth import DepthMap
 
@@ -25,8 +26,6 @@ BLOCK = 8
 TRUNCATION = 6.0
 #: Default side of a voxel, in pixels at the median depth.
 PIXELS_PER_VOXEL = 2.5
-#: Largest number of voxels (8 bytes each); larger voxels are used if a scene needs more.
-MAX_VOXELS = 24_000_000
 #: Depths beyond this multiple of the median depth contribute no surface: pixels are too coarse.
 FAR = 3.0
 #: Weight of an observation of free space; one of a surface weighs 1. Below 1, so that rays through
@@ -84,7 +83,8 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
     Args:
         depths: iterated several times.
         voxel: side, world units; None takes ``PIXELS_PER_VOXEL`` at the median depth. Either
-            is enlarged if ``MAX_VOXELS`` would be exceeded, or if blocks are narrower than a pixel.
+            is enlarged if ``MAX_MESH_VOXELS`` would be exceeded, or if blocks are narrower than a
+            pixel.
 
     Returns:
         None if no map has a depth.
@@ -100,7 +100,7 @@ def choose_grid(depths: Iterable[DepthMap], voxel: float | None) -> Grid | None:
         keys = np.zeros(0, np.int64)
         for depth in depths:
             keys = np.union1d(keys, _surface_blocks(depth, side, far))
-            if len(keys) * BLOCK**3 > MAX_VOXELS:
+            if len(keys) * BLOCK**3 > MAX_MESH_VOXELS:
                 break
         else:
             return Grid(side, far, _unpack(keys))

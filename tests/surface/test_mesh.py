@@ -66,7 +66,7 @@ def test_threads_do_not_change_a_bit(maps, built):
 
 
 def test_voxels_grow_until_they_fit(maps, monkeypatch):
-    monkeypatch.setattr(tsdf, "MAX_VOXELS", 300_000)
+    monkeypatch.setattr(tsdf, "MAX_MESH_VOXELS", 300_000)
     mesh, grid = build_mesh(maps, 0.001, threads=1)
     assert grid.voxel > 0.001
     assert len(grid.blocks) * tsdf.BLOCK**3 <= 300_000

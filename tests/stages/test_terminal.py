@@ -31,10 +31,9 @@ def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
 
 
 def rule_exception(end: str) -> None:
-    text = (
-        f'RuleException:\nCalledProcessError in file "/p/Snakefile", line 94:\nCommand \'{COMMAND}'
-    )
-    logger.error(f"{text}' {end}\n", extra={"event": LogEvent.ERROR, "exception": "RuleException"})
+    text = 'RuleException:\nCalledProcessError in file "/p/Snakefile", line 94:\n'
+    text += f"Command '{COMMAND}' {end}\n"
+    logger.error(text, extra={"event": LogEvent.ERROR, "exception": "RuleException"})
 
 
 @pytest.mark.parametrize(
@@ -86,7 +85,7 @@ def test_a_full_disk_under_snakemakes_own_files_is_named(terminal: io.StringIO) 
 
 def test_other_messages_stay_as_they_are(terminal: io.StringIO) -> None:
     logger.error("WorkflowError:\nMissing input", extra={"event": LogEvent.ERROR})
-    logger.info("Building DAG of jobs...")
+    logger.warning("Building DAG of jobs...")
     assert terminal.getvalue() == "WorkflowError:\nMissing input\nBuilding DAG of jobs...\n"
 
 

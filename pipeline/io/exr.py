@@ -1,12 +1,19 @@
-"""OpenEXR images: scene-linear colours in floating point, as renderers and HDR tools write them."""
+"""OpenEXR images: scene-linear colours in floating point, as renderers and HDR tools write them.
+
+The attribute ``chromaticities`` gives the primaries; without it they are those of sRGB (OpenEXR,
+"Standard Attributes").
+"""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import IO, Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from pipeline.io import icc
 
 EXR_SUFFIXES = frozenset({".exr"})
 # Larger images are refused before their pixels are decoded.
@@ -14,15 +21,27 @@ _MAX_PIXELS = 2**28
 # Bytes of all channels in single precision, and of the colours and alpha that are made of them.
 _MAX_DECODED = 3 << 30
 _COLOUR_BYTES = 16
+# Largest difference from the identity of a matrix that changes no 8-bit value by more than one.
+_SRGB_TOLERANCE = 2e-3
 
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """Size in pixels, and whether the image has an alpha channel."""
+    """What the header says of the image.
+
+    Attributes:
+        width, height: The size in pixels.
+        alpha: Whether there is an alpha channel.
+        to_srgb: (3, 3) matrix from the linear colours to linear sRGB; None if they are those.
+        fault: Why the colours are used as sRGB although the file says something else; empty
+            otherwise.
+    """
 
     width: int
     height: int
     alpha: bool
+    to_srgb: NDArray[np.float64] | None = None
+    fault: str = ""
 
 
 def read_header(file: IO[bytes]) -> ExrHeader:
@@ -51,16 +70,22 @@ def read_header(file: IO[bytes]) -> ExrHeader:
             f"{width}x{height} pixels of {len(header['channels'])} channels take {needed >> 20} MiB"
             f", more than {_MAX_DECODED >> 20}; reduce it, or leave out channels"
         )
-    return ExrHeader(width, height, "A" in names)
+    to_srgb, fault = None, ""
+    if "chromaticities" in header and {"R", "G", "B"} <= names:
+        try:
+            to_srgb = _to_srgb(header["chromaticities"])
+        except (TypeError, ValueError):
+            fault = "impossible chromaticities"
+    return ExrHeader(width, height, "A" in names, to_srgb, fault)
 
 
 def read_pixels(file: IO[bytes]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:
-    """(H, W, 3) linear RGB, as stored (multiplied by alpha), and (H, W) alpha or None.
+    """(H, W, 3) linear sRGB, multiplied by alpha as stored, and (H, W) alpha or None.
 
     Raises:
         ValueError: as ``read_header``, or the pixels are damaged.
     """
-    read_header(file)
+    found = read_header(file)
     file.seek(0)
     channels = _open(file, header_only=False).channels()
     names = ("R", "G", "B") if "R" in channels else ("Y", "Y", "Y")
@@ -68,7 +93,26 @@ def read_pixels(file: IO[bytes]) -> tuple[NDArray[np.float32], NDArray[np.float3
     if len({plane.shape for plane in planes}) != 1:
         raise ValueError("its channels differ in size")
     alpha = np.asarray(channels["A"].pixels, np.float32) if "A" in channels else None
-    return np.stack(planes, axis=-1), alpha
+    rgb = np.stack(planes, axis=-1)
+    if found.to_srgb is not None:
+        # A matrix product of BLAS may round differently with the number of threads.
+        rows = found.to_srgb.astype(np.float32)
+        rgb = np.stack([sum(row[k] * planes[k] for k in range(3)) for row in rows], axis=-1)
+    return rgb, alpha
+
+
+def _to_srgb(values: Sequence[float]) -> NDArray[np.float64] | None:
+    """The matrix for the attribute ``chromaticities``: x and y of red, green, blue and white.
+
+    Raises:
+        ValueError: no colours have these chromaticities.
+    """
+    numbers = [float(value) for value in values]
+    if len(numbers) != 8:
+        raise ValueError("expected eight chromaticities")
+    red, green, blue, white = zip(numbers[::2], numbers[1::2], strict=True)
+    matrix = np.linalg.solve(icc.matrix_of(icc.SRGB), icc.matrix_of((red, green, blue, white)))
+    return None if np.allclose(matrix, np.eye(3), atol=_SRGB_TOLERANCE) else matrix
 
 
 def _open(file: IO[bytes], *, header_only: bool) -> Any:

@@ -15,7 +15,7 @@ from pipeline.runtime.atomic import write_text
 from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
-_VERSION = 10
+_VERSION = 11
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")

@@ -236,6 +236,8 @@ def _exr_facts(path: Path, digest: str) -> FileFacts:
         linear=True,
         alpha=header.alpha,
         bits=16,
+        colours="" if header.to_srgb is None else "EXR files with primaries of their own",
+        colours_fault=header.fault,
     )
 
 

@@ -20,8 +20,9 @@ from tests.pictures import photos
 HEADER = {"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}
 
 
-def write(path: Path, **channels: np.ndarray) -> Path:
-    with OpenEXR.File(dict(HEADER), channels) as file:
+def write(path: Path, primaries: tuple[float, ...] = (), **channels: np.ndarray) -> Path:
+    header = dict(HEADER) | ({"chromaticities": primaries} if primaries else {})
+    with OpenEXR.File(header, channels) as file:
         file.write(str(path))
     return path
 
@@ -48,6 +49,32 @@ def test_linear_light_becomes_srgb_and_one_is_white(tmp_path: Path) -> None:
     linear = develop(found.manifest, Decode(linear=True), tmp_path / "linear", threads=1)
     deep = load_rgb(linear.manifest.photos[0].path)
     assert deep.dtype == np.uint16 and deep[0, 0, 1] == round(0.18 * 65535)
+
+
+def test_other_primaries_are_converted_to_those_of_srgb(tmp_path: Path) -> None:
+    """Display P3's, ACES AP0's (which differ in white as well), sRGB's own, and impossible ones."""
+    p3 = (0.680, 0.320, 0.265, 0.690, 0.150, 0.060, 0.3127, 0.3290)
+    aces = (0.7347, 0.2653, 0.0, 1.0, 0.0001, -0.077, 0.32168, 0.33767)
+    srgb = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+    plane = np.full((30, 40), 0.2, np.float32)
+    # sRGB (0.4, 0.2, 0.1) in linear Display P3 (CSS Color 4, section 10.2).
+    colour = {"R": 0.3645, "G": 0.2066, "B": 0.1124}
+    planes = {name: np.full((30, 40), value, np.float32) for name, value in colour.items()}
+    write(tmp_path / "a.exr", p3, **planes)
+    write(tmp_path / "b.exr", aces, R=plane, G=plane, B=plane)
+    write(tmp_path / "c.exr", srgb, R=plane, G=plane, B=plane)
+    write(tmp_path / "d.exr", (0.1,) * 8, R=plane, G=plane, B=plane)
+    found = scan(tmp_path, "s", Config(), cache=None)
+    assert [bool(photo.colours) for photo in found.photos] == [True, True, False, False]
+    (fault,) = [text for text in found.manifest.warnings if "used as sRGB" in text]
+    assert "impossible chromaticities" in fault and "d.exr" in fault
+    made = develop(found.manifest, Decode(linear=True), tmp_path / "out", threads=1).manifest
+    a, b, c, d = (load_rgb(photo.path)[0, 0] / 65535 for photo in made.photos)
+    np.testing.assert_allclose(a, [0.4, 0.2, 0.1], atol=1e-3)
+    # Grey stays grey.
+    np.testing.assert_allclose(b, 0.2, atol=1e-3)
+    np.testing.assert_allclose(c, 0.2, atol=1e-5)
+    np.testing.assert_allclose(d, 0.2, atol=1e-5)
 
 
 def test_colours_are_divided_by_alpha(tmp_path: Path) -> None:

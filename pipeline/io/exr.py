@@ -27,7 +27,7 @@ _SRGB_TOLERANCE = 2e-3
 
 @dataclass(frozen=True)
 class ExrHeader:
-    """What the header says of the image.
+    """The header of an image.
 
     Attributes:
         width, height: The size in pixels.
@@ -112,7 +112,7 @@ def _to_srgb(values: Sequence[float]) -> NDArray[np.float64] | None:
         raise ValueError("expected eight chromaticities")
     red, green, blue, white = zip(numbers[::2], numbers[1::2], strict=True)
     matrix = np.linalg.solve(icc.matrix_of(icc.SRGB), icc.matrix_of((red, green, blue, white)))
-    return None if np.allclose(matrix, np.eye(3), atol=_SRGB_TOLERANCE) else matrix
+    return None if np.allclose(matrix, np.eye(3), atol=_SRGB_TOLERANCE) else np.asarray(matrix)
 
 
 def _open(file: IO[bytes], *, header_only: bool) -> Any:

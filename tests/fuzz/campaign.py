@@ -1,6 +1,6 @@
 """Runs cases of a reader under limits of memory and time, in a process of its own.
 
-A process that a case ends (a crash of native code, a limit that Python cannot enforce) is a finding
+A process that a case ends (a crash of native code, native code that does not return) is a finding
 as well; the campaign continues after it.
 """
 
@@ -20,7 +20,7 @@ import time
 import traceback
 import zlib
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import NoReturn
@@ -32,8 +32,14 @@ from tests.fuzz.readers import READERS
 
 MEMORY = 1 << 30
 """Bytes of memory that a case may take beyond those of the idle process."""
+RESIDENT = 400 << 20
+"""Bytes of them that a case may use at a time."""
 SECONDS = 10
-"""Time that a case may take."""
+"""Processor time that a case may take. The clock would count the work of other programs."""
+MAX_MESSAGE = 2000
+"""Characters that a message may have."""
+PATIENCE = 120
+"""Seconds by the clock after which the process of a case that has not ended is killed."""
 ROOT = Path(__file__).resolve().parents[2]
 
 
@@ -58,7 +64,11 @@ class Outcome:
 
 
 class TooSlowError(Exception):
-    """A case took longer than ``SECONDS``."""
+    """A case took more than ``SECONDS``."""
+
+
+class BadSeedError(Exception):
+    """A reader refuses its own valid files, so its cases would show nothing."""
 
 
 def content(name: str, reader: Reader, seeds: Sequence[Files], number: int) -> Files:
@@ -87,7 +97,10 @@ def run(name: str, cases: range, progress: Path | None = None) -> Outcome:
         folder = Path(root) / "files"
         for files in seeds:  # Imports, which take memory, happen before the limit.
             _write(folder, files)
-            reader.read(folder)
+            try:
+                reader.read(folder)
+            except UserError as error:
+                raise BadSeedError(f"{name} refuses a valid file: {error}") from None
         with _limits():
             for number in cases:
                 if watched is not None:
@@ -111,19 +124,50 @@ def run_apart(name: str, cases: range) -> Outcome:
         progress = Path(folder) / "progress"
         start = cases.start
         while start < cases.stop:
-            progress.write_bytes(start.to_bytes(8, "little"))
+            progress.write_bytes(b"")
             command = [sys.executable, "-m", "tests.fuzz", "--worker", str(progress), name]
             command += ["--first", str(start), "--cases", str(cases.stop - start)]
-            done = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
-            if done.returncode == 0:
-                outcome.add(Outcome(**json.loads(done.stdout.splitlines()[-1])))
+            done, output, errors = _watched(command, progress)
+            if done == 0:
+                outcome.add(Outcome(**json.loads(output.splitlines()[-1])))
                 break
-            at = int.from_bytes(progress.read_bytes(), "little")
-            last = (done.stderr.strip().splitlines() or ["no message"])[-1][:200]
-            how = f"the process ended with {done.returncode}: {last}"
+            last = (errors.strip().splitlines() or ["no message"])[-1][:200]
+            if not progress.stat().st_size:
+                raise BadSeedError(errors.strip()[-1000:])
+            at = _case_of(progress)
+            how = f"the process ended with {done}: {last}"
+            if done == -signal.SIGKILL:
+                how = f"killed: it did not end within {PATIENCE} s, or the memory was full"
             outcome.add(Outcome(at - start + 1, 0, {how: at}))
             start = at + 1
     return outcome
+
+
+def _watched(command: Sequence[str], progress: Path) -> tuple[int, str, str]:
+    """Run a worker, and kill it after ``PATIENCE`` without a new case; its exit code and output."""
+    with (
+        tempfile.TemporaryFile("w+") as output,
+        tempfile.TemporaryFile("w+") as errors,
+        subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=errors) as process,
+    ):
+        case, since = -1, time.monotonic()
+        while process.poll() is None:
+            time.sleep(0.1)
+            if (now := _case_of(progress)) != case:
+                case, since = now, time.monotonic()
+            elif time.monotonic() - since > PATIENCE:
+                process.kill()
+        texts = []
+        for file in (output, errors):
+            file.seek(0)
+            texts.append(file.read())
+        return process.returncode, texts[0], texts[1]
+
+
+def _case_of(progress: Path) -> int:
+    """The number of the present case; -1 before the first."""
+    data = progress.read_bytes()
+    return int.from_bytes(data, "little") if data else -1
 
 
 def as_json(outcome: Outcome) -> str:
@@ -132,21 +176,51 @@ def as_json(outcome: Outcome) -> str:
 
 def _judge(reader: Reader, folder: Path) -> str | None:
     """None if the reader accepted the files, "" after a UserError, else what was raised where."""
-    signal.setitimer(signal.ITIMER_REAL, SECONDS)
-    start = time.monotonic()
+    resident = _reset_peak()
+    signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    start = time.process_time()
     try:
         reader.read(folder)
+        found = None
     except UserError as error:
-        text = str(error)
-        return "" if len(text) < 5000 else f"a message of {len(text)} characters"
+        found = _message_fault(str(error))
     except Exception as error:
         frames = traceback.extract_tb(error.__traceback__)
         own = [f for f in frames if "/pipeline/" in f.filename or "/tests/" in f.filename][-1]
         what = re.sub(r"\d+", "N", str(error))  # One finding, whatever its numbers are.
-        return f"{type(error).__name__} in {Path(own.filename).name} {own.name}: {what}"[:200]
+        found = f"{type(error).__name__} in {Path(own.filename).name} {own.name}: {what}"[:200]
     finally:
-        signal.setitimer(signal.ITIMER_REAL, 0)
-    return None if time.monotonic() - start < SECONDS else "too slow"
+        signal.setitimer(signal.ITIMER_PROF, 0)
+    if found:
+        return found
+    # Readers that catch every exception catch TooSlowError and MemoryError as well.
+    if time.process_time() - start > SECONDS:
+        return "too slow"
+    if _peak_resident() - resident > RESIDENT:
+        return "too much memory"
+    return found
+
+
+def _message_fault(text: str) -> str:
+    """What is wrong with a message: empty if it can be read."""
+    if len(text) > MAX_MESSAGE:
+        return f"a message of more than {MAX_MESSAGE} characters"
+    if not all(c.isprintable() or c == "\n" for c in text):
+        return "a message with characters that cannot be printed"
+    return ""
+
+
+def _reset_peak() -> int:
+    """The resident bytes of this process, with which its peak starts again (Linux)."""
+    with suppress(OSError):
+        Path("/proc/self/clear_refs").write_text("5")
+    return _peak_resident()
+
+
+def _peak_resident() -> int:
+    status = Path("/proc/self/status")
+    found = re.search(r"VmHWM:\s*(\d+) kB", status.read_text()) if status.exists() else None
+    return int(found[1]) << 10 if found else 0
 
 
 def _too_slow(*_: object) -> NoReturn:
@@ -157,13 +231,13 @@ def _too_slow(*_: object) -> NoReturn:
 def _limits() -> Iterator[None]:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before, most = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGALRM, _too_slow)
+    handler = signal.signal(signal.SIGPROF, _too_slow)
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, most))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (before, most))
-        signal.signal(signal.SIGALRM, handler)
+        signal.signal(signal.SIGPROF, handler)
 
 
 def _memory_folder() -> str | None:

@@ -5,10 +5,7 @@ from __future__ import annotations
 import gzip
 import io
 import json
-import struct
 import tempfile
-import zipfile
-import zlib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
@@ -32,8 +29,12 @@ from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 from tests.fuzz.clouds import CLOUDS
+from tests.fuzz.names import FOLDERS
+from tests.fuzz.packing import pack_glb, pack_gzip, pack_png, pack_zip, unpack_glb, unpack_zip
+from tests.fuzz.pictures import PICTURES
 from tests.fuzz.poses import POSES
 from tests.fuzz.reader import Files, Reader, of_file, same
+from tests.fuzz.videos import VIDEOS
 from tests.pictures import picture
 from tests.splats.samples import sample
 from tests.videos import write_video
@@ -228,55 +229,6 @@ def depth_seeds() -> Sequence[Files]:
     return found
 
 
-def unpack_zip(data: bytes) -> bytes:
-    """The members' bytes, each after its name and its length."""
-    with zipfile.ZipFile(io.BytesIO(data)) as archive:
-        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
-    return b"".join(struct.pack("<HI", len(name), len(body)) + name + body for name, body in parts)
-
-
-def pack_zip(data: bytes) -> bytes:
-    buffer, at = io.BytesIO(), 0
-    with zipfile.ZipFile(buffer, "w") as archive:
-        while at + 6 <= len(data):
-            name, body = struct.unpack_from("<HI", data, at)
-            at += 6
-            shown = data[at : at + name % 64].decode("latin-1").replace("\0", "_") or "_"
-            archive.writestr(zipfile.ZipInfo(shown), data[at + name : at + name + body])
-            at += name + body
-    return buffer.getvalue()
-
-
-def pack_gzip(data: bytes) -> bytes:
-    return gzip.compress(data, 1, mtime=0)
-
-
-def pack_png(data: bytes) -> bytes:
-    """The same chunks with correct checksums."""
-    out, at = [data[:8]], 8
-    while at + 8 <= len(data):
-        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
-        body = data[at + 4 : end]
-        out += [data[at : at + 4], body, zlib.crc32(body).to_bytes(4, "big")]
-        at = end + 4
-    return b"".join(out)
-
-
-def unpack_glb(data: bytes) -> bytes:
-    """The JSON chunk and the binary chunk, after the length of the first."""
-    (length,) = struct.unpack_from("<I", data, 12)
-    return data[12:16] + data[20 : 20 + length] + data[28 + length :]
-
-
-def pack_glb(data: bytes) -> bytes:
-    head = data[:4].ljust(4, b"\0")
-    length = struct.unpack("<I", head)[0] % (len(data) + 1)
-    text, body = data[4 : 4 + length], data[4 + length :]
-    chunks = struct.pack("<I", len(text)) + b"JSON" + text
-    chunks += struct.pack("<I", len(body)) + b"BIN\0" + body
-    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks
-
-
 def read_npy(file: Path) -> object:
     try:
         read_array(file.read_bytes())
@@ -315,4 +267,7 @@ READERS: dict[str, Reader] = {
     "heic": Reader(photo_seeds(".heic"), read_photo, weight=0.2),
     "exr": Reader(exr_seeds, of_file(read_exr), weight=0.3),
     "video": Reader(video_seeds, of_file(read_video_facts), weight=0.1),
+    **PICTURES,
+    **FOLDERS,
+    **VIDEOS,
 }

@@ -1,0 +1,58 @@
+"""Unpacking of formats with compression and checksums, and packing with correct ones."""
+
+from __future__ import annotations
+
+import gzip
+import io
+import struct
+import zipfile
+import zlib
+
+
+def unpack_zip(data: bytes) -> bytes:
+    """The members' bytes, each after its name and its length."""
+    with zipfile.ZipFile(io.BytesIO(data)) as archive:
+        parts = [(name.encode(), archive.read(name)) for name in archive.namelist()]
+    return b"".join(struct.pack("<HI", len(name), len(body)) + name + body for name, body in parts)
+
+
+def pack_zip(data: bytes) -> bytes:
+    buffer, at = io.BytesIO(), 0
+    with zipfile.ZipFile(buffer, "w") as archive:
+        while at + 6 <= len(data):
+            name, body = struct.unpack_from("<HI", data, at)
+            at += 6
+            shown = data[at : at + name % 64].decode("latin-1").replace("\0", "_") or "_"
+            archive.writestr(zipfile.ZipInfo(shown), data[at + name : at + name + body])
+            at += name + body
+    return buffer.getvalue()
+
+
+def pack_gzip(data: bytes) -> bytes:
+    return gzip.compress(data, 1, mtime=0)
+
+
+def pack_png(data: bytes) -> bytes:
+    """The same chunks with correct checksums."""
+    out, at = [data[:8]], 8
+    while at + 8 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        body = data[at + 4 : end]
+        out += [data[at : at + 4], body, zlib.crc32(body).to_bytes(4, "big")]
+        at = end + 4
+    return b"".join(out)
+
+
+def unpack_glb(data: bytes) -> bytes:
+    """The JSON chunk and the binary chunk, after the length of the first."""
+    (length,) = struct.unpack_from("<I", data, 12)
+    return data[12:16] + data[20 : 20 + length] + data[28 + length :]
+
+
+def pack_glb(data: bytes) -> bytes:
+    head = data[:4].ljust(4, b"\0")
+    length = struct.unpack("<I", head)[0] % (len(data) + 1)
+    text, body = data[4 : 4 + length], data[4 + length :]
+    chunks = struct.pack("<I", len(text)) + b"JSON" + text
+    chunks += struct.pack("<I", len(body)) + b"BIN\0" + body
+    return b"glTF" + struct.pack("<II", 2, 12 + len(chunks)) + chunks

@@ -17,6 +17,7 @@ from pipeline.io.names import (
 )
 from pipeline.io.walk import walk
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import is_plain
 
 
 @dataclass(frozen=True)
@@ -120,7 +121,9 @@ def find_companions(
                 name
                 for folder in walk(root, notes)
                 for name in folder.names()
-                if PurePosixPath(name).name[0] != "." and suffix_of(name) in kind.suffixes
+                if PurePosixPath(name).name[0] != "."
+                and suffix_of(name) in kind.suffixes
+                and is_plain(name)
             ]
             found = _matched(kind, root, files, photos)
             if found:

@@ -35,11 +35,11 @@ MEMORY = 1 << 30
 RESIDENT = 400 << 20
 """Bytes of them that a case may use at a time."""
 SECONDS = 10
-"""Processor time that a case may take. The clock would count the work of other programs."""
+"""Seconds of processor time that a case may take: elapsed time counts the work of others, too."""
 MAX_MESSAGE = 2000
 """Characters that a message may have."""
 PATIENCE = 120
-"""Seconds by the clock after which the process of a case that has not ended is killed."""
+"""Elapsed seconds after which the process of a case that has not ended is killed."""
 ROOT = Path(__file__).resolve().parents[2]
 
 

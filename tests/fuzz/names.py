@@ -98,8 +98,8 @@ def look(folder: Path) -> object:
         found = scan(root, "scene", Config(), cache=None)
     except OSError as error:
         raise UserError(str(error)) from None
-    warnings = found.manifest.warnings
-    assert all(len(line) < 2000 and line.isprintable() for line in warnings), max(warnings, key=len)
+    warnings = [*found.manifest.warnings, *found.unused]
+    assert all(len(line) < 2000 and line.isprintable() for line in warnings)
     return found
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import io
+import os
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +17,8 @@ from pipeline.runtime.errors import UserError
 from tests.fuzz.campaign import content
 from tests.fuzz.clouds import las_seeds, read_las_points
 from tests.fuzz.readers import READERS
+from tests.pictures import photos
+from tests.plan.scans import look
 
 
 def npy(header: str) -> bytes:
@@ -92,3 +95,14 @@ def test_a_las_file_that_ends_in_a_record(tmp_path) -> None:
         file.write_bytes(content[:end])
         with contextlib.suppress(UserError):
             read_las_points(file)
+
+
+def test_a_mask_in_a_folder_whose_name_is_not_utf8(tmp_path) -> None:
+    """No digest, manifest or message can hold the name; the inventory names the file."""
+    photos(tmp_path / "images", 2)
+    folder = os.fsencode(tmp_path / "masks") + b"/\xff"
+    os.makedirs(folder)
+    os.link(os.fsencode(tmp_path / "images" / "p00.jpg"), folder + b"/p00.jpg")
+    found = look(tmp_path)
+    assert all(photo.mask is None for photo in found.manifest.photos)
+    assert any("not UTF-8" in line for line in found.unused)

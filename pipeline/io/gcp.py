@@ -18,8 +18,9 @@ import numpy as np
 
 from pipeline.io.bounded import MIB, read_bounded
 from pipeline.io.names import NameIndex
-from pipeline.io.projection import FIX, MAX_DISTORTION, Projection, read_projection, shortened
+from pipeline.io.projection import FIX, MAX_DISTORTION, Projection, read_projection
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import shortened
 
 GCP_FILE = "gcp_list.txt"
 MAX_BYTES, MAX_LINES = 32 * MIB, 200_000

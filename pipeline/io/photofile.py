@@ -153,6 +153,7 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
     try:
         check_size(*image.size)
         _check_decoded(image)
+        _check_whole(image)
     except ValueError:
         image.close()
         raise
@@ -190,6 +191,26 @@ def _check_decoded(image: Image.Image) -> None:
             f"{width}x{height} pixels of {image.format} take more than {_MAX_DECODED >> 20} MiB to "
             "decode; reduce it, or save it as JPEG"
         )
+
+
+def _check_whole(image: Image.Image) -> None:
+    """Check that a TIFF or BMP file is large enough for its pixels, and has all parts of them: PIL
+    takes the missing ones for black."""
+    tiles = getattr(image, "tile", [])
+    if image.format not in ("TIFF", "BMP") or not tiles:
+        return
+    file = getattr(image, "fp", None)
+    pixels = image.width * image.height
+    covered = sum((right - left) * (low - top) for _, (left, top, right, low), *_ in tiles)
+    if covered < pixels:
+        raise ValueError("it lacks a part of its pixels: the file is truncated or damaged")
+    if file is None or any(kind != "raw" for kind, *_ in tiles):
+        return
+    at = file.tell()
+    size = file.seek(0, os.SEEK_END)
+    file.seek(at)
+    if pixels > 8 * size:  # One bit a pixel.
+        raise ValueError(f"{image.width}x{image.height} pixels are more than its {size} bytes hold")
 
 
 def _formats(name: str) -> tuple[str, ...]:

@@ -13,6 +13,8 @@ from typing import TYPE_CHECKING, Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.runtime.text import shortened
+
 if TYPE_CHECKING:
     from pyproj import CRS
 
@@ -199,8 +201,3 @@ def _standard(text: str) -> str:
     if not re.match(r"(epsg:|urn:|ogc:|esri:|iau|\+|[a-z0-9_]+\s*\[)", text, re.I):
         raise ValueError(f"expected a projection, found: {shortened(text)}")
     return text
-
-
-def shortened(text: str, limit: int = 100) -> str:
-    """A quotation of bounded length."""
-    return text if len(text) <= limit else f"{text[:limit]}..."

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import checked_name, is_number, read_json, shown
+from pipeline.io.poses.files import checked_name, is_number, read_json
 from pipeline.io.poses.frames import (
     FLIP_YZ,
     Lens,
@@ -32,6 +32,7 @@ from pipeline.io.poses.frames import (
 from pipeline.io.poses.matrices import pose_matrix
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import shown
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from pipeline.config.schema import Config
 from pipeline.io.gcp import ground_control_file, read_ground_control
-from pipeline.io.projection import shortened
+from pipeline.runtime.text import shortened
 from pipeline.scene.manifest import Photo
 
 

@@ -5,8 +5,12 @@ from __future__ import annotations
 import errno
 from pathlib import Path
 
+from pipeline.runtime.text import without_middle
+
 EXIT_USER_ERROR = 2
-_MAX_LINE = 1000
+# Characters of a line, and of the parts of a message.
+_MAX_LINE = 600
+_MAX_WHAT, _MAX_FILE, _MAX_FIX = 1150, 280, 450
 EXIT_INTERRUPTED = 130
 """By convention 128 and the number of the signal, SIGINT."""
 
@@ -23,26 +27,33 @@ class UserError(Exception):
     """
 
     def __init__(self, what: str, *, file: str | Path | None = None, fix: str | None = None):
-        self.what, self.file = _printable(what), file
-        self.fix = None if fix is None else _printable(fix)
+        self.what, self.file = _printable(what, _MAX_WHAT), file
+        self.fix = None if fix is None else _printable(fix, _MAX_FIX)
         super().__init__(str(self))
 
     def __str__(self) -> str:
-        name = _printable(str(self.file).replace("\n", "\\n"))
+        name = _printable(str(self.file).replace("\n", "\\n"), _MAX_FILE)
         where = f"{name}: " if self.file is not None else ""
         text = f"{where}{self.what}"
         return f"{text}\n  what to do: {self.fix}" if self.fix else text
 
 
-def _printable(text: str) -> str:
-    """``text`` in lines of bounded length without control characters: messages quote files and
-    their names, which may hold anything."""
-    shown = []
-    for line in text.split("\n"):
-        cut = line[:_MAX_LINE]
+def _printable(text: str, limit: int) -> str:
+    """``text`` of at most ``limit`` characters, in lines of bounded length without control
+    characters: messages quote files and their names, which may hold anything.
+
+    Lines beyond the limit are counted.
+    """
+    lines = text.split("\n")
+    shown: list[str] = []
+    for number, line in enumerate(lines):
+        cut = without_middle(line, _MAX_LINE)
         if not cut.isprintable():
-            cut = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in cut)[:_MAX_LINE]
-        shown.append(cut if len(line) <= _MAX_LINE else f"{cut}...")
+            cut = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in cut)
+        cut = without_middle(cut, min(_MAX_LINE, limit))
+        if sum(map(len, shown)) + len(shown) + len(cut) > limit:
+            return "\n".join([*shown, f"... and {len(lines) - number} more lines"])
+        shown.append(cut)
     return "\n".join(shown)
 
 

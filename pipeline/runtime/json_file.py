@@ -2,23 +2,20 @@
 
 from __future__ import annotations
 
-import reprlib
 from pathlib import Path
-from typing import Any, ClassVar, Self
+from typing import ClassVar, Self
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
 from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import rerun
+from pipeline.runtime.text import shown
 
 Vector3 = tuple[float, float, float]
 Vector4 = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
-
-# Longer values are not quoted in error messages.
-MAX_QUOTED = 60
 
 
 class JsonObject(BaseModel):
@@ -84,14 +81,5 @@ def first_error(error: ValidationError) -> str:
     where = ".".join(map(str, first["loc"]))
     found = first["msg"]
     if first["type"] not in ("json_invalid", "missing"):
-        found += f", found {quoted(first['input'])}"
+        found += f", found {shown(first['input'])}"
     return f"{where}: {found}" if where else found
-
-
-def quoted(value: Any) -> str:
-    """``repr(value)``, shortened; of bounded length and time whatever the value refers to."""
-    try:
-        text = repr(value) if isinstance(value, str) else reprlib.repr(value)
-    except ValueError:  # Python does not print integers of thousands of digits.
-        return "a number of thousands of digits"
-    return text if len(text) <= MAX_QUOTED else f"{text[:MAX_QUOTED]}..."

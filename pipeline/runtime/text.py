@@ -1,14 +1,47 @@
-"""Names of files that messages, JSON and command lines can hold."""
+"""Text that messages hold: which names are plain, and values in a bounded length."""
 
 from __future__ import annotations
 
+import reprlib
 import unicodedata
+from typing import Any
 
 # Control characters, surrogates (bytes that are not UTF-8), separators of lines and paragraphs.
 _REFUSED = frozenset({"Cc", "Cs", "Zl", "Zp"})
+# Of lists, as many values as lenses have numbers.
+_REPR = reprlib.Repr()
+_REPR.maxlist = _REPR.maxtuple = 14
 
 
 def is_plain(name: str) -> bool:
     """Whether a name is UTF-8 on one line. Spaces of any kind are allowed: macOS puts a narrow
     no-break space into the names of screenshots."""
     return all(unicodedata.category(c) not in _REFUSED for c in name)
+
+
+def shown(value: Any, limit: int = 60) -> str:
+    """A value of a file as messages quote it: Python's notation on one line, shortened to about
+    ``limit`` characters, in bounded time whatever the value refers to."""
+    try:
+        if isinstance(value, str):
+            text = repr(value[: limit + 1])
+            return text if len(value) <= limit else f"{text[: limit + 1]}..."
+        # numpy's numbers and small arrays are shown as Python's.
+        if hasattr(value, "tolist") and getattr(value, "size", 0) <= 100:
+            value = value.tolist()
+        return shortened(_REPR.repr(value), limit)
+    except ValueError:  # Python does not print integers of thousands of digits.
+        return "a number of thousands of digits"
+
+
+def shortened(text: str, limit: int = 100) -> str:
+    """A text without more than its first ``limit`` characters."""
+    return text if len(text) <= limit else f"{text[:limit]}..."
+
+
+def without_middle(text: str, limit: int) -> str:
+    """A text of at most ``limit`` characters: its start and its end, "..." for what is between."""
+    if len(text) <= limit:
+        return text
+    end = limit // 3
+    return f"{text[: limit - end - 3]}...{text[-end:]}"

@@ -24,8 +24,8 @@ from pipeline.geometry.similarity import (
     robust_similarity,
 )
 from pipeline.io.gcp import GCP_FILE, GroundControl
-from pipeline.io.projection import shortened
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import shortened
 from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Origin
 from pipeline.sfm.georeference import (
     MIN_POSITIONS,

@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.similarity import RobustFit, Similarity
 from pipeline.geometry.up_direction import ImageDirections
-from pipeline.io.projection import Projection, shortened
+from pipeline.io.projection import Projection
+from pipeline.runtime.text import shortened
 from pipeline.scene.georeference import (
     FrameUncertainty,
     Georeference,

@@ -146,8 +146,8 @@ def run_apart(name: str, cases: range) -> Outcome:
 def _watched(command: Sequence[str], progress: Path) -> tuple[int, str, str]:
     """Run a worker, and kill it after ``PATIENCE`` without a new case; its exit code and output."""
     with (
-        tempfile.TemporaryFile("w+") as output,
-        tempfile.TemporaryFile("w+") as errors,
+        tempfile.TemporaryFile("w+", errors="replace") as output,
+        tempfile.TemporaryFile("w+", errors="replace") as errors,
         subprocess.Popen(command, cwd=ROOT, stdout=output, stderr=errors) as process,
     ):
         case, since = -1, time.monotonic()

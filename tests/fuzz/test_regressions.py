@@ -106,3 +106,24 @@ def test_a_mask_in_a_folder_whose_name_is_not_utf8(tmp_path) -> None:
     found = look(tmp_path)
     assert all(photo.mask is None for photo in found.manifest.photos)
     assert any("not UTF-8" in line for line in found.unused)
+
+
+@pytest.mark.parametrize(("reader", "case"), [("tiff", 1100212), ("bmp", 1100616)])
+def test_a_small_file_that_claims_to_be_a_large_picture(reader, case, tmp_path) -> None:
+    """Pillow took missing strips for black: 5 GB of them."""
+    seeds = list(READERS[reader].seeds())
+    ((name, data),) = content(reader, READERS[reader], seeds, case).items()
+    file = tmp_path / name
+    file.write_bytes(data)
+    with pytest.raises(UserError, match=r"lacks a part|more than its \d+ bytes hold"):
+        read_picture(file)
+
+
+def test_a_name_of_many_digits(tmp_path) -> None:
+    """The message had 2048 characters."""
+    reader = READERS["colmap-images.bin"]
+    for name, data in content("colmap-images.bin", reader, list(reader.seeds()), 1102849).items():
+        (tmp_path / name).write_bytes(data)
+    with pytest.raises(UserError) as caught:
+        reader.read(tmp_path)
+    assert len(str(caught.value)) < 2000

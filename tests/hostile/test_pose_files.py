@@ -64,7 +64,7 @@ def put(**fields: object) -> Change:
 
 
 REFUSED: dict[str, tuple[Change, str]] = {
-    "translation-1e308": (move(1e308), "p01.jpg.*expected values below .* found '1e.308"),
+    "translation-1e308": (move(1e308), "p01.jpg.*expected values below .* found 1e.308"),
     "translation-1e20": (move(1e20), "p01.jpg.*expected values below"),
     "rotation-1e308": (rotate(1e308), "p01.jpg.*expected values below"),
     "rotation-1e155": (rotate(1e155), "p01.jpg.*expected values below"),
@@ -72,12 +72,12 @@ REFUSED: dict[str, tuple[Change, str]] = {
     "lone-surrogate": (rename("images/\ud800.jpg"), r"frames\[1\].file_path: expected a file name"),
     "nul": (rename("images/\0.jpg"), r"frames\[1\].file_path: expected a file name"),
     "mask-surrogate": (rename("\ud800.png", "mask_path"), "mask_path: expected a file name"),
-    "mask-number": (rename(3, "mask_path"), "mask_path: expected a file name, found '3'"),
-    "applied_scale-1e200": (put(applied_scale=1e200), "applied_scale.* found '1e.200"),
-    "applied_scale-1e-200": (put(applied_scale=1e-200), "applied_scale.* found '1e-200"),
+    "mask-number": (rename(3, "mask_path"), "mask_path: expected a file name, found 3"),
+    "applied_scale-1e200": (put(applied_scale=1e200), "applied_scale.* found 1e.200"),
+    "applied_scale-1e-200": (put(applied_scale=1e-200), "applied_scale.* found 1e-200"),
     "applied_transform-1e200": (
         put(applied_transform=(np.eye(4)[:3] * 1e200).tolist()),
-        "applied_transform.* found '1e.200",
+        "applied_transform.* found 1e.200",
     ),
     "principal-point": (put(cx=1e299), "expected finite intrinsics"),
     "focal-length": (put(fl_x=1e299), "expected finite intrinsics"),

@@ -165,7 +165,7 @@ NAN[0, 3] = np.nan
         ({"frames": [frame(np.eye(3))]}, "4x4"),
         ({"frames": [frame(2 * np.eye(4))]}, "last row 0 0 0 1, found 0 0 0 2"),
         ({"frames": [frame(np.diag([1.0, 1, -1, 1]))]}, "not a rotation"),
-        ({"frames": [frame(NAN)]}, r"frames\[0\] \(images/a.png\).transform_matrix.*found .nan"),
+        ({"frames": [frame(NAN)]}, r"frames\[0\] \(images/a.png\).transform_matrix.*found nan"),
         ({"frames": [frame()]}, "no focal length"),
         ({"fl_x": -1, "frames": [frame()]}, "fl_x is -1"),
         ({"fl_x": "wide", "frames": [frame()]}, "fl_x is 'wide'"),

@@ -15,9 +15,10 @@ from pathlib import Path
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import malformed, numbers, read_text, shown
+from pipeline.io.poses.files import malformed, numbers, read_text
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.runtime.text import shown
 
 _FILES = ("bundle.out", "bundle/bundle.out")
 # "images/a b.jpg 0 1234.5": the name may hold spaces, the focal length of EXIF may be missing.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from pipeline.io.bounded import read_bounded
 from pipeline.runtime.errors import UserError
+from pipeline.runtime.text import shown
 
 FIX = "export the file again, or set poses: ignore"
 # Larger files are no list of cameras: 100,000 photographs take about 100 MiB.
@@ -114,12 +115,3 @@ def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> 
                 if is_one(stream.read(_HEAD_BYTES)):
                     return file.name
     return None
-
-
-def shown(value: Any) -> str:
-    """``value`` in a message."""
-    try:
-        text = str(value.tolist() if isinstance(value, np.ndarray) else value)
-    except ValueError:  # Python does not print integers of thousands of digits.
-        text = "a number of thousands of digits"
-    return repr(text[:60].encode(errors="replace").decode())

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.names import match_names
-from pipeline.io.poses.files import checked_name, malformed, shown
+from pipeline.io.poses.files import checked_name, malformed
 from pipeline.io.poses.matrices import rotation_fault
+from pipeline.runtime.text import shown
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 Array = NDArray[np.float64]

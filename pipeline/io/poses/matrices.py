@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.poses.files import FIX, malformed, shown
+from pipeline.io.poses.files import FIX, malformed
+from pipeline.runtime.text import shown
 
 Array = NDArray[np.float64]
 

@@ -14,9 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.io.poses.files import malformed, number, numbers, read_json, shown
+from pipeline.io.poses.files import malformed, number, numbers, read_json
 from pipeline.io.poses.frames import Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
+from pipeline.runtime.text import shown
 
 _FILE = "sfm_data.json"
 _COEFFICIENTS = {"disto_k1": 1, "disto_k3": 3, "disto_t2": 5, "fisheye": 4}

@@ -13,9 +13,10 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.rotations import rotation_from_vector
-from pipeline.io.poses.files import malformed, number, numbers, read_json, shown
+from pipeline.io.poses.files import malformed, number, numbers, read_json
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
+from pipeline.runtime.text import shown
 
 _FILES = ("reconstruction.json", "opensfm/reconstruction.json")
 # Rotation vectors of one turn at most, in radians; those of degrees are rarely as short.

@@ -13,9 +13,10 @@ from pathlib import Path
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text, shown
+from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
 from pipeline.io.poses.frames import Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
+from pipeline.runtime.text import shown
 
 _SUFFIX = "calibrated_camera_parameters.txt"
 _LINES = 10

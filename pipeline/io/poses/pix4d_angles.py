@@ -17,9 +17,10 @@ import numpy as np
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import rotation_from_vector
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text, shown
+from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.runtime.text import shown
 
 _SUFFIX = "calibrated_external_camera_parameters.txt"
 _CAM_SUFFIX = "pix4d_calibrated_internal_camera_parameters.cam"

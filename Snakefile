@@ -7,6 +7,9 @@ import sys
 sys.path.insert(0, workflow.basedir)
 
 from stages.workflow.project import SnakemakeProject, check_config
+from stages.workflow.terminal import shorten_failures
+
+shorten_failures()
 
 if os.path.exists("config/config.yaml"):
     check_config("config/config.yaml")

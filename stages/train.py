@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    from pipeline.plan.budget import length_line, memory_line, resolution_line
+    from pipeline.plan.budget import length_line, memory_line, resolution_line, small_views_line
 
     config, why = settled.config, settled.why
     settled_options = (
@@ -31,6 +31,7 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     )
     decisions = [
         resolution_line(scan, config),
+        small_views_line(scan, config),
         *(why[name] for name in (*settled_options, "views.masks")),
         memory_line(scan, config),
     ]

@@ -13,6 +13,8 @@ from pipeline.plan.training_memory import gaussians_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import view_size
 
+# Side of the windows of SSIM, pixels.
+SSIM_WINDOW = 11
 # Pixels of a view per Gaussian, for training by steps and with a time budget. Fewer pixels improve
 # quality but cost time; a time budget limits the time by itself.
 PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET = 2.0, 0.5
@@ -157,6 +159,30 @@ def resolution_line(scan: Scan, config: Config) -> str:
     if others:
         text += f" (the most frequent of {len(others) + 1} sizes; all at most {cap} px)"
     return text
+
+
+def small_views_line(scan: Scan, config: Config) -> str:
+    """The plan's sentence about views that are smaller than SSIM's window; empty without any.
+
+    Raises:
+        UserError: all views are.
+    """
+    planned = _planned(scan, config)
+    small = [i for i, view in enumerate(planned) if min(view.width, view.height) < SSIM_WINDOW]
+    if not small:
+        return ""
+    first = planned[small[0]]
+    size = f"{first.width}x{first.height} pixels"
+    if len(small) == len(planned):
+        raise UserError(
+            f"views of {size} are too small for training: expected at least {SSIM_WINDOW} pixels "
+            "on the shorter side, the size of the windows in which images are compared",
+            fix="raise views.max_long_side_px, or give larger photographs",
+        )
+    return (
+        f"{len(small)} of {len(planned)} views have a shorter side of less than {SSIM_WINDOW} "
+        f"pixels and contribute little (first: {scan.planned[small[0]].name}, {size})"
+    )
 
 
 def length_line(config: Config) -> str:

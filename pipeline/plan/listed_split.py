@@ -32,6 +32,12 @@ def listed_split(
     found = set(lists.values())
     test: ListedSplit = "test" if "test" in found else "val"
     if not {"train", test} <= found:
+        if splits:
+            missing = "training" if "train" not in found else "test"
+            warnings.append(
+                f"the scene's own split is not used, because it lists no {missing} view with a "
+                "photograph and a pose: every n-th view is a test view (split.test_every)"
+            )
         return {}
     parts: dict[ListedSplit | None, Part] = {"train": "train", test: "test"}
     result = {photo: parts.get(lists.get(photo)) for photo in photos}

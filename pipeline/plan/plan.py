@@ -18,6 +18,7 @@ from pipeline.plan.record import PlanRecord
 from pipeline.plan.scan import Scan
 from pipeline.plan.settle import PROCESSOR, Choice, gps_extent_m, settle
 from pipeline.plan.stage import StageSpec
+from pipeline.plan.stage_memory import memory_warnings
 from pipeline.plan.summary import found
 from pipeline.plan.values import Plan, SceneFacts
 
@@ -38,7 +39,7 @@ def make_plan(
         device: the machine's, for ``train.device: auto``.
 
     Raises:
-        UserError: see ``settle``.
+        UserError: see ``settle`` and the stages' ``decide``.
     """
     scan = scan.with_frames(config.video.max_frames)
     settled = settle(scan, config, device)
@@ -48,14 +49,16 @@ def make_plan(
         sources = sorted(set(_upstream(stages[name], running, settled.config).values()))
         decided[name] = decided[name].model_copy(update={"inputs": sources})
     hints = panorama_hints(scan.maybe_panoramas, config) if scan.poses is None else []
-    return Plan(
+    plan = Plan(
         scene=scan.manifest.scene,
         stages=decided,
-        warnings=_shortened([*hints, *scan.warnings]),
+        warnings=[],
         config=settled.config,
         facts=_facts(scan, settled.config),
         folder=folder,
     )
+    warnings = _shortened([*memory_warnings(plan), *hints, *scan.warnings])
+    return plan.model_copy(update={"warnings": warnings})
 
 
 def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:

@@ -51,6 +51,24 @@ def memory_mb(stage: str, plan: Plan, threads: int) -> int:
     return needed if most is None else min(needed, most)
 
 
+def memory_warnings(plan: Plan) -> list[str]:
+    """A warning if a stage that runs needs more than ``partition.memory_mb`` with one thread."""
+    most = plan.config.partition.memory_mb
+    if most is None:
+        return []
+    running = [name for name in _ESTIMATES if name in plan.stages and plan.runs(name)]
+    needed = {name: math.ceil(_ESTIMATES[name](plan, 1)) for name in running}
+    above = {name: megabytes for name, megabytes in needed.items() if megabytes > most}
+    if not above:
+        return []
+    largest = max(above, key=lambda name: above[name])
+    return [
+        f"partition.memory_mb: {most} MB may not be enough for {', '.join(above)}; {largest} is "
+        f"estimated to take {above[largest]} MB with one thread. Increase it, or lower "
+        "views.max_long_side_px and features.max_features"
+    ]
+
+
 def threads_within(stage: str, plan: Plan, threads: int) -> int:
     """The number of threads, at most ``threads``, for which ``partition.memory_mb`` is enough."""
     most = plan.config.partition.memory_mb

@@ -271,12 +271,12 @@ def _run_locked(
         try:
             work(job)
             _check_counters(job, counters)
+            _write_records(job, digests, time.perf_counter() - start)
         except BaseException:
             shutil.rmtree(out, ignore_errors=True)
             raise
         finally:
             write_progress_to(None)
-        _write_records(job, digests, time.perf_counter() - start)
         replace_folder(out, request.out)
         _publish(request)
         shutil.rmtree(stage_scratch, ignore_errors=True)

@@ -207,8 +207,11 @@ class Progress:
         # Progress is optional: a full disk or another run's file is no error.
         temporary = _file.with_suffix(f".{os.getpid()}.tmp")
         with contextlib.suppress(OSError):
-            temporary.write_text(json.dumps(state.model_dump(mode="json")))
-            os.replace(temporary, _file)
+            try:
+                temporary.write_text(json.dumps(state.model_dump(mode="json")))
+                os.replace(temporary, _file)
+            finally:
+                temporary.unlink(missing_ok=True)
 
 
 def track(items: Iterable[T], label: str, total: int, unit: str = "it") -> Iterator[T]:

@@ -51,7 +51,6 @@ from stages.workflow.cluster import (
 from stages.workflow.failures import reporting_errors
 from stages.workflow.locks import prepare_folder, use_locks_of_runs
 from stages.workflow.registry import STAGES
-from stages.workflow.terminal import shorten_failures
 
 RESULTS = Path("results")
 # Written when runs of a batch failed. From then on it is an input of the tables, so that these are
@@ -94,7 +93,6 @@ class SnakemakeProject:
         try:
             _check_working_directory()
             use_locks_of_runs()
-            shorten_failures()
             self._project, named = load_project(self._raw)
         except UserError as error:
             _exit(error)
@@ -279,6 +277,8 @@ class SnakemakeProject:
         folder = self._root / run.scene
         found = scan(folder, run.scene, config, cache=RESULTS / name / SCAN_CACHE)
         plan = make_plan(found, config, STAGES, str(folder), self._device(config))
+        if not self._is_on_cluster() and self._will_use_gpu(plan, name):
+            check_device(config.train.device)
         first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
@@ -288,14 +288,34 @@ class SnakemakeProject:
         """The device for ``train.device: auto``. On a cluster, a plan must be the same on every
         node: there, a GPU is used only if the option names it, and the job that trains checks that
         its node has it."""
-        flow = self._workflow
-        if flow.remote_exec or flow.non_local_exec or "SLURM_JOB_ID" in os.environ:
+        if self._is_on_cluster():
             return PROCESSOR
         if config.train.device != "auto":
-            check_device(config.train.device)
             return PROCESSOR
         chosen = choose_device()
         return chosen.device, chosen.reason
+
+    def _is_on_cluster(self) -> bool:
+        flow = self._workflow
+        return bool(flow.remote_exec or flow.non_local_exec or "SLURM_JOB_ID" in os.environ)
+
+    def _will_use_gpu(self, plan: Plan, name: str) -> bool:
+        """Whether a stage that computes on a GPU has no current result."""
+        return any(
+            uses_gpu(STAGES[stage], plan) and self._outdated_job(plan, name, stage) is not None
+            for stage in filter(plan.runs, plan.stages)
+        )
+
+    def _outdated_job(self, plan: Plan, name: str, stage: str) -> str | None:
+        """The first folder of the stage's jobs without a current result; None if all have one."""
+        spec = STAGES[stage]
+        sources = {
+            role: RESULTS / name / source for role, source in input_folders(spec, plan).items()
+        }
+        for job, folder in enumerate(plan.stages[stage].folders(stage), 1):
+            if not is_current(RESULTS / name / folder, stage_key(spec, plan, job), sources):
+                return folder
+        return None
 
     def _check_results(self, name: str) -> None:
         """Check that the run can have a folder of results: otherwise Snakemake would end with an
@@ -418,16 +438,14 @@ class SnakemakeProject:
         """The outcome of a run of the batch."""
         plan = self._make_plan(run.name)
         for stage in filter(plan.runs, plan.stages):
-            folder, spec = RESULTS / run.name, STAGES[stage]
-            for job, name in enumerate(plan.stages[stage].folders(stage), 1):
-                key = stage_key(spec, plan, job)
-                if is_current(folder / name, key, self._inputs(spec, run.name)):
-                    continue
-                log = folder / "logs" / f"{name}.log"
-                if not self._has_run(log):
-                    return _outcome(run, "another failure stopped the batch", "not run", stage)
-                unknown = f"it ended without a message (it may have been killed): see {log}"
-                return _outcome(run, self._error_in(log) or unknown, "failed", stage)
+            job = self._outdated_job(plan, run.name, stage)
+            if job is None:
+                continue
+            log = RESULTS / run.name / "logs" / f"{job}.log"
+            if not self._has_run(log):
+                return _outcome(run, "another failure stopped the batch", "not run", stage)
+            unknown = f"it ended without a message (it may have been killed): see {log}"
+            return _outcome(run, self._error_in(log) or unknown, "failed", stage)
         return _outcome(run, None)
 
     def _has_run(self, log: Path) -> bool:

@@ -11,9 +11,11 @@ import cv2
 import numpy as np
 import pytest
 
+from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
 from tests.pictures import photos
-from tests.plan.scans import look, posed
+from tests.plan.scans import look, many, plan_of, posed
+from tests.plans import make_plan
 
 
 def depth(folder: Path, name: str, write: Callable[[Path], Any]) -> Path:
@@ -76,6 +78,41 @@ RIGHT_DEPTHS = {
 @pytest.mark.parametrize("case", RIGHT_DEPTHS)
 def test_a_depth_map_of_the_right_form_is_accepted(tmp_path: Path, case: str) -> None:
     assert look(depth(tmp_path / "s", *RIGHT_DEPTHS[case])).num_depths == 1
+
+
+@pytest.mark.parametrize("size", [(8, 6), (10, 400), (400, 10), (1, 4000)])
+def test_views_below_the_window_of_ssim_are_an_error_of_the_plan(
+    tmp_path: Path, size: tuple[int, int]
+) -> None:
+    photos(tmp_path / "s/images", 3, size)
+    with pytest.raises(UserError, match="are too small for training: expected at least 11 pixels"):
+        plan_of(tmp_path / "s")
+
+
+def test_views_reduced_below_the_window_of_ssim_are_an_error_of_the_plan(tmp_path: Path) -> None:
+    photos(tmp_path / "s/images", 3)
+    plan_of(tmp_path / "s", views={"max_long_side_px": 16})
+    with pytest.raises(UserError, match=r"raise views\.max_long_side_px"):
+        plan_of(tmp_path / "s", views={"max_long_side_px": 12})
+
+
+def test_single_views_below_the_window_of_ssim_are_named(tmp_path: Path) -> None:
+    photos(tmp_path / "s/images", 3)
+    cv2.imwrite(str(tmp_path / "s/images/strip.png"), np.zeros((4, 640, 3), np.uint8))
+    said = "\n".join(plan_of(tmp_path / "s").stages["train"].decisions)
+    assert "1 of 4 views have a shorter side of less than 11 pixels" in said
+    assert "strip.png, 640x4 pixels" in said
+
+
+def test_jobs_that_need_more_memory_than_is_configured_are_named(tmp_path: Path) -> None:
+    scan = many(tmp_path / "s", 12, width=lambda i: 12_000, height=lambda i: 9000)
+
+    def warned(**partition: Any) -> str:
+        plan = make_plan(scan, Config.model_validate({"partition": partition}))
+        return "\n".join(line for line in plan.warnings if "memory_mb" in line)
+
+    assert warned() == warned(memory_mb=8000) == ""
+    assert "partition.memory_mb: 700 MB may not be enough for" in warned(memory_mb=700)
 
 
 def transforms(folder: Path, **fields: Any) -> Path:

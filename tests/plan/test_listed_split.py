@@ -55,6 +55,13 @@ def test_validation_views_are_the_test_views_where_there_are_no_others(tmp_path)
     assert tested == ["val/r_0.png", "val/r_1.png"]
 
 
+@pytest.mark.parametrize(("lists", "missing"), [({"train": 9}, "test"), ({"test": 9}, "training")])
+def test_a_split_of_one_part_is_not_used_with_a_message(tmp_path, lists, missing):
+    nerf_synthetic(tmp_path, **lists)
+    assert sum(view.is_test for view in views_of(tmp_path)) == 2
+    assert any(f"lists no {missing} view" in line for line in look(tmp_path).warnings)
+
+
 def test_every_eighth_view_on_request(tmp_path):
     nerf_synthetic(tmp_path, train=6, test=3, val=1)
     views = views_of(tmp_path, split={"source": "every", "test_every": 5})

@@ -54,7 +54,7 @@ from pipeline.runtime.record import (
     read_record,
 )
 from pipeline.runtime.section import read_section
-from pipeline.runtime.termination import EXIT_TERMINATED, Terminated, raising_on_sigterm
+from pipeline.runtime.termination import EXIT_TERMINATED, Terminated, raising_when_terminated
 
 S = TypeVar("S", bound=BaseModel)
 
@@ -185,7 +185,7 @@ def run_stage(
     0: finished, or up to date. 2: a ``UserError``, with its message. 130: interrupted by Ctrl-C.
     1: another exception, which is a bug of the program, with a traceback.
     """
-    with logging_to(request.log, request.out.parent.name), raising_on_sigterm():
+    with logging_to(request.log, request.out.parent.name), raising_when_terminated():
         try:
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work, counters)
@@ -200,7 +200,7 @@ def run_stage(
             return EXIT_INTERRUPTED
         except Terminated:
             name = f"{request.name} of {request.out.parent.name}"
-            print(f"{name} was terminated (SIGTERM)", file=sys.stderr, flush=True)
+            print(f"{name} was terminated (SIGTERM or SIGHUP)", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
         except MemoryError:
             _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))

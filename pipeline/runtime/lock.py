@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import fcntl
 import getpass
 import os
@@ -17,12 +18,15 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.progress import Console
 
 _held: dict[Path, TextIO] = {}
+# Errors of file systems without locks, such as some mounts of NFS and Lustre.
+_NO_LOCKS = (errno.ENOLCK, errno.ENOSYS, errno.ENOTSUP, errno.EOPNOTSUPP, errno.EINVAL)
 
 
 def lock_run(folder: Path) -> None:
     """Lock a run's folder of results until this process ends.
 
-    Snakemake's own lock is in its working directory; several can have the same results.
+    Snakemake's own lock is in its working directory; several can have the same results. On a file
+    system without locks, only a warning is printed.
 
     Raises:
         UserError: another process has locked it.
@@ -36,10 +40,16 @@ def lock_run(folder: Path) -> None:
         check_not_locked(folder)
         raise
     try:
-        _lock(file, fcntl.LOCK_EX, folder)
+        has_locks = _lock(file, fcntl.LOCK_EX, folder)
     except UserError:
         file.close()
         raise
+    if not has_locks:
+        print(
+            f"warning: {folder}: its file system has no locks: do not run the same scene twice at "
+            "the same time",
+            file=sys.stderr,
+        )
     file.truncate(0)
     file.write(f"{user_name()} on {platform.node()}, process {os.getpid()}\n")
     file.flush()
@@ -76,9 +86,14 @@ def _lock_file(folder: Path) -> Path:
     return folder / ".scratch" / "run.lock"
 
 
-def _lock(file: TextIO, kind: int, folder: Path) -> None:
+def _lock(file: TextIO, kind: int, folder: Path) -> bool:
+    """Lock a run's file. Return False if its file system has no locks.
+
+    Raises:
+        UserError: another process has locked it.
+    """
     try:
-        fcntl.flock(file, kind | fcntl.LOCK_NB)
+        return _flock(file, kind | fcntl.LOCK_NB)
     except BlockingIOError:
         file.seek(0)
         owner = file.read().strip() or "starting"
@@ -87,20 +102,37 @@ def _lock(file: TextIO, kind: int, folder: Path) -> None:
         raise UserError(what, file=folder, fix=fix) from None
 
 
+def _flock(file: TextIO, kind: int) -> bool:
+    """Lock a file. Return False if its file system has no locks.
+
+    Raises:
+        BlockingIOError: another process has locked it.
+    """
+    try:
+        fcntl.flock(file, kind)
+    except BlockingIOError:
+        raise
+    except OSError as error:
+        if error.errno not in _NO_LOCKS:
+            raise
+        return False
+    return True
+
+
 @contextmanager
 def locked(path: Path, stage: str, out: Path) -> Iterator[None]:
     """Hold a stage's lock. A job that was orphaned by a killed Snakemake may still be writing to
     the stage's folder ``out``."""
     with open(path, "w") as file:
         try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except OSError:
+            _flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        except BlockingIOError:
             print(
                 f"{stage}: waiting for another run that writes to {out}",
                 file=sys.stderr,
                 flush=True,
             )
-            fcntl.flock(file, fcntl.LOCK_EX)
+            _flock(file, fcntl.LOCK_EX)
         yield
 
 

@@ -1,4 +1,5 @@
-"""Ending on SIGTERM, which batch systems send some seconds before they kill a job."""
+"""Ending on SIGTERM, which batch systems send some seconds before they kill a job, and on SIGHUP,
+which a terminal sends when it is closed."""
 
 from __future__ import annotations
 
@@ -20,16 +21,21 @@ _deferred = False
 
 
 @contextmanager
-def raising_on_sigterm() -> Iterator[None]:
-    """In the main thread, raise ``Terminated`` when SIGTERM arrives."""
+def raising_when_terminated() -> Iterator[None]:
+    """In the main thread, raise ``Terminated`` when SIGTERM or SIGHUP arrives. SIGHUP stays ignored
+    where it is, as under ``nohup``."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
-    before = signal.signal(signal.SIGTERM, _on_sigterm)
+    numbers = [signal.SIGTERM]
+    if signal.getsignal(signal.SIGHUP) is signal.SIG_DFL:
+        numbers.append(signal.SIGHUP)
+    before = [signal.signal(number, _on_signal) for number in numbers]
     try:
         yield
     finally:
-        signal.signal(signal.SIGTERM, before)
+        for number, handler in zip(numbers, before, strict=True):
+            signal.signal(number, handler)
         _requested.clear()
 
 
@@ -45,11 +51,11 @@ def deferred() -> Iterator[None]:
 
 
 def requested() -> bool:
-    """Whether SIGTERM has arrived."""
+    """Whether one of the signals has arrived."""
     return _requested.is_set()
 
 
-def _on_sigterm(number: int, frame: FrameType | None) -> None:
+def _on_signal(number: int, frame: FrameType | None) -> None:
     _requested.set()
     if not _deferred:
         raise Terminated

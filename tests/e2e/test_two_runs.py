@@ -6,14 +6,18 @@ import fcntl
 import os
 import shutil
 import signal
+import subprocess
 import time
+from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 
 from tests.e2e.harness import (
     TINY,
+    command,
     copy_run,
+    environment,
     model_digests,
     rules_run,
     snakemake,
@@ -30,6 +34,13 @@ TARGET = "results/tiny/metrics.json"
 @pytest.fixture
 def project(finished: Path, tmp_path: Path) -> Path:
     return copy_run(finished, tmp_path / "project")
+
+
+def wait_until(condition: Callable[[], bool]) -> None:
+    deadline = time.monotonic() + 120
+    while not condition():
+        assert time.monotonic() < deadline
+        time.sleep(0.02)
 
 
 def test_two_scenes_started_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
@@ -66,6 +77,30 @@ def test_kill_9_and_the_same_command_continues(project: Path, only_snakemake: bo
     start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=only_snakemake)
     done = snakemake(project, TARGET, config=TINY)
     assert "evaluate" in rules_run(done) and "train" not in rules_run(done)
+
+
+def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None:
+    """The terminal sends SIGHUP to Snakemake and to its job, which ends with a message."""
+    (project / TARGET).unlink()
+    shutil.rmtree(project / "results/tiny/train")
+    log, progress = (project / "results/tiny" / name for name in ("logs/train.log", ".scratch"))
+    log.unlink()
+    # Not in a fork: its job would end with the process that represents it.
+    with subprocess.Popen(
+        command(TARGET, config=TINY),
+        cwd=project,
+        env=environment(project),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
+    ) as run:
+        wait_until((progress / "train").is_dir)
+        time.sleep(1)
+        os.killpg(run.pid, signal.SIGHUP)
+    wait_until(lambda: "terminated" in log.read_text())
+    assert "Traceback" not in log.read_text()
+    done = snakemake(project, TARGET, config=TINY)
+    assert "train" in rules_run(done)
 
 
 def test_the_second_run_of_a_scene_is_refused_with_the_name_of_the_first(

@@ -1,7 +1,10 @@
-"""The lock of a run."""
+"""The locks of a run and of a stage."""
 
 from __future__ import annotations
 
+import errno
+import fcntl
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -9,12 +12,12 @@ from pathlib import Path
 import pytest
 
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.lock import lock_run
+from pipeline.runtime.lock import check_not_locked, lock_run, locked
 
 HOLD = """
 import sys
 from pathlib import Path
-from pipeline.runtime.lock import lock_run
+from pipeline.runtime.lock import check_not_locked, lock_run, locked
 lock_run(Path(sys.argv[1]))
 print("locked", flush=True)
 sys.stdin.read()
@@ -36,3 +39,25 @@ def test_a_second_run_is_refused_until_the_first_has_ended_or_was_killed(tmp_pat
         assert raised.value.file == tmp_path
         first.kill()
     lock_run(tmp_path)
+
+
+@pytest.mark.parametrize("code", [errno.ENOLCK, errno.EOPNOTSUPP, errno.ENOSYS])
+def test_a_file_system_without_locks_is_a_warning(
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    capsys: pytest.CaptureFixture[str],
+    code: int,
+) -> None:
+    """NFS without a lock daemon and some mounts of Lustre have none."""
+
+    def refuse(*arguments: object) -> None:
+        raise OSError(code, os.strerror(code))
+
+    monkeypatch.setattr(fcntl, "flock", refuse)
+    check_not_locked(tmp_path)
+    lock_run(tmp_path)
+    said = capsys.readouterr().err
+    assert said.count("warning") == 1 and "its file system has no locks" in said
+    with locked(tmp_path / "sfm.lock", "sfm", tmp_path / "sfm"):
+        pass
+    assert capsys.readouterr().err == ""

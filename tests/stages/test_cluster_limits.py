@@ -272,12 +272,12 @@ def test_a_scene_is_three_submissions_and_one_for_each_job_of_divided_stages(tmp
 
 
 def test_sigterm_ends_at_once_or_where_the_work_allows_it():
-    with termination.raising_on_sigterm():
+    with termination.raising_when_terminated():
         with pytest.raises(termination.Terminated):
             os.kill(os.getpid(), signal.SIGTERM)
             time.sleep(5)
         assert termination.requested()
-    with termination.raising_on_sigterm(), termination.deferred():
+    with termination.raising_when_terminated(), termination.deferred():
         assert not termination.requested()
         os.kill(os.getpid(), signal.SIGTERM)
         assert termination.requested()

@@ -75,7 +75,7 @@ class Session:
         self.metrics_log.write(state, last, factor, self.progress.seconds_left())
         if termination.requested():
             self._save()
-            self.log(f"terminated (SIGTERM) after {state.step} steps, which a checkpoint keeps")
+            self.log(f"terminated after {state.step} steps, which a checkpoint keeps")
             raise termination.Terminated
 
     def _resume(self) -> None:

@@ -23,8 +23,9 @@ from scipy.stats import spearmanr
 
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import CoverageResult, Place
+from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Gradient, Init, Train
+from pipeline.config.schema import Init, Train
 from pipeline.coverage.probe_views import Renderer, render_probe
 from pipeline.coverage.trust import trust_map
 from pipeline.coverage.viewpoints import MAX_PROPOSALS, Viewpoint, propose_viewpoints

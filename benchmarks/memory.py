@@ -19,8 +19,9 @@ from PIL import Image
 
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import MemoryResult
+from pipeline.config.density import Gradient
 from pipeline.config.experiments import DEFAULT
-from pipeline.config.schema import Gradient, Train
+from pipeline.config.schema import Train
 from pipeline.demo.cameras import lens, orbit
 from pipeline.plan.training_memory import memory_mb
 from pipeline.runtime.machine import usable_cores

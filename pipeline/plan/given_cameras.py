@@ -4,28 +4,15 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import numpy as np
 
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.posefiles import pose_files
-from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.recorded import digest_of
-from pipeline.plan.given_poses import read_fitted
+from pipeline.plan.given_poses import GivenFiles, read_fitted
 from pipeline.scene.manifest import Photo
-
-
-@dataclass(frozen=True)
-class GivenFiles:
-    """The pose files of a scene; see ``load_given``."""
-
-    path: Path
-    kind: PoseKind
-    listed: tuple[str, ...]
-    base_folder: str
 
 
 def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) -> float:
@@ -44,9 +31,7 @@ def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) ->
         state += [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
 
     def extent() -> float:
-        model = read_fitted(
-            files.path, files.kind, photos, files.listed, files.base_folder, points=False
-        )
+        model = read_fitted(files, photos, points=False)
         centres = [image.centre for image in model.images.values()]
         return float(np.ptp(centres, axis=0).max()) if centres else 0.0
 

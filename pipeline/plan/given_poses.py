@@ -117,6 +117,24 @@ class GivenModel:
         return messages
 
 
+@dataclass(frozen=True)
+class GivenFiles:
+    """The pose files of a scene.
+
+    Attributes:
+        path: the pose file or its folder.
+        kind: its format.
+        listed: for LLFF, the names of all photographs, also of those that are not used.
+        base_folder: the folder of the photographs relative to the scene folder, for formats whose
+            names are relative to the latter.
+    """
+
+    path: Path
+    kind: PoseKind
+    listed: tuple[str, ...] = ()
+    base_folder: str = "."
+
+
 def load_given(
     path: Path,
     kind: PoseKind,
@@ -129,28 +147,19 @@ def load_given(
     Points keep their observations in these photographs; points observed in none are dropped.
 
     Args:
-        path: the pose file or its folder.
-        kind: its format.
+        path, kind, listed, base_folder: see ``GivenFiles``.
         photos: the photographs that are used.
-        listed: for LLFF, the names of all photographs, also of those that are not used.
-        base_folder: the folder of the photographs relative to the scene folder, for formats whose
-            names are relative to the latter.
 
     Raises:
         UserError: malformed pose files; a camera with another aspect ratio than its photograph,
             or with an impossible focal length.
     """
-    return GivenModel.of(read_fitted(path, kind, photos, listed, base_folder), path)
+    files = GivenFiles(path, kind, tuple(listed), base_folder)
+    return GivenModel.of(read_fitted(files, photos), path)
 
 
 def read_fitted(
-    path: Path,
-    kind: PoseKind,
-    photos: Sequence[Photo],
-    listed: Sequence[str] = (),
-    base_folder: str = ".",
-    *,
-    points: bool = True,
+    files: GivenFiles, photos: Sequence[Photo], *, points: bool = True
 ) -> Reconstruction:
     """The model of ``load_given`` in the given world, or only its cameras and images.
 
@@ -161,20 +170,20 @@ def read_fitted(
         UserError: as ``load_given``.
     """
     by_name = {photo.name: photo for photo in photos}
-    entry = format_of(kind)
-    prefix = entry.prefix(base_folder)
-    sizes = {prefix + photo.name: (photo.width, photo.height) for photo in photos}
-    if kind == "colmap" and not points:
-        model = read_model(path, points=False)
+    entry = format_of(files.kind)
+    prefix = entry.prefix(files.base_folder)
+    if files.kind == "colmap" and not points:
+        model = read_model(files.path, points=False)
     else:
-        model = entry.read(path, sizes, listed)
+        sizes = {prefix + photo.name: (photo.width, photo.height) for photo in photos}
+        model = entry.read(files.path, sizes, files.listed)
     if prefix:
         images = {
             i: replace(image, name=image.name.removeprefix(prefix))
             for i, image in model.images.items()
         }
         model = replace(model, images=images)
-    return fit_to_photos(model, by_name, str(path))
+    return fit_to_photos(model, by_name, str(files.path))
 
 
 def _frame(model: Reconstruction, path: Path) -> tuple[Normalization, Rounding]:

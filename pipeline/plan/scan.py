@@ -30,7 +30,8 @@ from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
 from pipeline.plan.depth_maps import check_depth_maps
 from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
-from pipeline.plan.given_cameras import GivenFiles, check_given
+from pipeline.plan.given_cameras import check_given
+from pipeline.plan.given_poses import GivenFiles
 from pipeline.plan.ground_control import find_ground_control
 from pipeline.plan.inventory import Inventory
 from pipeline.plan.panoramas import partial_panoramas

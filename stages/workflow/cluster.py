@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.plan.values import Plan
+from pipeline.runtime.native import MODULES
 
 # Stages that are one submission of a scene, to save the time that each takes to start.
 GROUPS: Mapping[str, Sequence[str]] = {
@@ -188,3 +189,10 @@ def watch_jobs(executor: Any, seconds: float) -> None:
     executor.report_job_success = recording(executor.report_job_success)
     executor.report_job_error = recording(executor.report_job_error)
     executor.check_active_jobs = checked
+
+
+def compile_for_all_nodes() -> None:
+    """Compile the native libraries for every kind of processor that a node may have."""
+    for module in MODULES:
+        command = [sys.executable, "-m", module, "--target", "all"]
+        subprocess.run(command, check=False, stdout=sys.stderr)

@@ -28,7 +28,6 @@ from pipeline.runtime.atomic import write_json
 from pipeline.runtime.errors import UserError, as_user_error
 from pipeline.runtime.layout import PACKAGES, SCAN_CACHE
 from pipeline.runtime.lock import check_not_locked, lock_run, user_name
-from pipeline.runtime.native import MODULES
 from pipeline.runtime.record import (
     STAGE,
     canonical,
@@ -41,6 +40,7 @@ from pipeline.runtime.source import stage_source_hash
 from stages.workflow.cluster import (
     DEFAULT_CPUS,
     OVERHEAD_MB,
+    compile_for_all_nodes,
     granted_cpus,
     granted_memory_mb,
     group_of,
@@ -49,7 +49,9 @@ from stages.workflow.cluster import (
     watch_jobs,
 )
 from stages.workflow.failures import reporting_errors
-from stages.workflow.locks import prepare_folder, use_locks_of_runs
+from stages.workflow.folders import check_working_directory, check_writable
+from stages.workflow.locks import use_locks_of_runs
+from stages.workflow.outcomes import error_in, failed_job, outcome
 from stages.workflow.registry import STAGES
 
 RESULTS = Path("results")
@@ -91,7 +93,7 @@ class SnakemakeProject:
         # Snakemake and packages end with a traceback if the user has no name.
         os.environ.setdefault("LOGNAME", user_name())
         try:
-            _check_working_directory()
+            check_working_directory()
             use_locks_of_runs()
             self._project, named = load_project(self._raw)
         except UserError as error:
@@ -252,8 +254,7 @@ class SnakemakeProject:
         return canonical(plan_record(self._plan(wildcards.scene)).model_dump(mode="json"))
 
     def _inputs(self, spec: StageSpec, name: str) -> dict[str, Path]:
-        sources = input_folders(spec, self._plan(name))
-        return {role: RESULTS / name / source for role, source in sources.items()}
+        return _sources(spec, self._plan(name), name)
 
     def _plan(self, name: str) -> Plan:
         """The run's plan; a UserError ends Snakemake."""
@@ -288,9 +289,7 @@ class SnakemakeProject:
         """The device for ``train.device: auto``. On a cluster, a plan must be the same on every
         node: there, a GPU is used only if the option names it, and the job that trains checks that
         its node has it."""
-        if self._is_on_cluster():
-            return PROCESSOR
-        if config.train.device != "auto":
+        if self._is_on_cluster() or config.train.device != "auto":
             return PROCESSOR
         chosen = choose_device()
         return chosen.device, chosen.reason
@@ -309,9 +308,7 @@ class SnakemakeProject:
     def _outdated_job(self, plan: Plan, name: str, stage: str) -> str | None:
         """The first folder of the stage's jobs without a current result; None if all have one."""
         spec = STAGES[stage]
-        sources = {
-            role: RESULTS / name / source for role, source in input_folders(spec, plan).items()
-        }
+        sources = _sources(spec, plan, name)
         for job, folder in enumerate(plan.stages[stage].folders(stage), 1):
             if not is_current(RESULTS / name / folder, stage_key(spec, plan, job), sources):
                 return folder
@@ -327,7 +324,7 @@ class SnakemakeProject:
             raise UserError(what, file=self._root / shown[1:-1], fix="rename it")
         folder = RESULTS / name
         if not (folder / "metrics.json").exists():  # Else nothing may be left to write.
-            _check_writable(folder)
+            check_writable(folder)
 
     # --- batches --------------------------------------------------------------------------
 
@@ -377,7 +374,7 @@ class SnakemakeProject:
             {
                 "source": stage_source_hash("stages.workflow.batch"),
                 "published": file_digest(PUBLISHED),
-                "outcomes": [_outcome(run, left_out.get(run)) for run in runs],
+                "outcomes": [outcome(run, left_out.get(run)) for run in runs],
             }
         )
 
@@ -393,7 +390,7 @@ class SnakemakeProject:
         written = {RESULTS / getattr(job.wildcards, "scene", "") for job in needed if job.output}
         for folder in sorted(written):
             try:
-                _check_writable(folder)
+                check_writable(folder)
                 lock_run(folder)
             except UserError as error:
                 _exit(error)
@@ -405,9 +402,7 @@ class SnakemakeProject:
             for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
                 watch_jobs(executor, interval)
             wait_for_earlier_jobs(Path.cwd())
-            for module in MODULES:
-                command = [sys.executable, "-m", module, "--target", "all"]
-                subprocess.run(command, check=False, stdout=sys.stderr)
+            compile_for_all_nodes()
 
     # --- failures -------------------------------------------------------------------------
 
@@ -415,20 +410,19 @@ class SnakemakeProject:
         """Print the messages of the stages that failed, and write a batch's tables with the runs
         that succeeded."""
         for log in sorted(RESULTS.glob("*/logs/*.log")):
-            message = self._error_in(log)
+            message = error_in(log, self._started)
             if message:
                 run = log.parents[1].name
                 print(f"\nerror in {log.stem} of {run}: {message}", file=sys.stderr)
         if "_batch" in self.__dict__:
             runs, left_out = self._batch
             outcomes = [
-                _outcome(run, left_out[run]) if run in left_out else self._ended(run)
-                for run in runs
+                outcome(run, left_out[run]) if run in left_out else self._ended(run) for run in runs
             ]
             command = [sys.executable, "-m", "stages.workflow.batch", "--results", str(RESULTS)]
             text = canonical({"outcomes": outcomes})
             subprocess.run([*command, "--outcomes", "-"], input=text, text=True, check=False)
-            lost = [outcome for outcome in outcomes if outcome["status"] != "ok"]
+            lost = [ended for ended in outcomes if ended["status"] != "ok"]
             with reporting_errors("the batch's tables"):
                 write_json(FAILURES, {"at": self._started, "lost": lost})
             said = f"\n{len(lost)} of {len(runs)} runs have no result: see {RESULTS}/index.html"
@@ -442,50 +436,13 @@ class SnakemakeProject:
             if job is None:
                 continue
             log = RESULTS / run.name / "logs" / f"{job}.log"
-            if not self._has_run(log):
-                return _outcome(run, "another failure stopped the batch", "not run", stage)
-            unknown = f"it ended without a message (it may have been killed): see {log}"
-            return _outcome(run, self._error_in(log) or unknown, "failed", stage)
-        return _outcome(run, None)
-
-    def _has_run(self, log: Path) -> bool:
-        return log.is_file() and log.stat().st_mtime >= self._started
-
-    def _error_in(self, log: Path) -> str:
-        """The message of a stage that ended with a UserError in this run; else empty."""
-        if not self._has_run(log):
-            return ""
-        _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
-        return message.partition(": ")[2].rstrip() if found else ""
+            return failed_job(run, stage, log, self._started)
+        return outcome(run, None)
 
 
-def _outcome(
-    run: Run, message: str | None, status: str = "left out", stage: str = ""
-) -> dict[str, Any]:
-    """See ``stages.workflow.batch.write_batch``."""
-    named = {"run": [run.scene, run.config, run.seed]}
-    if message is None:
-        return named | {"status": "ok"}
-    return named | {"status": status, "stage": stage, "message": message.strip()}
-
-
-def _check_writable(folder: Path) -> None:
-    """Check that a run's folder of results, which may not exist yet, can be written."""
-    if folder.exists() and not os.access(folder, os.W_OK | os.X_OK):
-        fix = "make it writable, or run in another folder (snakemake --directory)"
-        raise UserError("this folder of results cannot be written", file=folder, fix=fix)
-
-
-def _check_working_directory() -> None:
-    """Check that Snakemake can write its own files, which otherwise ends it with a traceback."""
-    own = Path(".snakemake").absolute()
-    folders = [own, *filter(Path.is_dir, own.iterdir())] if own.exists() else [own.parent]
-    for folder in folders:
-        # Another Snakemake may have removed one in between.
-        if not os.access(folder, os.W_OK | os.X_OK) and folder.exists():
-            fix = "make it writable, or run in another folder (snakemake --directory)"
-            raise UserError("Snakemake cannot write to this folder", file=folder, fix=fix)
-    prepare_folder(own)
+def _sources(spec: StageSpec, plan: Plan, name: str) -> dict[str, Path]:
+    """Role of the stage's input -> its folder."""
+    return {role: RESULTS / name / source for role, source in input_folders(spec, plan).items()}
 
 
 def _exit(error: UserError) -> NoReturn:

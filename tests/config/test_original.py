@@ -7,8 +7,8 @@ Sources: Kerbl et al. 2023, "3D Gaussian Splatting for Real-Time Radiance Field 
 
 import pytest
 
+from pipeline.config.density import Original
 from pipeline.config.load import scene_config
-from pipeline.config.schema import Original
 from pipeline.training.density import original
 from pipeline.training.density.gradient import SPLIT_SHRINK
 

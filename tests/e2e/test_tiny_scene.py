@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -32,7 +31,6 @@ from tests.e2e.harness import (
     rules_run,
     snakemake,
     start_and_kill,
-    start_snakemake,
 )
 
 pytestmark = pytest.mark.slow
@@ -233,32 +231,6 @@ def test_kill_9_and_again_on_one_core_gives_the_bytes_of_two(project, finished):
     assert "resuming at" in (folder / "logs/train.log").read_text()
     assert not (project / scratch / "train").exists()
     assert metrics(project, "tiny") == metrics(finished, "tiny")
-    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
-
-
-def test_an_orphaned_job_and_a_new_run_do_not_meet(project, finished):
-    """SIGKILL on Snakemake alone leaves its job running; the next run waits for it."""
-    folder = project / "results/tiny"
-    shutil.rmtree(folder / "train")
-    (folder / "metrics.json").unlink()
-    ready = "results/tiny/.scratch/train/*/out"
-    start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=True)
-    snakemake(project, TARGET, config=TINY)
-    log = (folder / "logs/train.log").read_text()
-    assert "another run is at work" in log or "up to date" in log
-    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
-
-
-def test_two_runs_at_once_on_one_scene(project, finished):
-    """The second is refused, or finds the work done; the first one's result is whole."""
-    shutil.rmtree(project / "results/tiny/export")
-    (project / TARGET).unlink()
-    with open(os.devnull, "w") as nothing:
-        runs = [
-            start_snakemake(project, TARGET, output=nothing.fileno(), config=TINY) for _ in range(2)
-        ]
-    codes = sorted(run.wait() for run in runs)
-    assert codes[0] == 0
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
 
 

@@ -69,7 +69,9 @@ def test_lock_files_of_a_dead_snakemake_block_nothing(
 
 
 @pytest.mark.parametrize("only_snakemake", [False, True], ids=["with its job", "alone"])
-def test_kill_9_and_the_same_command_continues(project: Path, only_snakemake: bool) -> None:
+def test_kill_9_and_the_same_command_continues(
+    project: Path, finished: Path, only_snakemake: bool
+) -> None:
     """A job that lost its Snakemake goes on; the new one waits for its stage."""
     (project / "results/tiny/metrics.json").unlink()
     shutil.rmtree(project / "results/tiny/evaluate")
@@ -77,6 +79,7 @@ def test_kill_9_and_the_same_command_continues(project: Path, only_snakemake: bo
     start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=only_snakemake)
     done = snakemake(project, TARGET, config=TINY)
     assert "evaluate" in rules_run(done) and "train" not in rules_run(done)
+    assert model_digests(project, "tiny") == model_digests(finished, "tiny")
 
 
 def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None:

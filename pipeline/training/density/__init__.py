@@ -1,7 +1,7 @@
 """Density control: strategies that densify and prune Gaussians, one in each module."""
 
+from pipeline.config.density import Gradient, Mcmc, Original
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Gradient, Mcmc, Original
 from pipeline.splats.skybox import Sky
 from pipeline.training.density.gradient import GradientDensity
 from pipeline.training.density.mcmc import McmcDensity

@@ -12,8 +12,8 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from pipeline.config.density import Gradient, Mcmc, Original
 from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
-from pipeline.config.schema import Gradient, Mcmc, Original
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
 from pipeline.training.density import make_strategy

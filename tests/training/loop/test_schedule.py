@@ -6,8 +6,9 @@ from typing import Any
 
 import pytest
 
+from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Gradient, Train
+from pipeline.config.schema import Train
 from pipeline.training.loop.schedule import CAMERA_DECAY, Schedule
 
 

@@ -12,8 +12,9 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Gradient, Train
+from pipeline.config.schema import Train
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view

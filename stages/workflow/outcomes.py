@@ -1,0 +1,47 @@
+"""How the runs of a batch and their jobs ended, according to their logs."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from pipeline.config.runs import Run
+
+
+def outcome(
+    run: Run, message: str | None, status: str = "left out", stage: str = ""
+) -> dict[str, Any]:
+    """The record of a run for ``stages.workflow.batch.write_batch``.
+
+    Args:
+        message: why the run has no result; None if it has one.
+    """
+    named = {"run": [run.scene, run.config, run.seed]}
+    if message is None:
+        return named | {"status": "ok"}
+    return named | {"status": status, "stage": stage, "message": message.strip()}
+
+
+def failed_job(run: Run, stage: str, log: Path, started: float) -> dict[str, Any]:
+    """The record of a run whose first job without a result is one of ``stage``.
+
+    Args:
+        log: the log of the job.
+        started: when Snakemake was started.
+    """
+    if not _was_written(log, started):
+        return outcome(run, "another failure stopped the batch", "not run", stage)
+    unknown = f"it ended without a message (it may have been killed): see {log}"
+    return outcome(run, error_in(log, started) or unknown, "failed", stage)
+
+
+def error_in(log: Path, started: float) -> str:
+    """The message of a job that has ended with a UserError since ``started``; else empty."""
+    if not _was_written(log, started):
+        return ""
+    _, found, message = f"\n{log.read_text()}".rpartition("\nerror in ")
+    return message.partition(": ")[2].rstrip() if found else ""
+
+
+def _was_written(log: Path, started: float) -> bool:
+    return log.is_file() and log.stat().st_mtime >= started

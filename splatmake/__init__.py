@@ -203,8 +203,8 @@ def read_gaussians(file: str | PathLike[str]) -> Gaussians:
 
 
 def write_gaussians(file: str | PathLike[str], gaussians: Gaussians) -> None:
-    """Write Gaussians in the format of the file's suffix; what the format does not hold is a
-    warning.
+    """Write Gaussians in the format of the file's suffix. A warning names what the format does not
+    hold.
 
     Raises:
         UserError: an unknown suffix, or Gaussians that the format cannot hold.

@@ -13,7 +13,7 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-# Units a second of the movie's clock.
+# The movie's clock counts this many units a second.
 MOVIE_CLOCK = 1000
 MATRIX = struct.pack(">9i", 1 << 16, 0, 0, 0, 1 << 16, 0, 0, 0, 1 << 30)
 
@@ -23,11 +23,11 @@ class Stream:
     """A stream of a file.
 
     Attributes:
-        samples: the frames, or pieces of sound.
-        durations: of the samples, on the stream's clock.
-        size: width and height of the frames; None for sound.
-        edits: segments of a MOV file that are shown: duration on the movie's clock, start on the
-            stream's; None: all frames.
+        samples: The frames, or the pieces of sound.
+        durations: The duration of each sample in units of the stream's clock.
+        size: The width and height of the frames; None for sound.
+        edits: The segments of a MOV file that are shown, each with its duration on the movie's
+            clock and its start on the stream's; None shows all frames.
     """
 
     samples: Sequence[bytes]
@@ -38,7 +38,7 @@ class Stream:
 
 
 def jpeg(size: tuple[int, int], value: int) -> bytes:
-    """A picture of one grey."""
+    """A JPEG picture in a single shade of grey."""
     done, data = cv2.imencode(".jpg", np.full((size[1], size[0], 3), value, np.uint8))
     assert done
     return data.tobytes()
@@ -51,7 +51,7 @@ def video(
     pause_s: int = 0,
     edits: Sequence[tuple[int, int]] | None = None,
 ) -> Stream:
-    """Frames of one grey, 25 a second, with a pause in the middle."""
+    """25 frames a second, each in a single shade of grey, with a pause in the middle."""
     durations = [24] * frames
     durations[frames // 2] += 600 * pause_s
     return Stream([jpeg(size, value)] * frames, durations, 600, size, edits)
@@ -63,7 +63,7 @@ def sound(seconds: int) -> Stream:
 
 
 def interleaved(streams: Sequence[Stream]) -> list[tuple[float, int, int]]:
-    """Time, number of the stream and number of the sample, in the order of time."""
+    """The samples in the order of time: time, number of the stream, number of the sample."""
     return sorted(
         (float(time), number, index)
         for number, stream in enumerate(streams)

@@ -24,9 +24,9 @@ class DepthHeader(BaseModel):
     """What the header of a depth map says.
 
     Attributes:
-        width, height: pixels.
-        channels: the number of values of a pixel.
-        is_number: whether the values are integers or floats.
+        width, height: The size in pixels.
+        channels: The number of values of a pixel.
+        is_number: Whether the values are integers or floats.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -38,14 +38,14 @@ class DepthHeader(BaseModel):
 
 
 def read_depth_header(path: Path) -> DepthHeader | None:
-    """The header of a depth map; None if it is not understood, which is no error: the decoder of
-    the pixels may understand more.
+    """The header of a depth map. None if it cannot be parsed, which is no error: the decoder of the
+    pixels may accept more.
 
     Raises:
         OSError: the file cannot be read.
     """
     with opened_regular(path) as file:
-        # The suffixes of ``read_depth``.
+        # ``read_depth`` accepts the same suffixes.
         try:
             if path.suffix == ".npy":
                 return _of_array(file)

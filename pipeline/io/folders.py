@@ -25,12 +25,12 @@ class PhotoFolder:
     """A folder of photographs in a scene.
 
     Attributes:
-        path: relative to the scene folder, "." for itself.
-        base: the folder that the given poses refer to: that of the full-size photographs.
-        reason: why this folder was chosen.
-        names: its photographs, relative to it, sorted.
-        masks: name -> mask file listed in the pose file, relative to the scene folder.
-        depths: likewise, of depth maps.
+        path: The folder's path relative to the scene folder; "." for the scene folder itself.
+        base: The folder that the given poses refer to: that of the full-size photographs.
+        reason: The reason why this folder was chosen.
+        names: The sorted names of its photographs, relative to the folder.
+        masks: Name -> the mask file that the pose file lists, relative to the scene folder.
+        depths: Name -> the depth map that the pose file lists, relative to the scene folder.
     """
 
     path: str

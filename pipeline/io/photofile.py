@@ -55,8 +55,8 @@ class FileFacts(BaseModel):
 
     Attributes:
         gps_fault: The reason why a GPS position in the metadata is not used.
-        colours_fault: why its colours are used as sRGB although the file says something else; empty
-            otherwise.
+        colours_fault: The reason why the colours are used as sRGB although the file says something
+            else; empty otherwise.
     """
 
     model_config = ConfigDict(frozen=True)

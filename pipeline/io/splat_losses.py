@@ -19,10 +19,8 @@ WITHOUT_HARMONICS = (".splat",)
 
 
 def losses(path: Path, gaussians: GaussianSource) -> list[str]:
-    """A sentence for everything of the Gaussians that the file at ``path`` does not hold.
-
-    The suffix is the format's.
-    """
+    """A sentence for everything of the Gaussians that the file at ``path`` does not hold. The suffix
+    of ``path`` names the format."""
     suffix, found = path.suffix.lower(), []
     if suffix == ".spz":
         lost = count_out_of_range(gaussians)
@@ -61,8 +59,8 @@ def losses_of_reading(path: Path) -> list[str]:
 
 
 def unmarked(files: Sequence[str]) -> list[str]:
-    """The warning about ``files`` of Gaussians that were trained with opacity compensation; empty
-    if all of their formats record it."""
+    """The warning that ``files`` do not record the opacity compensation of the training; empty if
+    all of their formats record it."""
     names = [name for name in files if Path(name).suffix.lower() not in WITH_ANTIALIAS]
     if not names:
         return []

@@ -56,10 +56,10 @@ class Frame:
     """A frame of the file.
 
     Attributes:
-        path: photograph, relative to the folder of the json, often without suffix.
-        mask: file of its mask, likewise, or None.
-        depth: file of its depth map, likewise, or None.
-        rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
+        path: The photograph's path relative to the folder of the json, often without suffix.
+        mask: The path of its mask in the same form, or None.
+        depth: The path of its depth map in the same form, or None.
+        rotation, translation: The pose, world to camera in COLMAP's axes; (3, 3) and (3,) float64.
         fields: the file's fields, overridden by the frame's.
         split: the list of the scene's own split that it is in, or None: transforms_train.json and
             so on, or ``train_filenames`` and so on of nerfstudio.

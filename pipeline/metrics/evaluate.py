@@ -220,7 +220,7 @@ def diagnose(test_psnr: float, train_psnr: float) -> list[str]:
 def _describe_masks(protocol: Protocol, measured: Sequence[_Measured]) -> str | None:
     if all(view.mask is None for view in protocol.views):
         return None
-    # A view that its mask hides is not measured.
+    # A view whose mask excludes all pixels is not measured.
     if len(measured) < len(protocol.views) or any(view.is_masked for view in measured):
         return "masked pixels are excluded"
     return "the masks exclude no pixel of the measured views"

@@ -57,7 +57,7 @@ class Rendered:
 
     @property
     def is_masked(self) -> bool:
-        """Whether the mask excludes a measured pixel."""
+        """Whether the mask excludes at least one pixel that would be measured."""
         return self.measured_mask is not None and not self.measured_mask.all()
 
     def psnr(self, image: NDArray[np.uint8]) -> float:

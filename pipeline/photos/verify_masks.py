@@ -26,8 +26,8 @@ class _Found:
     """What one mask keeps.
 
     Attributes:
-        file: the mask.
-        kept: share of the pixels that it keeps.
+        file: The path of the mask.
+        kept: The share of the pixels that it keeps.
         darkest: The field of the same name of ``masks.MaskPixels``.
     """
 
@@ -40,7 +40,7 @@ def verify_masks(manifest: Manifest, *, threads: int) -> tuple[Manifest, list[st
     """Decode all masks.
 
     Args:
-        threads: number of threads; does not change the result.
+        threads: The number of threads. It does not change the result.
 
     Returns:
         The manifest with the new warnings, and these: one of masks that exclude nothing, one of

@@ -165,7 +165,7 @@ def small_views_line(scan: Scan, config: Config) -> str:
     """The plan's sentence about views that are smaller than SSIM's window; empty without any.
 
     Raises:
-        UserError: all views are.
+        UserError: all views are smaller than the window.
     """
     planned = _planned(scan, config)
     small = [i for i, view in enumerate(planned) if min(view.width, view.height) < SSIM_WINDOW]

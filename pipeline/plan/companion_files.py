@@ -97,7 +97,8 @@ def _files_of(
     listed: Mapping[str, str],
     facts: Mapping[str, FileFacts],
 ) -> dict[str, Path]:
-    """Those that ``listed`` names, or that lie beside the photographs; else those in folders."""
+    """The files that ``listed`` names, or that lie beside the photographs; otherwise those in
+    folders."""
     copy = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
     named = {name: folder / listed[name] for name in sorted(facts) if name in listed}
     others = [name for name in sorted(facts) if name not in named]

@@ -122,10 +122,10 @@ class GivenFiles:
     """The pose files of a scene.
 
     Attributes:
-        path: the pose file or its folder.
-        kind: its format.
-        listed: for LLFF, the names of all photographs, also of those that are not used.
-        base_folder: the folder of the photographs relative to the scene folder, for formats whose
+        path: The pose file or its folder.
+        kind: The format of the file.
+        listed: The names of all photographs, also of those that are not used. Only LLFF needs them.
+        base_folder: The folder of the photographs relative to the scene folder, for formats whose
             names are relative to the latter.
     """
 
@@ -148,7 +148,7 @@ def load_given(
 
     Args:
         path, kind, listed, base_folder: see ``GivenFiles``.
-        photos: the photographs that are used.
+        photos: The photographs that are used.
 
     Raises:
         UserError: malformed pose files; a camera with another aspect ratio than its photograph,
@@ -164,7 +164,7 @@ def read_fitted(
     """The model of ``load_given`` in the given world, or only its cameras and images.
 
     Args:
-        points: whether the points of a COLMAP model are read, which takes longest.
+        points: Whether to read the points of a COLMAP model, which takes longest.
 
     Raises:
         UserError: as ``load_given``.

@@ -15,7 +15,7 @@ from pipeline.scene.manifest import Photo
 
 @dataclass(frozen=True)
 class GroundControlFile:
-    """The file of the scene, None without one, and a description of its content."""
+    """The path of the scene's file, None without one, and a description of its content."""
 
     path: Path | None = None
     text: str = ""
@@ -33,10 +33,10 @@ def find_ground_control(
     """The scene's ``gcp_list.txt`` (in any case), checked as far as that is possible without poses.
 
     Args:
-        config: of which ``sfm.georeference`` is used.
-        warnings: sentences about the file are added.
-        posed: whether poses are given, which are not georeferenced.
-        complete: whether ``photos`` are all photographs; False if frames of videos will follow.
+        config: The configuration. Only ``sfm.georeference`` is used.
+        warnings: Sentences about the file are added to this list.
+        posed: Whether poses are given. These are not georeferenced.
+        complete: Whether ``photos`` are all photographs; False if frames of videos will follow.
 
     Raises:
         UserError: there are two files, or its content cannot be used; see ``read_ground_control``.

@@ -61,8 +61,8 @@ class Scan(BaseModel):
         listed: names of all photographs found, with those left out of the manifest.
         poses: None without given poses, or if they are ignored (``poses: ignore``).
         ordered: the reason to treat the photographs as a sequence, or None.
-        ground_control: the scene's ``gcp_list.txt``, if any.
-        ground_control_text: what it holds.
+        ground_control: The scene's ``gcp_list.txt``, if any.
+        ground_control_text: A description of the content of ``ground_control``.
         cloud: the point cloud that the Gaussians are initialised from, or None.
         truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
         fingerprint: digest of the names and contents of photographs, videos, masks, depth maps,
@@ -176,8 +176,8 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     Args:
         folder: the scene folder: photographs or videos, and optionally poses, masks, depth maps.
         scene: the scene's name.
-        config: of which ``inspect``, ``views``, ``features``, ``poses``,
-            ``split``, ``init.points_file`` and ``sfm.georeference`` are used.
+        config: The configuration. Only ``inspect``, ``views``, ``features``, ``poses``, ``split``,
+            ``init.points_file`` and ``sfm.georeference`` are used.
         cache: JSON file that caches facts about files; None for no cache. A file that cannot be
             written is no error.
 

@@ -13,7 +13,7 @@ from pipeline.scene.manifest import Photo, VideoFile
 
 # A folder of videos beside images/.
 VIDEO_FOLDER = "videos"
-# Streams that are not used and named in the plan.
+# The largest number of unused streams that the plan names.
 SHOWN_STREAMS = 4
 
 

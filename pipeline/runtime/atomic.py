@@ -16,7 +16,7 @@ def written(path: Path) -> Iterator[BinaryIO]:
     """A new file under a temporary name beside ``path``, which is renamed when it is complete.
 
     Raises:
-        OSError: with the file's name, also where writing fails because the disk is full.
+        OSError: the file cannot be written. It has the file's name, also if the disk is full.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
     temporary = path.with_name(f".{path.name}.{os.getpid()}.tmp")

@@ -207,8 +207,8 @@ def is_current(folder: Path, key: str, inputs: Mapping[str, Path]) -> bool:
 
 
 def missing_output(folder: Path) -> Path | None:
-    """A file that a finished stage with this folder must have and that does not exist; the folder
-    itself if it does not exist; None if all exist, or if the record cannot be read."""
+    """A file that is missing from the folder of a finished stage; the folder itself if it does not
+    exist. None if all files exist, or if the record cannot be read."""
     if not folder.is_dir():
         return folder
     if not (folder / STAGE).is_file():

@@ -128,7 +128,7 @@ def _split(pixels: NDArray) -> tuple[NDArray[np.uint8], NDArray | None]:
 
 
 def _read_mask(photo: Photo, size: tuple[int, int]) -> NDArray[np.uint8]:
-    """(h, w) uint8: 1 for the pixels that the photograph's mask keeps."""
+    """The photograph's mask at the size of the image: (h, w) uint8, 1 for the pixels that count."""
     assert photo.mask is not None
     usable = load_mask(photo.mask, photo.mask_digest).astype(np.uint8)
     if (usable.shape[1], usable.shape[0]) != size:

@@ -14,7 +14,7 @@ def reporting_errors(job: str) -> Iterator[None]:
     """End the process with one message and exit code 2 if the user can correct the error.
 
     Args:
-        job: the job's name in the message.
+        job: The name of the job in the message.
     """
     try:
         yield

@@ -14,7 +14,7 @@ def outcome(
     """The record of a run for ``stages.workflow.batch.write_batch``.
 
     Args:
-        message: why the run has no result; None if it has one.
+        message: The reason why the run has no result; None if it has one.
     """
     named = {"run": [run.scene, run.config, run.seed]}
     if message is None:
@@ -26,8 +26,8 @@ def failed_job(run: Run, stage: str, log: Path, started: float) -> dict[str, Any
     """The record of a run whose first job without a result is one of ``stage``.
 
     Args:
-        log: the log of the job.
-        started: when Snakemake was started.
+        log: The log of the job.
+        started: The time at which Snakemake was started.
     """
     if not _was_written(log, started):
         return outcome(run, "another failure stopped the batch", "not run", stage)

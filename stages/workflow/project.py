@@ -159,7 +159,7 @@ class SnakemakeProject:
         folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
         if lost := missing_output(folder):
             dag.forcefiles.add(str(folder / STAGE))
-            # Of a run that was not finished, all that is missing has not been made yet.
+            # The outputs of an unfinished run are not lost: they have not been made yet.
             if folder not in self._lost and (folder.parent / "metrics.json").is_file():
                 self._lost.add(folder)
                 print(f"{lost} is missing: {folder.name} runs again", file=sys.stderr)
@@ -259,7 +259,7 @@ class SnakemakeProject:
     def _plan(self, name: str) -> Plan:
         """The run's plan; a UserError ends Snakemake."""
         try:
-            # Before the permission to write is checked.
+            # A run of another user is named before the missing permission to write.
             if self._writes_results():
                 check_not_locked(RESULTS / name)
             return self._make_plan(name)

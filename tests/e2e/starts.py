@@ -27,9 +27,9 @@ def two_scenes(folder: Path) -> Path:
 
 
 def start_pairs(project: Path, pairs: int) -> list[str]:
-    """Start both scenes at once, for a result that takes no time; return what failed starts say.
+    """Start both scenes at once, for a result that takes no time. Return what failed starts print.
 
-    In every second pair they also create Snakemake's own folder at once.
+    Every second pair also creates Snakemake's own folder at the same time.
     """
     failed = []
     for pair in range(pairs):

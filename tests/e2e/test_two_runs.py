@@ -128,7 +128,7 @@ def test_the_second_run_of_a_scene_is_refused_with_the_name_of_the_first(
 
 
 def test_two_batches_do_not_write_the_tables_at_once(tmp_path: Path) -> None:
-    """Their runs may have nothing in common."""
+    """The tables are in one folder, even if the batches have no run in common."""
     project = two_scenes(tmp_path / "project")
     held = project / "results" / ".scratch" / "run.lock"
     held.parent.mkdir(parents=True)
@@ -152,7 +152,7 @@ def test_two_batches_do_not_write_the_tables_at_once(tmp_path: Path) -> None:
 def test_deleted_output_is_made_again(
     project: Path, finished: Path, lost: str, rerun: set[str]
 ) -> None:
-    """Snakemake says "Nothing to be done" of what is deleted in the middle."""
+    """Snakemake alone says "Nothing to be done" if an intermediate output is missing."""
     path = project / "results" / "tiny" / lost
     if path.is_dir():
         shutil.rmtree(path)

@@ -1,4 +1,4 @@
-"""A mask keeps what it means to keep, however a program wrote it."""
+"""The same mask excludes the same pixels in every form in which programs write it."""
 
 from __future__ import annotations
 
@@ -122,7 +122,7 @@ def test_numbers_of_classes_are_reported(tmp_path: Path) -> None:
 
 
 def test_masks_are_never_converted_by_a_profile(tmp_path: Path) -> None:
-    """A linear profile moves 100 above half of the range."""
+    """A linear profile would move the value 100 above half of the range."""
     from pipeline.io import icc
 
     profile = icc.write_profile("linear", icc.SRGB, (1.0,))

@@ -58,7 +58,7 @@ def decoded(path: Path) -> Decoded:
     cover=st.sampled_from(["none", "first", "last"]),
 )
 def test_the_largest_stream_is_decoded_whole(writer, frames, pause_s, others, place, cover):
-    """Among previews, single pictures that are larger, sound, covers and pauses."""
+    """The file also has previews, larger single pictures, sound, covers and pauses."""
     length = pause_s + 2
     others_of = {
         "small": lambda: video(SMALL, frames, 50),
@@ -131,7 +131,7 @@ def test_a_file_that_ends_early_is_named_in_the_plan(tmp_path, writer):
 
 
 def test_a_damaged_header_is_left_to_ffmpeg(tmp_path):
-    """Any byte of a header may have any value: no other error than that of a file as a whole."""
+    """Any byte of a header may have any value: the only error is that of the whole file."""
     rng = np.random.default_rng(0)
     for name, writer in WRITERS.items():
         whole = writer(

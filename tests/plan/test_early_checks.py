@@ -1,4 +1,4 @@
-"""What headers can tell is an error of the scan, not of a stage hours later."""
+"""Faults that headers show are errors of the plan, not of a stage hours later."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every option with every extreme value: a settled plan or one error, in a short time."""
+"""Every extreme value of every option gives a plan or one error within two seconds."""
 
 from __future__ import annotations
 

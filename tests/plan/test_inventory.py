@@ -136,7 +136,7 @@ def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, 
     try:
         after = look(scene)
     except UserError as error:
-        # Refused with its own name, its folder's, or that of what it contradicts.
+        # The error names the file, its folder, or the file that it contradicts.
         assert name in str(error) or path.parent.name in str(error)
         return
     finally:

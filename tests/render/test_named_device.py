@@ -1,4 +1,4 @@
-"""A device that the configuration names is known to be there before any job starts."""
+"""A device that the configuration names is looked for before any job starts."""
 
 from __future__ import annotations
 

@@ -154,7 +154,7 @@ def connects(port: int) -> bool:
 
 
 def may_have_no_network() -> bool:
-    """Whether the kernel lets this process give up its network."""
+    """Whether the kernel allows this process to enter a network namespace of its own."""
     import ctypes
 
     unshare = ctypes.CDLL(None).unshare

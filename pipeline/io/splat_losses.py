@@ -19,8 +19,10 @@ WITHOUT_HARMONICS = (".splat",)
 
 
 def losses(path: Path, gaussians: GaussianSource) -> list[str]:
-    """A sentence for everything of the Gaussians that the file at ``path`` does not hold. The suffix
-    of ``path`` names the format."""
+    """A sentence for everything of the Gaussians that the file at ``path`` does not hold.
+
+    The suffix of ``path`` names the format.
+    """
     suffix, found = path.suffix.lower(), []
     if suffix == ".spz":
         lost = count_out_of_range(gaussians)

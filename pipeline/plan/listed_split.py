@@ -33,10 +33,12 @@ def listed_split(
     test: ListedSplit = "test" if "test" in found else "val"
     if not {"train", test} <= found:
         if splits:
-            missing = "training" if "train" not in found else "test"
+            missing = "no training view"
+            if "train" in found:
+                missing = "no test view beside the training views"
             warnings.append(
-                f"the scene's own split is not used, because it lists no {missing} view with a "
-                "photograph and a pose: every n-th view is a test view (split.test_every)"
+                f"the scene's own split is not used, because it lists {missing}: every n-th view "
+                "is a test view (split.test_every)"
             )
         return {}
     parts: dict[ListedSplit | None, Part] = {"train": "train", test: "test"}

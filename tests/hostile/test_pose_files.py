@@ -133,11 +133,12 @@ def test_a_repeated_frame_is_a_warning_and_the_first_one_is_used(tmp_path):
     assert given.model.by_name()["p00.jpg"].centre[0] == 0
 
 
-def test_splits_that_list_the_same_frames_are_no_warning(tmp_path):
+def test_splits_that_list_the_same_frames_are_no_split(tmp_path):
     folder = make_scene(tmp_path / "scene")
     (folder / "transforms_train.json").write_bytes((folder / "transforms.json").read_bytes())
     (folder / "transforms.json").rename(folder / "transforms_val.json")
-    assert look(folder)[0].warnings == ()
+    (said,) = look(folder)[0].warnings
+    assert "split is not used, because it lists no test view beside the training views" in said
 
 
 @pytest.mark.parametrize("where", ["../other/p00.jpg", "{root}/other/p00.jpg", "gone.png"])

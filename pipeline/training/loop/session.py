@@ -81,10 +81,18 @@ class Session:
     def _resume(self) -> None:
         # Messages on checkpoints are logged only: they are not part of the result.
         found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
-        if found is not None:
-            if text := other_build(found.values, self.build):
-                self.log(text)
+        if found is None:
+            return
+        try:
             self.state.restore(found.step, found.arrays, found.values)
+        except ValueError as error:
+            self.log(
+                f"{self.checkpoint_dir}: the checkpoint of step {found.step} is not used, because "
+                f"it is not one of this run: {error}"
+            )
+            return
+        if text := other_build(found.values, self.build):
+            self.log(text)
 
     def _save(self) -> None:
         state = self.state

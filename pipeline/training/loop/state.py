@@ -15,6 +15,7 @@ from pipeline.splats.morton import morton_order
 from pipeline.splats.skybox import Sky
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
+from pipeline.training.checkpoints.form import check_arrays, check_position
 from pipeline.training.density import Changes, Strategy
 from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
@@ -156,7 +157,25 @@ class TrainState:
         }
 
     def restore(self, step: int, arrays: dict[str, NDArray[Any]], values: dict[str, Any]) -> None:
-        """Restore the state that ``arrays()`` and ``values()`` returned."""
+        """Restore the state that ``arrays()`` and ``values()`` returned.
+
+        Raises:
+            ValueError: they are not those of such a run. The state is unchanged.
+        """
+        check_arrays(arrays, self.arrays())
+        rng = np.random.default_rng()
+        # The values are JSON; what they lack or hold instead raises exceptions of many types.
+        try:
+            check_position(values, len(self.order))
+            rng.bit_generator.state = values["rng"]
+            counters = dict(values["counters"])
+            restored = Counters(changes=Changes(**counters.pop("changes")), **counters)
+            window = CurveWindow(**values["window"])
+            curve = [CurveRecord.model_validate(record) for record in values["curve"]]
+            curve_seconds = [float(seconds) for seconds in values["curve_seconds"]]
+            seconds = float(values["seconds"])
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
+            raise ValueError(f"{type(error).__name__} in its values") from None
         self.step, self.order = step, arrays["order"]
         self.gaussians = gaussians_of(arrays)
         self.adam = Adam(self.gaussians, self.adam.options, self.adam.backend)
@@ -170,12 +189,8 @@ class TrainState:
             self.appearance.restore(arrays)
         self.rng.bit_generator.state = values["rng"]
         self.position, self.clock = values["position"], values["clock"]
-        counters = dict(values["counters"])
-        self.counters = Counters(changes=Changes(**counters.pop("changes")), **counters)
-        self.window = CurveWindow(**values["window"])
-        self.curve = [CurveRecord.model_validate(record) for record in values["curve"]]
-        self.curve_seconds = values["curve_seconds"]
-        self.seconds = values["seconds"]
+        self.counters, self.window, self.curve = restored, window, curve
+        self.curve_seconds, self.seconds = curve_seconds, seconds
 
 
 def gaussians_of(arrays: dict[str, NDArray[Any]]) -> Gaussians:

@@ -51,7 +51,7 @@ def other_build(values: dict[str, Any], build: Mapping[str, str]) -> str | None:
     equal to the last bit only with one build, but of the same quality with any."""
     before = values.get("built")
     facts = "{instruction_set} ({compiler})"
-    if before is None or before == build:
+    if not isinstance(before, dict) or before == build or not before.keys() >= build.keys():
         return None
     return (
         f"training continues with {facts.format(**build)} from a checkpoint made with "

@@ -30,6 +30,8 @@ MAX_PIXELS = 1 << 29
 # Decoders that hold several copies of the pixels, and the bytes that they take for each.
 _DECODER_BYTES = {"WEBP": 24, "AVIF": 16, "HEIF": 16}
 _MAX_DECODED = 3 << 30
+# The largest side that libpng decodes.
+_MAX_SIDE = 1_000_000
 MAX_BYTES = 4 << 30
 """Largest file of a photograph: ``MAX_PIXELS`` of 16-bit RGB and alpha."""
 # The formats of the supported suffixes. PIL recognises a file by its content, and has decoders that
@@ -176,6 +178,8 @@ def _stored_size(image: Image.Image) -> tuple[int, int]:
 
 def check_size(width: int, height: int) -> None:
     """Raises: ValueError: more pixels than a photograph or a video has."""
+    if max(width, height) > _MAX_SIDE:
+        raise ValueError(f"{width}x{height} pixels: a side of more than {_MAX_SIDE}; reduce it")
     if width * height > MAX_PIXELS:
         raise ValueError(
             f"{width}x{height} pixels are more than {MAX_PIXELS // 10**6} megapixels; reduce it"

@@ -128,6 +128,8 @@ def _stored(data: bytes, image: Image.Image) -> _Stored | None:
     if image.format in ("AVIF", "HEIF"):
         return _Stored(_by_pillow(image), colours)
     picture = _of_tiff(data, image) if tiff.is_tiff(data) else _by_opencv(data)
+    if picture is None and image.format == "PNG":
+        return None  # Damaged: Pillow takes missing rows for black.
     if picture is None:  # OpenCV lacks some compressions.
         return _Stored(_by_pillow(image), colours)
     key = image.info.get("transparency")

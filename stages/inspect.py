@@ -41,6 +41,7 @@ def work(job: Job) -> None:
     from pipeline.plan.given_poses import load_given
     from pipeline.plan.point_cloud import read_point_cloud
     from pipeline.plan.scan import scan
+    from pipeline.sfm.pose_check import check_poses
 
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])
@@ -61,6 +62,14 @@ def work(job: Job) -> None:
             folder / poses.path, poses.kind, manifest.photos, found.listed, found.base_folder
         )
         job.add_messages(given.write(job.out), [])
+        if config.poses != "trust":
+            check = check_poses(
+                given.normalization.model_to_given(given.model),
+                manifest.photos,
+                poses.kind,
+                folder / poses.path,
+            )
+            job.add_messages(check.decisions, check.warnings)
         model = given.model
         given_counts = {"given_poses": len(model.images), "given_points": len(model.points)}
     if found.cloud is not None:

@@ -26,9 +26,9 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
     poses, freed = scan.poses, settled.config.sfm.refine_principal_point
     if poses is None:
         return StagePlan(run=False, reason="no poses are given; sfm adjusts the poses it finds")
-    if settled.config.poses == "keep":
+    if (wanted := settled.config.poses) in ("keep", "trust"):
         return StagePlan(
-            run=False, reason="given poses are not adjusted, as configured (poses: keep)"
+            run=False, reason=f"given poses are not adjusted, as configured (poses: {wanted})"
         )
     if freed == "no":
         return StagePlan(run=False, reason="principal points are fixed, as configured")

@@ -399,11 +399,12 @@ class Config(Section):
     preset: Literal["fast", "balanced", "high", "original"] = Field(
         "balanced", description="Set of default values; other options take precedence."
     )
-    poses: Literal["auto", "keep", "ignore"] = Field(
+    poses: Literal["auto", "keep", "trust", "ignore"] = Field(
         "auto",
         description="Poses in the scene folder. auto: used, and refined by bundle adjustment of "
         "their own tracks if the principal points are only assumed; keep: used without changes; "
-        "ignore: not used, poses are estimated.",
+        "trust: as keep, and not compared with the photographs; ignore: not used, poses are "
+        "estimated.",
     )
     seed: Seed = Field(0, description="Seed of all random numbers.")
     inspect: Inspect = Field(default_factory=Inspect)

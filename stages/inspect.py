@@ -41,7 +41,7 @@ def work(job: Job) -> None:
     from pipeline.plan.given_poses import load_given
     from pipeline.plan.point_cloud import read_point_cloud
     from pipeline.plan.scan import scan
-    from pipeline.sfm.pose_check import check_poses
+    from pipeline.sfm.pose_check.check import check_poses
 
     config = read_section(Config, job.key["config"])
     folder = Path(job.key["folder"])

@@ -19,8 +19,8 @@ from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
-from pipeline.sfm.pose_check import PoseCheck, check_poses
-from pipeline.sfm.pose_conventions import OPENGL
+from pipeline.sfm.pose_check.check import PoseCheck, check_poses
+from pipeline.sfm.pose_check.conventions import OPENGL
 
 Scene = tuple[Reconstruction, tuple[Photo, ...]]
 

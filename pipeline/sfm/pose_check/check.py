@@ -1,7 +1,7 @@
 """Comparison of given poses with the photographs' own matches, before anything expensive.
 
 A few pairs of photographs are matched without their poses. If most matches miss the epipolar
-geometry of the given poses, other readings of the file are tried (``pose_conventions``), and the
+geometry of the given poses, other readings of the file are tried (``readings``), and the
 error names the one that the matches fit.
 """
 
@@ -21,14 +21,9 @@ from pipeline.io.poses.kinds import PoseKind
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import Reconstruction
-from pipeline.sfm.pose_conventions import (
-    PoseSet,
-    Reading,
-    readings,
-    translation_centres,
-    turned_readings,
-)
-from pipeline.sfm.pose_matches import MatchedPair, PairFinder, relative_focal
+from pipeline.sfm.pose_check.conventions import PoseSet, Reading
+from pipeline.sfm.pose_check.matches import MatchedPair, PairFinder, relative_focal
+from pipeline.sfm.pose_check.readings import readings, translation_centres, turned_readings
 
 Array = NDArray[np.float64]
 

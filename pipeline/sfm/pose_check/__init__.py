@@ -1,0 +1,1 @@
+"""Comparison of given poses with the photographs' own matches."""

@@ -26,6 +26,8 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    PoseOutcome,
+    PoseResult,
     ScalingResult,
     SlurmResult,
     StabilityResult,
@@ -333,6 +335,23 @@ def lenses(found: Sequence[WideResult]) -> str:
     return markdown.table(rows)
 
 
+def pose_conventions(records: Sequence[Stored]) -> str:
+    return poses_table(results(records, Record[PoseResult]))
+
+
+def poses_table(found: Sequence[PoseResult]) -> str:
+    """A row for each scene: the outcomes of its mistakes, and of its right poses."""
+    rows = [["scene", "mistakes", "named", "refused otherwise", "warned", "silent", "right poses"]]
+    for scene in dict.fromkeys(r.scene for r in found):
+        wrong = [r.outcome for r in found if r.scene == scene and r.mistake]
+        right = [r.outcome for r in found if r.scene == scene and not r.mistake]
+        kinds: tuple[PoseOutcome, ...] = ("named", "refused", "warned", "silent")
+        counts = [str(wrong.count(kind)) if wrong else "-" for kind in kinds]
+        of_right = ", ".join(f"{right.count(o)} {o}" for o in dict.fromkeys(right)) or "-"
+        rows.append([scene, str(len(wrong)) if wrong else "-", *counts, of_right])
+    return markdown.table(rows)
+
+
 def slurm(records: Sequence[Stored]) -> str:
     return slurm_table(results(records, Record[SlurmResult]))
 
@@ -370,6 +389,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "raster_stress": raster_stress,
     "blocks": blocks,
     "budgets": budgets,
+    "pose_conventions": pose_conventions,
     "scaling": scaling,
     "slurm": slurm,
     "video": video,

@@ -6,6 +6,7 @@ The SfM benchmark's are in ``benchmarks.sfm.summary``.
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Literal
 
 from benchmarks.judge.truth import Grade, Truth
 
@@ -473,3 +474,30 @@ class BudgetResult:
     benchmark: str | None
     published_scene: str | None
     deviations: list[str]
+
+
+# ---- benchmarks.pose_conventions ----
+
+PoseOutcome = Literal["agree", "named", "refused", "warned", "silent"]
+"""What became of given poses: used after a comparison that found them right; refused with the right
+cause, or with another; used with a warning; used without a comparison, or although they are
+wrong."""
+
+
+@dataclass(frozen=True)
+class PoseResult:
+    """A pose file, right or with one mistake.
+
+    Attributes:
+        program: the format; empty for the scene's own file.
+        mistake: empty for right poses.
+        text: what was said.
+        seconds: the time of plan and comparison; features and matches are computed once a scene.
+    """
+
+    scene: str
+    program: str
+    mistake: str
+    outcome: PoseOutcome
+    text: str
+    seconds: float

@@ -16,6 +16,8 @@ Array = NDArray[np.float64]
 # them holds right ones alone with a probability above 0.99.
 _SAMPLES = 1200
 _SAMPLE_SIZE = 8
+# Matches, evenly distributed in their order, by which the samples are compared.
+_JUDGED = 400
 _REFITS = 3
 # Below this, translations are zero and directions parallel.
 _TINY = 1e-9
@@ -91,8 +93,10 @@ def consistent_matches(one: Array, two: Array, tolerance: float) -> NDArray[np.b
     rows = products[samples]
     # The eigenvector of the smallest eigenvalue is the matrix whose products are zero.
     matrices = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
-    agree = _plane_angles(matrices, one, two) < tolerance
-    best = agree[int(agree.sum(axis=1).argmax())]
+    judged = np.linspace(0, count - 1, min(count, _JUDGED)).astype(np.int64)
+    agree = _plane_angles(matrices, one[judged], two[judged]) < tolerance
+    first = int(agree.sum(axis=1).argmax())
+    best = _plane_angles(matrices[first : first + 1], one, two)[0] < tolerance
     for _ in range(_REFITS):
         if best.sum() < _SAMPLE_SIZE:
             break

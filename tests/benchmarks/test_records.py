@@ -23,6 +23,7 @@ from benchmarks.results import (
     MemoryResult,
     MeshResult,
     PageResult,
+    PoseResult,
     ScalingResult,
     SlurmResult,
     StabilityResult,
@@ -86,6 +87,11 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
         Record[WideResult],
         WideResult("fisheye", "720x720", 24, 23, 115, 0.01, 0.02, 1e-4, 33.5, 0.95, 0.987),
         "| fisheye | 720x720 | 24 | 23 | 115 | 98.7% | 0.0100, 0.0200 | 0.010% | 33.50 | 0.9500 |",
+    ),
+    "pose_conventions": (
+        Record[PoseResult],
+        PoseResult("fox", "COLMAP text", "axes", "named", "the camera axes look like", 2.5),
+        "| fox | 1 | 1 | 0 | 0 | 0 | - |",
     ),
     "mesh": (
         Record[MeshResult],

@@ -22,7 +22,12 @@ from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.sfm.pose_check.conventions import PoseSet, Reading
-from pipeline.sfm.pose_check.matches import MatchedPair, PairFinder, relative_focal
+from pipeline.sfm.pose_check.matches import (
+    FeatureMatcher,
+    MatchedPair,
+    PairFinder,
+    relative_focal,
+)
 from pipeline.sfm.pose_check.readings import readings, translation_centres, turned_readings
 
 Array = NDArray[np.float64]
@@ -144,7 +149,11 @@ class _Matches:
 
 
 def check_poses(
-    model: Reconstruction, photos: Sequence[Photo], kind: PoseKind, source: Path
+    model: Reconstruction,
+    photos: Sequence[Photo],
+    kind: PoseKind,
+    source: Path,
+    matcher: FeatureMatcher | None = None,
 ) -> PoseCheck:
     """Compare given poses with the photographs' own matches.
 
@@ -153,6 +162,7 @@ def check_poses(
         photos: the photographs, sorted by name.
         kind: the format of the poses.
         source: their file, for the message.
+        matcher: the source of matches; default: one for this check alone.
 
     Raises:
         UserError: the matches contradict the poses; the message names the reading of the file that
@@ -172,7 +182,7 @@ def check_poses(
     turned = turned_readings(given, kind)
     centres = np.stack([given.centres, translation_centres(given, kind)])
     pairs: list[MatchedPair] = []
-    finder = PairFinder(used, given.cameras, centres)
+    finder = PairFinder(used, given.cameras, centres, matcher or FeatureMatcher())
     for pair in finder.pairs():
         if pair is not None:
             pairs.append(pair)

@@ -65,19 +65,41 @@ class MatchedPair:
     found: int
 
 
+class FeatureMatcher:
+    """Matches of two photographs by their features alone. Features and matches are kept, so that
+    several checks of the same photographs compute them once."""
+
+    def __init__(self) -> None:
+        self._features = lru_cache(maxsize=64)(_features)
+        self.match = lru_cache(maxsize=512)(self._match)
+
+    def _match(self, one: Photo, two: Photo) -> tuple[Array, Array]:
+        """(M, 2) pixels of the matches in both stored photographs."""
+        (xy_one, table_one), (xy_two, table_two) = self._features(one), self._features(two)
+        matches = mutual_matches(table_one, table_two, _MAX_RATIO)
+        return xy_one[matches[:, 0]], xy_two[matches[:, 1]]
+
+
 class PairFinder:
-    """Finds pairs of photographs with matches; detects the features of each photograph once.
+    """Finds pairs of photographs with matches.
 
     Args:
         photos: photographs in the order of their names.
         cameras: their given cameras, which may be wrong.
         centres: (K, N, 3) positions of the photographs according to K readings of the poses, of
             which near ones are tried if the neighbours in the order of names do not match.
+        matcher: the source of matches.
     """
 
-    def __init__(self, photos: Sequence[Photo], cameras: Sequence[Camera], centres: Array) -> None:
+    def __init__(
+        self,
+        photos: Sequence[Photo],
+        cameras: Sequence[Camera],
+        centres: Array,
+        matcher: FeatureMatcher,
+    ) -> None:
         self._photos, self._cameras, self._centres = photos, cameras, centres
-        self._features = lru_cache(maxsize=64)(self._detect)
+        self._matcher = matcher
         self.tried = 0
 
     def pairs(self) -> Iterator[MatchedPair | None]:
@@ -128,9 +150,7 @@ class PairFinder:
         if one == two:
             return None
         self.tried += 1
-        (xy_one, table_one), (xy_two, table_two) = self._features(one), self._features(two)
-        matches = mutual_matches(table_one, table_two, _MAX_RATIO)
-        xy_one, xy_two = xy_one[matches[:, 0]], xy_two[matches[:, 1]]
+        xy_one, xy_two = self._matcher.match(self._photos[one], self._photos[two])
         sizes = [max(self._photos[i].width, self._photos[i].height) for i in (one, two)]
         moved = np.linalg.norm(xy_one / sizes[0] - xy_two / sizes[1], axis=1) > _FIXED
         if 2 * moved.sum() > len(moved):
@@ -159,10 +179,11 @@ class PairFinder:
             len(rows),
         )
 
-    def _detect(self, index: int) -> tuple[Array, NDArray[np.uint8]]:
-        """(F, 2) pixels of the stored photograph and (F, 128) descriptors."""
-        found = detect(DetectionImage(self._photos[index], MAX_SIDE_PX), MAX_FEATURES)
-        return found.xy.astype(np.float64), found.descriptors
+
+def _features(photo: Photo) -> tuple[Array, NDArray[np.uint8]]:
+    """(F, 2) pixels of the stored photograph and (F, 128) descriptors."""
+    found = detect(DetectionImage(photo, MAX_SIDE_PX), MAX_FEATURES)
+    return found.xy.astype(np.float64), found.descriptors
 
 
 def relative_focal(camera: Camera) -> float:

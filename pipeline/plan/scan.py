@@ -29,11 +29,13 @@ from pipeline.io.posefiles import (
 from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
 from pipeline.plan.depth_maps import check_depth_maps
+from pipeline.plan.faults import Faults
 from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
 from pipeline.plan.given_cameras import check_given
 from pipeline.plan.given_poses import GivenFiles
-from pipeline.plan.ground_control import find_ground_control
+from pipeline.plan.ground_control import GroundControlFile, find_ground_control
 from pipeline.plan.inventory import Inventory
+from pipeline.plan.listed_split import Part
 from pipeline.plan.panoramas import partial_panoramas
 from pipeline.plan.photo_folder import choose_photo_folder, read_all, uses_masks
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
@@ -199,10 +201,12 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
 def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     _check_folder(folder)
     facts_cache = FactCache(cache)
+    faults = Faults()
     warnings: list[str] = []
     poses = None
     if config.poses != "ignore":
-        poses = find_poses(folder, facts_cache)
+        with faults.of("poses", "models", "unlisted"):
+            poses = find_poses(folder, facts_cache)
         warnings += [*incomplete_models(folder), *other_models(folder, poses)]
 
     chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
@@ -224,8 +228,10 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     if not videos and len(facts) < max(config.inspect.min_images, 1):
         given = [file] if (file := ground_control_file(folder)) is not None else []
         given += pose_files(folder / poses.path, poses.kind) if poses is not None else []
-        named = [*photographs, *given, *(folder / name for name in found_videos)]
-        warnings += Inventory(folder, chosen, poses, named, _ignored(config)).unused()
+        named = [*photographs, *given, *(folder / name for name in found_videos), *faults.files]
+        ignored = _ignored(config) | faults.kinds
+        warnings += Inventory(folder, chosen, poses, named, ignored).unused()
+        faults.check(warnings)
         if not facts:
             _no_photographs(folder, [*chosen.names, *listed_videos], warnings)
         raise UserError(
@@ -234,14 +240,21 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
             file=folder / chosen.path,
             fix="add photographs, or lower inspect.min_images",
         )
-    if poses is not None:
-        check_pose_names(folder, poses, chosen, sorted(facts), warnings)
-    split = split_of(poses, chosen, sorted(facts), config, warnings)
+    posed = poses is not None or bool(faults)
+    split: dict[str, Part | None] = {}
+    with faults.of("unlisted"):
+        if poses is not None:
+            check_pose_names(folder, poses, chosen, sorted(facts), warnings)
+        split = split_of(poses, chosen, sorted(facts), config, warnings)
     facts = {name: found for name, found in facts.items() if not split or split[name]}
 
-    masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
-    depths = depths_of(folder, chosen, facts)
-    check_depth_maps(depths, facts, facts_cache)
+    masks: dict[str, Path] = {}
+    depths: dict[str, Path] = {}
+    with faults.of("masks"):
+        masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
+    with faults.of("depths"):
+        depths = depths_of(folder, chosen, facts)
+        check_depth_maps(depths, facts, facts_cache)
     photos = [
         _photo(
             folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
@@ -250,21 +263,27 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     ]
     warnings += unread_colours(facts)
     extent = None
-    if poses is None:
+    if not posed:
         warnings += partial_panoramas(facts)
-    else:
-        extent = check_given(
-            GivenFiles(folder / poses.path, poses.kind, tuple(chosen.names), chosen.base),
-            photos,
-            facts_cache,
-        )
-    if poses is None and config.sfm.georeference != "none":
+    elif poses is not None and not faults:
+        with faults.of("unlisted"):
+            extent = check_given(
+                GivenFiles(folder / poses.path, poses.kind, tuple(chosen.names), chosen.base),
+                photos,
+                facts_cache,
+            )
+    if not posed and config.sfm.georeference != "none":
         warnings += fault_warnings(facts)
     truth = truth_folder(folder)
-    control = find_ground_control(
-        folder, config, photos, warnings, posed=poses is not None, complete=not videos
-    )
-    cloud = find_point_cloud(folder, config, poses, control.path is not None, facts_cache, warnings)
+    control, cloud = GroundControlFile(), None
+    with faults.of():
+        control = find_ground_control(
+            folder, config, photos, warnings, posed=posed, complete=not videos
+        )
+    with faults.of("clouds"):
+        cloud = find_point_cloud(
+            folder, config, poses, control.path is not None, facts_cache, warnings
+        )
     manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
     used = [*photographs, *masks.values(), *depths.values()]
     used += [folder / name for name in found_videos]
@@ -272,7 +291,9 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
     used += [control.path] if control.path is not None else []
     used += [folder / name for name in cloud.files] if cloud is not None else []
     used += pose_files(truth, "colmap") if truth is not None else []
-    inventory = Inventory(folder, chosen, poses, used, _ignored(config))
+    ignored = _ignored(config) | faults.kinds
+    unused = Inventory(folder, chosen, poses, [*used, *faults.files], ignored).unused()
+    faults.check([*unused, *warnings])
     result = Scan(
         folder=folder,
         manifest=manifest,
@@ -285,7 +306,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         ground_control=control.path,
         ground_control_text=control.text,
         cloud=cloud,
-        unused=tuple(inventory.unused()),
+        unused=tuple(unused),
         given_extent=extent,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,

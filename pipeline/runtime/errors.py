@@ -24,7 +24,12 @@ class UserError(Exception):
         what: what is wrong, in one sentence: what was expected and what was found.
         file: the file or folder concerned, if any.
         fix: what to do, in one sentence.
+
+    Attributes:
+        warnings: Sentences about other files of the same input, to be shown before the error.
     """
+
+    warnings: tuple[str, ...] = ()
 
     def __init__(self, what: str, *, file: str | Path | None = None, fix: str | None = None):
         self.what, self.file = _printable(what, _MAX_WHAT), file

@@ -446,6 +446,8 @@ def _sources(spec: StageSpec, plan: Plan, name: str) -> dict[str, Path]:
 
 
 def _exit(error: UserError) -> NoReturn:
-    """End Snakemake with the error's message, without a traceback."""
+    """End Snakemake with the error's warnings and message, without a traceback."""
+    for warning in error.warnings:
+        print(f"  warning: {warning}", file=sys.stderr)
     print(f"error: {error}", file=sys.stderr, flush=True)
     raise SystemExit(2) from None

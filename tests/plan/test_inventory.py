@@ -370,3 +370,40 @@ def test_the_model_before_undistortion_is_used_with_its_photographs(tmp_path):
 
 def test_first_names():
     assert first_names(["a"], 2) == "a" and first_names(["a", "b", "c"], 2) == "a, b and 1 more"
+
+
+# --- errors -------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    "name, content, first",
+    [
+        ("GCP_list.txt", b"EPSG:32632\nnonsense", "line 2"),
+        ("transforms.json", b"{", "transforms.json"),
+        ("poses_bounds.npy", b"nonsense", "poses_bounds.npy"),
+        ("masks/p00.png", b"", "masks/p00.png"),
+    ],
+)
+def test_an_error_in_one_file_does_not_hide_the_others(tmp_path, name, content, first):
+    photos(tmp_path / "images", 3)
+    (tmp_path / "masks").mkdir()
+    (tmp_path / name).write_bytes(content)
+    (tmp_path / "geo.txt").write_bytes(b"content")
+    picture(tmp_path / "Masks_old" / "p00.png", mode="L")
+    with pytest.raises(UserError, match=first) as error:
+        look(tmp_path)
+    named = [line for line in error.value.warnings if "not used" in line]
+    assert sum("geo.txt" in line for line in named) == 1
+    if name.startswith("masks"):  # Its masks are unknown.
+        assert len(named) == 1
+    else:
+        assert sum("Masks_old/p00.png" in line for line in named) == 1 and len(named) == 2
+
+
+def test_errors_in_two_files_are_both_shown(tmp_path):
+    photos(tmp_path / "images", 3)
+    (tmp_path / "GCP_list.txt").write_text("EPSG:32632\nnonsense")
+    picture(tmp_path / "masks" / "p00.png", size=(8, 8), mode="L")
+    with pytest.raises(UserError, match="the mask is 8x8") as error:
+        look(tmp_path)
+    assert any("GCP_list.txt: line 2" in line for line in error.value.warnings)

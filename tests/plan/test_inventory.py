@@ -12,6 +12,7 @@ from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 
 from pipeline.io import walk as walks
+from pipeline.io.colmap import read_model, write_model
 from pipeline.io.names import PHOTO_SUFFIXES, first_names, suffix_of
 from pipeline.plan.inventory import _SIDE_CARS, _TEXTS
 from pipeline.runtime.errors import UserError
@@ -342,9 +343,7 @@ def test_photographs_and_masks_that_differ_in_case(tmp_path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_of_several_models_the_one_of_the_most_images_is_used(tmp_path, text):
-    from pipeline.io.colmap import read_model, write_model
-
+def test_of_several_models_the_one_with_the_most_photographs_is_used(tmp_path, text):
     photos(tmp_path / "images", 4)
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg"], SIZE)
     write_sparse(tmp_path / "sparse" / "1", [f"p0{i}.jpg" for i in range(1, 4)], SIZE)
@@ -354,7 +353,41 @@ def test_of_several_models_the_one_of_the_most_images_is_used(tmp_path, text):
     found = look(tmp_path)
     assert found.poses is not None and found.poses.path == "sparse/1"
     (line,) = (line for line in found.warnings if "of 2 COLMAP models" in line)
-    assert "sparse/1 is used, which has the most images (3); not used: sparse/0 (1 images)" in line
+    assert "sparse/1 (3 images) is used, which has the most photographs" in line
+    assert "not used: sparse/0 (1 images)" in line
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_images_of_other_scenes_do_not_count_in_the_choice_of_a_model(tmp_path, text):
+    photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", *(f"q{i}.jpg" for i in range(5))], SIZE)
+    write_sparse(tmp_path / "sparse" / "1", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    for name in ("0", "1"):
+        model = read_model(tmp_path / "sparse" / name)
+        write_model(tmp_path / "sparse" / name, model, text=text)
+    found = look(tmp_path)
+    assert found.poses is not None and found.poses.path == "sparse/1"
+    assert any("not used: sparse/0 (1 of 6 images)" in line for line in found.warnings)
+
+
+def test_text_files_beside_binary_ones_are_named(tmp_path):
+    photos(tmp_path / "images", 3)
+    model = tmp_path / "sparse" / "0"
+    write_sparse(model, [f"p0{i}.jpg" for i in range(3)], SIZE)
+    (model / "images.txt").write_text("# from another program\n")
+    (line,) = look(tmp_path).warnings
+    assert line == "sparse/0 has binary and text files; the binary ones are used, not images.txt"
+
+
+def test_a_damaged_model_is_an_error_if_it_has_the_most_images(tmp_path):
+    photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    write_sparse(tmp_path / "sparse" / "1", ["p00.jpg"], SIZE)
+    images = tmp_path / "sparse" / "0" / "images.bin"
+    images.write_bytes(images.read_bytes()[:-20])
+    with pytest.raises(UserError, match="ends too early") as error:
+        look(tmp_path)
+    assert error.value.file == images
 
 
 def test_the_model_before_undistortion_is_used_with_its_photographs(tmp_path):

@@ -17,10 +17,12 @@ from benchmarks.judge.truth import Grade
 from benchmarks.markdown import cell
 from benchmarks.measured import Record, Result
 from benchmarks.results import (
+    GEOREFERENCE_VERDICTS,
     BlocksResult,
     BudgetResult,
     CoverageResult,
     DenseResult,
+    GeoreferenceResult,
     GrowthResult,
     JudgeResult,
     MemoryResult,
@@ -352,6 +354,20 @@ def poses_table(found: Sequence[PoseResult]) -> str:
     return markdown.table(rows)
 
 
+def georeference(records: Sequence[Stored]) -> str:
+    return verdicts_table(results(records, Record[GeoreferenceResult]))
+
+
+def verdicts_table(found: Sequence[GeoreferenceResult]) -> str:
+    """A row for each source of a world frame: the verdicts on its cases."""
+    rows = [["measured by", "cases", "surveys", *GEOREFERENCE_VERDICTS]]
+    for source in ("GPS", "ground control points"):
+        own = [r for r in found if r.case.startswith("GPS") == (source == "GPS")]
+        counts = [sum(r.verdict == verdict for r in own) for verdict in GEOREFERENCE_VERDICTS]
+        rows.append([source, str(len({r.case for r in own})), str(len(own)), *map(str, counts)])
+    return markdown.table(rows)
+
+
 def slurm(records: Sequence[Stored]) -> str:
     return slurm_table(results(records, Record[SlurmResult]))
 
@@ -389,6 +405,7 @@ TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
     "raster_stress": raster_stress,
     "blocks": blocks,
     "budgets": budgets,
+    "georeference": georeference,
     "pose_conventions": pose_conventions,
     "scaling": scaling,
     "slurm": slurm,

@@ -10,6 +10,29 @@ from typing import Literal
 
 from benchmarks.judge.truth import Grade, Truth
 
+# ---- benchmarks.georeference ----
+
+GEOREFERENCE_VERDICTS = ("right", "refused", "stated", "silently wrong")
+
+
+@dataclass(frozen=True)
+class GeoreferenceResult:
+    """What the program made of a case.
+
+    Attributes:
+        verdict: One of ``GEOREFERENCE_VERDICTS``.
+        said: The messages to the user.
+        errors: The relative error of the scale, the angle of the frame's rotation in degrees, and
+            the largest horizontal and vertical errors of cameras, metres; None without a frame.
+    """
+
+    case: str
+    seed: int
+    verdict: str
+    said: str
+    errors: tuple[float, float, float, float] | None
+
+
 # ---- benchmarks.mesh ----
 
 

@@ -138,7 +138,8 @@ def _signed(degrees: float, reference: Any, letters: str) -> float | None:
 
 
 def _altitude(tags: Mapping[int, Any]) -> float | None:
-    """Metres above the reference; None if it is missing, no number or impossible."""
+    """Metres above the reference; None if it is missing, no number or impossible. Receivers that
+    measure no altitude write exactly 0, which counts as unknown."""
     altitude, reference = _number(tags.get(_GPS.GPSAltitude)), tags.get(_GPS.GPSAltitudeRef)
     if isinstance(reference, tuple | list) and len(reference) == 1:
         reference = reference[0]
@@ -151,7 +152,7 @@ def _altitude(tags: Mapping[int, Any]) -> float | None:
 
 
 def _possible(altitude: float) -> float | None:
-    return altitude if _ALTITUDES[0] <= altitude <= _ALTITUDES[1] else None
+    return altitude if altitude and _ALTITUDES[0] <= altitude <= _ALTITUDES[1] else None
 
 
 def _number(value: Any) -> float:

@@ -58,6 +58,7 @@ MAX_TILT_RAD = float(np.radians(5.0))
 # A mistake explains a misfit if undoing it reduces the residuals by this factor.
 EXPLAINS = 3.0
 FOOT_M = 0.3048
+_ON_A_LINE = "the ground control points lie on a line"
 _UP = np.array([0.0, 0.0, 1.0])
 
 
@@ -93,8 +94,12 @@ def from_gcp(
     noise = _noise(source, target, pixel)
     fit = robust_similarity(source, target, np.ones(3), noise)
     if fit is None:
-        return "the ground control points lie on a line"
+        return _ON_A_LINE
     fit = robust_similarity(source, target, np.ones(3), _noise(source, target, pixel, fit)) or fit
+    # With the errors that such measurements usually have: those of a mistake are larger.
+    usual = min(1.0, noise.sigma / max(fit.sigma, 1e-300))
+    if fit.uncertainty.tilt * usual > MAX_TILT_RAD:
+        return _line_text(fit)
     contradiction = _contradiction(cameras, fit.similarity)
     mistake = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
     if mistake is not None:
@@ -102,6 +107,13 @@ def from_gcp(
             f"{mistake.found}: {mistake.evidence}",
             file=path,
             fix=f"{mistake.fix}, or set sfm.georeference: gps or none",
+        )
+    if len(placed) > MIN_POSITIONS and np.ptp(places[:, 2]) == 0 and not fit.inliers.all():
+        raise UserError(
+            f"all {len(placed)} points have the height {places[0, 2]:g}, which "
+            f"{int((~fit.inliers).sum())} of them do not have in the photographs",
+            file=path,
+            fix="write the measured heights, or set sfm.georeference: gps or none",
         )
     if contradiction == "upside down":
         raise UserError(
@@ -113,10 +125,7 @@ def from_gcp(
     if (reason := undetermined(fit)) is not None:
         return f"of the ground control points, {reason}"
     if fit.uncertainty.tilt > MAX_TILT_RAD:
-        return (
-            "the ground control points lie on a line: they determine the tilt about it to "
-            f"{min(np.degrees(fit.uncertainty.tilt), 180.0):.0f} degrees only"
-        )
+        return _line_text(fit)
     names_used = [point.name for point, _ in placed]
     records = residual_records(names_used, fit.similarity(source) - target, fit.inliers)
     totals = summary(records, fit.observations, fit.freedoms)
@@ -153,6 +162,11 @@ def from_gcp(
         ],
         warnings=warnings,
     )
+
+
+def _line_text(fit: RobustFit) -> str:
+    tilt = min(np.degrees(fit.uncertainty.tilt), 180.0)
+    return f"{_ON_A_LINE}: they determine the tilt about it to {tilt:.0f} degrees only"
 
 
 def _local(control: GroundControl, places: Array) -> tuple[Array, Origin]:

@@ -42,6 +42,12 @@ ALTITUDE_RATIO = 3.0
 MAX_ANGLE_RAD, MUCH_WORSE = float(np.radians(20.0)), 2.0
 # The view downwards as up direction replaces that of the images' tops if it fits so much better.
 BETTER_FIT = 0.5
+# Largest standard deviation of positions that are used: metres, or this share of their extent up to
+# so many metres, since poses of a long route drift.
+MAX_SIGMA_M, MAX_SIGMA_SHARE, MAX_DRIFT_M = 50.0, 0.02, 1000.0
+# Altitudes are in feet if they vary by this factor, less or more by this share, and by so many
+# standard deviations more than the heights of the cameras; from so many positions.
+FEET_PER_M, FEET_TOLERANCE, FEET_SIGMAS, FEET_POSITIONS = 1 / 0.3048, 0.2, 5.0, 8
 # Positions within this angle of the vertical do not determine the heading.
 _MIN_SLOPE = float(np.sin(np.radians(60.0)))
 
@@ -71,6 +77,12 @@ def from_gps(cameras: Cameras, positions: Positions) -> WorldFrame | str:
     if (reason := undetermined(fit)) is not None:
         size = float(np.sqrt((centred(measured.enu[fit.inliers, :2]) ** 2).sum(1).mean()))
         return f"the GPS positions spread over {size:.1f} m: {reason}"
+    extent = float(np.abs(measured.enu[:, :2]).max())
+    if fit.sigma > max(MAX_SIGMA_M, min(MAX_SIGMA_SHARE * extent, MAX_DRIFT_M)):
+        return (
+            f"the GPS positions contradict each other, or the poses, by about {fit.sigma:.3g} m: "
+            "check the hemispheres (N, S, E, W) and the signs of latitude and longitude"
+        )
     up = fit.similarity.rotation.T @ [0.0, 0.0, 1.0]
     contradiction = cameras.directions and cameras.directions.contradiction(up)
     if contradiction == "upside down":
@@ -82,6 +94,11 @@ def from_gps(cameras: Cameras, positions: Positions) -> WorldFrame | str:
         warnings.append(
             f"in the frame of the GPS positions the photographs are {contradiction}: check that "
             "the scene is upright, or set sfm.georeference: none"
+        )
+    if _in_feet(centres, measured, cameras):
+        warnings.append(
+            "the GPS altitudes seem to be in feet: they vary about three times as much as the "
+            "heights of the cameras; EXIF's unit is the metre: check and convert them"
         )
     residual = fit.similarity(centres) - measured.enu
     residual[measured.weight[:, 2] == 0, 2] = np.nan
@@ -214,6 +231,29 @@ def _instead(
         for f in (fit, upright)
     ]
     return upright if errors[1] <= max(MUCH_WORSE * errors[0], GPS_NOISE.sigma) else None
+
+
+def _in_feet(centres: Array, measured: _Measured, cameras: Cameras) -> bool:
+    """Whether altitudes vary as feet would, in a frame that is fitted to horizontal positions."""
+    horizontal = measured._replace(weight=measured.weight * [1.0, 1.0, 0.0])
+    fit = _upright(cameras.up, centres, horizontal)
+    if fit is None:
+        return False
+    known = (measured.weight[:, 2] > 0) & fit.inliers
+    if known.sum() < FEET_POSITIONS:
+        return False
+    places = centred(fit.similarity(centres[known]))
+    altitudes = measured.enu[known, 2] - measured.enu[known, 2].mean()
+    # With x and y: the tilt of the frame is inaccurate.
+    factors, _, rank, _ = np.linalg.lstsq(places, altitudes, rcond=1e-9)
+    if rank < 3:
+        return False
+    errors = altitudes - places @ factors
+    variance = float(errors @ errors) / (len(errors) - 4) * np.linalg.inv(places.T @ places)[2, 2]
+    factor = float(factors[2])
+    return abs(factor / FEET_PER_M - 1) < FEET_TOLERANCE and factor - 1 > FEET_SIGMAS * float(
+        np.sqrt(variance)
+    )
 
 
 def _up_of(fit: RobustFit) -> Array:

@@ -18,6 +18,7 @@ from benchmarks.results import (
     BudgetResult,
     CoverageResult,
     DenseResult,
+    GeoreferenceResult,
     GrowthResult,
     JudgeResult,
     MemoryResult,
@@ -87,6 +88,11 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
         Record[WideResult],
         WideResult("fisheye", "720x720", 24, 23, 115, 0.01, 0.02, 1e-4, 33.5, 0.95, 0.987),
         "| fisheye | 720x720 | 24 | 23 | 115 | 98.7% | 0.0100, 0.0200 | 0.010% | 33.50 | 0.9500 |",
+    ),
+    "georeference": (
+        Record[GeoreferenceResult],
+        GeoreferenceResult("GPS on a line", 0, "right", "georeferenced", (0.01, 0.1, 1.0, 2.0)),
+        "| GPS | 1 | 1 | 1 | 0 | 0 | 0 |",
     ),
     "pose_conventions": (
         Record[PoseResult],

@@ -29,6 +29,7 @@ from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.views import View
 from tests.fuzz.clouds import CLOUDS
+from tests.fuzz.georeference import GEOREFERENCE
 from tests.fuzz.names import FOLDERS
 from tests.fuzz.packing import pack_glb, pack_gzip, pack_png, pack_zip, unpack_glb, unpack_zip
 from tests.fuzz.pictures import PICTURES
@@ -267,6 +268,7 @@ READERS: dict[str, Reader] = {
     "heic": Reader(photo_seeds(".heic"), read_photo, weight=0.2),
     "exr": Reader(exr_seeds, of_file(read_exr), weight=0.3),
     "video": Reader(video_seeds, of_file(read_video_facts), weight=0.1),
+    **GEOREFERENCE,
     **PICTURES,
     **FOLDERS,
     **VIDEOS,

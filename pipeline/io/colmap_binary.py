@@ -119,6 +119,17 @@ def read_images(
     return images, keypoints
 
 
+def image_names(file: Path) -> list[str]:
+    """The names of the images in ``images`` of a model, without their poses and keypoints."""
+    reader = _Reader(file)
+    names = []
+    for _ in range(reader.count(73)):
+        reader.skip(struct.calcsize("<I7dI"))
+        names.append(reader.name())
+        reader.skip(reader.count(POINT2D.itemsize) * POINT2D.itemsize)
+    return names
+
+
 def read_points(file: Path) -> PointTable:
     """The content of ``points3D``."""
     reader = _Reader(file)

@@ -112,6 +112,18 @@ def read_images(
     return images, keypoints
 
 
+def image_names(file: Path) -> list[str]:
+    """The names of the images in ``images`` of a model, without their poses and keypoints."""
+    names = []
+    lines = _lines(file)
+    types: list[Callable[[str], Any]] = [*[str] * 9, str.strip]
+    for number, line in lines:
+        if line.strip():
+            names.append(_fields(file, number, line, types)[-1])
+            next(lines, None)
+    return names
+
+
 def read_points(file: Path) -> PointTable:
     """The content of ``points3D``."""
     rows: list[list] = []

@@ -10,7 +10,7 @@ from pathlib import Path, PurePosixPath
 from pydantic import BaseModel, ConfigDict, Field
 
 from pipeline.io.colmap import has_model
-from pipeline.io.colmap_models import find_models, model_folders
+from pipeline.io.colmap_models import find_models, model_folders, text_files_beside_binary
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
 from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, suffix_of
@@ -105,16 +105,26 @@ def incomplete_models(folder: Path) -> list[str]:
 
 
 def other_models(folder: Path, poses: GivenPoses | None) -> list[str]:
-    """A warning if the scene has COLMAP models beside the one that is used."""
-    models = find_models(folder)
-    if poses is None or poses.kind != "colmap" or len(models) < 2:
+    """Warnings if the scene has COLMAP models beside the one that is used."""
+    if poses is None or poses.kind != "colmap":
         return []
-    others = ", ".join(f"{path} ({count} images)" for path, count in models[1:4])
-    more = f" and {len(models) - 4} more" if len(models) > 4 else ""
-    return [
-        f"of {len(models)} COLMAP models, {poses.path} is used, which has the most images "
-        f"({models[0][1]}); not used: {others}{more}; remove {poses.path} to use another"
-    ]
+    warnings = []
+    texts = text_files_beside_binary(folder / poses.path)
+    if texts:
+        warnings.append(
+            f"{poses.path} has binary and text files; the binary ones are used, not "
+            f"{', '.join(texts)}"
+        )
+    models = find_models(folder)
+    if len(models) > 1:
+        others = ", ".join(model.text for model in models[1:4])
+        more = f" and {len(models) - 4} more" if len(models) > 4 else ""
+        warnings.append(
+            f"of {len(models)} COLMAP models, {models[0].text} is used, which has the most "
+            f"photographs of this scene; not used: {others}{more}; remove {poses.path} to use "
+            "another"
+        )
+    return warnings
 
 
 def other_pose_files(folder: Path, poses: GivenPoses | None) -> list[Path]:

@@ -88,8 +88,8 @@ _KINDS: Mapping[str, _Kind] = {
     ),
     "models": _Kind(
         "files of COLMAP models",
-        "one COLMAP model is used, that of the most images in sparse/; move the one to use to "
-        "sparse/0",
+        "one COLMAP model is used, the one in sparse/ with the most photographs of this scene; "
+        "move the one to use to sparse/0",
     ),
     "poses": _Kind(
         "pose files",

@@ -108,8 +108,9 @@ def read_photo_gps(folder: Path) -> object:
 
 def read_xmp(folder: Path) -> object:
     found = read_gps({}, (folder / "x.xmp").read_bytes())
-    if found.position is not None:
-        _check(found.position)
+    if found.position is None:
+        raise UserError("expected a position")
+    _check(found.position)
     return found
 
 

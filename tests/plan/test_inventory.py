@@ -4,14 +4,17 @@ from __future__ import annotations
 
 import shutil
 import time
+import unicodedata
 from pathlib import Path, PurePosixPath
 
 import numpy as np
 import pytest
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
+from PIL import Image
 
 from pipeline.io import walk as walks
+from pipeline.io.colmap import read_model, write_model
 from pipeline.io.names import PHOTO_SUFFIXES, first_names, suffix_of
 from pipeline.plan.inventory import _SIDE_CARS, _TEXTS
 from pipeline.runtime.errors import UserError
@@ -20,6 +23,9 @@ from tests.pictures import photos, picture
 from tests.plan.test_scan import config, look, names, write_sparse
 
 SIZE = (64, 48)
+MODEL_STEMS = ("cameras", "images", "points3D", "rigs", "frames")
+# Contents of files: a picture, and a link to nothing.
+PICTURE, LINK = "picture", "link"
 
 
 @pytest.fixture(scope="module")
@@ -32,121 +38,98 @@ def small_scene(tmp_path_factory) -> Path:
     return folder
 
 
-FOLDERS = st.sampled_from(
-    [
-        "images",
-        "images/a",
-        "masks",
-        "masks/b",
-        "depths",
-        "mask",
-        "segmentation",
-        "sparse",
-        "sparse/0",
-        "sparse/1",
-        "orig",
-        "input",
-        "images_2",
-        "videos",
-        "points",
-        "distorted/sparse/0",
-        "keyframes",
-        "color",
-        "Masken",
-        "Köln",
-        "a/b/c",
-        ".",
-    ]
-)
+# fmt: off
+FOLDERS = st.sampled_from([
+    ".", "images", "images/a", "images_2", "input", "orig", "color", "keyframes", "a/b/c", "Köln",
+    unicodedata.normalize("NFD", "Köln"), "masks", "masks/b", "mask", "Masks", "Masken",
+    "segmentation", "images/masks", "depths", "depth", "sparse", "sparse/0", "sparse/1",
+    "colmap/sparse/0", "distorted/sparse/0", "sparse_gt", "videos", "points",
+])
 STEMS = st.one_of(
-    st.sampled_from(
-        [
-            "p00",
-            "p01",
-            "p00_mask",
-            "p01.jpg",
-            "x",
-            "transform",
-            "transforms",
-            "cameras",
-            "geo",
-            "gcp",
-            "points",
-            "metadata",
-            "bundle.out",
-            "readme2",
-            "images",
-            "points3D",
-        ]
-    ),
+    st.sampled_from([
+        "p00", "P00", "p02", "p00_mask", "p01.jpg", "p02_depth", "x", "é",
+        unicodedata.normalize("NFD", "é"), "transform", "transforms", "transforms_train", "cameras",
+        "camera", "images", "points3D", "rigs", "geo", "gps", "gcp", "gcp_list", "GCP_list",
+        "points", "cloud", "poses_bounds", "metadata", "bundle.out", "reconstruction", "Model",
+        "internal_external", "readme2", "pano",
+    ]),
     st.text(st.characters(codec="utf-8", exclude_characters="/.\\", exclude_categories=["C"])),
 )
-ENDINGS = st.sampled_from(
-    [
-        ".png",
-        ".jpg",
-        ".JPEG",
-        ".heic",
-        ".jfif",
-        ".xml",
-        ".json",
-        ".txt",
-        ".csv",
-        ".mp4",
-        ".mts",
-        ".ply",
-        ".las",
-        ".npy",
-        ".bin",
-        ".zip",
-        ".insp",
-        ".bak",
-        ".gif",
-        ".exr",
-        ".yaml",
-        ".pdf",
-        "",
-    ]
-)
+ENDINGS = st.sampled_from([
+    ".png", ".PNG", ".jpg", ".JPEG", ".jfif", ".jpe", ".tif", ".webp", ".heic", ".gif", ".exr",
+    ".insp", ".dng", ".xml", ".json", ".txt", ".csv", ".npy", ".NPY", ".npz", ".bin", ".mp4",
+    ".MOV", ".mts", ".mpg", ".ply", ".las", ".e57", ".pfm", ".zip", ".bak", ".yaml", ".pdf", "",
+])
+CONTENTS = st.sampled_from([
+    b"", b"some content that no reader expects", PICTURE, LINK,
+    "<?xml version='1.0' encoding='UTF-16'?><document/>".encode("utf-16"), b"[]", b"\0" * 64,
+])
+# fmt: on
+
+
+def put(path: Path, content: bytes | str) -> None:
+    """Write one of ``CONTENTS``."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    if content == PICTURE:
+        Image.new("L", SIZE, 200).save(path, format="PNG" if suffix_of(path.name) else "JPEG")
+    elif content == LINK:
+        path.symlink_to("nothing")
+    else:
+        assert isinstance(content, bytes)
+        path.write_bytes(content)
+
+
+def is_no_input(path: PurePosixPath) -> bool:
+    """Whether the guides say that a file of this path is not for reconstruction."""
+    return (
+        path.name[0] == "."
+        or suffix_of(path.name) in _SIDE_CARS
+        or path.stem.casefold() in _TEXTS
+        # Reduced copies of photographs, which the reason for the choice of the folder names.
+        or (path.parts[0] == "images_2" and suffix_of(path.name) in PHOTO_SUFFIXES)
+        # Parts of the COLMAP model that is used, and ground truth.
+        or (path.parts[0] == "sparse_gt" and path.stem in MODEL_STEMS)
+        or (path.parent.as_posix() == "sparse/0" and path.stem in ("rigs", "frames"))
+        or path.as_posix() == "sparse/0/points3D.ply"
+    )
 
 
 @settings(
-    max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=200, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
-@example("distorted/sparse/0", "cameras", ".bin")
-@example("Köln", "transforms", ".json.bak")
-@example("masks", "p00_mask", ".png")
-@given(FOLDERS, STEMS, ENDINGS)
-def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, ending):
-    name = f"{stem[:40]}{ending}".strip() or "x"
-    if name.startswith(".") or suffix_of(name) in _SIDE_CARS or PurePosixPath(name).stem in _TEXTS:
-        return
+@example("distorted/sparse/0", "cameras", ".bin", b"")
+@example("Köln", "transforms", ".json.bak", b"[]")
+@example("masks", "p00_mask", ".png", PICTURE)
+@example("sparse/0", "images", ".txt", b"")
+@example(".", "GCP_list", ".txt", b"")
+@example(".", "cameras", ".xml", "<a/>".encode("utf-16"))
+@example("images", "p02", ".jfif", LINK)
+@given(FOLDERS, STEMS, ENDINGS, CONTENTS)
+def test_any_file_is_used_or_named(small_scene, tmp_path_factory, folder, stem, ending, content):
+    """A warning or an error names the file, or the scene is another one with it."""
+    relative = PurePosixPath(folder) / (f"{stem[:40]}{ending}".strip() or "x")
     scene = tmp_path_factory.mktemp("any") / "scene"
     shutil.copytree(small_scene, scene)
-    before = look(scene)
-    path = scene / folder / name
-    if path.exists():
+    path = scene / relative
+    if is_no_input(relative) or path.exists():
+        shutil.rmtree(scene.parent)
         return
-    path.parent.mkdir(parents=True, exist_ok=True)
-    if ending in (".png", ".jpg", ".JPEG", ".jfif"):
-        picture(path.with_suffix(".png"), mode="L")
-        path.with_suffix(".png").rename(path)
-    else:
-        path.write_bytes(b"some content that no reader expects")
+    before = look(scene)
+    put(path, content)
+    used, error = False, ""
     try:
         after = look(scene)
-    except UserError as error:
-        # The error names the file, its folder, or the file that it contradicts.
-        assert name in str(error) or path.parent.name in str(error)
-        return
+    except UserError as found:
+        lines, error = found.warnings, str(found)
+    else:
+        lines = after.warnings
+        used = after.fingerprint != before.fingerprint
     finally:
         shutil.rmtree(scene.parent)
-    name = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in name)
-    named = any(name in line or path.parent.name in line for line in after.warnings)
-    used = after.fingerprint != before.fingerprint
-    known = path.parent.name == "0" and stem in ("cameras", "images", "points3D")
-    copy = folder == "images_2" and suffix_of(name) in PHOTO_SUFFIXES
-    assert named or used or known or copy, after.warnings
+    name = "".join(c if c.isprintable() else "\N{REPLACEMENT CHARACTER}" for c in relative.name)
+    escaped = "".join(c if c.isprintable() else ascii(c)[1:-1] for c in relative.name)
+    named = any(name in line for line in lines if line not in before.warnings)
+    assert named or used or name in error or escaped in error, (relative, lines, error)
 
 
 def test_each_kind_is_named_with_its_reason(tmp_path):
@@ -342,9 +325,7 @@ def test_photographs_and_masks_that_differ_in_case(tmp_path):
 
 
 @pytest.mark.parametrize("text", [False, True])
-def test_of_several_models_the_one_of_the_most_images_is_used(tmp_path, text):
-    from pipeline.io.colmap import read_model, write_model
-
+def test_of_several_models_the_one_with_the_most_photographs_is_used(tmp_path, text):
     photos(tmp_path / "images", 4)
     write_sparse(tmp_path / "sparse" / "0", ["p00.jpg"], SIZE)
     write_sparse(tmp_path / "sparse" / "1", [f"p0{i}.jpg" for i in range(1, 4)], SIZE)
@@ -354,7 +335,41 @@ def test_of_several_models_the_one_of_the_most_images_is_used(tmp_path, text):
     found = look(tmp_path)
     assert found.poses is not None and found.poses.path == "sparse/1"
     (line,) = (line for line in found.warnings if "of 2 COLMAP models" in line)
-    assert "sparse/1 is used, which has the most images (3); not used: sparse/0 (1 images)" in line
+    assert "sparse/1 (3 images) is used, which has the most photographs" in line
+    assert "not used: sparse/0 (1 images)" in line
+
+
+@pytest.mark.parametrize("text", [False, True])
+def test_images_of_other_scenes_do_not_count_in_the_choice_of_a_model(tmp_path, text):
+    photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", ["p00.jpg", *(f"q{i}.jpg" for i in range(5))], SIZE)
+    write_sparse(tmp_path / "sparse" / "1", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    for name in ("0", "1"):
+        model = read_model(tmp_path / "sparse" / name)
+        write_model(tmp_path / "sparse" / name, model, text=text)
+    found = look(tmp_path)
+    assert found.poses is not None and found.poses.path == "sparse/1"
+    assert any("not used: sparse/0 (1 of 6 images)" in line for line in found.warnings)
+
+
+def test_text_files_beside_binary_ones_are_named(tmp_path):
+    photos(tmp_path / "images", 3)
+    model = tmp_path / "sparse" / "0"
+    write_sparse(model, [f"p0{i}.jpg" for i in range(3)], SIZE)
+    (model / "images.txt").write_text("# from another program\n")
+    (line,) = look(tmp_path).warnings
+    assert line == "sparse/0 has binary and text files; the binary ones are used, not images.txt"
+
+
+def test_a_damaged_model_is_an_error_if_it_has_the_most_images(tmp_path):
+    photos(tmp_path / "images", 3)
+    write_sparse(tmp_path / "sparse" / "0", [f"p0{i}.jpg" for i in range(3)], SIZE)
+    write_sparse(tmp_path / "sparse" / "1", ["p00.jpg"], SIZE)
+    images = tmp_path / "sparse" / "0" / "images.bin"
+    images.write_bytes(images.read_bytes()[:-20])
+    with pytest.raises(UserError, match="ends too early") as error:
+        look(tmp_path)
+    assert error.value.file == images
 
 
 def test_the_model_before_undistortion_is_used_with_its_photographs(tmp_path):

@@ -106,7 +106,7 @@ def colmap_files(path: Path) -> list[Path]:
 
 def _find_colmap(folder: Path) -> str | None:
     models = find_models(folder)
-    return models[0][0] if models else None
+    return models[0].path if models else None
 
 
 def _find_transforms(folder: Path) -> str | None:

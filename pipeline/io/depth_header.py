@@ -47,9 +47,9 @@ def read_depth_header(path: Path) -> DepthHeader | None:
     with opened_regular(path) as file:
         # ``read_depth`` accepts the same suffixes.
         try:
-            if path.suffix == ".npy":
+            if suffix_of(path.name) == ".npy":
                 return _of_array(file)
-            if path.suffix == ".npz":
+            if suffix_of(path.name) == ".npz":
                 with zipfile.ZipFile(file) as archive:
                     first = next(iter(archive.infolist()), None)
                     if first is None:

@@ -15,7 +15,7 @@ from pipeline.runtime.atomic import write_text
 from pipeline.runtime.errors import UserError
 
 # Increase it whenever the cached facts change.
-_VERSION = 11
+_VERSION = 12
 
 M = TypeVar("M", bound=BaseModel)
 T = TypeVar("T")

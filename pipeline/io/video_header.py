@@ -13,7 +13,7 @@ class Track:
     """A video track, or a picture that FFmpeg takes for one.
 
     Attributes:
-        width, height: pixels as stored.
+        width, height: pixels as stored; 0 if the header does not say it.
         frames: the number of stored frames that are shown; None if the header does not say it.
         place: offset of the bytes that declare the track, in the order of the header.
         hidden: the bytes in their place that make FFmpeg ignore the track.

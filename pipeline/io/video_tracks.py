@@ -3,6 +3,7 @@
 OpenCV decodes the first video stream. That may be a preview, a thumbnail or a cover picture.
 Headers of MP4 and MOV, Matroska and WebM, and AVI are read here, so that the largest track is used.
 Their numbers of frames are those of the file's index; FFmpeg's may be estimates from its length.
+Of MPEG transport and program streams only the number of tracks is read; the first one is used.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import BinaryIO
 
-from pipeline.io import video_avi, video_matroska, video_mp4
+from pipeline.io import video_avi, video_matroska, video_mp4, video_mpeg
 from pipeline.io.video_header import Header, Track
 
 # Tracks with a smaller share of the frames of the longest are pictures or thumbnails of chapters.
@@ -23,6 +24,7 @@ READERS: tuple[tuple[Callable[[bytes], bool], Callable[[BinaryIO], Header]], ...
     (video_mp4.is_mp4, video_mp4.read_header),
     (video_matroska.is_matroska, video_matroska.read_header),
     (video_avi.is_avi, video_avi.read_header),
+    (video_mpeg.is_mpeg, video_mpeg.read_header),
 )
 
 

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.masks import MaskPixels
+from pipeline.io.names import suffix_of
 from pipeline.io.pictures import decode_depth, decode_mask, decode_photograph
 from pipeline.io.recorded import read_recorded
 from pipeline.runtime.errors import UserError
@@ -106,9 +107,9 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
     path = Path(path)
     data = read_recorded(path, digest)
     try:
-        if path.suffix == ".npy":
+        if suffix_of(path.name) == ".npy":
             depth: Picture | None = read_array(data)
-        elif path.suffix == ".npz":
+        elif suffix_of(path.name) == ".npz":
             depth = next(iter(read_archive(io.BytesIO(data)).values()), None)
         else:
             depth = decode_depth(data)

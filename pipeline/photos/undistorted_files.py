@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config import schema
+from pipeline.io.names import suffix_of
 from pipeline.io.recorded import digest_of
 from pipeline.photos.encode import write_picture
 from pipeline.photos.faces import Face, WideCamera, depth_factor, padded
@@ -115,7 +116,7 @@ def write_view(
         write_picture(mask_path, mask.astype(np.uint8) * 255)
     depth_path = None
     if source.depth is not None:
-        suffix = Path(str(photo.depth)).suffix.replace(".npz", ".npy")
+        suffix = suffix_of(str(photo.depth)).replace(".npz", ".npy")
         depth_path = out / "depths" / f"{name}{suffix}"
         _write_depth(source.depth, target, depth_path)
     return photo.model_copy(

@@ -72,7 +72,13 @@ def _doubts(facts: VideoFacts) -> list[str]:
     found = []
     if facts.truncated:
         found.append("its end is missing: the file is shorter than its header says; copy it again")
-    if facts.alike > 1:
+    if any(0 in size for size in facts.others):
+        found.append(
+            f"{len(facts.others) + 1} video streams, of which the first is used, because the "
+            "header does not say their sizes; if it is not the right one, export the other as a "
+            "video of its own"
+        )
+    elif facts.alike > 1:
         found.append(
             f"{facts.alike} video streams of the same size, of which one is used; if they are of "
             "several lenses, export each as a video of its own"
@@ -93,7 +99,9 @@ def description(video: VideoFile) -> str:
     count = video.frames or "an unknown number of"
     length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
     largest = ""
-    if video.others:
+    if any(0 in size for size in video.others):
+        largest = f"; the first of {len(video.others) + 1} video streams"
+    elif video.others:
         sizes = ", ".join(f"{width}x{height}" for width, height in video.others[:SHOWN_STREAMS])
         more = ", ..." if len(video.others) > SHOWN_STREAMS else ""
         largest = (

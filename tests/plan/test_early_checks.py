@@ -12,6 +12,8 @@ import numpy as np
 import pytest
 
 from pipeline.config.schema import Config
+from pipeline.io.depth_header import read_depth_header
+from pipeline.photos.load import read_depth
 from pipeline.runtime.errors import UserError
 from tests.pictures import photos
 from tests.plan.scans import look, many, plan_of, posed
@@ -78,6 +80,16 @@ RIGHT_DEPTHS = {
 @pytest.mark.parametrize("case", RIGHT_DEPTHS)
 def test_a_depth_map_of_the_right_form_is_accepted(tmp_path: Path, case: str) -> None:
     assert look(depth(tmp_path / "s", *RIGHT_DEPTHS[case])).num_depths == 1
+
+
+@pytest.mark.parametrize("suffix", [".NPY", ".Npz", ".PNG", ".TIF"])
+def test_suffixes_of_depth_maps_may_be_in_capitals(tmp_path: Path, suffix: str) -> None:
+    name, write = RIGHT_DEPTHS[{".TIF": "tiff"}.get(suffix, suffix[1:].lower())]
+    scene = depth(tmp_path / "s", name, write)
+    file = (scene / "depths" / name).rename(scene / "depths" / f"p01{suffix}")
+    assert look(scene).photos[1].depth == str(file)
+    assert read_depth(file).ndim == 2
+    assert read_depth_header(file) is not None
 
 
 @pytest.mark.parametrize("size", [(8, 6), (10, 400), (400, 10), (1, 4000)])

@@ -19,6 +19,7 @@ from pipeline.io.names import (
     suffix_of,
 )
 from pipeline.io.posefiles import GivenPoses, other_pose_files
+from pipeline.io.poses.kinds import POSE_LABELS
 from pipeline.io.walk import TooManyFilesError, walk
 from pipeline.runtime.text import is_plain
 
@@ -168,6 +169,8 @@ class Inventory:
         path = self.chosen.path
         photos = "the scene folder itself" if path == "." else f"{path}/"
         poses = "another file" if self.poses is None else self.poses.source
+        if self.poses is not None and poses == ".":  # Several files in the scene folder.
+            poses = f"the set of {POSE_LABELS[self.poses.kind]}"
         reason = _KINDS[kind].reason.replace("{photos}", photos).replace("{poses}", poses)
         if kind == "unread":
             kinds = ", ".join(sorted({suffix_of(name)[1:].upper() for name in names}))

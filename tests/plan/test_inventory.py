@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import shutil
 import time
 import unicodedata
@@ -385,6 +386,40 @@ def test_the_model_before_undistortion_is_used_with_its_photographs(tmp_path):
 
 def test_first_names():
     assert first_names(["a"], 2) == "a" and first_names(["a", "b", "c"], 2) == "a, b and 1 more"
+
+
+def test_scans_of_other_programs_are_used_with_their_depth_maps(tmp_path):
+    """ScanNet has smaller maps in depth/; Polycam has keyframes/depth/."""
+    for i in range(3):
+        picture(tmp_path / "a" / "color" / f"{i}.jpg")
+        picture(tmp_path / "a" / "depth" / f"{i}.png", (32, 24), mode="L")
+        pose = tmp_path / "a" / "pose" / f"{i}.txt"
+        pose.parent.mkdir(exist_ok=True)
+        pose.write_text(f"1 0 0 {i}\n0 1 0 0\n0 0 1 0\n0 0 0 1\n")
+    (tmp_path / "a" / "intrinsic").mkdir()
+    for name in ("intrinsic_color", "intrinsic_depth"):
+        lens = "50 0 32 0\n0 50 24 0\n0 0 1 0\n0 0 0 1\n"
+        (tmp_path / "a" / "intrinsic" / f"{name}.txt").write_text(lens)
+    found = look(tmp_path / "a")
+    depths = [str(tmp_path / "a" / "depth" / f"{i}.png") for i in range(3)]
+    assert [photo.depth for photo in found.photos] == depths
+    (line,) = found.warnings
+    assert line.startswith("intrinsic/intrinsic_depth.txt is not used")
+    assert "or the set of ScanNet poses comes first" in line
+
+    frames = tmp_path / "b" / "keyframes"
+    for i in range(3):
+        picture(frames / "corrected_images" / f"{i}.jpg")
+        picture(frames / "depth" / f"{i}.png", (32, 24), mode="L")
+        camera = {
+            f"t_{r}{c}": float(r == c) + i * (r == 0 and c == 3) for r in range(3) for c in range(4)
+        }
+        camera |= {"fx": 50, "fy": 50, "cx": 32, "cy": 24, "width": 64, "height": 48}
+        (frames / "corrected_cameras").mkdir(exist_ok=True)
+        (frames / "corrected_cameras" / f"{i}.json").write_text(json.dumps(camera))
+    found = look(tmp_path / "b")
+    depths = [str(frames / "depth" / f"{i}.png") for i in range(3)]
+    assert [photo.depth for photo in found.photos] == depths and not found.warnings
 
 
 # --- errors -------------------------------------------------------------------------------

@@ -1,4 +1,4 @@
-"""EXIF positions and XMP of any bytes, projections of any text, and surveys with any coordinates."""
+"""EXIF positions and XMP of any bytes, projections of any text, surveys with any coordinates."""
 
 from __future__ import annotations
 

@@ -25,12 +25,12 @@ class CompanionKind:
     """A kind of files that belong to photographs.
 
     Attributes:
-        noun: one of them, in words.
-        folders: the folders that hold them, in the order of preference.
-        suffixes: the suffixes of files.
-        affix: what precedes or follows the photograph's name in the names of files: the groups are
+        noun: The name of the kind in the singular.
+        folders: The folders that hold them, in the order of preference.
+        suffixes: The suffixes of their files.
+        affix: A pattern of names with a word before or after the photograph's name. Its groups are
             the photograph's name before and after it.
-        fix: what to do if it is unknown which photograph a file belongs to.
+        fix: The remedy, for the error message if it is unknown which photograph a file belongs to.
     """
 
     noun: str
@@ -52,8 +52,8 @@ class CompanionKind:
         """The folders that may hold them, relative to the scene folder.
 
         Args:
-            photos: the folder of the photographs.
-            copy: the suffix of its name for reduced copies: "_4" of "images_4".
+            photos: The folder of the photographs.
+            copy: The suffix of its name for reduced copies: "_4" of "images_4".
         """
         suffixes = dict.fromkeys([copy, ""])
         own = [f"{name}{suffix}" for suffix in suffixes for name in self.folders]
@@ -86,8 +86,11 @@ KINDS = (MASKS, DEPTHS)
 
 
 def beside_photographs(kind: CompanionKind, names: Iterable[str]) -> dict[str, str]:
-    """Photograph -> its mask or depth map, of files in the photographs' own folders: "a_mask.png"
-    beside "a.jpg"."""
+    """Find the masks or depth maps in the photographs' own folders, as "a_mask.png" beside "a.jpg".
+
+    Returns:
+        Photograph -> file.
+    """
     index = NameIndex(names)
     found: dict[str, str] = {}
     for name in sorted(names):
@@ -102,13 +105,13 @@ def beside_photographs(kind: CompanionKind, names: Iterable[str]) -> dict[str, s
 def find_companions(
     kind: CompanionKind, scene: Path, places: Sequence[str], photos: Sequence[str]
 ) -> dict[str, Path]:
-    """Photograph -> its mask or depth map, of the first folder that has any.
+    """Find each photograph's mask or depth map in the first folder that has any.
 
     The file of ``a/b.jpg`` is ``a/b.png`` (any suffix), ``a/b.jpg.png`` as in COLMAP, or one with
     the word before or after the photograph's name: ``a/b_mask.png``, ``a/mask_b.png``.
 
     Args:
-        places: folders relative to ``scene``, in any case.
+        places: The folders to search, relative to ``scene``. Case is ignored.
 
     Raises:
         OSError: a folder cannot be read.

@@ -13,10 +13,10 @@ class Track:
     """A video track, or a picture that FFmpeg takes for one.
 
     Attributes:
-        width, height: pixels as stored; 0 if the header does not say it.
-        frames: the number of stored frames that are shown; None if the header does not say it.
-        place: offset of the bytes that declare the track, in the order of the header.
-        hidden: the bytes in their place that make FFmpeg ignore the track.
+        width, height: The size in pixels as stored; 0 if the header does not say it.
+        frames: The number of stored frames that are shown; None if the header does not say it.
+        place: The offset of the bytes that declare the track, in the order of the header.
+        hidden: The bytes in their place that make FFmpeg ignore the track.
     """
 
     width: int
@@ -35,9 +35,9 @@ class Header:
     """The header of a video file.
 
     Attributes:
-        tracks: the video tracks, in the order of FFmpeg's streams.
-        pictures: cover pictures among them, which FFmpeg takes for video tracks.
-        truncated: whether the file is shorter than the header says.
+        tracks: The video tracks, in the order of FFmpeg's streams.
+        pictures: The cover pictures, which FFmpeg takes for video tracks.
+        truncated: Whether the file is shorter than the header says.
     """
 
     tracks: tuple[Track, ...]

@@ -33,13 +33,13 @@ class ChosenTrack:
     """The video track that is used, and what its file has besides.
 
     Attributes:
-        track: the track; None if the header was not read.
-        number: its number among the video tracks, from 1.
-        others: the other video tracks.
-        alike: the number of tracks of the same size, as a camera with two lenses records them.
-        truncated: whether the file is shorter than its header says.
-        patches: offset -> bytes that replace those of the file, so that FFmpeg's first video stream
-            is this track; empty if it is.
+        track: The track; None if the header was not read.
+        number: Its number among the video tracks, from 1.
+        others: The other video tracks.
+        alike: The number of tracks of the same size, as a camera with two lenses records them.
+        truncated: Whether the file is shorter than its header says.
+        patches: Offset -> the bytes that replace those of the file, so that FFmpeg's first video
+            stream is this track; empty if it is.
     """
 
     track: Track | None = None
@@ -51,7 +51,7 @@ class ChosenTrack:
 
 
 def choose_track(path: Path) -> ChosenTrack:
-    """The largest video track of a file; of equally large ones that with most frames.
+    """The largest video track of a file; of equally large ones, the one with the most frames.
 
     Pictures and tracks with few frames are used only if there are no others. A header that is
     damaged or of another format chooses nothing: FFmpeg's first video stream is decoded.
@@ -87,7 +87,7 @@ class PatchedFile(io.BufferedIOBase):
     """A file with some bytes replaced, for OpenCV, which must not get an exception.
 
     Attributes:
-        error: the first error of reading, None if there was none.
+        error: The first error of reading, None if there was none.
     """
 
     def __init__(self, file: BinaryIO, patches: Mapping[int, bytes]):

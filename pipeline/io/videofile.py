@@ -41,16 +41,16 @@ class VideoFacts(BaseModel):
     """Facts from the header of a video file.
 
     Attributes:
-        digest: hex digest of the file's bytes.
-        width, height: pixels of a frame as it is shown, with the rotation and the pixel aspect
-            ratio of the header applied.
-        frames: number of frames according to the header, 0 if it has none. Headers may be wrong.
-        fps: frames per second according to the header, 0 if it has none.
-        counted: whether ``frames`` is the number of stored frames. Else it is estimated from the
-            length, and pauses are no missing frames.
-        truncated: whether the file is shorter than its header says.
-        others: width and height of the video streams that are not used.
-        alike: number of streams of the same size as the one that is used, with it.
+        digest: The hex digest of the file's bytes.
+        width, height: The size of a frame in pixels as it is shown, with the rotation and the
+            pixel aspect ratio of the header applied.
+        frames: The number of frames according to the header, 0 if it has none. It may be wrong.
+        fps: The number of frames per second according to the header, 0 if it has none.
+        counted: Whether ``frames`` is the number of stored frames. Otherwise it is estimated from
+            the length, and pauses are no missing frames.
+        truncated: Whether the file is shorter than its header says.
+        others: Width and height of the video streams that are not used.
+        alike: The number of streams of the same size as the one that is used, including it.
     """
 
     model_config = ConfigDict(frozen=True)
@@ -126,7 +126,7 @@ def opened_video(path: Path, threads: int = 1) -> Iterator[cv2.VideoCapture]:
     """The largest video stream of a file, whose frames are rotated as the header says.
 
     Args:
-        threads: number of threads of the decoder.
+        threads: The number of threads of the decoder.
 
     Raises:
         UserError: the file is not a video in a supported format, or cannot be read to its end.

@@ -23,10 +23,10 @@ class Folder:
     """The files of one folder.
 
     Attributes:
-        path: relative to the folder where the walk began, "." for itself.
-        real: the absolute path without symbolic links.
-        files: names of files and of links to nothing, sorted.
-        special: names of pipes, sockets and devices, sorted.
+        path: The path relative to the folder where the walk began, which is "." itself.
+        real: The absolute path without symbolic links.
+        files: The sorted names of files and of links to nothing.
+        special: The sorted names of pipes, sockets and devices.
     """
 
     path: PurePosixPath
@@ -39,7 +39,7 @@ class Folder:
         return ((self.path / name).as_posix() for name in self.files)
 
     def all_names(self) -> Iterator[str]:
-        """Likewise, with pipes, sockets and devices."""
+        """The files, pipes, sockets and devices, relative to the folder where the walk began."""
         return ((self.path / name).as_posix() for name in (*self.files, *self.special))
 
 
@@ -51,9 +51,9 @@ def walk(
     Links to folders are followed, except to folders that contain ``root``.
 
     Args:
-        notes: a line is added for each folder that is not visited for another reason than its
+        notes: A line is added for each folder that is not visited for another reason than its
             name.
-        enter: whether to visit a subfolder of this name.
+        enter: Returns True for the names of subfolders to visit.
 
     Raises:
         OSError: ``root`` cannot be read.

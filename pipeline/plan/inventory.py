@@ -47,9 +47,9 @@ class _Kind:
     """A kind of files that are not used.
 
     Attributes:
-        nouns: several of them, in words.
-        reason: why they are not used, and what to do. "{photos}" is the folder of the photographs,
-            "{poses}" the pose file.
+        nouns: The name of the kind in the plural.
+        reason: The reason why they are not used, and what to do. "{photos}" is the folder of the
+            photographs, "{poses}" the pose file.
     """
 
     nouns: str
@@ -116,11 +116,11 @@ class Inventory:
     """What decides which files of a scene are used.
 
     Attributes:
-        folder: the scene folder.
-        chosen: the folder of the photographs.
-        poses: the given poses, or None.
-        used: files that are used, or have a warning of their own.
-        ignored: kinds that the configuration leaves out: keys of ``_KINDS``.
+        folder: The scene folder.
+        chosen: The folder of the photographs.
+        poses: The given poses, or None.
+        used: The files that are used, or have a warning of their own.
+        ignored: The keys of ``_KINDS`` that get no warning: the configuration leaves them out.
     """
 
     folder: Path

@@ -51,8 +51,8 @@ def read_header(file: IO[bytes]) -> ExrHeader:
         ValueError: not an OpenEXR file, or one without such channels; a crop of a larger image; or
             an impossible size.
     """
-    part = _open(file, header_only=True)
-    header = part.header()
+    opened = _open(file, header_only=True)
+    header = opened.header()
     names = {channel.name for channel in header["channels"]}
     if not {"R", "G", "B"} <= names and "Y" not in names:
         raise ValueError(f"expected channels R, G, B or Y, found {', '.join(sorted(names)[:8])}")
@@ -64,11 +64,14 @@ def read_header(file: IO[bytes]) -> ExrHeader:
         raise ValueError(f"impossible size {width}x{height}")
     if "deep" in str(header.get("type", "")):
         raise ValueError("expected one colour a pixel, found several (deep data)")
-    needed = width * height * (4 * len(header["channels"]) + _COLOUR_BYTES)
+    # All parts are decoded, not only the first.
+    parts = [part.header for part in opened.parts]
+    needed = width * height * _COLOUR_BYTES + sum(_decoded_bytes(part) for part in parts)
     if needed > _MAX_DECODED:
+        count = sum(len(part["channels"]) for part in parts)
         raise ValueError(
-            f"{width}x{height} pixels of {len(header['channels'])} channels take {needed >> 20} MiB"
-            f", more than {_MAX_DECODED >> 20}; reduce it, or leave out channels"
+            f"{width}x{height} pixels of {count} channels take {needed >> 20} MiB, more than "
+            f"{_MAX_DECODED >> 20}; reduce it, or leave out channels and parts"
         )
     to_srgb, fault = None, ""
     if "chromaticities" in header and {"R", "G", "B"} <= names:
@@ -77,6 +80,16 @@ def read_header(file: IO[bytes]) -> ExrHeader:
         except (TypeError, ValueError):
             fault = "impossible chromaticities"
     return ExrHeader(width, height, "A" in names, to_srgb, fault)
+
+
+def _decoded_bytes(header: Any) -> int:
+    """Bytes of the channels of a part, and of a tile, which are decoded as a whole."""
+    (left, top), (right, bottom) = (corner.tolist() for corner in header["dataWindow"])
+    pixels = max(right - left + 1, 0) * max(bottom - top + 1, 0)
+    tile = header.get("tiles")
+    if tile is not None:
+        pixels += tile.xSize * tile.ySize
+    return int(pixels * 4 * len(header["channels"]))
 
 
 def read_pixels(file: IO[bytes]) -> tuple[NDArray[np.float32], NDArray[np.float32] | None]:

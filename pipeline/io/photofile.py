@@ -20,7 +20,7 @@ from pipeline.io.colour import Colours, colours_of
 from pipeline.io.gps import Fault, Position, read_gps
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.panorama import Panorama, panorama_of
-from pipeline.io.recorded import digest_of
+from pipeline.io.recorded import MAX_BYTES, digest_of
 from pipeline.runtime.errors import UserError
 
 # ``check_size`` takes the place of PIL's limit, which is lower than some photographs are large.
@@ -32,8 +32,6 @@ _DECODER_BYTES = {"WEBP": 24, "AVIF": 16, "HEIF": 16}
 _MAX_DECODED = 3 << 30
 # The largest side that libpng decodes.
 _MAX_SIDE = 1_000_000
-MAX_BYTES = 4 << 30
-"""Largest file of a photograph: ``MAX_PIXELS`` of 16-bit RGB and alpha."""
 # The formats of the supported suffixes. PIL recognises a file by its content, and has decoders that
 # run other programs.
 _FORMATS = ("JPEG", "PNG", "TIFF", "BMP", "WEBP")

@@ -27,9 +27,10 @@ from PIL import Image, ImageCms
 from pipeline.io import colour, tiff
 from pipeline.io.colour import Colours
 from pipeline.io.masks import MaskPixels, valid_pixels
-from pipeline.io.photofile import colours_of_file, opened_image
+from pipeline.io.photofile import check_size, colours_of_file, opened_image
 
 Picture = NDArray[Any]
+_PNG = b"\x89PNG\r\n\x1a\n"
 TRUNCATED = "the image is truncated or damaged"
 UNREADABLE = "not a readable image (expected JPEG, PNG, TIFF, WebP or AVIF)"
 
@@ -86,7 +87,16 @@ def decode_mask(data: bytes, name: str) -> MaskPixels:
 
 
 def decode_depth(data: bytes) -> Picture | None:
-    """Decode a depth map (PNG or TIFF) as stored; None if that is not possible."""
+    """Decode a depth map (PNG or TIFF) as stored; None if that is not possible.
+
+    Raises:
+        ValueError: it has more pixels than photographs have.
+    """
+    if tiff.is_tiff(data):
+        layout = tiff.layout_of(data)
+        check_size(layout.width, layout.height)
+    elif data[:8] == _PNG and len(data) >= 24:
+        check_size(*struct.unpack(">II", data[16:24]))
     return _by_opencv(tiff.without_orientation(data) if tiff.is_tiff(data) else data)
 
 
@@ -229,7 +239,7 @@ def _is_truncated(data: bytes) -> bool:
     """Whether a JPEG, PNG or WebP file is incomplete according to its format."""
     if data[:2] == b"\xff\xd8":
         return not _jpeg_is_complete(data)
-    if data[:8] == b"\x89PNG\r\n\x1a\n":
+    if data[:8] == _PNG:
         return not _png_is_complete(data)
     if data[:4] == b"RIFF" and data[8:12] == b"WEBP":
         return len(data) < 8 + int(struct.unpack("<I", data[4:8])[0])

@@ -25,6 +25,8 @@ from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import NAMES, GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
+# Lines of text that are parsed at a time.
+_ROWS = 10_000
 _POSITION = ("x", "y", "z")
 _NORMAL = ("nx", "ny", "nz")
 _SCALE = tuple(f"scale_{i}" for i in range(3))
@@ -167,12 +169,18 @@ def _read_body(file: BinaryIO, header: PlyHeader, path: Path) -> dict[str, NDArr
 
 
 def _read_ascii(file: BinaryIO, header: PlyHeader, path: Path) -> dict[str, NDArray[Any]]:
-    rows = file.read().splitlines()
+    body = file.read()
+    rows = body.splitlines()
     if len(rows) < header.count or (len(rows) > header.count and not header.more):
         raise wrong(path, f"expected {header.count} lines of Gaussians, found {len(rows)}")
     try:
-        values = np.array([row.split() for row in rows[: header.count]], np.float64)
-        values = values.reshape(header.count, len(header.fields))
+        if 2 * header.count * len(header.fields) > len(body) + 1:  # A digit and a separator each.
+            raise ValueError
+        values = np.empty((header.count, len(header.fields)))
+        # In pieces: a number takes ten times as much memory as an object.
+        for start in range(0, header.count, _ROWS):
+            piece = [row.split() for row in rows[start : min(start + _ROWS, header.count)]]
+            values[start : start + _ROWS] = np.array(piece, np.float64)
     except ValueError:
         raise wrong(path, f"expected {len(header.fields)} numbers in each line") from None
     return dict(zip(header.fields, values.T, strict=True))

@@ -5,10 +5,12 @@ from __future__ import annotations
 import hashlib
 from pathlib import Path
 
-from pipeline.io.bounded import opened_regular
-from pipeline.runtime.errors import ChangedFileError, UserError
+from pipeline.io.bounded import opened_regular, read_bounded
+from pipeline.runtime.errors import ChangedFileError
 from pipeline.runtime.record import changed, owner_of, rerun
 
+MAX_BYTES = 4 << 30
+"""Largest file of a photograph, a mask or a depth map: 512 megapixels of 16-bit RGB and alpha."""
 _DIGEST_BYTES = 16
 
 
@@ -32,18 +34,12 @@ def read_recorded(path: str | Path, digest: str | None) -> bytes:
 
     Raises:
         ChangedFileError: the file has another digest.
-        UserError: the file cannot be read.
+        UserError: the file cannot be read, or is larger than ``MAX_BYTES``.
     """
     path = Path(path)
-    try:
-        with opened_regular(path) as file:
-            data = file.read()
-    except OSError as error:
-        raise UserError(
-            f"cannot be read: {error.strerror}",
-            file=path,
-            fix="replace the file by a whole one, or remove it from the folder",
-        ) from None
+    data = read_bounded(
+        path, MAX_BYTES, fix="replace the file by a whole one, or remove it from the folder"
+    )
     if digest is None or _hash(data).hexdigest() == digest:
         return data
     folder = owner_of(path)

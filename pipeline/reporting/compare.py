@@ -18,6 +18,7 @@ from typing import Any
 
 from pipeline.config.runs import Run
 from pipeline.config.schema import Config
+from pipeline.io.bounded import MIB, read_bounded
 from pipeline.runtime.errors import UserError
 
 # Identical, to the bit, for repeated runs on the same machine.
@@ -37,6 +38,9 @@ POSES = (
     *("refine", "undistort"),
 )
 WORK = (*POSES, "train")
+# A batch of 200,000 runs.
+_MAX_BYTES = 256 * MIB
+_FIX = "create one: snakemake results/benchmark.csv"
 
 Row = dict[str, Any]
 
@@ -217,10 +221,10 @@ def compare(batches: Sequence[Path], base: str | None = None, each: bool = False
 
 def _read(path: Path) -> list[Row]:
     try:
-        return list(json.loads(path.read_text())["runs"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        return list(json.loads(read_bounded(path, _MAX_BYTES, fix=_FIX))["runs"])
+    except (ValueError, KeyError, TypeError, RecursionError) as error:
         raise UserError(
             f"expected a benchmark.json: {error}",
             file=path,
-            fix="create one: snakemake results/benchmark.csv",
+            fix=_FIX,
         ) from None

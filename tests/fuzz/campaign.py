@@ -19,7 +19,7 @@ import tempfile
 import time
 import traceback
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
@@ -168,6 +168,23 @@ def _case_of(progress: Path) -> int:
     """The number of the present case; -1 before the first."""
     data = progress.read_bytes()
     return int.from_bytes(data, "little") if data else -1
+
+
+def judged(
+    reader: Reader, cases: Mapping[str, Files | None], folder: Path
+) -> dict[str, str | None]:
+    """What ``_judge`` says of each case, under the limits, in this process.
+
+    Args:
+        cases: name -> the files; None for those that ``folder`` has.
+    """
+    found = {}
+    with _limits():
+        for name, files in cases.items():
+            if files is not None:
+                _write(folder, files)
+            found[name] = _judge(reader, folder)
+    return found
 
 
 def as_json(outcome: Outcome) -> str:

@@ -38,6 +38,8 @@ SECONDS = 10
 """Seconds of processor time that a case may take: elapsed time counts the work of others, too."""
 MAX_MESSAGE = 2000
 """Characters that a message may have."""
+WAITING = 8
+"""Elapsed seconds after which a case that waits, as for a pipe's writer, is interrupted."""
 PATIENCE = 120
 """Elapsed seconds after which the process of a case that has not ended is killed."""
 ROOT = Path(__file__).resolve().parents[2]
@@ -195,6 +197,7 @@ def _judge(reader: Reader, folder: Path) -> str | None:
     """None if the reader accepted the files, "" after a UserError, else what was raised where."""
     resident = _reset_peak()
     signal.setitimer(signal.ITIMER_PROF, SECONDS)
+    signal.setitimer(signal.ITIMER_REAL, WAITING)
     start = time.process_time()
     try:
         reader.read(folder)
@@ -208,6 +211,7 @@ def _judge(reader: Reader, folder: Path) -> str | None:
         found = f"{type(error).__name__} in {Path(own.filename).name} {own.name}: {what}"[:200]
     finally:
         signal.setitimer(signal.ITIMER_PROF, 0)
+        signal.setitimer(signal.ITIMER_REAL, 0)
     if found:
         return found
     # Readers that catch every exception catch TooSlowError and MemoryError as well.
@@ -248,13 +252,14 @@ def _too_slow(*_: object) -> NoReturn:
 def _limits() -> Iterator[None]:
     pages = int(Path("/proc/self/statm").read_text().split()[0])
     before, most = resource.getrlimit(resource.RLIMIT_AS)
-    handler = signal.signal(signal.SIGPROF, _too_slow)
+    handlers = {kind: signal.signal(kind, _too_slow) for kind in (signal.SIGPROF, signal.SIGALRM)}
     resource.setrlimit(resource.RLIMIT_AS, (pages * resource.getpagesize() + MEMORY, most))
     try:
         yield
     finally:
         resource.setrlimit(resource.RLIMIT_AS, (before, most))
-        signal.signal(signal.SIGPROF, handler)
+        for kind, handler in handlers.items():
+            signal.signal(kind, handler)
 
 
 def _memory_folder() -> str | None:

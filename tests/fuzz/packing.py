@@ -19,7 +19,7 @@ def unpack_zip(data: bytes) -> bytes:
 def pack_zip(data: bytes) -> bytes:
     buffer, at = io.BytesIO(), 0
     with zipfile.ZipFile(buffer, "w") as archive:
-        while at + 6 <= len(data):
+        while at + 6 <= len(data) and len(archive.filelist) < 2000:
             name, body = struct.unpack_from("<HI", data, at)
             at += 6
             shown = data[at : at + name % 64].decode("latin-1").replace("\0", "_") or "_"

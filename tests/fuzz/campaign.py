@@ -175,7 +175,7 @@ def _case_of(progress: Path) -> int:
 def judged(
     reader: Reader, cases: Mapping[str, Files | None], folder: Path
 ) -> dict[str, str | None]:
-    """What ``_judge`` says of each case, under the limits, in this process.
+    """What ``_judge`` reports about each case, under the limits, in this process.
 
     Args:
         cases: name -> the files; None for those that ``folder`` has.

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from tests.fuzz.reader import Reader
 
-SIZE = 1 << 19
+SIZE = 1 << 18
 """Bytes of the files that are made, and of the content that packs into less."""
 _NUMBER = re.compile(rb"-?\d+(\.\d+)?(e[-+]?\d+)?")
 

@@ -38,7 +38,7 @@ SECONDS = 10
 """Seconds of processor time that a case may take: elapsed time counts the work of others, too."""
 MAX_MESSAGE = 2000
 """Characters that a message may have."""
-WAITING = 8
+WAITING = 60
 """Elapsed seconds after which a case that waits, as for a pipe's writer, is interrupted."""
 PATIENCE = 120
 """Elapsed seconds after which the process of a case that has not ended is killed."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 import re
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 
@@ -13,6 +13,7 @@ from pipeline.io.names import (
     Ambiguity,
     NameIndex,
     compare_names,
+    stem_key,
     suffix_of,
 )
 from pipeline.io.walk import walk
@@ -85,21 +86,35 @@ DEPTHS = CompanionKind(
 KINDS = (MASKS, DEPTHS)
 
 
-def beside_photographs(kind: CompanionKind, names: Iterable[str]) -> dict[str, str]:
+def beside_photographs(kind: CompanionKind, names: Iterable[str]) -> dict[str, list[str]]:
     """Find the masks or depth maps in the photographs' own folders, as "a_mask.png" beside "a.jpg".
 
     Returns:
-        Photograph -> file.
+        Photograph -> its files: one, or several that are ambiguous. Two photographs that differ
+        only in the suffix, as a RAW file and its JPEG, share their files.
     """
     index = NameIndex(names)
-    found: dict[str, str] = {}
+    found: dict[str, list[str]] = {}
     for name in sorted(names):
         base = kind.photograph_in(name)
-        if base is not None:
-            photos = [photo for photo in index.equal(base)[1] if photo != name]
-            if len(photos) == 1 and kind.photograph_in(photos[0]) is None:
-                found.setdefault(photos[0], name)
+        if base is None:
+            continue
+        photos = [p for p in index.equal(base)[1] if p != name and kind.photograph_in(p) is None]
+        if len({stem_key(photo) for photo in photos}) == 1:
+            for photo in photos:
+                found.setdefault(photo, []).append(name)
     return found
+
+
+def several_beside(
+    kind: CompanionKind, root: Path, found: Mapping[str, Sequence[str]]
+) -> UserError | None:
+    """The error of a result of ``beside_photographs`` with several files of one photograph; None
+    if there is none."""
+    several = [Ambiguity(tuple(files), (photo,)) for photo, files in found.items() if files[1:]]
+    if not several:
+        return None
+    return _ambiguous(kind, root, several, {name: [name] for a in several for name in a.listed})
 
 
 def find_companions(

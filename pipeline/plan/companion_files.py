@@ -8,7 +8,14 @@ from functools import partial
 from pathlib import Path
 
 from pipeline.config.schema import Config
-from pipeline.io.companions import DEPTHS, MASKS, CompanionKind, beside_photographs, find_companions
+from pipeline.io.companions import (
+    DEPTHS,
+    MASKS,
+    CompanionKind,
+    beside_photographs,
+    find_companions,
+    several_beside,
+)
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
 from pipeline.io.photofile import FileFacts, read_facts
@@ -18,29 +25,44 @@ from pipeline.runtime.errors import UserError
 
 
 def without_companions(
-    chosen: PhotoFolder, poses: GivenPoses | None, warnings: list[str]
+    folder: Path,
+    config: Config,
+    chosen: PhotoFolder,
+    poses: GivenPoses | None,
+    warnings: list[str],
 ) -> PhotoFolder:
     """The folder's photographs without the masks and depth maps that lie beside them.
 
     Files that the poses name, or count, are photographs.
+
+    Raises:
+        UserError: There are several files of one photograph, and their kind is used.
     """
     if poses is not None and poses.format.names != "photos":
         return chosen
     posed = set(poses.names) if poses is not None else set()
     found: dict[str, dict[str, str]] = {}
+    taken: set[str] = set()
     for kind in (MASKS, DEPTHS):
-        beside = beside_photographs(kind, chosen.names)
-        beside = {photo: name for photo, name in beside.items() if name not in posed}
-        found[kind.noun] = {
-            photo: (Path(chosen.path) / name).as_posix() for photo, name in beside.items()
+        beside = {
+            photo: unposed
+            for photo, names in beside_photographs(kind, chosen.names).items()
+            if (unposed := [name for name in names if name not in posed])
         }
-        if beside:
+        error = several_beside(kind, folder / chosen.path, beside)
+        if error is not None and (kind is DEPTHS or uses_masks(config)):
+            raise error
+        found[kind.noun] = {
+            photo: (Path(chosen.path) / names[0]).as_posix() for photo, names in beside.items()
+        }
+        files = {name for names in beside.values() for name in names}
+        taken |= files
+        if files:
             warnings.append(
-                f"{len(beside)} images beside the photographs are used as {kind.noun}s, for their "
-                f"names (first: {min(beside.values())}); rename them if they are photographs"
+                f"{len(files)} images beside the photographs are used as {kind.noun}s, for their "
+                f"names (first: {min(files)}); rename them if they are photographs"
             )
-    taken = {name for files in found.values() for name in files.values()}
-    names = [name for name in chosen.names if (Path(chosen.path) / name).as_posix() not in taken]
+    names = [name for name in chosen.names if name not in taken]
     return replace(
         chosen,
         names=names,

@@ -210,7 +210,7 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         warnings += [*incomplete_models(folder), *other_models(folder, poses)]
 
     chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
-    chosen = without_companions(chosen, poses, warnings)
+    chosen = without_companions(folder, config, chosen, poses, warnings)
     photographs = [folder / chosen.path / name for name in chosen.names]
     facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
     facts = {name: facts[name] for name in without_linear_pairs(sorted(facts), poses, warnings)}

@@ -272,6 +272,24 @@ def test_masks_beside_photographs_are_no_photographs(tmp_path, pattern):
     assert "2 images beside the photographs are used as masks" in found.warnings[0]
 
 
+def test_two_masks_beside_one_photograph_are_an_error_and_no_photographs(tmp_path):
+    photos(tmp_path / "images", 2)
+    for name in ("p00_mask.png", "p00-mask.png"):
+        picture(tmp_path / "images" / name, mode="L")
+    with pytest.raises(UserError, match=r"found 2 for p00\.jpg: p00-mask\.png, p00_mask\.png"):
+        look(tmp_path)
+    found = look(tmp_path, config(views={"masks": "ignore"}))
+    assert names(found) == ["p00.jpg", "p01.jpg"] and found.num_masks == 0
+
+
+def test_a_mask_beside_two_files_of_one_photograph_is_no_photograph(tmp_path):
+    photos(tmp_path / "images", 1)
+    picture(tmp_path / "images" / "p00.png")
+    picture(tmp_path / "images" / "p00_mask.png", mode="L")
+    found = look(tmp_path)
+    assert names(found) == ["p00.jpg", "p00.png"] and found.num_masks == 2
+
+
 def test_depth_maps_and_masks_that_transforms_list(tmp_path):
     photos(tmp_path / "images", 2)
     (tmp_path / "d").mkdir()

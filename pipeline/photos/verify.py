@@ -25,6 +25,8 @@ from pipeline.scene.manifest import Manifest, Photo
 
 # Peak memory per pixel of a photograph while it is decoded.
 _PHOTO_BYTES = 7.0
+# Smaller images are no photographs: reduced ones would have no pixels.
+_MIN_SIDE = 4
 
 
 def verify_manifest(
@@ -161,6 +163,10 @@ class _Check:
 
 
 def _check(photo: Photo) -> _Check:
+    if min(photo.width, photo.height) < _MIN_SIDE:
+        return _Check(
+            f"it is {photo.width}x{photo.height} pixels, expected at least {_MIN_SIDE} a side"
+        )
     try:
         return _Check(signature=_decode(photo))
     except (MemoryError, ChangedFileError):

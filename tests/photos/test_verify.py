@@ -7,6 +7,7 @@ from pipeline.photos.verify import verify_photos
 from pipeline.plan.scan import scan
 from pipeline.runtime.errors import UserError
 from tests.pictures import photos, picture
+from tests.plan.scans import look
 from tests.plan.test_scan import write_dng
 
 
@@ -76,3 +77,14 @@ def test_a_photograph_replaced_after_the_scan_is_an_error(tmp_path):
     files[1].write_bytes(files[2].read_bytes())
     with pytest.raises(UserError, match=r"p01\.jpg: has changed since the scene was inspected"):
         verify_photos(manifest, threads=1)
+
+
+@pytest.mark.parametrize("size", [(1, 4000), (4000, 1), (1, 1), (3, 40)])
+def test_a_photograph_of_a_few_pixels_is_left_out_with_its_size(tmp_path, size):
+    photos(tmp_path / "images", 4)
+    picture(tmp_path / "images" / "thin.png", size)
+    manifest, warnings = verify_photos(look(tmp_path).manifest, threads=1)
+    assert len(manifest.photos) == 4
+    assert warnings == [
+        f"thin.png: left out: it is {size[0]}x{size[1]} pixels, expected at least 4 a side"
+    ]

@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 
 Array = NDArray[np.float64]
 
-# Samples of eight matches that ``consistent_matches`` tries: with half of the matches wrong, one of
-# them holds right ones alone with a probability above 0.99.
-_SAMPLES = 1200
+# Largest number of samples of eight matches that ``consistent_matches`` tries: with half of the
+# matches wrong, one of them holds right ones alone with this probability. Samples are compared in
+# batches, and fewer are tried where more of the matches are right.
+_SAMPLES, _CERTAINTY = 1200, 0.99
+_BATCH = 150
 _SAMPLE_SIZE = 8
 # Matches, evenly distributed in their order, by which the samples are compared.
 _JUDGED = 400
@@ -89,14 +91,20 @@ def consistent_matches(one: Array, two: Array, tolerance: float) -> NDArray[np.b
         return np.zeros(count, np.bool_)
     products = np.einsum("ni,nj->nij", two, one).reshape(count, 9)
     rng = np.random.default_rng(0)
-    samples = np.argpartition(rng.random((_SAMPLES, count)), _SAMPLE_SIZE, axis=1)[:, :_SAMPLE_SIZE]
-    rows = products[samples]
-    # The eigenvector of the smallest eigenvalue is the matrix whose products are zero.
-    matrices = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
     judged = np.linspace(0, count - 1, min(count, _JUDGED)).astype(np.int64)
-    agree = _plane_angles(matrices, one[judged], two[judged]) < tolerance
-    first = int(agree.sum(axis=1).argmax())
-    best = _plane_angles(matrices[first : first + 1], one, two)[0] < tolerance
+    most, matrix = -1, np.zeros((1, 3, 3))
+    for tried in range(_BATCH, _SAMPLES + 1, _BATCH):
+        order = np.argpartition(rng.random((_BATCH, count)), _SAMPLE_SIZE, axis=1)
+        rows = products[order[:, :_SAMPLE_SIZE]]
+        # The eigenvector of the smallest eigenvalue is the matrix whose products are zero.
+        matrices = np.linalg.eigh(np.swapaxes(rows, 1, 2) @ rows)[1][:, :, 0].reshape(-1, 3, 3)
+        agree = (_plane_angles(matrices, one[judged], two[judged]) < tolerance).sum(axis=1)
+        first = int(agree.argmax())
+        if agree[first] > most:
+            most, matrix = int(agree[first]), matrices[first : first + 1]
+        if (1 - (most / len(judged)) ** _SAMPLE_SIZE) ** tried < 1 - _CERTAINTY:
+            break
+    best = _plane_angles(matrix, one, two)[0] < tolerance
     for _ in range(_REFITS):
         if best.sum() < _SAMPLE_SIZE:
             break

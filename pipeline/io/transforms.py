@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
+from pipeline.io.names import first_names
 from pipeline.io.poses.files import checked_name, is_number, read_json
 from pipeline.io.poses.frames import (
     FLIP_YZ,
@@ -44,6 +45,8 @@ _SCALES = (1e-12, 1e12)
 _LISTS = tuple(f"{name}_filenames" for name in SPLITS)
 # Units farther apart are a mistake, and overflow where they are multiplied.
 _SMALLEST_SCALE = 1e-15
+# Poses that differ by less, relative to the translation, are equal.
+_EQUAL = 1e-5
 # The fields of a frame's mask and depth map, of nerfstudio and of others.
 _COMPANIONS = (
     ("mask_path", "mask_file_path"),
@@ -77,6 +80,14 @@ class Frame:
     file: Path
     source: str
 
+    def has_same_pose(self, other: Frame) -> bool:
+        """Whether the poses are equal up to the digits that files are printed with."""
+        size = max(1.0, float(np.abs(self.translation).max()))
+        return bool(
+            np.abs(self.rotation - other.rotation).max() < _EQUAL
+            and np.abs(self.translation - other.translation).max() < _EQUAL * size
+        )
+
     def is_same_camera(self, other: Frame) -> bool:
         """Whether pose and intrinsics are equal."""
         return self.fields == other.fields and np.array_equal(self.translation, other.translation)
@@ -95,11 +106,12 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
     """All frames of a file or of the files in a scene folder, each path once: its first frame.
 
     Args:
-        repeated: the paths of the other frames are added to this list, except for equal frames in
-            other files: files of several splits may list the same frames.
+        repeated: the paths of the other frames are added to this list, except for equal frames:
+            files of several splits may list the same frames.
 
     Raises:
-        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses.
+        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses, a
+            path with two poses.
     """
     files = [path] if path.is_file() else find_transforms(path)
     if not files:
@@ -107,8 +119,17 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
     frames: dict[str, Frame] = {}
     for frame in (frame for file in files for frame in _frames_of(file)):
         first = frames.setdefault(frame.path, frame)
-        is_copy = first.file != frame.file and first.is_same_camera(frame)
-        if first is not frame and not is_copy and repeated is not None:
+        if first is frame or first.is_same_camera(frame):
+            continue
+        if not first.has_same_pose(frame):
+            raise UserError(
+                f"{frame.source} and {first.source} of {first.file.name} are the same photograph "
+                "with different poses",
+                file=frame.file,
+                fix=f"remove one of the two frames of {first_names([frame.path])}, or set poses: "
+                "ignore",
+            )
+        if repeated is not None:
             repeated.append(frame.path)
     return list(frames.values())
 

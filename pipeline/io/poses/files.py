@@ -26,6 +26,7 @@ _JSON_BYTES = {"{": 240, "[": 90, ",": 40}
 _MAX_JSON_MEMORY = 2 << 30
 _MAX_NAME = 1000
 _HEAD_BYTES = 4096
+_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 def malformed(file: Path, what: str, fix: str = FIX) -> UserError:
@@ -51,11 +52,26 @@ def checked_name(file: Path, name: str, where: str = "") -> str:
 
 
 def read_text(file: Path) -> str:
-    """The file's text (UTF-8, with or without byte order mark)."""
+    """The file's text: UTF-8 with or without byte order mark, or UTF-16, which Windows' tools
+    write."""
+    data = read_bounded(file, MAX_BYTES, fix=FIX)
     try:
-        return read_bounded(file, MAX_BYTES, fix=FIX).decode("utf-8-sig")
+        return data.decode("utf-16" if data[:2] in _UTF_16_MARKS else "utf-8-sig")
     except UnicodeDecodeError as error:
-        raise malformed(file, f"expected UTF-8 text: {error}") from None
+        raise malformed(file, f"expected UTF-8 or UTF-16 text: {error}") from None
+
+
+def read_head(file: Path) -> bytes:
+    """The first bytes of a file; as UTF-8 if the file is UTF-16."""
+    with file.open("rb") as stream:
+        head = stream.read(_HEAD_BYTES)
+    if head[:2] in _UTF_16_MARKS:
+        return head.decode("utf-16", errors="ignore").encode(errors="ignore")
+    # XML names its encoding only in its own encoding.
+    for start, encoding in ((b"<\0", "utf-16-le"), (b"\0<", "utf-16-be")):
+        if head.startswith(start):
+            return head.decode(encoding, errors="ignore").encode(errors="ignore")
+    return head
 
 
 def read_json(file: Path) -> Any:
@@ -111,7 +127,6 @@ def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> 
         return None
     for file in sorted(folder.iterdir()):
         if file.suffix.lower() == suffix and file.is_file() and file.name[0] != ".":
-            with file.open("rb") as stream:
-                if is_one(stream.read(_HEAD_BYTES)):
-                    return file.name
+            if is_one(read_head(file)):
+                return file.name
     return None

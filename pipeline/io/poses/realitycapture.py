@@ -14,6 +14,7 @@ Sources: nerfstudio's ``realitycapture_utils.py``; AliceVision's ``importKnownPo
 from __future__ import annotations
 
 import csv
+import os
 from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import Element
@@ -22,7 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
+from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_head, read_text
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
 from pipeline.io.poses.xml import read_xml
@@ -33,7 +34,6 @@ _XCR = "{http://www.capturingreality.com/ns/xcr/1.1#}"
 _FILM_MM = 36.0
 # Folders of photographs that XMP files may be beside.
 _PHOTO_FOLDERS = ("images", ".")
-_HEAD_BYTES = 4096
 
 
 def find_csv(folder: Path) -> str | None:
@@ -83,31 +83,33 @@ def find_xmp(folder: Path) -> str | None:
 
 
 def xmp_files(path: Path) -> list[Path]:
-    """The XMP files in a folder that have a pose."""
+    """The XMP files in a folder and its subfolders that have a pose."""
     if not path.is_dir():
         return []
     found = [
-        file for file in sorted(path.iterdir()) if file.suffix.lower() == ".xmp" and file.is_file()
+        Path(folder) / name
+        for folder, _, names in os.walk(path)
+        for name in names
+        if name.lower().endswith(".xmp")
     ]
-    return [file for file in found if _has_pose(file)]
+    return [file for file in sorted(found) if file.is_file() and _has_pose(file)]
 
 
 def xmp_frames(path: Path) -> list[PosedFrame]:
-    """The cameras of the XMP files in a folder.
+    """The cameras of the XMP files in a folder and its subfolders, named by their paths in it.
 
     Raises:
         UserError: a malformed file, or a lens that is not supported.
     """
-    return [_of_xmp(file) for file in xmp_files(path)]
+    return [_of_xmp(file, file.relative_to(path)) for file in xmp_files(path)]
 
 
 def _has_pose(file: Path) -> bool:
-    with file.open("rb") as stream:
-        head = stream.read(_HEAD_BYTES)
+    head = read_head(file)
     return b"xcr:Rotation" in head and b"xcr:Position" in head
 
 
-def _of_xmp(file: Path) -> PosedFrame:
+def _of_xmp(file: Path, name: Path) -> PosedFrame:
     root = read_xml(file)
     found = [e for e in root.iter() if _field(e, "Rotation") and _field(e, "Position")]
     if not found:
@@ -139,7 +141,7 @@ def _of_xmp(file: Path) -> PosedFrame:
             f"xcr:DistortionModel {model[:40]} is not supported; expected perspective, brown3, "
             "brown4, with or without tangential coefficients, or division",
         )
-    return make_frame(file, file.stem, lens, rotation, centre)
+    return make_frame(file, name.with_suffix("").as_posix(), lens, rotation, centre)
 
 
 def _field(element: Element, name: str) -> str | None:

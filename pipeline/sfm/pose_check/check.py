@@ -49,6 +49,8 @@ _CONTRADICTION_DEG, _CONTRADICTION_SHARE = 6.0, 0.5
 # Fewer matches than this refuse poses only for other axes, directions or another order. Repeated
 # structures can imitate another focal length in a few hundred matches.
 _STRONG = 800
+# No more matches than this are sought, whatever they say.
+_PLENTY = 2400
 # Median angle from which poses are called inaccurate.
 _INACCURATE_DEG = 0.75
 # Readings within this factor of the best one are as good: the simplest of them is named.
@@ -171,7 +173,10 @@ def check_poses(
     posed = model.by_name()
     used = [photo for photo in photos if photo.name in posed and not photo.linear]
     if len(used) < 2:
-        return PoseCheck(["the given poses could not be compared with the photographs"], [])
+        text = "the given poses could not be compared with the photographs: "
+        if len(photos) < 2:
+            return PoseCheck([f"{text}there is one photograph"], [])
+        return PoseCheck([], [f"{text}they are RAW or EXR"])
     images = [posed[photo.name] for photo in used]
     given = PoseSet(
         np.stack([image.rotation for image in images]),
@@ -186,14 +191,18 @@ def check_poses(
     for pair in finder.pairs():
         if pair is not None:
             pairs.append(pair)
-            if len(pairs) >= ENOUGH_PAIRS and _is_clear(_Matches(pairs, given), given, turned):
+            if len(pairs) < ENOUGH_PAIRS:
+                continue
+            matches = _Matches(pairs, given)
+            if matches.found >= _PLENTY or _is_clear(matches, given, turned):
                 break
     if len(pairs) < MIN_PAIRS:
         text = (
             f"the given poses could not be compared with the photographs: {len(pairs)} of "
-            f"{finder.tried} pairs of photographs have enough matches"
+            f"{finder.tried} pairs of photographs have enough matches; look at the result's "
+            "page, or set poses: trust if they are right"
         )
-        return PoseCheck([text], [])
+        return PoseCheck([], [text])
     return _verdict(_Matches(pairs, given), given, partial(readings, given, kind, names), source)
 
 

@@ -57,6 +57,8 @@ def readings(given: PoseSet, kind: PoseKind, names: Sequence[str]) -> Iterator[R
     if kind in ANGLES:
         simple += angles(given, convention)
     yield from simple
+    if convention.position == "centre":
+        yield _translations(given)
     yield from _positions(given)
     for axes in _two_mistakes(given, convention):
         yield from (
@@ -97,6 +99,19 @@ def interpretations(given: PoseSet, convention: Convention) -> list[Reading]:
             poses = other.read(given, rotations, positions)
             found.append(Reading(cause, fix, poses, rank))
     return found
+
+
+def _translations(given: PoseSet) -> Reading:
+    """COLMAP's translations where the format has the cameras' centres, beside rotations that were
+    converted to the format's axes."""
+    centres = -np.einsum("nji,nj->ni", given.rotations, given.centres)
+    return Reading(
+        "the positions look like the translations t of world to camera, expected the cameras' "
+        "centres",
+        "write the centres, -R^T t",
+        given.posed(given.rotations, centres),
+        2,
+    )
 
 
 def _positions(given: PoseSet) -> list[Reading]:

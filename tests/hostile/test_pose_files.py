@@ -126,11 +126,17 @@ def repeat(content: dict[str, Any]) -> None:
     content["frames"][-1]["transform_matrix"][0][3] = 9.0
 
 
-def test_a_repeated_frame_is_a_warning_and_the_first_one_is_used(tmp_path):
-    found, given = look(make_scene(tmp_path / "scene", repeat))
-    assert "1 frames of transforms*.json name the file of an earlier frame" in found.warnings[0]
-    assert found.warnings[0].endswith("(first: images/p00.jpg)")
-    assert given.model.by_name()["p00.jpg"].centre[0] == 0
+def test_a_photograph_with_two_poses_is_an_error(tmp_path):
+    with pytest.raises(UserError, match=r"p00\.jpg.*the same photograph with different poses"):
+        look(make_scene(tmp_path / "scene", repeat))
+
+
+def test_a_repeated_frame_of_the_same_pose_is_used_once(tmp_path):
+    def again(content: dict[str, Any]) -> None:
+        content["frames"].append(dict(content["frames"][0]))
+
+    found, given = look(make_scene(tmp_path / "scene", again))
+    assert not found.warnings and given.model.by_name()["p00.jpg"].centre[0] == 0
 
 
 def test_splits_that_list_the_same_frames_are_no_split(tmp_path):

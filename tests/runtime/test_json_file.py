@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import math
+import os
 import struct
 from pathlib import Path
 from typing import ClassVar, Literal
@@ -135,3 +136,15 @@ def test_numbers_that_are_not_finite_cannot_be_written(value: float) -> None:
 def test_contents_do_not_change() -> None:
     with pytest.raises(ValidationError, match="frozen"):
         CONTENT.number = 1.0  # type: ignore[misc]
+
+
+@pytest.mark.parametrize("kind", ["pipe", "sparse"])
+def test_a_file_without_end_is_an_error_at_once(tmp_path, kind):
+    file = tmp_path / Content.file_name
+    if kind == "pipe":
+        os.mkfifo(file)
+    else:
+        file.touch()
+        os.truncate(file, 4 << 40)
+    with pytest.raises(UserError, match="expected a file of at most 512 MiB"):
+        Content.read(tmp_path)

@@ -39,13 +39,11 @@ def verdict(name: str, found: Found, seed: int) -> GeoreferenceResult:
     close = CLOSE[found.frame.method]
     assert found.frame.fit is not None
     known = uncertainty(found.frame.fit, found.frame.tilt_from)
-    size = float(np.linalg.norm(found.survey.enu - found.survey.enu.mean(0), axis=1).max())
-    stated = (
-        known.scale,
-        max(known.heading_deg, known.tilt_deg),
-        size * (known.scale + np.radians(known.heading_deg)),
-        size * (known.scale + np.radians(known.tilt_deg)),
-    )
+    # The distance of the cameras from each other and from the points.
+    size = float(np.linalg.norm(found.survey.enu, axis=1).max())
+    angle = max(known.heading_deg, known.tilt_deg)
+    place = size * (known.scale + np.radians(angle))
+    stated = (known.scale, angle, place, place)
     if all(error <= limit for error, limit in zip(errors, close, strict=True)):
         outcome = "right"
     elif all(

@@ -86,8 +86,10 @@ def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None
     """The terminal sends SIGHUP to Snakemake and to its job, which ends with a message."""
     (project / TARGET).unlink()
     shutil.rmtree(project / "results/tiny/train")
-    log, progress = (project / "results/tiny" / name for name in ("logs/train.log", ".scratch"))
-    log.unlink()
+    logs = project / "results/tiny/logs"
+    log, progress = (logs / name for name in ("train.log", "train.metrics.jsonl"))
+    for file in (log, progress):
+        file.unlink()
     # Not in a fork: its job would end with the process that represents it.
     with subprocess.Popen(
         command(TARGET, config=TINY),
@@ -97,8 +99,8 @@ def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None
         stderr=subprocess.DEVNULL,
         start_new_session=True,
     ) as run:
-        wait_until((progress / "train").is_dir)
-        time.sleep(1)
+        # Not in the imports before the first step, which may drop an exception.
+        wait_until(lambda: progress.is_file() and progress.stat().st_size > 0)
         os.killpg(run.pid, signal.SIGHUP)
     wait_until(lambda: "terminated" in log.read_text())
     assert "Traceback" not in log.read_text()

@@ -26,6 +26,7 @@ def test_a_bomb_ends_with_one_error(name, tmp_path):
 # These read the bytes themselves for the function under test, or are called after a check of the
 # file's kind.
 READ_HERE = {"npy", "icc", "names", "folders", "video", "video-mov", "video-mkv", "video-avi"}
+READ_HERE |= {"gps-xmp", "projection"}
 
 
 @pytest.mark.parametrize("kind", ENDLESS)

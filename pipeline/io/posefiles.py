@@ -257,7 +257,7 @@ def _frame_warnings(source: str, repeated: list[str], noun: str, lost: list[str]
 def _summary(folder: Path, entry: PoseFormat, path: str, cache: FactCache) -> GivenPoses:
     """Summarise the poses; cached by the files' digests, because large models take seconds."""
     digests = [
-        [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
+        [str(file), cache.get(file, "digest", str, partial(digest_of, file))]
         for file in entry.files(folder / path)
     ]
     return cache.get_for_state(

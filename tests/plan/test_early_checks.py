@@ -169,6 +169,19 @@ def test_possible_cameras_are_accepted(tmp_path: Path) -> None:
         assert look(transforms(tmp_path / "s", **fields)).poses is not None
 
 
+def test_transposed_matrices_are_an_error_of_the_scan(tmp_path: Path) -> None:
+    file = transforms(tmp_path) / "transforms.json"
+    content = json.loads(file.read_text())
+    for number, frame in enumerate(content["frames"]):
+        matrix = np.eye(4)
+        matrix[:3, 3] = number, 2, 3
+        frame["transform_matrix"] = matrix.T.tolist()
+    file.write_text(json.dumps(content))
+    with pytest.raises(UserError, match=r"transposed: its translation is in the last row"):
+        look(tmp_path)
+
+
+
 @pytest.mark.parametrize(
     ("size", "said"), [((48, 64), "are swapped"), ((64, 20), "aspect ratios differ")]
 )

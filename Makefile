@@ -95,6 +95,7 @@ lint: $(VENV)/dev
 	@$(BIN)/snakefmt --check Snakefile
 	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
 	@$(BIN)/python -m tests.style.words
+	@$(BIN)/python -m tests.rooms --check
 
 format: $(VENV)/dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile
@@ -104,6 +105,7 @@ docs: $(VENV)/product
 	@$(BIN)/python -m pipeline.config.docs
 	@$(BIN)/python -m pipeline.command.reference_pages
 	@$(BIN)/python -m benchmarks.tables
+	@$(BIN)/python -m tests.rooms
 
 site: $(VENV)/docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet

@@ -20,8 +20,6 @@ from benchmarks import markdown, record_tables
 from benchmarks.like_for_like import like_for_like
 from benchmarks.raster.tables import steps_table, table
 from benchmarks.record import POSES
-from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
-from pipeline.reporting.batch import published_for
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 ROOT = Path(__file__).parents[1]
@@ -75,11 +73,9 @@ def scenes(records: Sequence[Record]) -> str:
 
 
 def headline(records: Sequence[Record]) -> str:
-    """The short table of the README, of scenes and of budgets; after a benchmark scene, 3DGS's
-    published values for it."""
+    """The short table of the README, of scenes and of budgets."""
     head = ["scene", "training", "test views, pixels", "seeds", "PSNR (dB)", "SSIM", "Gaussians"]
     rows = [[*head, "CPU minutes in all", "where"]]
-    published: dict[str, list[str]] = {}
     for record in records:
         if "runs" not in record:
             rows += _headline_of_budgets(record)
@@ -98,18 +94,7 @@ def headline(records: Sequence[Record]) -> str:
                 f"{record['cores']} cores, {record['instruction_set']}",
             ]
         )
-        for entry in published_for(scene, record["photographs"]):
-            if entry["method"].startswith("3DGS, ") and not entry["differs"]:
-                width, height = PUBLISHED_SCENES[benchmark_scene(scene)].size
-                published[entry["method"]] = [
-                    scene,
-                    f"{entry['method']}, published",
-                    *(f"{width}x{height}", ""),
-                    f"{entry['psnr']:.2f}",
-                    f"{entry['ssim']:.3f}",
-                    *("", "", "GPU"),
-                ]
-    return markdown.table([*rows, *published.values()])
+    return markdown.table(rows)
 
 
 def _headline_of_budgets(record: Record) -> list[list[str]]:

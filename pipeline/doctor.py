@@ -212,7 +212,9 @@ def _training_devices(has_graphics: bool) -> list[Finding]:
 
         chosen = choose_device()
         if find_spec("wgpu") is None:
-            fix = "pip install 'splatmake[gpu]', to train on a GPU" if has_graphics else None
+            fix = (
+                "pip install '.[gpu]' in the checkout, to train on a GPU" if has_graphics else None
+            )
             return [Finding("training", chosen.detail, "absent", fix)]
         found = adapters()
     except (ImportError, UserError) as error:

@@ -11,16 +11,10 @@ from pathlib import Path
 
 import pytest
 
+from tests.rooms import ROOMS as TABLE
+
 ROOT = Path(__file__).parents[1]
-ROOMS = (
-    *("runtime", "config", "geometry", "scene", "splats", "io", "plan", "photos", "sfm", "mvs"),
-    "render",
-    *("training.data", "training.losses", "training.optimisers", "training.cameras"),
-    "training.appearance",
-    *("training.density", "training.checkpoints", "training.loop", "training.scene"),
-    "training.blocks",
-    *("metrics", "coverage", "surface", "export", "reporting", "watching", "demo"),
-)
+ROOMS = tuple(TABLE)
 PACKAGES = ("training",)  # hold rooms, and nothing else
 MODULES = ("commands", "command", "doctor", "__main__")  # the command line
 

@@ -181,7 +181,6 @@ def test_transposed_matrices_are_an_error_of_the_scan(tmp_path: Path) -> None:
         look(tmp_path)
 
 
-
 @pytest.mark.parametrize(
     ("size", "said"), [((48, 64), "are swapped"), ((64, 20), "aspect ratios differ")]
 )

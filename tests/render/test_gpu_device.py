@@ -47,7 +47,7 @@ def test_without_wgpu_the_error_says_what_to_install(monkeypatch: pytest.MonkeyP
             Gpu()
     finally:
         device._adapters.cache_clear()
-    assert "splatmake[gpu]" in str(error.value.fix)
+    assert ".[gpu]" in str(error.value.fix)
 
 
 def test_the_memory_of_a_large_scene_is_known_before(gpu: Gpu) -> None:

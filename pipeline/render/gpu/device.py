@@ -34,7 +34,7 @@ SMALLER = (
     "lower train.density.max_gaussians or views.max_long_side_px, set partition.blocks, or set "
     "train.device: cpu"
 )
-NO_WGPU = "install it with pip install 'splatmake[gpu]', or set train.device: cpu"
+NO_WGPU = "install it with pip install '.[gpu]' in the checkout, or set train.device: cpu"
 NO_GPU = (
     "install the GPU's driver with Vulkan (vulkaninfo lists devices), or set train.device: "
     "cpu; splatmake doctor shows what is found"

@@ -25,7 +25,8 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import CoverageResult, Place
 from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Init, Train
+from pipeline.config.schema import Init
+from pipeline.config.settled import TrainOptions
 from pipeline.coverage.probe_views import Renderer, render_probe
 from pipeline.coverage.trust import trust_map
 from pipeline.coverage.viewpoints import MAX_PROPOSALS, Viewpoint, propose_viewpoints
@@ -45,6 +46,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import gaussians_from_points
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 
 Array = NDArray[np.float64]
 UP = np.array([0.0, 0.0, 1.0])
@@ -124,23 +126,17 @@ def cameras() -> list[PosedImage]:
 
 
 def train_scene(studio: Studio, views: Sequence[View], steps: int, extent: float) -> Gaussians:
-    config = Train(
+    options = TrainOptions(
         steps=steps,
-        background="black",
-        appearance="none",
         density=Gradient(max_gaussians=MAX_GAUSSIANS),
+        experiments=TrainExperiments(learning_rate_factor=4.0),
     )
-    experiments = TrainExperiments(learning_rate_factor=4.0)
     centres = np.stack([view.centre for view in views])
-    first = gaussians_from_points(studio.sparse(views), centres, Init(), config.sh_degree)
+    first = gaussians_from_points(studio.sparse(views), centres, Init(), options.sh_degree)
     with TemporaryDirectory() as folder:
         return train(
             Inputs(views, Gaussians.from_arrays(first), extent),
-            config,
-            experiments,
-            seed=0,
-            threads=2,
-            checkpoint_dir=Path(folder),
+            TrainingRun(options, Path(folder), threads=2),
         ).gaussians
 
 

@@ -20,8 +20,7 @@ from PIL import Image
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import MemoryResult
 from pipeline.config.density import Gradient
-from pipeline.config.experiments import DEFAULT
-from pipeline.config.schema import Train
+from pipeline.config.settled import TrainOptions
 from pipeline.demo.cameras import lens, orbit
 from pipeline.plan.training_memory import memory_mb
 from pipeline.runtime.machine import usable_cores
@@ -31,6 +30,7 @@ from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 
 PIXELS_ACROSS = 3.0  # 3-sigma radius of a Gaussian
 
@@ -88,15 +88,12 @@ def main() -> int:
         views = made_views(args.views, width, height, folder)
         result = train(
             Inputs(views, made_gaussians(args.gaussians, views[0].fx), scene_extent(views)),
-            Train(
-                steps=args.steps,
-                density=Gradient(max_gaussians=args.gaussians),
+            TrainingRun(
+                TrainOptions(steps=args.steps, density=Gradient(max_gaussians=args.gaussians)),
+                folder / "checkpoints",
+                threads=args.threads,
+                memory_mb=args.memory_mb,
             ),
-            DEFAULT.train,
-            seed=0,
-            threads=args.threads,
-            memory_mb=args.memory_mb,
-            checkpoint_dir=folder / "checkpoints",
         )
         saved = sum(file.stat().st_size for file in (folder / "checkpoints").rglob("*"))
     planned = memory_mb(args.views * width * height, args.gaussians)

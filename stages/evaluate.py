@@ -5,7 +5,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING, Any
 
-from pipeline.config.schema import Evaluate, Split, Train
+from pipeline.config.schema import Evaluate, Split
+from pipeline.config.settled import Train
 from pipeline.metrics.counters import EvaluateCounters
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import Plan, StagePlan

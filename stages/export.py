@@ -11,8 +11,9 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Train, Views
+from pipeline.config.schema import BLOCKS_FORMAT, DENSE_FORMATS, Export, Split, Views
 from pipeline.config.section import MAX_SIDE_PX
+from pipeline.config.settled import Train
 from pipeline.export.counters import ExportCounters
 from pipeline.plan.mesh_voxel import check_mesh_voxel
 from pipeline.plan.stage import StageSpec

@@ -6,7 +6,8 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Features, Init, Matches, Train
+from pipeline.config.schema import Features, Init, Matches
+from pipeline.config.settled import Train
 from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION, PointCloudFiles
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan

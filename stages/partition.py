@@ -4,7 +4,8 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Partition, Train
+from pipeline.config.schema import Partition
+from pipeline.config.settled import Train
 from pipeline.plan.stage import StageSpec, if_blocks
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job

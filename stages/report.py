@@ -6,7 +6,8 @@ import time
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Split, Train
+from pipeline.config.schema import Split
+from pipeline.config.settled import Train
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan

@@ -6,8 +6,6 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Train
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -49,15 +47,11 @@ def work(job: Job) -> None:
 
     from pipeline.io.npz import read_npz
     from pipeline.training.scene import train_scene
-    from stages.workflow.training import training_run
+    from stages.workflow.training import scene_data, training_run
 
     trained = train_scene(
-        inputs.input_views(job),
-        inputs.read_manifest(job, "views"),
-        inputs.input_model(job),
+        scene_data(job),
         read_npz(job.inputs["init"] / "gaussians.npz"),
-        job.section(Train),
-        job.section(Experiments).train,
         training_run(job),
         dense=job.inputs.get("dense"),
     )

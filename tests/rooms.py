@@ -29,6 +29,7 @@ ROOMS = {
     "training.cameras": "refinement of poses and intrinsics",
     "training.appearance": "exposure gains and appearance embeddings",
     "training.density": "density strategies, removal of floaters",
+    "training.run": "what a training is given besides its inputs",
     "training.checkpoints": "files that resume a killed run",
     "training.loop": "the optimisation, step by step",
     "training.scene": "the training of a scene, described",

@@ -22,7 +22,6 @@ from pipeline.config.experiments import Experiments
 from pipeline.config.load import REFERENCE, Project
 from pipeline.config.options import sections_of
 from pipeline.config.presets import PRESETS
-from pipeline.config.renamed import RENAMED
 from pipeline.config.section import Unit
 from pipeline.runtime.atomic import write_text
 
@@ -103,8 +102,6 @@ def page() -> str:
     for preset, values in PRESETS.items():
         lines += [f"`{preset}`:", "", "```yaml"]
         lines += [yaml.safe_dump(values or {}, sort_keys=False).strip(), "```", ""]
-    lines += ["## Renamed options", "", "| old name | new name |", "|---|---|"]
-    lines += [f"| `{old}` | {', '.join(f'`{n}`' for n in new)} |" for old, new in RENAMED.items()]
     return "\n".join(lines).rstrip() + "\n"
 
 

@@ -82,23 +82,6 @@ class GradientExperiments(DensityExperiments):
         description="Gaussians with a larger mean gradient of their projected centre are split, "
         "the largest gradients first, up to the limit of Gaussians (3DGS: 2e-4).",
     )
-    absolute_gradient: bool = Field(
-        False,
-        description="Sum absolute values of the gradients over pixels (AbsGS), so that opposite "
-        "directions do not cancel; needs a larger grad_threshold.",
-    )
-    clone: bool = Field(
-        False, description="Clone small Gaussians instead of splitting them (3DGS)."
-    )
-    split: bool = Field(True, description="False: all are cloned.")
-    split_kind: Literal["long_axis", "sampled"] = Field(
-        "long_axis",
-        description="long_axis: two halves side by side along the longest axis (after Deng et al. "
-        "2025); sampled: two positions drawn from the Gaussian, scales divided by 1.6 (3DGS).",
-    )
-    split_scale: SceneShare = Field(
-        0.01, description="With clone: only Gaussians with a larger scale are split."
-    )
     recycle_share: Share = Field(
         0.02,
         description="At the limit of Gaussians: maximum share of it that is removed at each "
@@ -132,10 +115,10 @@ class McmcExperiments(DensityExperiments):
 class TrainExperiments(Section):
     """The optimisation of the Gaussians."""
 
-    coarse_share: Literal["auto"] | PartOfRun = Field(
-        "auto",
+    coarse_share: PartOfRun | None = Field(
+        None,
         description="Share of the run, in steps or minutes, at reduced resolution (1/4, then 1/2). "
-        "auto: 0.15 of the steps, or 0.1 of budget_minutes but at most 1.2 minutes (3DGS: 0).",
+        "null: 0.15 of the steps, or 0.1 of budget_minutes but at most 1.2 minutes (3DGS: 0).",
     )
     sh_degree_interval: Steps = Field(
         1000, description="Steps after which the degree of spherical harmonics grows by one."
@@ -153,16 +136,10 @@ class TrainExperiments(Section):
         description="No gradient for a colour that is clamped at 0 (3DGS). False: gradients that "
         "raise it pass.",
     )
-    isotropic: bool = Field(False, description="Spheres instead of ellipsoids.")
     gradients_per_pixel: Annotated[int, Field(ge=0, le=MAX_GAUSSIANS), Unit("Gaussians")] = Field(
         0,
         description="Backpropagate only to the first Gaussians along each pixel's ray, up to this "
         "number. 0: to all.",
-    )
-    salt_and_pepper_share: Share = Field(
-        0.0,
-        description="Share of the training pixels that is replaced by black or white at random. "
-        "Test views are not changed.",
     )
     appearance_size: Annotated[int, Field(ge=1, le=6), Unit("numbers")] = Field(
         3, description="With train.appearance: embedding: size of a photograph's embedding."
@@ -215,9 +192,9 @@ class TrainExperiments(Section):
     shN_learning_rate: LearningRate = Field(
         6e-4, description="Learning rate of the other SH coefficients (3DGS: 1.25e-4)."
     )
-    learning_rate_factor: Literal["auto"] | Factor = Field(
-        "auto",
-        description="Factor of all learning rates. auto: sqrt(30000 / steps), between 1 and 4, "
+    learning_rate_factor: Factor | None = Field(
+        None,
+        description="Factor of all learning rates. null: sqrt(30000 / steps), between 1 and 4, "
         "or less than 4 if fewer than half of the views see a Gaussian (3DGS: 1).",
     )
     learning_rate_decay_start: PartOfRun = Field(

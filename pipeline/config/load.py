@@ -10,7 +10,6 @@ from pydantic import BaseModel, BeforeValidator, Field, ValidationError
 
 from pipeline.config.options import sections_of
 from pipeline.config.presets import PRESETS
-from pipeline.config.renamed import renamed
 from pipeline.config.runs import is_config_name
 from pipeline.config.schema import Config
 from pipeline.config.section import FilePath, Seed
@@ -145,7 +144,7 @@ def _error_lines(model: type[BaseModel], error: ValidationError, prefix: str) ->
     for problem in problems[:_MAX_ERRORS]:
         path, sections = _path(model, problem["loc"])
         if problem["type"] == "extra_forbidden":
-            lines += renamed(path) or [f"{path}: no such option{_nearest(sections, path)}"]
+            lines.append(f"{path}: no such option{_nearest(sections, path)}")
             continue
         expected, _ = wrong.setdefault(path, ([], shown(problem["input"])))
         expected.append(shortened(problem["msg"].removeprefix("Value error, "), _MAX_MESSAGE))

@@ -272,13 +272,13 @@ class Train(Section):
         "white if images have alpha, black if there are masks or with strategy: original, else "
         "skybox.",
     )
-    appearance: Literal["auto", "none", "exposure", "embedding"] = Field(
-        "auto",
+    appearance: Literal["measured", "none", "exposure", "embedding"] = Field(
+        "measured",
         description="How colours differ between photographs. none: they do not; exposure: renders "
         "are multiplied by each photograph's exposure and white balance, measured at the sparse "
         "points; embedding: the colours of Gaussians depend on a vector for each photograph, for "
         "another light or weather, and test views are measured on the right half after a fit on "
-        "the left. auto: embedding if photographs disagree on colours after exposure, else "
+        "the left. measured: embedding if photographs disagree on colours after exposure, else "
         "exposure if exposures differ by more than 0.2 stops (standard deviation).",
     )
     refine_poses: bool = Field(

@@ -45,7 +45,7 @@ def as_published(scan: Scan, config: Config) -> Config:
     train: dict[str, Any] = {}
     if config.train.background == "auto" and scene.background is not None:
         train["background"] = scene.background
-    if config.train.appearance == "auto":
+    if config.train.appearance == "measured":
         train["appearance"] = "none"
     changes = {
         "views": config.views.model_copy(

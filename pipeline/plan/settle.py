@@ -13,6 +13,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
+from pipeline.config import settled
 from pipeline.config.schema import MAX_BLOCKS, Config
 from pipeline.io.posefiles import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.budget import gaussian_budget, typical_view
@@ -52,13 +53,13 @@ PROCESSOR: Choice = ("cpu", "")
 
 @dataclass(frozen=True)
 class Settled:
-    """A config whose options are no longer "auto", as far as the scan decides them.
+    """A config whose options are no longer "auto".
 
     Attributes:
         why: dotted path of an option -> the sentence that gives its value and the reason.
     """
 
-    config: Config
+    config: settled.Config
     why: Mapping[str, str]
 
 
@@ -93,7 +94,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
         )
     method = _init_method(scan, config)
     depth_weight, depth_reason = _depth_loss_weight(scan, config, method == "dense" and blocks == 1)
-    settled = _updated(
+    replaced = _updated(
         config,
         {
             "inspect": {"image_folder": scan.image_folder},
@@ -122,7 +123,7 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
     why["partition.blocks"] = blocks_reason
     why["split.source"] = published_line(scan, config)
     why["features.photos_per_job"] = jobs_reason
-    return Settled(settled, why)
+    return Settled(replaced, why)
 
 
 def _pairs(scan: Scan, config: Config) -> Choice:
@@ -340,9 +341,9 @@ def _depth_loss_weight(scan: Scan, config: Config, dense: bool) -> tuple[float, 
     return weight, f"few photographs: the loss on sparse points' depths has weight {weight:g}"
 
 
-def _updated(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> Config:
+def _updated(config: Config, changes: Mapping[str, Mapping[str, Any]]) -> settled.Config:
     sections = {
         name: getattr(config, name).model_copy(update=dict(values))
         for name, values in changes.items()
     }
-    return Config.model_validate(config.model_copy(update=sections).model_dump())
+    return settled.Config.model_validate(config.model_copy(update=sections).model_dump())

@@ -4,6 +4,8 @@ import ctypes
 import re
 import resource
 import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 _M_ARENA_MAX = -8  # malloc.h of glibc
@@ -33,6 +35,15 @@ def release_free_memory() -> None:
     """Return freed memory to the system, which glibc keeps where allocations differ in size."""
     if sys.platform == "linux" and hasattr(libc := ctypes.CDLL(None), "malloc_trim"):
         libc.malloc_trim(0)
+
+
+@contextmanager
+def freed_memory() -> Iterator[None]:
+    """Return memory that is freed before and inside the block to the system. Arrays of another size
+    would leave gaps, and what the block leaves behind would stay beside the next large arrays."""
+    release_free_memory()
+    yield
+    release_free_memory()
 
 
 def share_heap() -> None:

@@ -10,8 +10,6 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
 from pipeline.scene.exposure import NO_GAINS, ExposureGains
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction, with_poses
@@ -32,11 +30,10 @@ from pipeline.training.data.known_depths import (
     scene_scale,
 )
 from pipeline.training.density.floaters import empty_depths
-from pipeline.training.loop import metrics_log
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.result import TrainResult
-from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 
 # Epochs (passes over the training views) below which no scene is sharp.
 MIN_EPOCHS = 3.0
@@ -68,21 +65,12 @@ class TrainedScene:
 
 
 @dataclass(frozen=True)
-class TrainingRun:
-    """How a training runs. Only the seed changes the result.
+class SceneData:
+    """A scene as the stages before training describe it: all views, test views as well."""
 
-    Attributes:
-        threads: of the native operators.
-        memory_mb: memory limit; see ``training.loop.train``.
-        checkpoint_dir: where a killed training is resumed from.
-        logs: folder of the metrics log.
-    """
-
-    seed: int
-    threads: int
-    memory_mb: int | None
-    checkpoint_dir: Path
-    logs: Path
+    views: list[View]
+    manifest: Manifest
+    model: Reconstruction
 
 
 @dataclass
@@ -95,96 +83,61 @@ class Notes:
 
 
 def train_scene(
-    views: list[View],
-    manifest: Manifest,
-    model: Reconstruction,
-    initial: Gaussians,
-    config: Train,
-    experiments: TrainExperiments,
-    run: TrainingRun,
-    part: Part = WHOLE_RUN,
-    dense: Path | None = None,
+    scene: SceneData, initial: Gaussians, run: TrainingRun, dense: Path | None = None
 ) -> TrainedScene:
     """Train on the views that are not test views.
 
     Args:
-        dense: outputs of the stage dense, whose depths the depth loss uses.
-        part: of the schedule.
+        dense: The folder with the dense stage's depth maps. Ignored if the user gave depth maps.
 
     Raises:
         UserError: see ``training.loop.train``.
     """
-    notes = Notes()
-    has_alpha = any(photo.alpha for photo in manifest.photos)
+    notes, manifest = Notes(), scene.manifest
     appearance = choose_appearance(
-        views,
-        model,
+        scene.views,
+        scene.model,
         initial.means.double().numpy(),
-        config.appearance,
+        run.options.appearance,
         cameras=[photo.camera_group for photo in manifest.photos],
-        has_alpha=has_alpha,
-        in_blocks=part != WHOLE_RUN,
+        has_alpha=any(photo.alpha for photo in manifest.photos),
+        in_blocks=run.is_part,
     )
     notes.decisions += appearance.decisions
     notes.counters |= appearance.counters
-    gains = appearance.gains
-    inputs = scene_inputs(views, manifest, model, initial, gains, config, notes, dense)
+    inputs = scene_inputs(scene, initial, run, appearance.gains, notes, dense)
     if appearance.embeddings:
-        size = experiments.appearance_size
+        size = run.options.experiments.appearance_size
         inputs = replace(inputs, embeddings=initial_embeddings(inputs.views, size))
-    trained = run_training(
-        inputs,
-        config,
-        experiments,
-        run,
-        part,
-        notes,
-    )
-    result, refined = trained.result, model
+    trained = run_training(inputs, run, notes)
+    result, refined = trained.result, scene.model
     if result.intrinsics is not None:
         refined = with_intrinsics(refined, result.intrinsics)
         trained.decisions.append(describe_intrinsics(result.intrinsics))
     if result.poses is not None:
-        refined = with_poses(refined, with_common_motion(views, result.poses))
-        trained.decisions.append(describe_poses(views, result.poses))
-    return replace(trained, model=None if refined is model else refined, gains=gains)
+        refined = with_poses(refined, with_common_motion(scene.views, result.poses))
+        trained.decisions.append(describe_poses(scene.views, result.poses))
+    model = None if refined is scene.model else refined
+    return replace(trained, model=model, gains=appearance.gains)
 
 
-def run_training(
-    inputs: Inputs,
-    config: Train,
-    experiments: TrainExperiments,
-    run: TrainingRun,
-    part: Part = WHOLE_RUN,
-    notes: Notes | None = None,
-) -> TrainedScene:
-    """Train, and describe the result; arguments and errors as ``train_scene``.
+def run_training(inputs: Inputs, run: TrainingRun, notes: Notes | None = None) -> TrainedScene:
+    """Train, and describe the result; errors as of ``train_scene``.
 
     Args:
-        notes: messages and counters of the inputs.
+        notes: Messages and counters of the inputs.
     """
     notes = notes or Notes()
     start = time.perf_counter()
-    result = train(
-        inputs,
-        config,
-        experiments,
-        seed=run.seed,
-        threads=run.threads,
-        memory_mb=run.memory_mb,
-        checkpoint_dir=run.checkpoint_dir,
-        metrics_log=run.logs / metrics_log.NAME,
-        on_log=lambda text: print(text, file=sys.stderr, flush=True),
-        part=part,
-    )
+    result = train(inputs, run, log=lambda text: print(text, file=sys.stderr, flush=True))
     # Seconds that earlier, killed processes spent on this training.
     earlier = max(0.0, result.seconds - (time.perf_counter() - start))
-    _describe(result, len(inputs.views), config, part, notes)
+    _describe(result, len(inputs.views), run, notes)
     counters = TrainCounters(
         num_gaussians=len(result.gaussians),
         steps=result.steps,
         known_depths=sum(map(len, inputs.depths or ())),
-        device="gpu" if config.device.startswith("gpu") else "cpu",
+        device="gpu" if run.options.device.startswith("gpu") else "cpu",
         **notes.counters,
         **result.counters,
     )
@@ -206,26 +159,24 @@ def run_training(
 
 
 def scene_inputs(
-    views: list[View],
-    manifest: Manifest,
-    model: Reconstruction,
+    scene: SceneData,
     initial: Gaussians,
+    run: TrainingRun,
     gains: ExposureGains,
-    config: Train,
     notes: Notes | None = None,
     dense: Path | None = None,
 ) -> Inputs:
     """The inputs of training a scene.
 
     Args:
-        gains: of all views; empty if exposure is not modelled.
-        notes: receives messages and counters about depth maps.
-        dense: outputs of the stage dense; not used beside depth maps of the user.
+        gains: The gains of all views; empty if exposure is not modelled.
+        notes: Receives messages and counters about depth maps.
+        dense: See ``train_scene``.
     """
     notes = notes or Notes()
-    training = [view for view in views if not view.is_test]
-    points = point_depths(training, model)
-    extent = scene_extent(views)
+    training = [view for view in scene.views if not view.is_test]
+    points = point_depths(training, scene.model)
+    extent = scene_extent(scene.views)
     return Inputs(
         views=training,
         initial=initial,
@@ -233,8 +184,8 @@ def scene_inputs(
         scale=scene_scale(extent, points),
         gains=np.array([gains.of(view.name) for view in training]) if gains else None,
         depths=(
-            _known_depths(training, manifest, points, initial, notes, dense)
-            if config.depth_loss_weight
+            _known_depths(training, scene.manifest, points, initial, notes, dense)
+            if run.options.depth_loss_weight
             else None
         ),
         empty_depths=empty_depths(points),
@@ -271,11 +222,12 @@ def _known_depths(
     return known
 
 
-def _describe(result: TrainResult, num_views: int, config: Train, part: Part, notes: Notes) -> None:
+def _describe(result: TrainResult, num_views: int, run: TrainingRun, notes: Notes) -> None:
     notes.warnings += result.warnings
-    minutes = config.budget_minutes
-    whole = part == WHOLE_RUN
-    if whole and (few := too_few_epochs(result.steps, num_views, result.seconds, minutes)):
+    minutes = run.options.budget_minutes
+    if not run.is_part and (
+        few := too_few_epochs(result.steps, num_views, result.seconds, minutes)
+    ):
         notes.warnings.append(few)
     if minutes is not None:
         notes.decisions.append(

@@ -6,8 +6,6 @@ import shutil
 from collections.abc import Callable
 from typing import TYPE_CHECKING
 
-from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Train
 from pipeline.runtime.job import Job
 from pipeline.scene.blocks import Partition
 from stages.workflow import inputs
@@ -16,7 +14,7 @@ if TYPE_CHECKING:
     from pipeline.splats.arrays import GaussianSource
     from pipeline.training.blocks.train import SceneInBlocks
     from pipeline.training.blocks.union import Union
-    from pipeline.training.loop.schedule import Part
+    from pipeline.training.run import Part
 
 INPUTS = {
     "views": inputs.VIEWS,
@@ -50,19 +48,9 @@ def train(job: Job, open_scene: Callable[[], GaussianSource], part: Part) -> Non
     from pipeline.training.scene import run_training
     from stages.workflow.training import training_run
 
-    run = training_run(job)
     trained = run_training(
         # Not a local variable here: what it is made from is not held during training.
-        *block_training(
-            _scene(job, open_scene),
-            job.number,
-            job.section(Train),
-            job.section(Experiments).train,
-            part,
-            run.seed,
-        ),
-        run,
-        part,
+        *block_training(_scene(job, open_scene), job.number, training_run(job, part))
     )
     gaussians = with_far_field(
         trained.result.gaussians, open_scene(), read_partition(job), job.number
@@ -75,12 +63,11 @@ def _scene(job: Job, open_scene: Callable[[], GaussianSource]) -> SceneInBlocks:
     from pipeline.splats.arrays import collect
     from pipeline.splats.gaussians import Gaussians
     from pipeline.training.blocks.train import SceneInBlocks
+    from pipeline.training.scene import SceneData
 
     views = inputs.coarse_views(job)
     return SceneInBlocks(
-        views=views,
-        manifest=inputs.read_manifest(job, "views"),
-        model=inputs.coarse_model(job),
+        SceneData(views, inputs.read_manifest(job, "views"), inputs.coarse_model(job)),
         gains=ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
         partition=read_partition(job),
         read_gaussians=lambda: Gaussians.sharing(collect(open_scene())),

@@ -2,16 +2,13 @@
 
 import re
 from pathlib import Path
-from typing import Any
 
 import pytest
 import yaml
 
 from pipeline.config import docs
 from pipeline.config.load import Project, load_project, merge, scene_config
-from pipeline.config.options import option_paths
 from pipeline.config.presets import PRESETS
-from pipeline.config.renamed import RENAMED
 from pipeline.config.schema import Config
 from pipeline.runtime.errors import UserError
 
@@ -170,20 +167,3 @@ def test_the_product_has_few_options():
             assert meaning.removesuffix(" |").strip().endswith("."), name
             assert not re.search(r"(^|, )(whole )?number(,|$)", values), f"{name} has no range"
             assert ("number" in values) <= bool(unit), f"{name} has no unit"
-
-
-@pytest.mark.parametrize(("old", "new"), RENAMED.items())
-def test_an_old_name_is_an_error_that_says_the_new_one(old, new):
-    """And every new name is an option."""
-    # The last decides no result.
-    assert set(new) <= {*option_paths(), "partition.memory_mb"}
-    assert old not in set(option_paths())
-    for prefix in ((), ("scenes", "fox"), ("configs", "other")):
-        raw: Any = 1
-        for name in reversed((*prefix, *old.split("."))):
-            raw = {name: raw}
-        with pytest.raises(UserError) as caught:
-            load_project(raw)
-        (line,) = str(caught.value).split("not valid:")[1].splitlines()[1:2]
-        where = f"{'.'.join(prefix)}: " if prefix else ""
-        assert line.strip() == f"{where}{old} is now {' or '.join(new)}"

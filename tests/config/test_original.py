@@ -10,10 +10,10 @@ import pytest
 from pipeline.config.density import Original
 from pipeline.config.load import scene_config
 from pipeline.training.density import original
-from pipeline.training.density.gradient import SPLIT_SHRINK
+from pipeline.training.density.growth import SPLIT_SHRINK
 
 CONFIG = scene_config({"preset": "original"}, "scene")
-RATES, DENSITY = CONFIG.experiments.train, original.PUBLISHED
+RATES = CONFIG.experiments.train
 
 PUBLISHED = {
     "iterations": (CONFIG.train.steps, 30_000),
@@ -33,14 +33,14 @@ PUBLISHED = {
     "Adam's first beta": (RATES.adam_beta1, 0.9),
     "Adam's epsilon": (RATES.adam_epsilon, 0.0),
     "initial opacity": (CONFIG.experiments.init.opacity, 0.1),
-    "densify_from_iter": (DENSITY.start_step, 500),
+    "densify_from_iter": (original.FROM_STEP, 500),
     "densify_until_iter": (original.UNTIL_STEP, 15_000),
-    "densification_interval": (DENSITY.interval, 100),
-    "densify_grad_threshold": (DENSITY.grad_threshold, 0.0002),
-    "percent_dense": (DENSITY.split_scale, 0.01),
-    "opacity_reset_interval": (DENSITY.opacity_reset_interval, 3000),
-    "min_opacity": (DENSITY.prune_opacity, 0.005),
-    "pruned scale, extents": (DENSITY.prune_scale, 0.1),
+    "densification_interval": (original.INTERVAL, 100),
+    "densify_grad_threshold": (original.GRADIENT_THRESHOLD, 0.0002),
+    "percent_dense": (original.PERCENT_DENSE, 0.01),
+    "opacity_reset_interval": (original.RESET_INTERVAL, 3000),
+    "min_opacity": (original.MIN_OPACITY, 0.005),
+    "pruned scale, extents": (original.MAX_SCALE, 0.1),
     "split: factor of the scales": (SPLIT_SHRINK, 0.8 * 2),
 }
 
@@ -55,8 +55,6 @@ def test_nothing_is_added_to_the_published_method():
     """No coarse phase (the authors' code has none), no other losses, no changed learning rates."""
     train, experiments = CONFIG.train, CONFIG.experiments.train
     assert isinstance(train.density, Original)
-    assert DENSITY.clone and DENSITY.split and DENSITY.split_kind == "sampled"
-    assert not DENSITY.recycle_share and not DENSITY.absolute_gradient
     assert not (train.antialias or train.refine_poses or train.refine_intrinsics)
     assert train.appearance == "none"
     losses = (

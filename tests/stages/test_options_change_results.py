@@ -55,8 +55,6 @@ FIXED = under(poses="auto", sfm__refine_principal_point="no")
 RANDOM = under(poses="keep", init__method="random", experiments__init__num_random=500)
 MCMC = under(poses="keep", train__density__strategy="mcmc")
 RESETS = under(poses="keep", experiments__train__gradient__opacity_reset_interval=1000)
-CLONES = under(poses="keep", experiments__train__gradient__clone=True)
-ALL_SMALL = under(poses="keep", experiments__train__gradient__split_scale=10.0)
 DARK = under(poses="keep", experiments__train__sh0_learning_rate=1.0)
 LARGE = under(poses="keep", views__max_long_side_px=200)
 FULL = under(poses="keep", experiments__init__opacity=0.05, train__density__max_gaussians=320)
@@ -124,9 +122,7 @@ FLIPS = {
     f"{_T}.squared_error_loss_weight": Flip(0.0, POSED),
     f"{_T}.alpha_loss_weight": Flip(0.0, POSED, "alpha"),
     f"{_T}.clamp_color_gradient": Flip(True, DARK),
-    f"{_T}.isotropic": Flip(True, POSED),
     f"{_T}.gradients_per_pixel": Flip(1, POSED),
-    f"{_T}.salt_and_pepper_share": Flip(0.1, POSED),
     f"{_T}.max_pose_change": Flip(1e-6, under(poses="keep", train__refine_poses=True)),
     f"{_T}.max_intrinsics_change": Flip(1e-6, under(poses="keep", train__refine_intrinsics=True)),
     f"{_T}.adam_beta1": Flip(0.9, POSED),
@@ -138,11 +134,6 @@ FLIPS = {
     f"{_G}.interval": Flip(2000, POSED),
     f"{_G}.prune_opacity": Flip(0.25, POSED),
     f"{_G}.grad_threshold": Flip(1.0, POSED),
-    f"{_G}.absolute_gradient": Flip(True, POSED),
-    f"{_G}.clone": Flip(True, ALL_SMALL),
-    f"{_G}.split": Flip(False, POSED),
-    f"{_G}.split_kind": Flip("sampled", POSED),
-    f"{_G}.split_scale": Flip(10.0, CLONES),
     f"{_G}.recycle_share": Flip(0.0, FULL),
     f"{_G}.prune_scale": Flip(1e-3, RESETS),
     f"{_G}.opacity_reset_interval": Flip(1000, POSED),

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 import pytest
@@ -14,7 +14,7 @@ from PIL import Image
 
 from pipeline.config.experiments import TrainExperiments
 from pipeline.config.options import option_paths
-from pipeline.config.schema import Train
+from pipeline.config.settled import Train, TrainOptions
 from pipeline.render import make_backend
 from pipeline.render.views import render_view
 from pipeline.scene.views import View
@@ -36,17 +36,10 @@ class TinyScene:
     extent: float
 
 
-class Options(NamedTuple):
-    """The arguments of ``train`` that hold its options."""
-
-    train: Train
-    experiments: TrainExperiments
-
-
 def tiny_config(
     steps: int = 40, density: dict[str, object] | None = None, **changes: object
-) -> Options:
-    """Options of a training short enough for a test, with every phase in it.
+) -> TrainOptions:
+    """TrainOptions of a training short enough for a test, with every phase in it.
 
     Args:
         density: options of density control and of experiments with it, for each strategy.
@@ -64,9 +57,8 @@ def tiny_config(
         if name in ("gradient", "mcmc")
     }
     train = {name: values.pop(name) for name in list(values) if name in Train.model_fields}
-    return Options(
-        Train.model_validate(train | {"density": kept}),
-        TrainExperiments.model_validate(values | strategies),
+    return TrainOptions.model_validate(
+        train | {"density": kept, "experiments": values | strategies}
     )
 
 

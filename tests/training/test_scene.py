@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from pipeline.config.settled import TrainOptions
 from pipeline.scene.manifest import Manifest
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.training import scene as stage
 from pipeline.training.appearance.choose import AppearanceChoice
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import SCALE_SHARE, KnownDepths
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import ball, camera_at
 
 
@@ -46,13 +46,9 @@ def test_the_scale_follows_the_depths_of_training_views(
     monkeypatch.setattr(stage, "point_depths", lambda training, _: [known] * len(training))
     with pytest.raises(Started):
         stage.train_scene(
-            views,
-            Manifest(scene="street", photos=()),
-            Reconstruction({}, {}),
+            stage.SceneData(views, Manifest(scene="street", photos=()), Reconstruction({}, {})),
             ball(5, 0),
-            Train(depth_loss_weight=0.0),
-            TrainExperiments(),
-            stage.TrainingRun(0, 1, None, tmp_path, tmp_path),
+            TrainingRun(TrainOptions(), tmp_path),
         )
     assert [view.name for view in given[0].views] == ["1", "2"]
     assert given[0].extent == 50.0

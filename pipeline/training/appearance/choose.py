@@ -51,20 +51,20 @@ def choose_appearance(
     has_alpha: bool,
     in_blocks: bool,
 ) -> AppearanceChoice:
-    """Settle ``train.appearance``.
+    """Choose the model of appearance that ``wanted`` names, or by measurement.
 
     Args:
         views: all views.
         points: (N, 3) of the scene, for a model without points.
-        wanted: the option.
+        wanted: The option ``train.appearance``.
         cameras: camera group of each photograph.
         has_alpha: whether photographs have alpha: exposure is not modelled.
-        in_blocks: whether the scene is trained in blocks: ``auto`` chooses no embeddings.
+        in_blocks: whether the scene is trained in blocks: ``measured`` chooses no embeddings.
     """
     choice = AppearanceChoice(embeddings=wanted == "embedding")
     if wanted in ("none", "embedding") or has_alpha:
         return choice
-    if wanted == "auto" and not in_blocks:
+    if wanted == "measured" and not in_blocks:
         training = [view for view in views if not view.is_test]
         disagreement = colour_disagreement(training, model, points)
         choice.counters["colour_disagreement"] = round(disagreement, 4)
@@ -77,7 +77,7 @@ def choose_appearance(
                 "each has an appearance embedding (train.appearance)"
             )
             return choice
-    if wanted == "auto":
+    if wanted == "measured":
         spread = measure_exposures(sample_views(views), model).spread
         choice.counters["exposure_spread_stops"] = round(spread, 4)
         if spread < EXPOSURES_DIFFER:

@@ -6,10 +6,13 @@ that is configured. Then each block is trained twice.
 
 from __future__ import annotations
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from dataclasses import replace
+
+from pipeline.config.settled import TrainOptions
 from pipeline.scene.blocks import Block, Box, Partition
-from pipeline.training.loop.schedule import Part, Schedule
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop.schedule import Schedule
+from pipeline.training.run import Part, TrainingRun
 
 # The parts of a run's schedule: on the whole scene, in blocks among the coarse Gaussians, and in
 # blocks among what the other blocks have become. Alternating over subdomains that overlap is the
@@ -33,57 +36,46 @@ def corrected_box(partition: Partition, number: int, part: Part) -> Box:
     return partition.region(number) if part == SECOND else partition.kept(number)
 
 
-def coarse_options(train: Train) -> Train:
-    """The options of the coarse run of a scene that ``train`` trains in blocks."""
-    return train.model_copy(
-        update={
-            "budget_minutes": _minutes(train, COARSE, 1.0),
-            "sh_degree": min(COARSE_SH_DEGREE, train.sh_degree),
-        }
-    )
+def coarse_run(run: TrainingRun) -> TrainingRun:
+    """The coarse run of a scene that ``run`` trains in blocks."""
+    options = run.options
+    changes = {
+        "budget_minutes": _minutes(options, COARSE, 1.0),
+        "sh_degree": min(COARSE_SH_DEGREE, options.sh_degree),
+    }
+    return replace(run, options=options.model_copy(update=changes), part=COARSE)
 
 
-def block_options(
-    train: Train,
-    experiments: TrainExperiments,
-    block: Block,
-    part: Part,
-    *,
-    share: float,
-    seen_share: float,
-    initial: int,
-) -> tuple[Train, TrainExperiments]:
-    """The options of a part of the training of a block.
+def block_run(run: TrainingRun, block: Block, *, share: float, inputs: Inputs) -> TrainingRun:
+    """The training of a block by ``run``, which trains a part of the schedule of a whole scene.
 
     Learning rates are those of a run of the whole scene, in which each Gaussian is seen in as many
     steps.
 
     Args:
-        share: of the block in the cost of all.
-        seen_share: mean share of its views that see one of its Gaussians.
-        initial: number of its first Gaussians, all of which are kept.
+        share: The block's share of the cost of all blocks.
+        inputs: The inputs of the block; all of its first Gaussians are kept.
     """
-    whole = Schedule.of(train, experiments, seen_share)
+    options, experiments = run.options, run.options.experiments
+    whole = Schedule.of(options, inputs.seen_share)
     factor = experiments.learning_rate_factor
-    if train.budget_minutes is None:
+    if options.budget_minutes is None:
         factor = whole.learning_rate_factor(whole.steps)
-    limit = max(block.max_gaussians, initial)
-    density = train.density.model_copy(update={"max_gaussians": limit})
-    return (
-        train.model_copy(
-            update={
-                "steps": block.steps,
-                "budget_minutes": _minutes(train, part, share),
-                "refine_poses": False,
-                "refine_intrinsics": False,
-                "density": density,
-            }
+    limit = max(block.max_gaussians, len(inputs.initial))
+    changes = {
+        "steps": block.steps,
+        "budget_minutes": _minutes(options, run.part, share),
+        "refine_poses": False,
+        "refine_intrinsics": False,
+        "density": options.density.model_copy(update={"max_gaussians": limit}),
+        "experiments": experiments.model_copy(
+            update={"coarse_share": 0.0, "learning_rate_factor": factor}
         ),
-        experiments.model_copy(update={"coarse_share": 0.0, "learning_rate_factor": factor}),
-    )
+    }
+    return replace(run, options=options.model_copy(update=changes))
 
 
-def _minutes(train: Train, part: Part, share: float) -> float | None:
+def _minutes(options: TrainOptions, part: Part, share: float) -> float | None:
     """The time budget of a part of the training."""
-    minutes = train.budget_minutes
+    minutes = options.budget_minutes
     return None if minutes is None else minutes * (part.end - part.begin) * share

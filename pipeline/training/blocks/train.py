@@ -4,31 +4,26 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 import torch
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
 from pipeline.render import BACKGROUNDS, RasterOptions, make_backend
 from pipeline.render.views import near_plane
 from pipeline.runtime.errors import UserError
 from pipeline.scene.blocks import Partition
 from pipeline.scene.exposure import ExposureGains
-from pipeline.scene.manifest import Manifest
-from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, reduced_size, resized
 from pipeline.scene.visibility import seen_share
 from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianSource
 from pipeline.splats.gaussians import Gaussians, concat
 from pipeline.training.blocks.layers import BlockLayers
-from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_options, corrected_box
+from pipeline.training.blocks.options import OVERVIEW_FACTOR, block_run, corrected_box
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.data.targets import usable_factor
-from pipeline.training.loop.schedule import Part
-from pipeline.training.scene import scene_inputs
+from pipeline.training.run import TrainingRun
+from pipeline.training.scene import SceneData, scene_inputs
 
 
 @dataclass(frozen=True)
@@ -36,41 +31,26 @@ class SceneInBlocks:
     """A scene of which blocks are trained.
 
     Attributes:
-        views: all views.
-        gains: of all views; empty if exposure is not modelled.
-        read_gaussians: reads the Gaussians of the whole scene, from which each block starts and its
+        data: The scene.
+        gains: The gains of all views; empty if exposure is not modelled.
+        read_gaussians: Reads the Gaussians of the whole scene, from which each block starts and its
             surroundings are rendered. They are not held while a block is trained.
     """
 
-    views: list[View]
-    manifest: Manifest
-    model: Reconstruction
+    data: SceneData
     gains: ExposureGains
     partition: Partition
     read_gaussians: Callable[[], Gaussians]
 
 
-class BlockTraining(NamedTuple):
-    """The arguments of ``training.scene.run_training`` for one block."""
-
-    inputs: Inputs
-    config: Train
-    experiments: TrainExperiments
-
-
 def block_training(
-    scene: SceneInBlocks,
-    number: int,
-    config: Train,
-    experiments: TrainExperiments,
-    part: Part,
-    seed: int,
-) -> BlockTraining:
-    """What a part of the training of block ``number`` works on: the training views that see it, or
-    as many of them as the part has steps.
+    scene: SceneInBlocks, number: int, run: TrainingRun
+) -> tuple[Inputs, TrainingRun]:
+    """The inputs and the run of a part of the training of block ``number``: the training views that
+    see it, or as many of them as the part has steps.
 
     Args:
-        seed: of the choice of views.
+        run: The part of the training of the whole scene.
 
     Raises:
         UserError: no view sees the block.
@@ -80,29 +60,22 @@ def block_training(
     if not block.views or not block.gaussians:
         raise UserError(f"no training view sees block {number}", fix="lower partition.blocks")
     share = block.pixels / max(1, sum(other.pixels for other in partition.blocks))
-    inputs = block_inputs(scene, number, config, part)
-    options, experiments = block_options(
-        config,
-        experiments,
-        block,
-        part,
-        share=share,
-        seen_share=inputs.seen_share,
-        initial=len(inputs.initial),
-    )
-    if options.budget_minutes is None:
+    inputs = block_inputs(scene, number, run)
+    run = block_run(run, block, share=share, inputs=inputs)
+    if run.options.budget_minutes is None:
         # No other views are read, and no layers are rendered in them.
-        rng = np.random.Generator(np.random.PCG64([seed, number]))
-        inputs = inputs.sampled(len(part.of(options.steps)), rng)
-    return BlockTraining(inputs, options, experiments)
+        rng = np.random.Generator(np.random.PCG64([run.seed, number]))
+        inputs = inputs.sampled(len(run.span), rng)
+    return inputs, run
 
 
-def block_inputs(scene: SceneInBlocks, number: int, config: Train, part: Part) -> Inputs:
+def block_inputs(scene: SceneInBlocks, number: int, run: TrainingRun) -> Inputs:
     """The inputs of a part of the training of block ``number``: its windows in the views that see
     it, and overviews."""
+    settings = run.options
     partition, gains, read_gaussians = scene.partition, scene.gains, scene.read_gaussians
     gaussians = read_gaussians()
-    whole = scene_inputs(scene.views, scene.manifest, scene.model, gaussians, scene.gains, config)
+    whole = scene_inputs(scene.data, gaussians, run, gains)
     block = partition.blocks[number - 1]
     windows, through = {view.name: view for view in block.views}, set(block.overviews)
     shown = [index for index, view in enumerate(whole.views) if view.name in windows]
@@ -115,16 +88,18 @@ def block_inputs(scene: SceneInBlocks, number: int, config: Train, part: Part) -
     own = torch.from_numpy(np.flatnonzero(region.contains(gaussians.means.numpy())))
     initial = gaussians.select(own)
     options = RasterOptions(
-        sh_degree=gaussians.sh_degree, antialias=config.antialias, near=near_plane(whole.extent)
+        sh_degree=gaussians.sh_degree,
+        antialias=settings.antialias,
+        near=near_plane(whole.extent),
     )
-    background = config.background if config.background in BACKGROUNDS else "black"
+    background = settings.background if settings.background in BACKGROUNDS else "black"
 
     def open_layers(threads: int) -> BlockLayers:
         return BlockLayers(
             read_gaussians(),
             partition,
             number,
-            corrected_box(partition, number, part),
+            corrected_box(partition, number, run.part),
             BACKGROUNDS[background],
             replace(options, threads=threads),
             make_backend(),

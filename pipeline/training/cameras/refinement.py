@@ -8,8 +8,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from pipeline.config.settled import TrainOptions
 from pipeline.render import CameraGradients, RasterCamera
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -36,20 +35,19 @@ class CameraRefinement:
         views: Sequence[View],
         gaussians: Gaussians,
         extent: float,
-        config: Train,
-        experiments: TrainExperiments,
+        options: TrainOptions,
     ) -> CameraRefinement:
-        """The given cameras, refined as ``config`` says.
+        """The given cameras, refined as ``options`` say.
 
         Args:
             extent: ``scene.views.scene_extent``, world units.
         """
         poses, intrinsics = None, None
-        if config.refine_poses:
-            limit = experiments.max_pose_change
+        if options.refine_poses:
+            limit = options.experiments.max_pose_change
             poses = PoseRefinement.of(views, gaussians, extent, limit)
-        if config.refine_intrinsics:
-            intrinsics = IntrinsicsRefinement.of(views, experiments.max_intrinsics_change)
+        if options.refine_intrinsics:
+            intrinsics = IntrinsicsRefinement.of(views, options.experiments.max_intrinsics_change)
         return CameraRefinement(len(views), poses, intrinsics)
 
     @property

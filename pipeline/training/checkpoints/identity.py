@@ -8,15 +8,14 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
 from pipeline.training.data.inputs import Inputs
+from pipeline.training.run import TrainingRun
 
 # Increment when the contents of checkpoints or their meaning change.
-STATE_VERSION = 19
+STATE_VERSION = 20
 
 
-def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, seed: int) -> str:
+def identity_of(inputs: Inputs, run: TrainingRun) -> str:
     """Digest of everything that determines the result but the pixels, which the key of the stage
     (in the name of the folder of checkpoints) covers."""
     digest = hashlib.sha256()
@@ -29,8 +28,8 @@ def identity_of(inputs: Inputs, config: Train, experiments: TrainExperiments, se
     embeddings = None if inputs.embeddings is None else inputs.embeddings.tolist()
     empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
     # Another device can continue: the log says so.
-    options = [config.model_dump(exclude={"device"}), experiments.model_dump()]
-    text = json.dumps([STATE_VERSION, options, seed, sizes, views, gains, embeddings, empty])
+    options = run.options.model_dump(exclude={"device"})
+    text = json.dumps([STATE_VERSION, options, run.seed, sizes, views, gains, embeddings, empty])
     digest.update(text.encode())
     arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
     for known in inputs.depths or ():

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import zlib
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
@@ -92,28 +91,21 @@ class Targets:
     one reduced resolution is stored at a time.
 
     Args:
-        noise: share of the pixels that become black or white, deterministic by ``seed`` and the
-            view's name.
-        store: holds the pixels; None: in memory.
-        layers: of each view, if a block is trained.
+        store: The storage of the pixels. None: in memory.
+        layers: The layers around a block in each view. None: the whole scene is trained.
     """
 
     def __init__(
         self,
         views: Sequence[View],
         threads: int,
-        noise: float = 0.0,
-        seed: int = 0,
         store: ImageStore | None = None,
         layers: LayerSource | None = None,
     ):
         self._store = MemoryStore() if store is None else store
 
         def load(view: View) -> _StoredTarget:
-            pixels = load_view(view)
-            if noise:
-                _salt_and_pepper(pixels.rgb, noise, [seed, zlib.crc32(view.name.encode())])
-            target = _target(pixels)
+            target = _target(load_view(view))
             if layers is not None:
                 target = _among(target, layers(view))
             return _StoredTarget(target, self._store)
@@ -179,13 +171,6 @@ def usable_factor(views: Sequence[View], factor: int) -> int:
     while factor > 1 and shortest / factor < MIN_SHORT_SIDE:
         factor //= 2
     return factor
-
-
-def _salt_and_pepper(rgb: NDArray[np.uint8], share: float, seed: list[int]) -> None:
-    """Make this share of the pixels of (H, W, 3) black or white, in place."""
-    draw = np.random.Generator(np.random.PCG64(seed)).random(rgb.shape[:2])
-    rgb[draw < share / 2] = 0
-    rgb[draw > 1 - share / 2] = 255
 
 
 def _target(pixels: ViewPixels) -> Target:

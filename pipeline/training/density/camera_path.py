@@ -15,9 +15,9 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
 from pipeline.render.contributions import contributions, in_grey
 from pipeline.splats.gaussians import Gaussians
+from pipeline.training.density.reduced_views import ReducedViews
 
 #: The path joins each camera to so many of its nearest.
 NEIGHBOURS = 4
@@ -90,24 +90,17 @@ def distances_to_path(
 
 
 def on_camera_path(
-    gaussians: Gaussians,
-    cameras: Sequence[RasterCamera],
-    depths: NDArray[np.float64],
-    options: RasterOptions,
-    backend: Backend | None = None,
+    gaussians: Gaussians, views: ReducedViews, depths: NDArray[np.float64]
 ) -> Tensor:
     """(N,) bool: Gaussians that would hide a view from the path, and explain little of any training
     view.
 
     Args:
-        cameras: of all training views, at a reduced size if need be.
+        views: All training views.
         depths: (V,) camera z (``floaters.empty_depths``).
-        options: as in training, but of SH degree 0 and without a background.
-        backend: None: the default.
     """
-    backend = backend or make_backend()
     found = torch.zeros(len(gaussians), dtype=torch.bool)
-    matrices = np.stack([camera.world_to_camera.double().numpy() for camera in cameras])
+    matrices = np.stack([camera.world_to_camera.double().numpy() for camera in views.cameras])
     centres = -np.einsum("vji,vj->vi", matrices[:, :3, :3], matrices[:, :3, 3])
     distance = distances_to_path(gaussians.means.double().numpy(), camera_path(centres, depths))
     size = gaussians.log_scales.amax(1).double().exp().numpy()
@@ -118,8 +111,9 @@ def on_camera_path(
         return found
     # Rendered without the Gaussians in front of them, so that the share is an upper bound.
     grey, share = in_grey(gaussians.select(candidates)), torch.zeros(len(candidates))
-    for camera in cameras:
+    for camera in views.cameras:
         pixel = 1 / (camera.width * camera.height)
-        share = torch.maximum(share, contributions(grey, camera, options, pixel, backend))
+        seen = contributions(grey, camera, views.options, pixel, views.backend)
+        share = torch.maximum(share, seen)
     found[candidates] = share < MAX_VIEW_SHARE * opacity[candidates]
     return found

@@ -7,17 +7,18 @@ look past them or see them as dots. With changing light, a few neighbouring view
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Backend, RasterCamera, RasterOptions, make_backend
 from pipeline.render.contributions import contributions, in_grey
 from pipeline.splats.gaussians import Gaussians
 from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.density.camera_path import on_camera_path
+from pipeline.training.density.reduced_views import ReducedViews
 
 #: Space closer than this share of the depth of a view's nearest sparse points is taken as empty.
 #: Nearest is this quantile, since a few points are wrong, of at least so many points.
@@ -44,11 +45,11 @@ def empty_depths(known: Sequence[KnownDepths]) -> NDArray[np.float64]:
 
 @dataclass(frozen=True)
 class FloaterRemoval:
-    """Removes floaters a few times in a run.
+    """Removes floaters a few times in a run, and at its end.
 
     Attributes:
         depths: (V,) camera z (``empty_depths``).
-        steps: length of the schedule.
+        steps: The length of the schedule.
     """
 
     depths: NDArray[np.float64]
@@ -58,64 +59,48 @@ class FloaterRemoval:
         """Whether floaters are removed after these steps of the schedule.
 
         Args:
-            run_length: expected number of optimiser steps of the run.
+            run_length: The expected number of optimiser steps of the run.
         """
         if run_length < MIN_EPOCHS * len(self.depths):
             return False
         return any(round(share * self.steps) in steps for share in RUN_SHARES)
 
-    def fade(
-        self,
-        gaussians: Gaussians,
-        cameras: Sequence[RasterCamera],
-        options: RasterOptions,
-        pixel: float,
-        backend: Backend,
-    ) -> int:
+    def fade(self, gaussians: Gaussians, views: ReducedViews) -> int:
         """Make floaters transparent, in place, so that density control prunes them.
-
-        See ``floaters`` for the arguments.
 
         Returns:
             the number of floaters.
         """
-        found = floaters(gaussians, cameras, self.depths, options, pixel, backend)
+        found = floaters(gaussians, views, self.depths)
         gaussians.opacity_logits[found] = FADED_LOGIT
         return int(found.sum())
 
+    def without_blockers(self, gaussians: Gaussians, views: ReducedViews) -> Gaussians:
+        """The Gaussians without those that hide views from between the cameras, unless all do."""
+        found = on_camera_path(gaussians, views, self.depths)
+        return gaussians if found.all() else gaussians.select(torch.nonzero(~found)[:, 0])
 
-def floaters(
-    gaussians: Gaussians,
-    cameras: Sequence[RasterCamera],
-    depths: NDArray[np.float64],
-    options: RasterOptions,
-    pixel: float = 1.0,
-    backend: Backend | None = None,
-) -> Tensor:
+
+def floaters(gaussians: Gaussians, views: ReducedViews, depths: NDArray[np.float64]) -> Tensor:
     """(N,) bool: Gaussians with most of their weight in one view, or in a hundredth of the views,
     and there closer than ``depths``.
 
     The weight of a Gaussian in a view is its ``render.contributions``.
 
     Args:
-        cameras: of all training views, at a reduced size if need be.
+        views: All training views.
         depths: (V,) camera z (``empty_depths``).
-        options: as in training; SH degree and background do not matter.
-        pixel: number of pixels of the view in one pixel of the reduced size.
-        backend: None: the default.
     """
-    backend = backend or make_backend()
     grey = in_grey(gaussians)
-    options = replace(options, sh_degree=0, background=None)
     total = torch.zeros(len(grey))
     # The largest weights so far, and the part of each that is in empty space.
-    few = max(1, round(len(cameras) / VIEWS_PER_FLOATER_VIEW))
+    few = max(1, round(len(views.cameras) / VIEWS_PER_FLOATER_VIEW))
     largest, largest_empty = torch.zeros(few, len(grey)), torch.zeros(few, len(grey))
-    for camera, depth in zip(cameras, depths, strict=True):
-        weight = contributions(grey, camera, options, pixel, backend)
+    for camera, depth in zip(views.cameras, depths, strict=True):
+        weight = contributions(grey, camera, views.options, views.pixel, views.backend)
         total += weight
         x, y, z, shift = camera.world_to_camera[2].to(torch.float32).tolist()
-        # Not a matrix product: BLAS may round differently with the number of threads.
+        # A matrix product of BLAS may round differently with the number of threads.
         z_camera = grey.means[:, 0] * x + grey.means[:, 1] * y + grey.means[:, 2] * z + shift
         empty = torch.where(z_camera < depth, weight, 0.0)
         # Insertion sort: smaller weights move down a row, the smallest is dropped.

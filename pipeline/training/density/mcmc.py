@@ -15,11 +15,17 @@ import torch
 from torch import Tensor
 
 from pipeline.config.experiments import McmcExperiments
-from pipeline.render import Gradients
+from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density.strategy import Changes, Strategy, not_finite, rotations
+from pipeline.training.density.strategy import (
+    Changes,
+    DensityStep,
+    Strategy,
+    Update,
+    not_finite,
+    rotations,
+)
 from pipeline.training.density.timeline import Timeline
-from pipeline.training.optimisers.adam import Adam
 
 # Upper limit of the copies of one Gaussian in one refinement (the authors' code).
 MAX_COPIES = 51
@@ -37,9 +43,9 @@ class McmcDensity(Strategy):
     """Relocation, growth and noise.
 
     Attributes:
-        options: growth, pruning threshold, weights of the regularisers.
-        steps: length of the schedule.
-        scale: size of the scene (``training.data.known_depths.scene_scale``). The paper's scale
+        options: Growth, pruning threshold, weights of the regularisers.
+        steps: The length of the schedule.
+        scale: The size of the scene (``training.data.known_depths.scene_scale``). The paper's scale
             loss and noise are in world units; here they are in this unit, so that results do not
             depend on the world's unit.
     """
@@ -52,7 +58,13 @@ class McmcDensity(Strategy):
     def __post_init__(self) -> None:
         self.timeline = Timeline.of(self.options, self.steps)
 
-    def regularise(self, gaussians: Gaussians, gradients: Gradients) -> None:
+    def is_due(self, steps: range) -> bool:
+        return self._has_noise(steps) or super().is_due(steps)
+
+    def start(self, count: int) -> None:
+        """Nothing is observed."""
+
+    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
         """Add the gradients of the mean opacity and the mean scale (equation 10)."""
         if self.options.opacity_loss_weight:
             opacity = torch.sigmoid(gaussians.opacity_logits)
@@ -62,10 +74,16 @@ class McmcDensity(Strategy):
             weight = self.options.scale_loss_weight / (self.scale * gaussians.log_scales.numel())
             gradients.log_scales.add_(gaussians.log_scales.exp(), alpha=weight)
 
-    def add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
-        """Noise of the Gaussian's covariance, for transparent Gaussians (equation 8)."""
-        if not self.options.noise:
-            return
+    def after_step(self, step: DensityStep) -> Update:
+        if self._has_noise(step.steps):
+            self._add_noise(step.gaussians, step.noise_rate, step.rng)
+        return super().after_step(step)
+
+    def _has_noise(self, steps: range) -> bool:
+        return self.options.noise and steps.stop - 1 <= self.timeline.stop
+
+    def _add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
+        """Noise of the Gaussian's covariance, for transparent Gaussians (equation 8), in place."""
         opacity = torch.sigmoid(gaussians.opacity_logits)
         moved = torch.nonzero(opacity < NOISE_OPACITY)[:, 0]
         if not len(moved):
@@ -78,29 +96,21 @@ class McmcDensity(Strategy):
         size = NOISE * MEANS_LEARNING_RATE * rate / self.scale
         gaussians.means[moved] += noise * (share * size)[:, None]
 
-    def refine(
-        self,
-        gaussians: Gaussians,
-        adam: Adam,
-        rng: np.random.Generator,
-        *,
-        densify: bool,
-        prune_large: bool,
-        budget: int,
-    ) -> tuple[Gaussians, Changes]:
+    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
         """Relocate transparent Gaussians onto others, drawn by opacity, and grow; without
-        ``densify``, remove them. Large Gaussians are left to the regulariser."""
+        densification, remove them. Large Gaussians are left to the regulariser."""
+        gaussians, adam = step.gaussians, step.adam
         useless = torch.sigmoid(gaussians.opacity_logits) <= self.options.prune_opacity
         useless |= not_finite(gaussians)
         alive = torch.nonzero(~useless)[:, 0]
         dead = int(useless.sum())
-        if not densify or not len(alive):
+        if not self.densifies_after(step.steps) or not len(alive):
             adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
             return gaussians.select(alive), Changes(pruned=dead)
-        grown = min(budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
+        grown = min(step.budget, math.ceil(len(gaussians) * (1 + self.options.growth_share)))
         added = max(0, grown - len(gaussians))
         opacity = torch.sigmoid(gaussians.opacity_logits[alive]).double().numpy()
-        chosen = rng.choice(len(alive), size=dead + added, p=opacity / opacity.sum())
+        chosen = step.rng.choice(len(alive), size=dead + added, p=opacity / opacity.sum())
         copies = torch.from_numpy(np.bincount(chosen, minlength=len(alive)))
         sources = alive[torch.from_numpy(np.sort(chosen))]
         shared = gaussians.clone()

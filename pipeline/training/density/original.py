@@ -8,47 +8,72 @@ cleared before it, and the extra opacity reset with a white background.
 
 from __future__ import annotations
 
-import numpy as np
-import torch
+from dataclasses import dataclass, field
+from typing import Any
 
-from pipeline.config.experiments import GradientExperiments
+import torch
+from numpy.typing import NDArray
+from torch import Tensor
+
+from pipeline.render import Forward, Gradients
 from pipeline.splats.gaussians import Gaussians
-from pipeline.training.density.gradient import GradientDensity, highest
-from pipeline.training.density.strategy import Changes
+from pipeline.training.density.growth import (
+    GradientStatistics,
+    limit_opacity,
+    longest_scale,
+    multiply,
+    sample_halves,
+)
+from pipeline.training.density.strategy import (
+    Changes,
+    DensityStep,
+    Strategy,
+    highest,
+    not_finite,
+)
 from pipeline.training.density.timeline import Timeline, shrunk, shrunk_interval
 from pipeline.training.optimisers.adam import Adam
 
-#: densify_from_iter, densification_interval, densify_grad_threshold, percent_dense, opacity_reset_
-#: interval, and the thresholds of densify_and_prune.
-PUBLISHED = GradientExperiments(
-    start_step=500,
-    interval=100,
-    grad_threshold=2e-4,
-    clone=True,
-    split_kind="sampled",
-    split_scale=0.01,
-    recycle_share=0.0,
-    prune_opacity=0.005,
-    prune_scale=0.1,
-    opacity_reset_interval=3000,
-)
-#: densify_until_iter: density control takes place before this step.
-UNTIL_STEP = 15_000
+#: densify_from_iter, densify_until_iter (density control takes place before this step),
+#: densification_interval and opacity_reset_interval, in steps.
+FROM_STEP, UNTIL_STEP, INTERVAL, RESET_INTERVAL = 500, 15_000, 100, 3000
+#: densify_grad_threshold, per NDC; percent_dense, the scale above which Gaussians are split rather
+#: than cloned, in scene extents.
+GRADIENT_THRESHOLD, PERCENT_DENSE = 2e-4, 0.01
+#: The thresholds of densify_and_prune: opacity, and scale in scene extents.
+MIN_OPACITY, MAX_SCALE = 0.005, 0.1
 
 
-class OriginalDensity(GradientDensity):
+@dataclass
+class OriginalDensity(Strategy):
     """Clone small and split large Gaussians with large gradients; then remove transparent and large
-    ones. Nothing is removed after densification."""
+    ones. Nothing is removed after densification.
 
-    def __init__(self, steps: int, extent: float):
-        super().__init__(PUBLISHED, steps, extent)
-        stop = shrunk(UNTIL_STEP, steps) - 1
+    Attributes:
+        steps: The length of the schedule.
+        extent: 3DGS's size of the scene (``scene.views.scene_extent``), world units.
+        reset_interval: The number of steps between opacity resets.
+    """
+
+    steps: int
+    extent: float
+    timeline: Timeline = field(init=False)
+    reset_interval: int = field(init=False)
+    observed: GradientStatistics = field(default_factory=GradientStatistics)
+
+    def __post_init__(self) -> None:
+        stop = shrunk(UNTIL_STEP, self.steps) - 1
         self.timeline = Timeline(
-            start=shrunk(PUBLISHED.start_step, steps) + 1,
+            start=shrunk(FROM_STEP, self.steps) + 1,
             stop=stop,
-            interval=shrunk_interval(PUBLISHED.interval, steps),
+            interval=shrunk_interval(INTERVAL, self.steps),
             prune_stop=stop,
         )
+        self.reset_interval = max(1, shrunk(RESET_INTERVAL, self.steps))
+
+    @property
+    def statistics(self) -> tuple[Tensor, Tensor]:
+        return self.observed.gradient_sum, self.observed.seen
 
     def resets_opacity_after(self, step: int) -> bool:
         return step % self.reset_interval == 0 and step <= self.timeline.stop
@@ -56,26 +81,39 @@ class OriginalDensity(GradientDensity):
     def prunes_large_after(self, step: int) -> bool:
         return step > self.reset_interval
 
-    def refine(
-        self,
-        gaussians: Gaussians,
-        adam: Adam,
-        rng: np.random.Generator,
-        *,
-        densify: bool,
-        prune_large: bool,
-        budget: int,
-    ) -> tuple[Gaussians, Changes]:
-        """(``densify``) Split and clone, then prune."""
-        kept = torch.ones(len(gaussians), dtype=torch.bool)
-        grow = torch.zeros_like(kept)
-        if densify:
-            gradient = self.mean_gradient()
-            room = max(0, budget - len(gaussians))
-            grow = highest(gradient, gradient >= self.options.grad_threshold, room)
-        gaussians, changes = self.multiply(gaussians, adam, rng, kept, grow)
-        alive = torch.nonzero(~self.useless(gaussians, prune_large))[:, 0]
+    def start(self, count: int) -> None:
+        self.observed.start(count)
+
+    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
+        self.observed.observe(rendered, gradients)
+
+    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+        """Split and clone, then prune."""
+        every = torch.ones(len(step.gaussians), dtype=torch.bool)
+        grow = torch.zeros_like(every)
+        if self.densifies_after(step.steps):
+            gradient = self.observed.mean()
+            room = max(0, step.budget - len(step.gaussians))
+            grow = highest(gradient, gradient >= GRADIENT_THRESHOLD, room)
+        large = longest_scale(step.gaussians) > PERCENT_DENSE * self.extent
+        result = multiply(step, every, cloned=grow & ~large, split=grow & large)
+        gaussians, changes = result.gaussians, result.changes
+        if changes.split:
+            sample_halves(gaussians, result.halves, step.rng)
+        useless = torch.sigmoid(gaussians.opacity_logits) < MIN_OPACITY
+        if any(map(self.prunes_large_after, step.steps)):
+            useless |= longest_scale(gaussians) > MAX_SCALE * self.extent
+        alive = torch.nonzero(~(useless | not_finite(gaussians)))[:, 0]
         changes.pruned = len(gaussians) - len(alive)
-        adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
+        step.adam.select(alive, torch.zeros(len(alive), dtype=torch.bool))
         self.start(len(alive))
         return gaussians.select(alive), changes
+
+    def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
+        limit_opacity(gaussians, adam)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        return self.observed.arrays()
+
+    def restore(self, arrays: dict[str, NDArray[Any]]) -> None:
+        self.observed.restore(arrays)

@@ -1,4 +1,4 @@
-"""The interface of density strategies: hooks before and after each optimiser step."""
+"""The interface of density strategies: two hooks, before and after each optimiser step."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from pipeline.training.optimisers.adam import Adam
 
 @dataclass
 class Changes:
-    """Counts of one ``refine``.
+    """The numbers of Gaussians that density control has changed.
 
     Attributes:
         cloned, split: Gaussians that were cloned or split.
-        relocated: useless Gaussians that were moved onto others.
+        relocated: Useless Gaussians that were moved onto others.
         pruned: Gaussians that were removed.
     """
 
@@ -39,13 +39,36 @@ class Changes:
 
 
 @dataclass(frozen=True)
-class Update:
-    """What a strategy did after a step.
+class DensityStep:
+    """What a strategy works on after an optimiser step.
 
     Attributes:
-        gaussians: the Gaussians after it.
+        gaussians, adam: The Gaussians, and their moments, which the strategy changes in place.
+        rng: The generator of the random numbers of the run.
+        steps: The steps of the schedule that the optimiser step covers: one, or any number with a
+            time budget.
+        noise_rate: The learning rate of the means over its initial value, times the run's factor.
+        budget: The upper limit of the number of Gaussians.
+        prune: Whether to prune even if the timeline does not say so.
+    """
+
+    gaussians: Gaussians
+    adam: Adam
+    rng: np.random.Generator
+    steps: range
+    noise_rate: float = 1.0
+    budget: int = 1_000_000_000
+    prune: bool = False
+
+
+@dataclass(frozen=True)
+class Update:
+    """The result of a strategy's work after a step.
+
+    Attributes:
+        gaussians: The Gaussians after it.
         changes: None if the set of Gaussians is the same as before.
-        opacity_reset: whether all opacities were reset.
+        opacity_reset: Whether all opacities were reset.
     """
 
     gaussians: Gaussians
@@ -56,111 +79,61 @@ class Update:
 class Strategy:
     """Observes every step and, on its timeline, changes the set of Gaussians and Adam's moments.
 
-    Subclasses implement ``refine``; the other hooks do nothing unless they are overridden.
+    Subclasses implement ``start`` and ``refine``; the other hooks do nothing unless they are
+    overridden.
 
     Attributes:
-        timeline: when Gaussians are densified and pruned.
+        timeline: The steps after which Gaussians are densified and pruned.
     """
 
     timeline: Timeline
 
     @property
     def statistics(self) -> tuple[Tensor, Tensor] | None:
-        """``gradient_sum`` and ``seen`` of ``render.resident.Optimised``, if that is all that the
-        hooks of a step do, so that a device can do it; else None."""
+        """``gradient_sum`` and ``seen`` of ``render.resident.Optimised``, if ``before_step`` only
+        accumulates these, so that a device can do it; else None."""
         return None
 
     def is_due(self, steps: range) -> bool:
-        """Whether ``after_step`` reads or changes the Gaussians after these steps, if it is not to
-        ``prune``. Only of strategies with ``statistics``."""
-        rules = (
-            self.timeline.densifies_after,
-            self.timeline.prunes_after,
-            self.resets_opacity_after,
-        )
-        return any(rule(step) for rule in rules for step in steps)
+        """Return True if ``after_step`` will read or change the Gaussians in these steps. Pruning
+        on request is not counted."""
+        return self.refines_after(steps) or any(map(self.resets_opacity_after, steps))
 
-    @property
-    def needs_absolute_gradients(self) -> bool:
-        """Whether ``observe`` reads ``Gradients.means2d_abs``."""
-        return False
+    def refines_after(self, steps: range) -> bool:
+        return self.densifies_after(steps) or any(map(self.timeline.prunes_after, steps))
 
-    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
-        """The hook between the backward pass and the optimiser step."""
-        self.observe(rendered, gradients)
-        self.regularise(gaussians, gradients)
-
-    def after_step(
-        self,
-        gaussians: Gaussians,
-        adam: Adam,
-        rng: np.random.Generator,
-        steps: range,
-        *,
-        rate: float,
-        budget: int,
-        prune: bool,
-    ) -> Update:
-        """The hook after an optimiser step: noise, densification, pruning and opacity resets.
-
-        Args:
-            steps: steps of the schedule that the optimiser step covers: one, or any number with a
-                time budget.
-            rate: learning rate of the means over its initial value, times the run's factor.
-            budget: upper limit of the number of Gaussians.
-            prune: prune even if the timeline does not say so.
-        """
-        if steps.stop - 1 <= self.timeline.stop:
-            self.add_noise(gaussians, rate, rng)
-        changes = None
-        densify = any(map(self.timeline.densifies_after, steps))
-        if densify or prune or any(map(self.timeline.prunes_after, steps)):
-            gaussians, changes = self.refine(
-                gaussians,
-                adam,
-                rng,
-                densify=densify,
-                prune_large=any(map(self.prunes_large_after, steps)),
-                budget=budget,
-            )
-        reset = any(map(self.resets_opacity_after, steps))
-        if reset:
-            self.reset_opacity(gaussians, adam)
-        return Update(gaussians, changes, reset)
-
-    def start(self, count: int) -> None:
-        """Forget all observations; ``count`` Gaussians from here on."""
-
-    def observe(self, rendered: Forward, gradients: Gradients) -> None:
-        """Accumulate statistics of one step."""
-
-    def regularise(self, gaussians: Gaussians, gradients: Gradients) -> None:
-        """Add the gradients of the strategy's own losses, in place."""
-
-    def add_noise(self, gaussians: Gaussians, rate: float, rng: np.random.Generator) -> None:
-        """Move Gaussians at random, in place; ``rate`` as in ``after_step``."""
-
-    def refine(
-        self,
-        gaussians: Gaussians,
-        adam: Adam,
-        rng: np.random.Generator,
-        *,
-        densify: bool,
-        prune_large: bool,
-        budget: int,
-    ) -> tuple[Gaussians, Changes]:
-        """Remove useless Gaussians and (``densify``) add new ones. Statistics start anew.
-
-        The result has at most ``budget`` Gaussians, or at most as many as before.
-        """
-        raise NotImplementedError
+    def densifies_after(self, steps: range) -> bool:
+        return any(map(self.timeline.densifies_after, steps))
 
     def resets_opacity_after(self, step: int) -> bool:
         return False
 
-    def prunes_large_after(self, step: int) -> bool:
-        return False
+    def before_step(self, gaussians: Gaussians, rendered: Forward, gradients: Gradients) -> None:
+        """The hook between the backward pass and the optimiser step: accumulates statistics, and
+        adds the gradients of the strategy's own losses, in place."""
+
+    def after_step(self, step: DensityStep) -> Update:
+        """The hook after an optimiser step: noise, densification, pruning and opacity resets."""
+        gaussians, changes = step.gaussians, None
+        if step.prune or self.refines_after(step.steps):
+            gaussians, changes = self.refine(step)
+        reset = any(map(self.resets_opacity_after, step.steps))
+        if reset:
+            self.reset_opacity(gaussians, step.adam)
+        return Update(gaussians, changes, reset)
+
+    def start(self, count: int) -> None:
+        """Forget all observations; ``count`` Gaussians are observed from here on."""
+        raise NotImplementedError
+
+    def refine(self, step: DensityStep) -> tuple[Gaussians, Changes]:
+        """Remove useless Gaussians and, if the timeline says so, add new ones. Statistics start
+        anew.
+
+        Returns:
+            at most ``step.budget`` Gaussians, or at most as many as before, and what was changed.
+        """
+        raise NotImplementedError
 
     def reset_opacity(self, gaussians: Gaussians, adam: Adam) -> None:
         """Lower all opacities, in place."""
@@ -179,6 +152,18 @@ def not_finite(gaussians: Gaussians) -> Tensor:
     for tensor in gaussians.tensors().values():
         bad |= ~torch.isfinite(tensor).reshape(len(tensor), tensor[:1].numel()).all(1)
     return bad
+
+
+def highest(score: Tensor, among: Tensor, count: int) -> Tensor:
+    """(N,) bool: rows with the ``count`` highest scores ``among`` (N,) bool, the first of ties."""
+    if int(among.sum()) <= count:
+        return among
+    chosen = torch.zeros_like(among)
+    if count > 0:
+        lowest = torch.full_like(score, -torch.inf)
+        order = torch.argsort(score.where(among, lowest), descending=True, stable=True)
+        chosen[order[:count]] = True
+    return chosen
 
 
 def rotations(quats: Tensor) -> Tensor:

@@ -10,12 +10,19 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from pipeline.config.experiments import DensityExperiments
+from pipeline.config.settled import TrainOptions
 
 NOMINAL_STEPS = 7000
 # The mean of a gradient over fewer steps than this is too noisy.
 MIN_INTERVAL = 10
 # Without densification afterwards, pruned Gaussians are not replaced in the rest of the run.
 PRUNE_UNTIL = 0.9
+
+
+def schedule_length(options: TrainOptions) -> int:
+    """The number of steps of the schedule. A run with a time budget passes through a schedule of
+    ``NOMINAL_STEPS`` steps."""
+    return options.steps if options.budget_minutes is None else NOMINAL_STEPS
 
 
 def shrunk(interval: int, steps: int) -> int:

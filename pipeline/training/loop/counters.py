@@ -43,12 +43,12 @@ class TrainCounters(StageCounters):
     exposure_spread_stops: float | None = Field(
         None,
         description="Standard deviation of the photographs' exposures, stops; absent unless "
-        "`train.appearance` is `auto`, and for photographs with alpha.",
+        "`train.appearance` is `measured`, and for photographs with alpha.",
     )
     colour_disagreement: float | None = Field(
         None,
         description="Standard deviation of log2 of the colours of a point over the photographs, "
-        "after gains that compensate exposure; absent unless `train.appearance` is `auto`, for "
+        "after gains that compensate exposure; absent unless `train.appearance` is `measured`, for "
         "photographs with alpha, and for blocks.",
     )
     changes: ChangeCounters = Field(

@@ -9,9 +9,8 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
-from pipeline.training.density.timeline import NOMINAL_STEPS, shrunk
+from pipeline.config.settled import TrainOptions
+from pipeline.training.density.timeline import schedule_length, shrunk
 from pipeline.training.optimisers.adam import Rates
 
 COARSE_FACTORS = (4, 2)
@@ -34,29 +33,10 @@ WARM_UP_STEPS, WARM_UP_SHARE = 50, 0.2
 CAMERA_DECAY = 0.01
 
 
-@dataclass(frozen=True)
-class Part:
-    """A part of a run's schedule.
-
-    Attributes:
-        begin, end: shares of the schedule.
-    """
-
-    begin: float = 0.0
-    end: float = 1.0
-
-    def of(self, steps: int) -> range:
-        """The steps of a schedule of so many steps, counted from 0."""
-        return range(round(self.begin * steps), max(1, round(self.end * steps)))
-
-
 def warm_up(part: range, step: int) -> float:
     """Factor of the learning rates in a step of a part, counted from 1."""
     steps = min(WARM_UP_STEPS, WARM_UP_SHARE * len(part)) if part.start else 0
     return min(1.0, step / steps) if steps else 1.0
-
-
-WHOLE_RUN = Part()
 
 
 @dataclass(frozen=True)
@@ -64,39 +44,35 @@ class Schedule:
     """The phases of one run.
 
     Attributes:
-        steps: number of steps.
-        sh_degree, sh_interval: final SH degree; steps between one degree and the next.
-        coarse_steps: steps at reduced resolution: the first half at 1/4, the others at 1/2.
-        max_gaussians: upper limit of the number of Gaussians at full resolution.
-        experiments: learning rates and their decay.
-        seen_share: mean share of the views that see a Gaussian.
+        options: The options of the run.
+        steps: The number of steps.
+        sh_interval: The number of steps between one SH degree and the next.
+        coarse_steps: The number of steps at reduced resolution: the first half at 1/4, the others
+            at 1/2.
+        seen_share: The mean share of the views that see a Gaussian.
     """
 
+    options: TrainOptions
     steps: int
-    sh_degree: int
     sh_interval: int
     coarse_steps: int
-    max_gaussians: int
-    experiments: TrainExperiments
-    seen_share: float = 1.0
+    seen_share: float
 
     @staticmethod
-    def of(config: Train, experiments: TrainExperiments, seen_share: float = 1.0) -> Schedule:
-        """The schedule of ``config.steps`` steps, or of ``config.budget_minutes``."""
-        minutes = config.budget_minutes
-        steps = config.steps if minutes is None else NOMINAL_STEPS
+    def of(options: TrainOptions, seen_share: float = 1.0) -> Schedule:
+        """The schedule of ``options.steps`` steps, or of ``options.budget_minutes``."""
+        minutes, experiments = options.budget_minutes, options.experiments
+        steps = schedule_length(options)
         coarse = experiments.coarse_share
-        if coarse == "auto":
+        if coarse is None:
             coarse = COARSE_STEPS
             if minutes is not None:
                 coarse = min(COARSE_MINUTES, MAX_COARSE_MINUTES / minutes)
         return Schedule(
+            options=options,
             steps=steps,
-            sh_degree=config.sh_degree,
             sh_interval=max(1, shrunk(experiments.sh_degree_interval, steps)),
             coarse_steps=int(coarse * steps),
-            max_gaussians=config.density.max_gaussians,
-            experiments=experiments,
             seen_share=seen_share,
         )
 
@@ -107,12 +83,12 @@ class Schedule:
         return COARSE_FACTORS[(step - 1) * len(COARSE_FACTORS) // self.coarse_steps]
 
     def sh_degree_at(self, step: int) -> int:
-        return min(self.sh_degree, step // self.sh_interval)
+        return min(self.options.sh_degree, step // self.sh_interval)
 
     def budget_at(self, step: int) -> int:
         """Upper limit of the number of Gaussians: lower at reduced resolution, which has fewer
         pixels to fit."""
-        return round(self.max_gaussians / math.sqrt(self.resolution_factor(step)))
+        return round(self.options.density.max_gaussians / math.sqrt(self.resolution_factor(step)))
 
     def learning_rates(
         self, step: int, run_length: float, unit: float, warm_up: float = 1.0
@@ -124,7 +100,7 @@ class Schedule:
             run_length: number of optimiser steps of the whole run, or its estimate.
             unit: of the means' learning rate, world units; 1 for each Gaussian's own scales.
         """
-        rates = self.experiments
+        rates = self.options.experiments
         run_factor = self.learning_rate_factor(run_length) * warm_up
         factor = run_factor * self.decay_at(step)
         means = rates.means_learning_rate * self.means_decay_at(step)
@@ -139,22 +115,22 @@ class Schedule:
 
     def means_decay_at(self, step: int) -> float:
         """Learning rate of the means over its initial value: log-linear decay over the run."""
-        initial = self.experiments.means_learning_rate
+        initial = self.options.experiments.means_learning_rate
         if not initial:
             return 1.0
         t = (step - 1) / max(1, self.steps - 1)
-        return float((self.experiments.means_final_learning_rate / initial) ** t)
+        return float((self.options.experiments.means_final_learning_rate / initial) ** t)
 
     def decay_at(self, step: int) -> float:
         """The other learning rates over their initial values: 1, then log-linear decay."""
-        begin = self.experiments.learning_rate_decay_start * self.steps
+        begin = self.options.experiments.learning_rate_decay_start * self.steps
         t = max(0.0, step - begin) / max(1.0, self.steps - begin)
-        return float(self.experiments.learning_rate_final_factor**t)
+        return float(self.options.experiments.learning_rate_final_factor**t)
 
     def learning_rate_factor(self, run_length: float) -> float:
         """Factor of all learning rates in a run of so many optimiser steps."""
-        factor = self.experiments.learning_rate_factor
-        if factor != "auto":
+        factor = self.options.experiments.learning_rate_factor
+        if factor is not None:
             return factor
         limit = MAX_FACTOR * math.sqrt(min(1.0, self.seen_share / USUAL_SEEN_SHARE))
         return min(max(1.0, limit), math.sqrt(max(1.0, PAPER_STEPS / run_length)))

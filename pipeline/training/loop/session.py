@@ -4,15 +4,17 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 
 from pipeline.runtime import termination
 from pipeline.runtime.progress import Progress
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
-from pipeline.training.loop.metrics_log import MetricsLog
+from pipeline.training.checkpoints.identity import identity_of
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.loop.metrics_log import NAME, MetricsLog
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
 from pipeline.training.loop.step_timer import StepTimer, other_build
+from pipeline.training.run import TrainingRun
 
 CHECKPOINT_SECONDS = 30.0
 
@@ -21,84 +23,79 @@ class Session:
     """Everything around the steps of one process that does not change the result.
 
     Args:
-        part: steps of the schedule, counted from 0.
+        inputs: The inputs of the run, by which its checkpoints are recognised.
+        state: The state before the part; restored from the newest checkpoint of the run.
         build: ``Backend.facts``.
-        identity: of the run (``checkpoints.identity``).
-        metrics_log: path of the metrics log, or None.
-        log: called with each line for the log.
-        unit: of the progress bar.
+        log: Called with each line for the log.
     """
 
     def __init__(
         self,
+        inputs: Inputs,
         state: TrainState,
-        part: range,
-        *,
+        run: TrainingRun,
         build: Mapping[str, str],
-        identity: str,
-        checkpoint_dir: Path,
-        metrics_log: Path | None,
         log: Callable[[str], None],
-        threads: int,
-        unit: str,
-    ):
-        self.state, self.part, self.log = state, part, log
-        self.identity, self.checkpoint_dir = identity, checkpoint_dir
-        self.build = dict(build)
+    ) -> None:
+        self.state, self.run, self.log, self.build = state, run, log, dict(build)
+        self.identity = identity_of(inputs, run)
         self._resume()
         self.started = self.saved = time.monotonic()
         self.seconds_before = state.seconds
-        self.progress = Progress("training", len(part), unit=unit)
-        self.progress.start_at(state.clock - part.start)
-        self.metrics_log = MetricsLog(metrics_log, state.step)
-        self.timer = StepTimer(self.build, threads, part.stop - state.clock)
+        unit = "steps" if run.options.budget_minutes is None else "parts"
+        self.progress = Progress("training", len(run.span), unit=unit)
+        self.progress.start_at(state.clock - run.span.start)
+        self.metrics_log = MetricsLog(run.logs and run.logs / NAME, state.step)
+        self.timer = StepTimer(self.build, run.threads, run.span.stop - state.clock)
 
-    def after_step(self, before: int, factor: int) -> None:
+    def after_step(self, before: int, factor: int, fetch: Callable[[], None]) -> None:
         """Log, record and save what is due after a step.
 
         Args:
             before: ``state.clock`` before the step.
-            factor: by which images are reduced.
+            factor: The factor by which images are reduced.
+            fetch: Makes the tensors of the state current (``StepEngine.fetch``).
         """
-        state, last = self.state, self.part.stop
+        state, last = self.state, self.run.span.stop
         now = time.monotonic()
         state.seconds = self.seconds_before + now - self.started
         if text := self.timer.after_step(state.seconds, factor):
             self.log(text)
-        interval = max(1, len(self.part) // CURVE_RECORDS)
+        interval = max(1, len(self.run.span) // CURVE_RECORDS)
         if state.clock // interval > before // interval or state.clock == last:
             state.record()
         if now - self.saved >= CHECKPOINT_SECONDS and state.clock < last:
-            self._save()
+            self._save(fetch)
             self.saved = now
         self.progress.advance(state.clock - before, note=self._note())
         self.metrics_log.write(state, last, factor, self.progress.seconds_left())
         if termination.requested():
-            self._save()
+            self._save(fetch)
             self.log(f"terminated after {state.step} steps, which a checkpoint keeps")
             raise termination.Terminated
 
     def _resume(self) -> None:
         # Messages on checkpoints are logged only: they are not part of the result.
-        found = checkpoint.load_latest(self.checkpoint_dir, self.identity, self.log)
+        found = checkpoint.load_latest(self.run.checkpoint_dir, self.identity, self.log)
         if found is None:
             return
         try:
             self.state.restore(found.step, found.arrays, found.values)
         except ValueError as error:
             self.log(
-                f"{self.checkpoint_dir}: the checkpoint of step {found.step} is not used, because "
+                f"{self.run.checkpoint_dir}: the checkpoint of step {found.step} is not used, because "
                 f"it is not one of this run: {error}"
             )
             return
         if text := other_build(found.values, self.build):
             self.log(text)
 
-    def _save(self) -> None:
+    def _save(self, fetch: Callable[[], None]) -> None:
+        fetch()
         state = self.state
         values = state.values() | {"built": self.build}
         saved = Checkpoint(state.step, self.identity, state.arrays(), values)
-        checkpoint.save(self.checkpoint_dir, saved)
+        checkpoint.save(self.run.checkpoint_dir, saved)
 
     def _note(self) -> str:
         text = f"{len(self.state.gaussians)} Gaussians"

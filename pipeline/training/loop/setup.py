@@ -11,13 +11,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from pipeline.config.settled import TrainOptions
 from pipeline.plan.training_memory import machine_mb, memory_mb
 from pipeline.render import Backend, RasterCamera
 from pipeline.render.views import near_plane, raster_camera
 from pipeline.runtime.errors import UserError
-from pipeline.runtime.memory import release_free_memory
+from pipeline.runtime.memory import freed_memory
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.morton import in_morton_order
@@ -28,9 +27,9 @@ from pipeline.training.data.image_store import DiskStore, ImageStore, MemoryStor
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.targets import Target, Targets
 from pipeline.training.density import make_strategy
-from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.state import TrainState
 from pipeline.training.optimisers.adam import Adam, AdamOptions
+from pipeline.training.run import TrainingRun
 
 Warn = Callable[[str], None]
 
@@ -71,38 +70,16 @@ class TrainingScene:
         return self._cameras[index, factor]
 
 
-def load_scene(
-    inputs: Inputs,
-    config: Train,
-    experiments: TrainExperiments,
-    *,
-    seed: int,
-    threads: int,
-    memory_mb: int | None,
-    part: Part,
-    warn: Warn,
-) -> TrainingScene:
+def load_scene(inputs: Inputs, run: TrainingRun, warn: Warn) -> TrainingScene:
     """Read the images of the views.
-
-    Args:
-        part: of the schedule.
 
     Raises:
         UserError: an image cannot be read, or the masks hide all views.
     """
-    store = choose_image_store(inputs, config, memory_mb, part)
-    noise = experiments.salt_and_pepper_share
-    release_free_memory()  # That the inputs were read with.
-    layers = inputs.open_layers(threads) if inputs.open_layers else None
-    targets = Targets(inputs.views, threads, noise, seed, store, layers)
-    del layers
-    release_free_memory()
+    targets = read_targets(inputs, run)
     near = near_plane(inputs.extent)
     inputs = _without_hidden_views(inputs, targets, warn)
-    background = config.background
-    if background == "auto":
-        background = "white" if targets.have_alpha else "black"
-    sky = None
+    background, sky = run.options.background, None
     if background == "skybox":
         background = "black"  # Behind the Gaussians of the skybox.
         sky = Sky(np.array([view.centre for view in inputs.views]))
@@ -110,62 +87,56 @@ def load_scene(
     return TrainingScene(inputs, targets, gains, background, near, sky)
 
 
-def choose_image_store(
-    inputs: Inputs, config: Train, limit_mb: int | None, part: Part
-) -> ImageStore:
-    """Memory if the views' pixels fit beside the Gaussians, else a file; always a file for a scene
-    in blocks, which are chosen to save memory."""
-    if part != WHOLE_RUN:
+def read_targets(inputs: Inputs, run: TrainingRun) -> Targets:
+    """The pixels of the views, in memory if they fit beside the Gaussians, else in a file; always
+    in a file for a scene in blocks, which are chosen to save memory."""
+    with freed_memory():
+        return Targets(
+            inputs.views,
+            run.threads,
+            choose_image_store(inputs, run),
+            inputs.open_layers(run.threads) if inputs.open_layers else None,
+        )
+
+
+def choose_image_store(inputs: Inputs, run: TrainingRun) -> ImageStore:
+    """Where the pixels of the views are held; see ``read_targets``."""
+    if run.is_part:
         return DiskStore()
     pixels = sum(view.width * view.height for view in inputs.views)
-    limit = min(machine_mb(), limit_mb or math.inf)
-    fits = memory_mb(pixels, config.density.max_gaussians) <= limit
+    limit = min(machine_mb(), run.memory_mb or math.inf)
+    fits = memory_mb(pixels, run.options.density.max_gaussians) <= limit
     return MemoryStore() if fits else DiskStore()
 
 
 def initial_state(
-    scene: TrainingScene,
-    config: Train,
-    experiments: TrainExperiments,
-    backend: Backend,
-    *,
-    steps: int,
-    start: int,
-    seed: int,
-    warn: Warn,
+    scene: TrainingScene, run: TrainingRun, backend: Backend, warn: Warn
 ) -> TrainState:
-    """The state after ``start`` steps of a schedule of ``steps`` steps. In the middle of it, the
-    degree of spherical harmonics is that of the initial Gaussians."""
-    inputs = scene.inputs
-    rng = np.random.Generator(np.random.PCG64(seed))
+    """The state before the first step of the run's part. In the middle of a schedule, the degree of
+    spherical harmonics is that of the initial Gaussians."""
+    inputs, options, start = scene.inputs, run.options, run.span.start
+    rng = np.random.Generator(np.random.PCG64(run.seed))
     gaussians = inputs.initial if start else inputs.initial.with_sh_degree(0)
     # A copy: the initial Gaussians stay as they are.
-    gaussians = in_morton_order(_thinned(gaussians, config.density.max_gaussians, rng, warn))
+    gaussians = in_morton_order(_thinned(gaussians, options.density.max_gaussians, rng, warn))
     appearance = None
     if inputs.embeddings is not None:
         appearance = AppearanceEmbeddings(inputs.embeddings.copy())
         size = inputs.embeddings.shape[1]
         gaussians = replace(gaussians, appearance=torch.zeros(len(gaussians), size, 3))
     density = make_strategy(
-        config.density,
-        experiments,
-        steps=steps,
-        scale=inputs.size,
-        extent=inputs.extent,
-        sky=scene.sky,
+        options, steps=run.steps, scale=inputs.size, extent=inputs.extent, sky=scene.sky
     )
     density.start(len(gaussians))
-    cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, config, experiments)
+    cameras = CameraRefinement.of(scene.views, gaussians, inputs.extent, options)
     order = rng.permutation(len(scene.views))
-    own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
-    options = AdamOptions(experiments.adam_beta1, own_frames, experiments.adam_epsilon)
-    adam = Adam(gaussians, options, backend)
+    adam = Adam(gaussians, AdamOptions.of(options), backend)
     return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
 
 
-def learning_rate_unit(inputs: Inputs, experiments: TrainExperiments) -> float:
+def learning_rate_unit(inputs: Inputs, options: TrainOptions) -> float:
     """Unit of the means' learning rate, world units; 1 for each Gaussian's own scales."""
-    match experiments.means_learning_rate_unit:
+    match options.experiments.means_learning_rate_unit:
         case "gaussian_scale":
             return 1.0
         case "scene_scale":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, field
 from typing import Any
 
@@ -16,7 +15,7 @@ from pipeline.splats.skybox import Sky
 from pipeline.training.appearance.embedding import AppearanceEmbeddings
 from pipeline.training.cameras.refinement import CameraRefinement
 from pipeline.training.checkpoints.form import check_arrays, check_position
-from pipeline.training.density import Changes, Strategy
+from pipeline.training.density import Changes, Strategy, Update
 from pipeline.training.loop.curve import CurveRecord
 from pipeline.training.optimisers.adam import Adam
 
@@ -64,7 +63,6 @@ class TrainState:
         clock: position in the schedule: ``step``, or less or more with a time budget.
         order: (V,) int64, order of the views in this epoch, of which ``position`` are done.
         appearance: the embeddings of the views; None if appearance is not modelled.
-        fetch: called before the tensors are read, which may be newer on a device.
         curve: records without times; ``curve_seconds`` has the time of each.
         seconds: training time so far, in all processes.
     """
@@ -84,7 +82,6 @@ class TrainState:
     curve: list[CurveRecord] = field(default_factory=list)
     curve_seconds: list[float] = field(default_factory=list)
     seconds: float = 0.0
-    fetch: Callable[[], None] = lambda: None
 
     def next_view(self) -> int:
         """Index of the next view: each view once in each shuffled epoch."""
@@ -92,6 +89,22 @@ class TrainState:
             self.order, self.position = self.rng.permutation(len(self.order)), 0
         self.position += 1
         return int(self.order[self.position - 1])
+
+    def apply(self, update: Update) -> bool:
+        """Take over what density control did; returns whether the set of Gaussians changed."""
+        self.gaussians = update.gaussians
+        self.counters.opacity_resets += update.opacity_reset
+        if update.changes is not None:
+            self.counters.changes.add(update.changes)
+        return update.changes is not None
+
+    def add_to_window(self, loss: float, psnr: float | None) -> None:
+        """Add a step to the sums of the curve's next record."""
+        self.window.loss += loss
+        self.window.steps += 1
+        if psnr is not None:
+            self.window.psnr += psnr
+            self.window.samples += 1
 
     def reorder(self) -> None:
         """Sort Gaussians along a Z-order curve: neighbours in space become neighbours in memory,
@@ -132,7 +145,6 @@ class TrainState:
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """The arrays of a checkpoint, sharing memory."""
-        self.fetch()
         result: dict[str, NDArray[Any]] = {"order": self.order}
         for name, tensor in self.gaussians.tensors().items():
             result[f"parameter.{name}"] = tensor.numpy()

@@ -3,35 +3,47 @@ block among its surroundings."""
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import torch
 from torch import Tensor
 
 from pipeline.render import AlphaChangeLoss
+from pipeline.render.resident import Planes
+from pipeline.training.data.step_view import StepView
 from pipeline.training.data.targets import Target
+from pipeline.training.losses.plane import PlaneGradients, add
 
 # Without it a block would fade, since what is behind it often has its colour, and each of two
 # blocks on a ray could leave a pixel to the other one.
 BLOCK_ALPHA_LOSS = AlphaChangeLoss(weight=1.0, fade=0.02, growth=0.25)
 
 
-def alpha_gradient(
-    alpha: Tensor,
-    target: Target,
-    mask_loss_weight: float,
-    alpha_loss_weight: float,
-    squared_error_weight: float,
-) -> Tensor | None:
-    """(H, W) float32 gradient of the losses on the rendered ``alpha`` (H, W); None without any.
+@dataclass(frozen=True)
+class AlphaLoss:
+    """The losses on the rendered alpha of a view.
 
-    Args:
-        mask_loss_weight: of alpha at ignored pixels (``mask_gradient``).
-        alpha_loss_weight, squared_error_weight: of the error at other pixels (``error_gradient``).
+    Attributes:
+        mask_loss_weight: The weight of alpha at ignored pixels (``mask_gradient``).
+        alpha_loss_weight, squared_error_weight: Those of the error at other pixels
+            (``error_gradient``).
     """
-    masked = mask_gradient(target, mask_loss_weight)
-    error = error_gradient(alpha, target, alpha_loss_weight, squared_error_weight)
-    if masked is None or error is None:
-        return error if masked is None else masked
-    return masked + error
+
+    mask_loss_weight: float
+    alpha_loss_weight: float
+    squared_error_weight: float
+
+    def is_due(self, view: StepView, step: int) -> bool:
+        target = view.target
+        masked = target.ignored is not None and self.mask_loss_weight > 0
+        return masked or (target.alpha is not None and self.alpha_loss_weight > 0)
+
+    def gradients(self, rendered: Planes, view: StepView) -> PlaneGradients:
+        masked = mask_gradient(view.target, self.mask_loss_weight)
+        error = error_gradient(
+            rendered.alpha, view.target, self.alpha_loss_weight, self.squared_error_weight
+        )
+        return PlaneGradients(alpha=add(masked, error))
 
 
 def mask_gradient(target: Target, weight: float) -> Tensor | None:

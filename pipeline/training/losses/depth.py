@@ -6,6 +6,9 @@ to one camera explain its photograph as well as the surface.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+from dataclasses import dataclass
+
 import numpy as np
 import torch
 from torch import Tensor
@@ -13,11 +16,36 @@ from torch import Tensor
 from pipeline.render.resident import Planes
 from pipeline.scene.views import View
 from pipeline.training.data.known_depths import KnownDepths
+from pipeline.training.data.step_view import StepView
+from pipeline.training.losses.plane import PlaneGradients
+
+#: The loss is computed in some of the steps only, with a weight as if in all: rendering depths and
+#: their gradients takes half the time of a step.
+INTERVAL = 4
 
 #: Error of the logarithm at which the Huber loss becomes linear: 1 %.
 TOLERANCE = 0.01
 #: Pixels with less alpha have no depth.
 MIN_ALPHA = 0.1
+
+
+@dataclass(frozen=True)
+class DepthLoss:
+    """The depth loss of a run.
+
+    Attributes:
+        known: The known depths of each training view.
+    """
+
+    known: Sequence[KnownDepths]
+    weight: float
+
+    def is_due(self, view: StepView, step: int) -> bool:
+        return bool(self.known[view.index]) and step % INTERVAL == 0
+
+    def gradients(self, rendered: Planes, view: StepView) -> PlaneGradients:
+        known = self.known[view.index]
+        return PlaneGradients(*depth_gradients(rendered, known, view.full, self.weight * INTERVAL))
 
 
 def depth_gradients(

@@ -12,6 +12,7 @@ from dataclasses import asdict, dataclass
 import torch
 from torch import Tensor
 
+from pipeline.config.settled import TrainOptions
 from pipeline.render import Backend, DenseAdam, FrameAdam, Gradients, ShAdam, make_backend
 from pipeline.render.resident import GaussianAdam
 from pipeline.splats.gaussians import Gaussians, resize_bands
@@ -63,6 +64,12 @@ class AdamOptions:
     beta1: float
     own_frames: bool
     epsilon: float = 0.0
+
+    @staticmethod
+    def of(options: TrainOptions) -> AdamOptions:
+        experiments = options.experiments
+        own_frames = experiments.means_learning_rate_unit == "gaussian_scale"
+        return AdamOptions(experiments.adam_beta1, own_frames, experiments.adam_epsilon)
 
 
 class Adam:

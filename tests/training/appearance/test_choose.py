@@ -36,14 +36,14 @@ def choose(
     )
 
 
-def test_auto_chooses_by_what_the_photographs_show(tmp_path: Path) -> None:
-    alike = choose(tmp_path, "auto", [0] * 8)
+def test_photographs_choose_by_what_the_photographs_show(tmp_path: Path) -> None:
+    alike = choose(tmp_path, "measured", [0] * 8)
     assert not alike.gains and not alike.embeddings and not alike.decisions
     assert alike.counters["colour_disagreement"] < 0.03
-    exposed = choose(tmp_path, "auto", [0] * 8, EXPOSED)
+    exposed = choose(tmp_path, "measured", [0] * 8, EXPOSED)
     assert exposed.gains and not exposed.embeddings
     assert "exposures differ" in exposed.decisions[0]
-    lights = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED)
+    lights = choose(tmp_path, "measured", [0, 1] * 4, EXPOSED)
     assert lights.embeddings and not lights.gains
     assert "train.appearance" in lights.decisions[0]
 
@@ -59,9 +59,9 @@ def test_a_chosen_model_is_used(tmp_path: Path, wanted: str, gains: bool, embedd
 
 
 def test_blocks_have_no_embeddings_and_alpha_no_gains(tmp_path: Path) -> None:
-    in_blocks = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED, in_blocks=True)
+    in_blocks = choose(tmp_path, "measured", [0, 1] * 4, EXPOSED, in_blocks=True)
     assert in_blocks.gains and not in_blocks.embeddings
-    with_alpha = choose(tmp_path, "auto", [0, 1] * 4, EXPOSED, has_alpha=True)
+    with_alpha = choose(tmp_path, "measured", [0, 1] * 4, EXPOSED, has_alpha=True)
     assert not with_alpha.gains and not with_alpha.embeddings and not with_alpha.counters
 
 
@@ -73,5 +73,5 @@ def test_a_collection_by_many_cameras_needs_less_evidence(
     monkeypatch.setattr(choose_module, "colour_disagreement", lambda *_: 0.2)
     scene = photographs(tmp_path, [0] * 8, ALIKE)
     groups = [f"{number % cameras}" for number in range(8)]
-    found = choose_appearance(*scene, "auto", cameras=groups, has_alpha=False, in_blocks=False)
+    found = choose_appearance(*scene, "measured", cameras=groups, has_alpha=False, in_blocks=False)
     assert found.embeddings == (cameras == 8)

@@ -10,6 +10,7 @@ import pytest
 import torch
 from PIL import Image
 
+from pipeline.config.settled import TrainOptions
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
 from pipeline.scene.views import View
@@ -19,8 +20,9 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import session
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.tools import need_gpu
-from tests.training.conftest import WIDTH, Options, TinyScene, killed_in_step, tiny_config
+from tests.training.conftest import WIDTH, TinyScene, killed_in_step, tiny_config
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +45,7 @@ def run(
     scene: TinyScene,
     views: list[View],
     folder: Path,
-    config: Options,
+    config: TrainOptions,
     *,
     embeddings: bool = True,
     threads: int = 1,
@@ -51,7 +53,7 @@ def run(
     inputs = Inputs(views, scene.initial, scene.extent)
     if embeddings:
         inputs = replace(inputs, embeddings=initial_embeddings(views, 2))
-    return train(inputs, *config, seed=3, threads=threads, checkpoint_dir=folder)
+    return train(inputs, TrainingRun(config, folder, seed=3, threads=threads))
 
 
 def assert_same(a: TrainResult, b: TrainResult) -> None:
@@ -114,7 +116,7 @@ def test_a_checkpoint_of_other_embeddings_is_not_used(
     run(scene, views, tmp_path, config, embeddings=False)
     said: list[str] = []
     inputs = Inputs(views, scene.initial, scene.extent, embeddings=initial_embeddings(views, 2))
-    train(inputs, *config, seed=3, threads=1, checkpoint_dir=tmp_path, on_log=said.append)
+    train(inputs, TrainingRun(config, tmp_path, seed=3, threads=1), log=said.append)
     assert any("other inputs" in line for line in said)
 
 

@@ -13,7 +13,7 @@ from pipeline.render.views import raster_camera
 from pipeline.scene.exposure import ExposureGains
 from pipeline.training.blocks.options import FIRST, SECOND, corrected_box
 from pipeline.training.blocks.shares import IMAGE_FACTOR
-from pipeline.training.loop.schedule import Part
+from pipeline.training.run import Part
 from tests.training.blocks.conftest import NEAR, WHITE, DividedScene, layers_of
 
 

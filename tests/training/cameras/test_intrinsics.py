@@ -21,6 +21,7 @@ from pipeline.training.cameras.intrinsics import (
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 STILL = ("means", "scales", "quats", "opacities", "sh0", "shN")
@@ -49,10 +50,7 @@ def trained(scene: TinyScene, folder: Path, steps: int, **options: object) -> Tr
     config = tiny_config(steps, density={"stop_share": 0.0, "prune_opacity": 0.0}, **options)
     return train(
         Inputs(views, scene.truth, scene.extent),
-        *config,
-        seed=3,
-        threads=1,
-        checkpoint_dir=folder,
+        TrainingRun(config, folder, seed=3, threads=1),
     )
 
 

@@ -17,6 +17,7 @@ from pipeline.training.cameras.poses import rigid, with_common_motion
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 
@@ -80,10 +81,9 @@ def trained(scene: TinyScene, folder: Path, threads: int = 1, **options: object)
             scene.truth,
             scene.extent,
         ),
-        *tiny_config(300, means_learning_rate=5e-3, **options),
-        seed=3,
-        threads=threads,
-        checkpoint_dir=folder,
+        TrainingRun(
+            tiny_config(300, means_learning_rate=5e-3, **options), folder, seed=3, threads=threads
+        ),
     )
 
 
@@ -96,10 +96,7 @@ def test_training_recovers_a_wrong_pose(scene: TinyScene, tmp_path: Path) -> Non
     config = tiny_config(600, density={"stop_share": 0.0, "prune_opacity": 0.0}, **options)
     result = train(
         Inputs(views, scene.truth, scene.extent),
-        *config,
-        seed=3,
-        threads=1,
-        checkpoint_dir=tmp_path,
+        TrainingRun(config, tmp_path, seed=3, threads=1),
     )
     assert result.poses is not None and list(result.poses) == [view.name for view in views]
     moved = [replace(view, world_to_camera=result.poses[view.name]) for view in views]

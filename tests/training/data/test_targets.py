@@ -90,16 +90,6 @@ def test_small_images_are_not_reduced() -> None:
         assert usable_factor([view], 4) == wanted
 
 
-def test_salt_and_pepper_has_its_share_and_depends_on_the_seed(tmp_path: Path) -> None:
-    views = [view_of(tmp_path / "a.png", np.full((80, 100, 3), 120, np.uint8))]
-    clean = Targets(views, threads=1).get(0, 1).rgb
-    assert (clean == 120).all()
-    noisy = [Targets(views, 1, 0.2, seed).get(0, 1).rgb.numpy() for seed in (0, 0, 1)]
-    assert (noisy[0] == noisy[1]).all() and (noisy[0] != noisy[2]).any()
-    assert abs((noisy[0] == 0).all(2).mean() - 0.1) < 0.015
-    assert abs((noisy[0] == 255).all(2).mean() - 0.1) < 0.015
-
-
 def test_both_image_stores_give_the_same_bits(tmp_path: Path) -> None:
     """With and without alpha and masks, at every size, repeatedly."""
     rng = np.random.default_rng(0)

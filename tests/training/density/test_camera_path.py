@@ -22,7 +22,9 @@ from pipeline.training.density.camera_path import (
     distances_to_path,
     on_camera_path,
 )
+from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, tiny_config
 
 # Neighbouring cameras of the tiny scene are up to 3.3 apart.
@@ -45,7 +47,8 @@ def between(scene: TinyScene, *, size: float = 0.02, aside: float = 0.04) -> Gau
 def found(scene: TinyScene, gaussians: Gaussians, depth: float = EMPTY) -> list[int]:
     cameras = [raster_camera(view) for view in scene.views]
     options = RasterOptions(sh_degree=0, threads=1)
-    flags = on_camera_path(gaussians, cameras, np.full(len(cameras), depth), options)
+    views = ReducedViews(cameras, options)
+    flags = on_camera_path(gaussians, views, np.full(len(cameras), depth))
     return torch.nonzero(flags)[:, 0].tolist()
 
 
@@ -118,6 +121,6 @@ def test_training_removes_them_at_its_end(scene: TinyScene, tmp_path: Path) -> N
     for remove in (True, False):
         config = tiny_config(4, **still, density={"grad_threshold": 1e6, "remove_floaters": remove})
         folder = tmp_path / str(remove)
-        result = train(inputs, *config, seed=3, threads=1, checkpoint_dir=folder)
+        result = train(inputs, TrainingRun(config, folder, seed=3, threads=1))
         assert result.counters["floaters"] == remove
         assert len(result.gaussians) == len(inputs.initial) - remove

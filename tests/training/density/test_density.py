@@ -14,21 +14,25 @@ from hypothesis import strategies as st
 
 from pipeline.config.density import Gradient, Mcmc, Original
 from pipeline.config.experiments import GradientExperiments, McmcExperiments, TrainExperiments
+from pipeline.config.settled import TrainOptions
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.skybox import Sky
-from pipeline.training.density import make_strategy
-from pipeline.training.density.gradient import (
+from pipeline.training.density import DensityStep, Strategy, make_strategy
+from pipeline.training.density.gradient import GradientDensity
+from pipeline.training.density.growth import (
     HALVES_OPACITY,
     LONG_AXIS,
     OTHER_AXES,
     SPLIT_SHRINK,
-    GradientDensity,
+    sample_halves,
 )
 from pipeline.training.density.mcmc import McmcDensity, share_out
 from pipeline.training.density.original import OriginalDensity
 from pipeline.training.density.strategy import rotations
 from pipeline.training.optimisers.adam import Adam, AdamOptions
 from tests.training.conftest import ball
+
+STEPS = 1000  # the length of the schedule
 
 
 def marked(count: int) -> tuple[Gaussians, Adam]:
@@ -42,26 +46,38 @@ def marked(count: int) -> tuple[Gaussians, Adam]:
 
 
 def strategy(count: int, **options: object) -> GradientDensity:
-    """3DGS's way of densification, unless ``options`` differ."""
-    published: dict[str, object] = {"clone": True, "split_kind": "sampled"}
-    density = GradientDensity(GradientExperiments(**published | options), 1000, 1.0)  # type: ignore[arg-type]
+    density = GradientDensity(GradientExperiments(**options), STEPS, 1.0)  # type: ignore[arg-type]
     density.start(count)
-    density.seen += 1
+    density.observed.seen += 1
     return density
 
 
+def step_of(
+    density: Strategy,
+    gaussians: Gaussians,
+    adam: Adam,
+    *,
+    densify: bool = True,
+    budget: int = 1_000_000,
+    seed: int = 0,
+) -> DensityStep:
+    """A step of the schedule after which ``density`` densifies, or another one."""
+    due = next(n for n in range(STEPS, 0, -1) if density.timeline.densifies_after(n))
+    number = due if densify else 1
+    rng = np.random.Generator(np.random.PCG64(seed))
+    return DensityStep(gaussians, adam, rng, range(number, number + 1), budget=budget, prune=True)
+
+
 def refine(
-    density: GradientDensity,
+    density: Strategy,
     gaussians: Gaussians,
     adam: Adam,
     *,
     densify: bool = True,
     budget: int = 1_000_000,
 ) -> Gaussians:
-    rng = np.random.Generator(np.random.PCG64(0))
-    return density.refine(gaussians, adam, rng, densify=densify, prune_large=False, budget=budget)[
-        0
-    ]
+    step = step_of(density, gaussians, adam, densify=densify, budget=budget)
+    return density.refine(step)[0]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -69,19 +85,17 @@ def refine(
 def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: bool) -> None:
     gaussians, adam = marked(count)
     rng = np.random.default_rng(seed)
-    density = strategy(count, split_scale=0.13)
-    density.gradient_sum = torch.from_numpy(rng.uniform(0, 4e-4, count).astype(np.float32))
+    density = strategy(count)
+    density.observed.gradient_sum = torch.from_numpy(rng.uniform(0, 4e-4, count).astype(np.float32))
     gaussians.opacity_logits[torch.from_numpy(rng.random(count) < 0.2)] = -9.0
     rows = {row.numpy().tobytes(): index + 1 for index, row in enumerate(gaussians.means)}
 
-    rng2 = np.random.Generator(np.random.PCG64(seed))
-    result, changes = density.refine(
-        gaussians, adam, rng2, densify=densify, prune_large=False, budget=budget
-    )
+    step = step_of(density, gaussians, adam, densify=densify, budget=budget)
+    result, changes = density.refine(step)
 
     assert len(result) == count - changes.pruned + changes.cloned + changes.split
     assert len(result) <= max(budget, count - changes.pruned)
-    assert len(density.gradient_sum) == len(density.seen) == len(result)
+    assert len(density.observed.gradient_sum) == len(density.observed.seen) == len(result)
     for name, tensor in result.tensors().items():
         assert tensor.is_contiguous()
         for moments in (adam.first, adam.second):
@@ -99,11 +113,12 @@ def test_counts_moments_and_budget(count: int, budget: int, seed: int, densify: 
 
 def test_the_budget_goes_to_the_largest_gradients() -> None:
     gaussians, adam = marked(10)
-    density = strategy(10, split_scale=100.0)
-    density.gradient_sum = torch.arange(10.0)
+    density = strategy(10)
+    density.observed.gradient_sum = torch.arange(10.0)
     result = refine(density, gaussians, adam, budget=13)
     assert len(result) == 13
-    assert torch.equal(result.means[10:], gaussians.means[[7, 8, 9]])
+    assert torch.equal(result.means[:7], gaussians.means[:7])
+    assert torch.equal(result.sh[7:], gaussians.sh[[7, 8, 9, 7, 8, 9]])
 
 
 def test_transparent_gaussians_with_small_gradients_are_recycled() -> None:
@@ -111,36 +126,32 @@ def test_transparent_gaussians_with_small_gradients_are_recycled() -> None:
     gaussians, adam = marked(40)
     gaussians.opacity_logits[:] = 2.0
     gaussians.opacity_logits[:2] = -3.0  # 0.05
-    density = strategy(40, split_scale=100.0, recycle_share=0.1)
+    density = strategy(40, recycle_share=0.1)
     # All are above the threshold; the tenth with the smallest gradients are 0 and 2 to 4.
-    density.gradient_sum += torch.arange(1.0, 41.0)
-    density.gradient_sum[1] = 30.5
+    density.observed.gradient_sum += torch.arange(1.0, 41.0)
+    density.observed.gradient_sum[1] = 30.5
     result = refine(density, gaussians, adam, budget=40)
-    assert torch.equal(result.means[:39], gaussians.means[1:])
-    assert torch.equal(result.means[39:], gaussians.means[39:])
+    assert torch.equal(result.means[:38], gaussians.means[1:39])
+    assert torch.equal(result.sh[38:], gaussians.sh[[39, 39]])
 
 
 def test_steps_without_the_gaussian_do_not_change_its_mean_gradient() -> None:
     gaussians, adam = marked(2)
-    density = strategy(2, split_scale=100.0, grad_threshold=1.0)
-    density.gradient_sum = torch.tensor([3.0, 3.0])
-    density.seen = torch.tensor([2.0, 4.0])
+    density = strategy(2, grad_threshold=1.0)
+    density.observed.gradient_sum = torch.tensor([3.0, 3.0])
+    density.observed.seen = torch.tensor([2.0, 4.0])
     assert len(refine(density, gaussians, adam)) == 3
 
 
-def test_a_split_keeps_the_mean_and_shrinks() -> None:
+def test_sampled_halves_keep_the_mean_and_shrink() -> None:
     one = ball(1, 4)
     count = 20_000
     gaussians = one.select(torch.zeros(count, dtype=torch.int64))
-    adam = Adam(gaussians, AdamOptions(0.8, own_frames=True))
-    density = strategy(count, split_scale=0.0)
-    density.gradient_sum += 1.0
-    result = refine(density, gaussians, adam)
-    assert len(result) == 2 * count
-    assert torch.allclose(result.log_scales, one.log_scales - math.log(SPLIT_SHRINK))
-    offset = (result.means - one.means).double()
+    sample_halves(gaussians, slice(0, count), np.random.Generator(np.random.PCG64(0)))
+    assert torch.allclose(gaussians.log_scales, one.log_scales - math.log(SPLIT_SHRINK))
+    offset = (gaussians.means - one.means).double()
     sigma = one.log_scales.exp().max().item()
-    assert offset.mean(0).abs().max() < 5 * sigma / math.sqrt(2 * count)
+    assert offset.mean(0).abs().max() < 5 * sigma / math.sqrt(count)
     # Drawn from the Gaussian itself: its covariance R S S R^T.
     axes = rotations(one.quats)[0].double() * one.log_scales.exp().double()
     wanted = axes @ axes.T
@@ -151,8 +162,8 @@ def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
     """About the old centre, with the old variance along the axis."""
     gaussians, adam = marked(5)
     gaussians.log_scales += torch.rand(5, 3, generator=torch.Generator().manual_seed(0))
-    density = strategy(5, clone=False, split_kind="long_axis")
-    density.gradient_sum += 1.0
+    density = strategy(5)
+    density.observed.gradient_sum += 1.0
     result = refine(density, gaussians, adam)
     assert len(result) == 10
     middle = (result.means[:5] + result.means[5:]) / 2
@@ -175,8 +186,10 @@ def test_halves_stand_side_by_side_along_the_longest_axis() -> None:
 
 def test_clones_are_copies() -> None:
     gaussians, adam = marked(5)
-    density = strategy(5, split_scale=100.0)
-    density.gradient_sum += 1.0
+    gaussians.log_scales[:] = -9.0
+    density = OriginalDensity(STEPS, extent=1.0)
+    density.start(5)
+    density.observed.gradient_sum += 1.0
     result = refine(density, gaussians, adam)
     for tensor in result.tensors().values():
         assert torch.equal(tensor[:5], tensor[5:])
@@ -206,29 +219,24 @@ def test_the_sky_is_neither_reset_nor_too_large() -> None:
     gaussians, adam = marked(6)
     gaussians.means[0] = torch.tensor([0.0, 0.0, 1e4])
     gaussians.log_scales[:2] = 5.0
-    density = replace(strategy(6), sky=Sky(np.zeros((1, 3))))
+    density = GradientDensity(
+        GradientExperiments(prune_scale=1.0), 30_000, 1.0, Sky(np.zeros((1, 3)))
+    )
     density.start(6)
     before = gaussians.opacity_logits[0].clone()
     density.reset_opacity(gaussians, adam)
     assert gaussians.opacity_logits[0] == before
     assert torch.allclose(torch.sigmoid(gaussians.opacity_logits[1:]), torch.tensor(0.01))
-    assert density.useless(gaussians, prune_large=True)[:2].tolist() == [False, True]
-
-
-def test_without_splits_all_are_cloned_and_without_clones_all_are_split() -> None:
-    for options, cloned, split in (({"split": False}, 5, 0), ({"clone": False}, 0, 5)):
-        gaussians, adam = marked(5)
-        density = strategy(5, split_scale=0.13, **options)
-        density.gradient_sum += 1.0
-        rng = np.random.Generator(np.random.PCG64(0))
-        _, changes = density.refine(
-            gaussians, adam, rng, densify=True, prune_large=False, budget=100
-        )
-        assert (changes.cloned, changes.split) == (cloned, split)
+    after_reset = density.reset_interval + 1
+    due = next(n for n in range(after_reset, 30_000) if density.prunes_large_after(n))
+    refined, _ = density.refine(
+        DensityStep(gaussians, adam, np.random.default_rng(0), range(due, due + 1))
+    )
+    assert refined.log_scales.max() == 5.0 and len(refined) == 5
 
 
 def mcmc(**options: object) -> McmcDensity:
-    return McmcDensity(McmcExperiments(**options), 1000, 1.0)  # type: ignore[arg-type]
+    return McmcDensity(McmcExperiments(**options), STEPS, 1.0)  # type: ignore[arg-type]
 
 
 @settings(max_examples=60, deadline=None, derandomize=True)
@@ -237,10 +245,9 @@ def test_mcmc_counts_moments_and_budget(count: int, budget: int, seed: int, dens
     gaussians, adam = marked(count)
     faint = np.random.default_rng(seed).random(count) < 0.3
     gaussians.opacity_logits[torch.from_numpy(faint)] = -9.0
-    rng = np.random.Generator(np.random.PCG64(seed))
-    result, changes = mcmc(growth_share=0.2).refine(
-        gaussians, adam, rng, densify=densify, prune_large=False, budget=budget
-    )
+    density = mcmc(growth_share=0.2)
+    step = step_of(density, gaussians, adam, densify=densify, budget=budget, seed=seed)
+    result, changes = density.refine(step)
     alive = count - int(faint.sum())
     if densify and alive:
         assert len(result) == max(count, min(budget, math.ceil(1.2 * count)))
@@ -280,7 +287,10 @@ def test_noise_moves_transparent_gaussians_along_their_axes() -> None:
     gaussians.quats[:] = torch.tensor([1.0, 0, 0, 0])
     gaussians.log_scales[:] = torch.tensor([-1.0, -9.0, -9.0])
     before = gaussians.means.clone()
-    mcmc().add_noise(gaussians, 1e-2, np.random.Generator(np.random.PCG64(0)))
+    adam = Adam(gaussians, AdamOptions(0.8, own_frames=True))
+    rng = np.random.Generator(np.random.PCG64(0))
+    assert mcmc().is_due(range(1, 2))
+    mcmc().after_step(DensityStep(gaussians, adam, rng, range(1, 2), noise_rate=1e-2))
     moved = (gaussians.means - before).abs()
     assert not moved[1000:].any()
     assert moved[:1000, 0].mean() > 1e5 * moved[:1000, 1].mean() > 0
@@ -292,7 +302,7 @@ def test_mcmc_regularisers_are_gradients_of_the_mean_opacity_and_scale() -> None
     scales = gaussians.log_scales.clone().requires_grad_()
     (0.1 * torch.sigmoid(logits).mean() + 0.2 * scales.exp().mean()).backward()
     gradients = SimpleNamespace(opacity_logits=torch.zeros(5), log_scales=torch.zeros(5, 3))
-    mcmc(opacity_loss_weight=0.1, scale_loss_weight=0.2).regularise(gaussians, gradients)  # type: ignore[arg-type]
+    mcmc(opacity_loss_weight=0.1, scale_loss_weight=0.2).before_step(gaussians, None, gradients)  # type: ignore[arg-type]
     assert torch.allclose(gradients.opacity_logits, logits.grad)
     assert torch.allclose(gradients.log_scales, scales.grad)
 
@@ -309,25 +319,19 @@ def test_density_control_does_not_depend_on_the_unit(
         gaussians.means *= unit
         gaussians.log_scales += math.log(unit)
         gaussians.opacity_logits[:60] = -6.0
-        gradient = GradientExperiments(split_scale=0.13, prune_scale=0.17)
-        density = make_strategy(
-            config,
-            TrainExperiments(gradient=gradient),
-            steps=1000,
-            scale=1.5 * unit,
-            extent=9.0 * unit,
-        )
+        gradient = GradientExperiments(prune_scale=0.17)
+        options = TrainOptions(density=config, experiments=TrainExperiments(gradient=gradient))
+        density = make_strategy(options, steps=STEPS, scale=1.5 * unit, extent=9.0 * unit)
         density.start(200)
-        if isinstance(density, GradientDensity):
-            density.gradient_sum += torch.linspace(0, 4e-4, 200)
-            density.seen += 1
         costs = SimpleNamespace(opacity_logits=torch.zeros(200), log_scales=torch.zeros(200, 3))
-        density.regularise(gaussians, costs)  # type: ignore[arg-type]
-        rng = np.random.Generator(np.random.PCG64(0))
-        density.add_noise(gaussians, 1e-2, rng)
-        result, changes = density.refine(
-            gaussians, adam, rng, densify=True, prune_large=True, budget=300
-        )
+        if isinstance(density, McmcDensity):
+            density.before_step(gaussians, None, costs)  # type: ignore[arg-type]
+        else:
+            density.observed.gradient_sum += torch.linspace(0, 4e-4, 200)
+            density.observed.seen += 1
+        step = replace(step_of(density, gaussians, adam, budget=300), noise_rate=1e-2)
+        update = density.after_step(step)
+        result, changes = update.gaussians, update.changes
         log_scales = result.log_scales - math.log(unit)
         found.append((changes, costs.log_scales, result.means / unit, log_scales))
     assert found[0][0] == found[1][0]
@@ -339,10 +343,10 @@ def test_gradients_are_measured_in_normalised_device_coordinates() -> None:
     """A pixel is 2 / width: thresholds are independent of the size of the image."""
     density = strategy(2)
     means2d = torch.tensor([[3e-6, 0.0], [0.0, 4e-6]])
-    gradients = SimpleNamespace(means2d=means2d, means2d_abs=None)
+    gradients = SimpleNamespace(means2d=means2d)
     rendered = SimpleNamespace(radii=torch.ones(2), alpha=torch.zeros(100, 200))
-    density.observe(rendered, gradients)  # type: ignore[arg-type]
-    assert torch.allclose(density.gradient_sum, torch.tensor([3e-4, 2e-4]))
+    density.before_step(ball(2, 0), rendered, gradients)  # type: ignore[arg-type]
+    assert torch.allclose(density.observed.gradient_sum, torch.tensor([3e-4, 2e-4]))
 
 
 def test_the_published_strategy_prunes_after_it_densifies() -> None:
@@ -353,13 +357,13 @@ def test_the_published_strategy_prunes_after_it_densifies() -> None:
     gaussians.opacity_logits[:] = torch.tensor([2.0, 2.0, 2.0, -9.0])
     density = OriginalDensity(steps=30_000, extent=1.0)
     density.start(4)
-    density.seen += 1
-    density.gradient_sum = torch.tensor([3e-4, 3e-4, 3e-4, 0.0])
+    density.observed.seen += 1
+    density.observed.gradient_sum = torch.tensor([3e-4, 3e-4, 3e-4, 0.0])
     rng = np.random.Generator(np.random.PCG64(0))
     result, changes = density.refine(
-        gaussians, adam, rng, densify=True, prune_large=True, budget=100
+        DensityStep(gaussians, adam, rng, range(9000, 9001), budget=100)
     )
     assert (changes.cloned, changes.split, changes.pruned) == (1, 2, 3)
     scales = result.log_scales.exp()[:, 0]
     assert torch.allclose(scales, torch.tensor([0.009, 0.009, 0.0125, 0.0125]))
-    assert len(density.gradient_sum) == len(adam.first["means"]) == 4
+    assert len(density.observed.gradient_sum) == len(adam.first["means"]) == 4

@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 import torch
 
+from pipeline.config.settled import TrainOptions
 from pipeline.render import RasterOptions
 from pipeline.render.views import raster_camera
 from pipeline.splats.gaussians import Gaussians
@@ -16,9 +17,11 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths
 from pipeline.training.density import floaters as floaters_module
 from pipeline.training.density.floaters import MIN_POINTS, empty_depths, floaters
+from pipeline.training.density.reduced_views import ReducedViews
 from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
-from tests.training.conftest import Options, TinyScene, killed_in_step, tiny_config
+from pipeline.training.run import TrainingRun
+from tests.training.conftest import TinyScene, killed_in_step, tiny_config
 
 EMPTY = 1.0
 
@@ -45,7 +48,8 @@ def with_close(scene: TinyScene, distance: float, views: tuple[int, ...] = (0,))
 
 def found(scene: TinyScene, gaussians: Gaussians, depth: float) -> list[int]:
     cameras = [raster_camera(view) for view in scene.views]
-    flags = floaters(gaussians, cameras, np.full(len(cameras), depth), RasterOptions(threads=1))
+    views = ReducedViews(cameras, RasterOptions(sh_degree=0, threads=1))
+    flags = floaters(gaussians, views, np.full(len(cameras), depth))
     return torch.nonzero(flags)[:, 0].tolist()
 
 
@@ -99,10 +103,10 @@ def test_empty_space_ends_at_half_the_depth_of_the_nearest_points() -> None:
 
 
 def run(
-    scene: TinyScene, folder: Path, config: Options, first: Gaussians, threads: int = 1
+    scene: TinyScene, folder: Path, config: TrainOptions, first: Gaussians, threads: int = 1
 ) -> TrainResult:
     inputs = Inputs(scene.views, first, scene.extent, empty_depths=np.full(len(scene.views), EMPTY))
-    return train(inputs, *config, seed=3, threads=threads, checkpoint_dir=folder)
+    return train(inputs, TrainingRun(config, folder, seed=3, threads=threads))
 
 
 def nearest(scene: TinyScene, result: TrainResult) -> float:

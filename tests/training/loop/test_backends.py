@@ -10,6 +10,7 @@ from pipeline.render import make_backend
 from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, tiny_config
 
 
@@ -18,10 +19,7 @@ def test_the_reference_trains_what_the_kernels_train(scene: TinyScene, tmp_path:
     kernels, reference = (
         train(
             inputs,
-            *tiny_config(4),
-            seed=0,
-            threads=1,
-            checkpoint_dir=tmp_path / name,
+            TrainingRun(tiny_config(4), tmp_path / name, seed=0, threads=1),
             backend=make_backend(name),
         )
         for name in ("cpu", "reference")

@@ -15,6 +15,7 @@ from pipeline.splats.morton import in_morton_order
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.density.strategy import rotations
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, tiny_config
 
 RATES = {
@@ -40,10 +41,9 @@ def test_each_parameter_has_its_own_learning_rate(
     world_unit = scene.extent if unit == "camera_extent" else scale
     result = train(
         Inputs(scene.views, scene.initial, scene.extent, scale),
-        *tiny_config(1, **RATES, means_learning_rate_unit=unit),
-        seed=0,
-        threads=1,
-        checkpoint_dir=tmp_path,
+        TrainingRun(
+            tiny_config(1, **RATES, means_learning_rate_unit=unit), tmp_path, seed=0, threads=1
+        ),
     )
     expected = {
         "means": RATES["means_learning_rate"],
@@ -89,10 +89,7 @@ def test_the_gradient_is_that_of_the_loss(
     gains = np.tile([0.4, 1.0, 2.5], (len(scene.views), 1))
     train(
         Inputs(scene.views, scene.initial, scene.extent, gains=gains),
-        *tiny_config(1),
-        seed=0,
-        threads=1,
-        checkpoint_dir=tmp_path,
+        TrainingRun(tiny_config(1), tmp_path, seed=0, threads=1),
     )
     gain = torch.tensor(gains[0], dtype=torch.float32)
 

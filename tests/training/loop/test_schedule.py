@@ -8,12 +8,13 @@ import pytest
 
 from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from pipeline.config.settled import Train, TrainOptions
 from pipeline.training.loop.schedule import CAMERA_DECAY, Schedule
 
 
 def schedule_of(train: Train | None = None, **experiments: Any) -> Schedule:
-    return Schedule.of(train or Train(), TrainExperiments(**experiments))
+    options = dict(train or Train()) | {"experiments": TrainExperiments(**experiments)}
+    return Schedule.of(TrainOptions(**options))
 
 
 @pytest.mark.parametrize("steps", [1, 10, 60, 600, 2000, 7000, 30_000])
@@ -82,6 +83,6 @@ def test_learning_rates_are_lower_where_few_views_see_a_gaussian(
     seen: float, factor: float
 ) -> None:
     """Its steps would be larger than those of others, and scenes of hundreds of views diverge."""
-    schedule = Schedule.of(Train(steps=1500), TrainExperiments(), seen)
+    schedule = Schedule.of(TrainOptions(steps=1500), seen)
     assert schedule.learning_rate_factor(1500) == pytest.approx(factor)
     assert schedule.learning_rate_factor(30_000) == 1.0

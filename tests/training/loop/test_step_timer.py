@@ -16,6 +16,7 @@ from pipeline.training.loop.step_timer import (
     other_build,
 )
 from pipeline.training.loop.train import train
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import TinyScene, tiny_config
 
 HERE = {"instruction_set": "x86-64-v3", "compiler": "g++ 12.2.0"}
@@ -56,7 +57,7 @@ def test_training_resumes_from_a_checkpoint_of_another_instruction_set(
         said: list[str] = []
         inputs = Inputs(scene.views, scene.initial, scene.extent)
         config = tiny_config(12)
-        train(inputs, *config, seed=0, threads=1, checkpoint_dir=tmp_path, on_log=said.append)
+        train(inputs, TrainingRun(config, tmp_path, seed=0, threads=1), log=said.append)
         return said
 
     monkeypatch.setattr(session, "CHECKPOINT_SECONDS", 0.0)

@@ -14,6 +14,7 @@ import torch
 from numpy.typing import NDArray
 from PIL import Image
 
+from pipeline.config.settled import TrainOptions
 from pipeline.io.npz import write_npz
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import render_view
@@ -25,31 +26,33 @@ from pipeline.training.data.image_store import DiskStore, MemoryStore
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop import metrics_log, session, setup
 from pipeline.training.loop.result import TrainResult
-from pipeline.training.loop.schedule import WHOLE_RUN, Part
 from pipeline.training.loop.train import train
-from tests.training.conftest import HEIGHT, WIDTH, Options, TinyScene, tiny_config
+from pipeline.training.run import Part, TrainingRun
+from tests.training.conftest import HEIGHT, WIDTH, TinyScene, tiny_config
 
 
 def run(
     scene: TinyScene,
     folder: Path,
-    config: Options | None = None,
+    config: TrainOptions | None = None,
     views: list[View] | None = None,
     threads: int = 1,
     seed: int = 3,
     said: list[str] | None = None,
-    log: Path | None = None,
+    logs: Path | None = None,
     memory_mb: int | None = None,
 ) -> TrainResult:
     return train(
         Inputs(scene.views if views is None else views, scene.initial, scene.extent),
-        *(config or tiny_config()),
-        seed=seed,
-        threads=threads,
-        memory_mb=memory_mb,
-        checkpoint_dir=folder,
-        metrics_log=log,
-        on_log=None if said is None else said.append,
+        TrainingRun(
+            config or tiny_config(),
+            folder,
+            logs=logs,
+            seed=seed,
+            threads=threads,
+            memory_mb=memory_mb,
+        ),
+        log=[].append if said is None else said.append,
     )
 
 
@@ -98,23 +101,24 @@ def test_gaussians_that_no_view_sees_are_removed(scene: TinyScene, tmp_path: Pat
     assert (places == initial.means[2]).all(1).any()
     # With a skybox, the far one is part of it.
     initial.means[0] = torch.tensor([0.0, -500.0, 0.0])
-    sky = fixed.train.model_copy(update={"background": "skybox"})
-    kept = run(planted, tmp_path / "c", Options(sky, fixed[1])).gaussians.means
+    sky = fixed.model_copy(update={"background": "skybox"})
+    kept = run(planted, tmp_path / "c", sky).gaussians.means
     assert (kept == initial.means[0]).all(1).any() and not (kept == initial.means[1]).all(1).any()
     steps = 2 * len(scene.views) - 1
-    short = run(
-        planted, tmp_path / "b", Options(fixed.train.model_copy(update={"steps": steps}), fixed[1])
-    )
+    short = run(planted, tmp_path / "b", fixed.model_copy(update={"steps": steps}))
     assert short.counters["unseen"] == 0 and len(short.gaussians) == len(initial)
 
 
 def test_images_read_from_disk_give_the_same_bits(scene: TinyScene, tmp_path: Path) -> None:
     config = tiny_config(coarse_share=0.3)
     inputs = Inputs(scene.views, scene.initial, scene.extent)
-    assert isinstance(setup.choose_image_store(inputs, config.train, None, WHOLE_RUN), MemoryStore)
-    assert isinstance(setup.choose_image_store(inputs, config.train, 1, WHOLE_RUN), DiskStore)
-    in_blocks = setup.choose_image_store(inputs, config.train, None, Part(0.0, 0.5))
-    assert isinstance(in_blocks, DiskStore)
+    for changes, kind in (
+        ({}, MemoryStore),
+        ({"memory_mb": 1}, DiskStore),
+        ({"part": Part(0.0, 0.5)}, DiskStore),
+    ):
+        store = setup.choose_image_store(inputs, TrainingRun(config, tmp_path, **changes))
+        assert isinstance(store, kind), changes
     little = run(scene, tmp_path / "b", config, memory_mb=1)
     assert_same(run(scene, tmp_path / "a", config), little)
 
@@ -187,17 +191,17 @@ def test_the_metrics_log_has_each_step_once_after_a_kill(
     with monkeypatch.context() as patch:
         interrupt_at(patch, 23)
         with pytest.raises(KeyboardInterrupt):
-            run(scene, tmp_path, log=file)
+            run(scene, tmp_path, logs=file.parent)
     with open(file, "a") as half:
         half.write('{"time": 1, "step": 2')
-    result = run(scene, tmp_path, log=file)
+    result = run(scene, tmp_path, logs=file.parent)
     lines = metrics_log.read_metrics_log(file)
     assert [line.step for line in lines] == list(range(1, 41))
     assert lines[-1].share == 1
     assert lines[-1].psnr == result.curve.root[-1].psnr
     assert lines[-1].num_gaussians == len(result.gaussians)
     assert lines[-1].seconds_left == 0 < lines[5].seconds_left
-    run(scene, tmp_path / "again", log=file)
+    run(scene, tmp_path / "again", logs=file.parent)
     assert len(metrics_log.read_metrics_log(file)) == 40
 
 
@@ -218,16 +222,6 @@ def test_a_time_budget_passes_through_the_whole_schedule(
     steps = [record.step for record in result.curve.root]
     assert steps == sorted(steps)
     assert steps[-1] == result.steps
-
-
-def test_isotropic_gaussians_stay_spheres(scene: TinyScene, tmp_path: Path) -> None:
-    start = scene.initial.clone()
-    start.log_scales[:] = start.log_scales[:, :1]
-    inputs = Inputs(scene.views, start, scene.extent)
-    config = tiny_config(60, isotropic=True)
-    scales = train(inputs, *config, seed=0, threads=1, checkpoint_dir=tmp_path).gaussians.log_scales
-    assert torch.equal(scales, scales[:, :1].expand(-1, 3))
-    assert (scales[:5] != start.log_scales[:5]).all()
 
 
 def test_resuming_from_an_older_step_gives_the_same_bits(
@@ -323,7 +317,7 @@ def test_gains_compensate_for_different_exposures(scene: TinyScene, tmp_path: Pa
 
     def trained(name: str, gains: NDArray[np.float64] | None) -> TrainResult:
         inputs = Inputs(views, scene.initial, scene.extent, gains=gains)
-        return train(inputs, *config, seed=0, threads=1, checkpoint_dir=tmp_path / name)
+        return train(inputs, TrainingRun(config, tmp_path / name, seed=0, threads=1))
 
     with_gains, without = trained("a", gains), trained("b", None)
     assert with_gains.curve.root[-1].psnr > without.curve.root[-1].psnr + 3
@@ -348,10 +342,7 @@ def test_transparent_pixels_stay_empty(scene: TinyScene, tmp_path: Path) -> None
     start.log_scales += 0.7
     result = train(
         Inputs(scene.alpha_views, start, scene.extent),
-        *tiny_config(500),
-        seed=0,
-        threads=1,
-        checkpoint_dir=tmp_path,
+        TrainingRun(tiny_config(500, background="white"), tmp_path),
     )
     assert result.background == "white"
     for view in scene.alpha_views[:2]:
@@ -388,10 +379,7 @@ def test_gaussians_that_no_camera_sees_are_a_clear_error(scene: TinyScene, tmp_p
     with pytest.raises(UserError, match="no camera sees"):
         train(
             Inputs(scene.views, far, scene.extent),
-            *tiny_config(),
-            seed=0,
-            threads=1,
-            checkpoint_dir=tmp_path,
+            TrainingRun(tiny_config(), tmp_path, seed=0, threads=1),
         )
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import torch
 
 from pipeline.training.data.targets import Targets
-from pipeline.training.losses.alpha import alpha_gradient, mask_gradient
+from pipeline.training.losses.alpha import AlphaLoss, mask_gradient
 from tests.training.data.test_targets import view_of
 
 
@@ -35,7 +36,9 @@ def test_alpha_gradient_is_the_gradient_of_its_losses(tmp_path: Path) -> None:
     error = alpha - torch.from_numpy(picture[..., 3] / np.float32(255))
     wanted = 0.4 * (error.abs() + 2.5 * error.square())[counts].mean()
     (wanted + 0.3 * alpha[~counts].sum() / counts.sum()).backward()
-    gradient = alpha_gradient(alpha.detach(), target, 0.3, 0.4, 2.5)
+    view = SimpleNamespace(target=target)
+    rendered = SimpleNamespace(alpha=alpha.detach())
+    gradient = AlphaLoss(0.3, 0.4, 2.5).gradients(rendered, view).alpha
     assert gradient is not None and alpha.grad is not None
     torch.testing.assert_close(gradient, alpha.grad)
-    assert alpha_gradient(alpha.detach(), target, 0.0, 0.0, 2.5) is None
+    assert not AlphaLoss(0.0, 0.0, 2.5).is_due(view, 1)

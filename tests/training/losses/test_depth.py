@@ -14,7 +14,7 @@ from PIL import Image
 
 from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Train
+from pipeline.config.settled import TrainOptions
 from pipeline.geometry.cameras import Camera
 from pipeline.render import Forward
 from pipeline.render.views import render_view
@@ -25,6 +25,7 @@ from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.known_depths import KnownDepths, point_depths, scene_scale
 from pipeline.training.loop.train import train
 from pipeline.training.losses.depth import TOLERANCE, depth_gradients
+from pipeline.training.run import TrainingRun
 from tests.training.conftest import HEIGHT, WIDTH, camera_at
 
 
@@ -117,23 +118,22 @@ def test_training_moves_a_wall_without_features_to_its_known_depth(tmp_path, wei
     x, y = np.meshgrid(np.arange(2, WIDTH, 4) + 0.5, np.arange(2, HEIGHT, 4) + 0.5)
     xy = np.stack([x.ravel(), y.ravel()], 1)
     known = KnownDepths(xy, np.full(len(xy), 3.0, np.float32), np.ones(len(xy), np.float32))
-    config = Train(
-        steps=200, sh_degree=0, depth_loss_weight=weight, density=Gradient(max_gaussians=120)
-    )
-    experiments = TrainExperiments(
-        coarse_share=0.0,
-        means_learning_rate=0.02,
-        means_final_learning_rate=0.02,
-        means_learning_rate_unit="scene_scale",
-        learning_rate_factor=1.0,
+    options = TrainOptions(
+        steps=200,
+        sh_degree=0,
+        depth_loss_weight=weight,
+        density=Gradient(max_gaussians=120),
+        experiments=TrainExperiments(
+            coarse_share=0.0,
+            means_learning_rate=0.02,
+            means_final_learning_rate=0.02,
+            means_learning_rate_unit="scene_scale",
+            learning_rate_factor=1.0,
+        ),
     )
     result = train(
         Inputs([view], initial, extent=1.0, depths=[known]),
-        config,
-        experiments,
-        seed=0,
-        threads=1,
-        checkpoint_dir=tmp_path / "checkpoints",
+        TrainingRun(options, tmp_path / "checkpoints"),
     )
     render = render_view(result.gaussians, view)
     depth = float(np.median((render.depth / render.alpha)[8:-8, 8:-8]))

@@ -1,0 +1,111 @@
+"""A step in the memory of a device, which has its own copy of the Gaussians."""
+
+from __future__ import annotations
+
+import numpy as np
+from torch import Tensor
+
+from pipeline.render import Backend
+from pipeline.render.resident import (
+    Optimised,
+    Planes,
+    ResidentImage,
+    ResidentStep,
+    ResidentTraining,
+)
+from pipeline.training.data.targets import psnr_of
+from pipeline.training.loop.setup import TrainingScene
+from pipeline.training.loop.state import TrainState
+from pipeline.training.loop.step import Step, StepEngine, StepResult
+from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
+from pipeline.training.losses.plane import summed_gradients
+from pipeline.training.run import TrainingRun
+
+
+class DeviceStep(StepEngine):
+    """Renders, differentiates and updates on a device.
+
+    Before the tensors of ``state`` are read, ``fetch`` makes them current; after they were changed,
+    ``invalidate`` makes the next step copy them again.
+    """
+
+    def __init__(
+        self,
+        scene: TrainingScene,
+        state: TrainState,
+        run: TrainingRun,
+        backend: Backend,
+        training: ResidentTraining,
+    ) -> None:
+        super().__init__(scene, state, run, backend)
+        self.training = training
+        self._loaded = False  # Whether the device has what the state has, or newer.
+        self._ahead = False
+
+    def step(self, step: Step) -> StepResult:
+        state, view, options = self.state, step.view, self.run.options
+        if not self._loaded:
+            self.training.load(self._optimised())
+            self._loaded = True
+        self._ahead = True
+        embedding = None
+        if state.appearance is not None:
+            embedding = tuple(state.appearance.embeddings[view.index])
+
+        def losses(planes: Planes) -> tuple[Tensor | None, Tensor | None]:
+            return summed_gradients(self.losses, planes, view, state.step)
+
+        has_losses = any(loss.is_due(view, state.step) for loss in self.losses)
+        result = self.training.step(
+            ResidentStep(
+                camera=view.camera,
+                options=step.options,
+                image=self._image(step),
+                ssim_weight=options.ssim_loss_weight,
+                l2_weight=options.experiments.squared_error_loss_weight,
+                absolute=False,
+                camera_gradients=state.cameras.enabled,
+                embedding=embedding,
+                alpha_loss=BLOCK_ALPHA_LOSS,
+                losses=losses if has_losses else None,
+                adam=state.adam.resident(step.adam),
+            )
+        )
+        self.require_finite(result.loss, view)
+        if result.camera is not None:
+            state.cameras.step(view.index, view.camera, result.camera, step.camera_rate)
+        if state.appearance is not None and result.embedding is not None:
+            gradient = np.array(result.embedding)
+            state.appearance.update(view.index, gradient, self.embedding_rate(step))
+        psnr = psnr_of(result.squared_error) if step.measures_psnr else None
+        return StepResult(result.loss, psnr, result.num_visible, result.num_dropped)
+
+    def fetch(self) -> None:
+        if self._ahead:
+            self.training.store(self._optimised())
+            self._ahead = False
+
+    def invalidate(self) -> None:
+        self.fetch()
+        self._loaded = False
+
+    def _image(self, step: Step) -> ResidentImage:
+        view, target = step.view, step.view.target
+        fixed = target.alpha is None or self.scene.background != "random"
+        red, green, blue = (
+            (1.0, 1.0, 1.0) if self.scene.gains is None else self.scene.gains[view.index].tolist()
+        )
+        return ResidentImage(
+            key=(view.index, view.factor) if fixed else None,
+            target=target.over(view.background),
+            mask=target.ignored,
+            gain=(red, green, blue),
+            surroundings=target.surroundings,
+        )
+
+    def _optimised(self) -> Optimised:
+        state, adam = self.state, self.state.adam
+        assert state.density.statistics is not None
+        return Optimised(
+            state.gaussians.tensors(), adam.first, adam.second, adam.last, *state.density.statistics
+        )

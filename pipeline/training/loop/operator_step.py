@@ -1,0 +1,75 @@
+"""A step by the operators of a backend, with all parameters in the memory of the CPU."""
+
+from __future__ import annotations
+
+from pipeline.render import Backend, Gradients
+from pipeline.training.loop.setup import TrainingScene
+from pipeline.training.loop.state import TrainState
+from pipeline.training.loop.step import Step, StepEngine, StepResult
+from pipeline.training.losses.color import ColorLoss
+from pipeline.training.losses.plane import add, summed_gradients
+from pipeline.training.run import TrainingRun
+
+
+class OperatorStep(StepEngine):
+    """Renders, differentiates and updates, an operator at a time."""
+
+    def __init__(
+        self, scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
+    ) -> None:
+        super().__init__(scene, state, run, backend)
+        self.color_loss = ColorLoss(
+            run.options.ssim_loss_weight,
+            run.options.experiments.squared_error_loss_weight,
+            scene.gains,
+            backend,
+            run.threads,
+        )
+
+    def step(self, step: Step) -> StepResult:
+        state, view = self.state, step.view
+        gaussians, appearance = state.gaussians, state.appearance
+        shown = None if appearance is None else appearance.show(gaussians, view.index)
+        rendered = self.backend.forward(*gaussians.parameters(), view.camera, step.options)
+        color = self.color_loss.gradients(rendered, view, measures_psnr=step.measures_psnr)
+        self.require_finite(color.loss, view)
+        others = summed_gradients(self.losses, rendered, view, state.step)
+        gradients = self.backend.backward(
+            rendered,
+            color.d_color,
+            add(color.d_alpha, others.alpha),
+            others.depth,
+            means2d_abs=False,
+            colors=appearance is not None,
+            camera=state.cameras.enabled,
+            sh_adam=state.adam.harmonics(step.adam),
+        )
+        if appearance is not None and shown is not None:
+            appearance.hide(gaussians, shown)
+        self._update_cameras(step, gradients)
+        state.density.before_step(gaussians, rendered, gradients)
+        state.adam.step(gaussians, gradients, step.adam, self.run.threads)
+        return StepResult(color.loss, color.psnr, rendered.num_visible, rendered.num_dropped)
+
+    def fetch(self) -> None:
+        """The tensors of the state are always current."""
+
+    def invalidate(self) -> None:
+        """There are no others."""
+
+    def _update_cameras(self, step: Step, gradients: Gradients) -> None:
+        """Update what belongs to the photograph: its camera and its appearance."""
+        state, view = self.state, step.view
+        if state.appearance is not None:
+            assert gradients.colors is not None
+            state.appearance.step(
+                view.index,
+                state.gaussians,
+                gradients.colors,
+                state.adam.appearance(step.adam),
+                self.embedding_rate(step),
+                self.backend,
+                self.run.threads,
+            )
+        if gradients.camera is not None:
+            state.cameras.step(view.index, view.camera, gradients.camera, step.camera_rate)

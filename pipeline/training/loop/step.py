@@ -1,0 +1,99 @@
+"""One step of the optimisation, and the interface of what computes it."""
+
+from __future__ import annotations
+
+import math
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from pipeline.render import Backend, RasterOptions
+from pipeline.runtime.errors import UserError
+from pipeline.training.data.step_view import StepView
+from pipeline.training.loop.setup import TrainingScene
+from pipeline.training.loop.state import TrainState
+from pipeline.training.losses.alpha import AlphaLoss
+from pipeline.training.losses.depth import DepthLoss
+from pipeline.training.losses.plane import PlaneLoss
+from pipeline.training.optimisers.adam import AdamStep
+from pipeline.training.run import TrainingRun
+
+
+@dataclass(frozen=True)
+class Step:
+    """The inputs of an optimiser step.
+
+    Attributes:
+        camera_rate: The learning rate of the parameters of cameras and photographs that a share of
+            the steps uses (``Schedule.camera_rate``), as a function of that share.
+        measures_psnr: Whether the PSNR of the render is measured, which takes a pass over the
+            image.
+    """
+
+    view: StepView
+    options: RasterOptions
+    adam: AdamStep
+    camera_rate: Callable[[float], float]
+    measures_psnr: bool
+
+
+@dataclass(frozen=True)
+class StepResult:
+    """The figures of a step; ``psnr`` in dB, None if it was not measured."""
+
+    loss: float
+    psnr: float | None
+    num_visible: int
+    num_dropped: int
+
+
+class StepEngine(ABC):
+    """Renders a view, compares it with its photograph, and updates all parameters."""
+
+    def __init__(
+        self, scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
+    ) -> None:
+        self.scene, self.state, self.run, self.backend = scene, state, run, backend
+        self.losses = plane_losses(scene, run)
+
+    @abstractmethod
+    def step(self, step: Step) -> StepResult:
+        """Change ``state`` by one step.
+
+        Raises:
+            UserError: the loss is not finite.
+        """
+
+    @abstractmethod
+    def fetch(self) -> None:
+        """Make the tensors of ``state`` current, before they are read."""
+
+    @abstractmethod
+    def invalidate(self) -> None:
+        """The tensors of ``state`` were changed, or will be before the next step."""
+
+    def require_finite(self, loss: float, view: StepView) -> None:
+        if not math.isfinite(loss):
+            raise UserError(
+                f"the loss is not finite at step {self.state.step}, view {view.full.name}",
+                fix="lower experiments.train.learning_rate_factor, or check the poses and points",
+            )
+
+    def embedding_rate(self, step: Step) -> float:
+        """The learning rate of an appearance embedding, which one view uses."""
+        return step.camera_rate(1 / len(self.scene.views))
+
+
+def plane_losses(scene: TrainingScene, run: TrainingRun) -> Sequence[PlaneLoss]:
+    """The losses besides that on colours."""
+    options, depths = run.options, scene.inputs.depths
+    losses: list[PlaneLoss] = [
+        AlphaLoss(
+            options.mask_loss_weight,
+            options.experiments.alpha_loss_weight,
+            options.experiments.squared_error_loss_weight,
+        )
+    ]
+    if depths is not None and options.depth_loss_weight:
+        losses.append(DepthLoss(depths, options.depth_loss_weight))
+    return losses

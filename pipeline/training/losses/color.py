@@ -1,0 +1,71 @@
+"""The loss on the rendered colours: L1, squared error and D-SSIM (Kerbl et al. 2023, eq. 7)."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+from torch import Tensor
+
+from pipeline.render import Backend, Forward
+from pipeline.training.data.step_view import StepView
+from pipeline.training.losses.alpha import BLOCK_ALPHA_LOSS
+
+
+@dataclass(frozen=True)
+class ColorGradients:
+    """The loss of a view, and its gradients.
+
+    Attributes:
+        d_color: (H, W, 3) gradient with respect to the rendered colours.
+        d_alpha: (H, W) gradient with respect to alpha, for a block among its surroundings.
+        psnr: dB; None if it was not measured.
+    """
+
+    loss: float
+    d_color: Tensor
+    d_alpha: Tensor | None
+    psnr: float | None
+
+
+@dataclass(frozen=True)
+class ColorLoss:
+    """The loss on colours of a run.
+
+    Attributes:
+        ssim_weight, squared_error_weight: See ``Backend.l1_ssim``.
+        gains: (V, 3) factors of the renders; None: all 1.
+    """
+
+    ssim_weight: float
+    squared_error_weight: float
+    gains: Tensor | None
+    backend: Backend
+    threads: int
+
+    def gradients(
+        self, rendered: Forward, view: StepView, *, measures_psnr: bool
+    ) -> ColorGradients:
+        """Compare a render with its photograph."""
+        target, around = view.target, view.target.surroundings
+        image = target.over(view.background)
+        gain = None if self.gains is None else self.gains[view.index]
+        color = rendered.color
+        if around is not None:
+            color = self.backend.compose(around, color, rendered.alpha, self.threads)
+        if gain is not None:
+            color = color * gain
+        loss = self.backend.l1_ssim(
+            color,
+            image,
+            self.ssim_weight,
+            target.ignored,
+            self.squared_error_weight,
+            self.threads,
+        )
+        psnr = target.psnr(color, image) if measures_psnr else None
+        d_color, d_alpha = loss.grad if gain is None else loss.grad * gain, None
+        if around is not None:
+            d_color, d_alpha = self.backend.compose_backward(
+                around, rendered.alpha, d_color, BLOCK_ALPHA_LOSS, self.threads
+            )
+        return ColorGradients(float(loss.loss), d_color, d_alpha, psnr)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.config.schema import Config
+from pipeline.config.settled import Config
 from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.point_cloud import PointCloudFiles
 

@@ -30,8 +30,8 @@ from pipeline.runtime.errors import UserError
             "train.density.remove_floaters: no such option",
         ),
         (
-            {"experiments": {"train": {"gradient": {"clone_": True}}}},
-            "experiments.train.gradient.clone_: no such option (did you mean clone?)",
+            {"experiments": {"train": {"gradient": {"interval_": 1}}}},
+            "experiments.train.gradient.interval_: no such option (did you mean interval?)",
         ),
         ({"scenes": {"fox": {"exprt": {}}}}, "scenes.fox: exprt"),
         ({"preset": "quick"}, "preset"),

@@ -84,7 +84,7 @@ def reference_ratio(threads: int) -> ReferenceRatio:
         (out.color * weight).sum().backward()
 
     def in_kernels() -> None:
-        backward(forward(*scene.gaussians, scene.camera, options), weight, means2d_abs=False)
+        backward(forward(*scene.gaussians, scene.camera, options), weight)
 
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

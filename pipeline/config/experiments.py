@@ -12,7 +12,6 @@ from pydantic import Field
 
 from pipeline.config.section import (
     MAX_FACTOR,
-    MAX_GAUSSIANS,
     MAX_STEPS,
     Count,
     GaussianCount,
@@ -135,11 +134,6 @@ class TrainExperiments(Section):
         False,
         description="No gradient for a colour that is clamped at 0 (3DGS). False: gradients that "
         "raise it pass.",
-    )
-    gradients_per_pixel: Annotated[int, Field(ge=0, le=MAX_GAUSSIANS), Unit("Gaussians")] = Field(
-        0,
-        description="Backpropagate only to the first Gaussians along each pixel's ray, up to this "
-        "number. 0: to all.",
     )
     appearance_size: Annotated[int, Field(ge=1, le=6), Unit("numbers")] = Field(
         3, description="With train.appearance: embedding: size of a photograph's embedding."

@@ -96,7 +96,6 @@ class Backend(ABC, Generic[Projected, Binned]):
         d_alpha: torch.Tensor | None = None,
         d_depth: torch.Tensor | None = None,
         *,
-        means2d_abs: bool = True,
         colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
@@ -107,7 +106,6 @@ class Backend(ABC, Generic[Projected, Binned]):
             fwd: the result of ``forward``.
             d_color: (H, W, 3) float32.
             d_alpha, d_depth: (H, W) float32 or None.
-            means2d_abs: compute ``Gradients.means2d_abs``.
             colors: compute ``Gradients.colors``.
             camera: compute ``Gradients.camera``.
             sh_adam: update the SH coefficients of the Gaussians with a gradient in place by Adam

@@ -106,7 +106,6 @@ def _resident(
         image=ResidentImage((0, 1), scene.target, None, (1.0, 1.0, 1.0), None),
         ssim_weight=SSIM_WEIGHT,
         l2_weight=0.0,
-        absolute=False,
         camera_gradients=False,
         embedding=None,
         alpha_loss=AlphaChangeLoss(0.0, 0.0, 0.0),
@@ -129,7 +128,7 @@ def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Calla
     def step() -> None:
         drawn = backend.forward(*scene.gaussians, scene.camera, RasterOptions())
         loss = backend.l1_ssim(drawn.color, scene.target, SSIM_WEIGHT)
-        g = backend.backward(drawn, loss.grad, means2d_abs=False, sh_adam=harmonics)
+        g = backend.backward(drawn, loss.grad, sh_adam=harmonics)
         backend.frame_adam(means, quats, log_scales, g.means, g.quats, FrameAdam(*moments, 0, 0, 1))
         backend.adam_step(log_scales, g.log_scales, dense["log_scales"])
         backend.adam_step(opacity_logits, g.opacity_logits, dense["opacity_logits"])

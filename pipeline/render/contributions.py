@@ -35,4 +35,4 @@ def contributions(
     """
     rendered = backend.forward(*grey.parameters(), camera, options)
     d_color = torch.full((camera.height, camera.width, 3), pixel / SH_C0)
-    return backend.backward(rendered, d_color, means2d_abs=False).sh[:, 0, 0]
+    return backend.backward(rendered, d_color).sh[:, 0, 0]

@@ -31,7 +31,7 @@ class _Render(torch.autograd.Function):
         d_color, d_alpha, d_depth = grads[:3]
         if d_color is None:
             d_color = torch.zeros_like(ctx.fwd.color)
-        g = backward(ctx.fwd, d_color, d_alpha, d_depth, means2d_abs=False)
+        g = backward(ctx.fwd, d_color, d_alpha, d_depth)
         return None, None, g.means, g.log_scales, g.quats, g.opacity_logits, g.sh
 
 

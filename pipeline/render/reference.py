@@ -272,37 +272,29 @@ def blend(
         T_i = prod_{j < i} (1 - alpha_j),  C = sum_i T_i alpha_i c_i + T_n background
 
     in order of depth, equal depths by index. A pixel stops before the Gaussian that would lower its
-    transmittance below 1e-4. Only the first ``gradients_per_pixel`` contributing Gaussians of a
-    pixel receive gradients. ``projection.means2d`` may be (H W, V, 2), a centre for each pixel.
+    transmittance below 1e-4.
     """
     dtype, height, width = colors.dtype, camera.height, camera.width
     order = torch.sort(projection.depths.detach().float(), stable=True).indices
-    center, conic = projection.means2d[..., order, :], projection.conics[order]
+    center, conic = projection.means2d[order], projection.conics[order]
     depth, color = projection.depths[order], colors[order]
     grid_y, grid_x = torch.meshgrid(
         torch.arange(height, dtype=dtype) + 0.5, torch.arange(width, dtype=dtype) + 0.5,
         indexing="ij",
     )  # fmt: skip
-    dx = grid_x.reshape(-1, 1) - center[..., 0]
-    dy = grid_y.reshape(-1, 1) - center[..., 1]
+    dx = grid_x.reshape(-1, 1) - center[:, 0]
+    dy = grid_y.reshape(-1, 1) - center[:, 1]
     power = -0.5 * (conic[:, 0] * dx * dx + conic[:, 2] * dy * dy) - conic[:, 1] * dx * dy
     raw = projection.opacities[order] * power.exp()
     alpha = torch.where(raw >= ALPHA_MIN, raw.clamp(max=ALPHA_MAX), torch.zeros_like(raw))
     # Transmittance is monotonic: a comparison with the running product finds where a pixel stops.
     alive = torch.cumprod(1 - alpha, 1) >= TRANSMITTANCE_MIN
     used = torch.where(alive, alpha, torch.zeros_like(alpha))
-    beyond = torch.cumsum(used > 0, 1) > (options.gradients_per_pixel or math.inf)
-    used = torch.where(beyond, used.detach(), used)
     after = torch.cumprod(1 - used, 1)
     before = torch.cat([torch.ones_like(after[:, :1]), after[:, :-1]], 1)
     weight = before * used
 
-    def composite(values: torch.Tensor) -> torch.Tensor:
-        if not beyond.any():
-            return weight @ values
-        return (weight * ~beyond) @ values + (weight * beyond) @ values.detach()
-
-    rgb = composite(color)
+    rgb = weight @ color
     opaque = weight.sum(1)
     if options.background is not None:
         rgb = rgb + (1 - opaque).unsqueeze(-1) * torch.tensor(options.background, dtype=dtype)
@@ -321,7 +313,7 @@ def blend(
         )
     shape = (height, width)
     return Blend(
-        rgb.reshape(height, width, 3), opaque.reshape(shape), composite(depth).reshape(shape),
+        rgb.reshape(height, width, 3), opaque.reshape(shape), (weight @ depth).reshape(shape),
         median.reshape(shape), margin.reshape(shape), int((used > 0).sum()),
     )  # fmt: skip
 

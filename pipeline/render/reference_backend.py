@@ -54,11 +54,9 @@ class Projected:
 
 @dataclass(frozen=True)
 class State:
-    """State of a rendered view for ``backward``. ``centres`` (pixels, V, 2) are the 2D means,
-    expanded for each pixel so that absolute gradients can be summed over pixels."""
+    """State of a rendered view for ``backward``."""
 
     projected: Projected
-    centres: torch.Tensor
     image: reference.Blend
 
 
@@ -110,13 +108,12 @@ class ReferenceBackend(Backend[Projected, Projected]):
             options.sh_degree,
             options.clamp_color_gradient,
         )
-        centres = projection.means2d.expand(camera.height * camera.width, -1, -1)
-        image = reference.blend(replace(projection, means2d=centres), colors, camera, options)
+        image = reference.blend(projection, colors, camera, options)
         return Forward(
             image.color.detach().float(), image.alpha.detach().float(), binned.radii,
             len(visible), projection.num_dropped, image.pairs,
             lambda: (image.depth.detach().float(), image.median_depth.float()),
-            State(binned, centres, image),
+            State(binned, image),
         )  # fmt: skip
 
     def backward(
@@ -126,7 +123,6 @@ class ReferenceBackend(Backend[Projected, Projected]):
         d_alpha: torch.Tensor | None = None,
         d_depth: torch.Tensor | None = None,
         *,
-        means2d_abs: bool = True,
         colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
@@ -141,16 +137,15 @@ class ReferenceBackend(Backend[Projected, Projected]):
                 total = total + (plane * gradient).sum()
         found = torch.autograd.grad(
             total,
-            [*projected.leaves, projected.change, state.centres],
+            [*projected.leaves, projected.change, projected.projection.means2d],
             retain_graph=True,
             allow_unused=True,
             materialize_grads=True,
         )
         arrays, d_change, d_centres = found[:5], found[5], found[6]
-        index, count = projected.projection.index, len(arrays[0])
-        d_means2d, d_abs = torch.zeros(count, 2), torch.zeros(count, 2)
-        d_means2d[index] = d_centres.sum(0).float()
-        d_abs[index] = d_centres.abs().sum(0).float()
+        count = len(arrays[0])
+        d_means2d = torch.zeros(count, 2)
+        d_means2d[projected.projection.index] = d_centres.float()
         d_sh = arrays[4]
         # The constant basis function is the same for every direction.
         d_colors = (d_sh[:, 0] / SH_C0).float() if colors else None
@@ -160,7 +155,7 @@ class ReferenceBackend(Backend[Projected, Projected]):
             d_sh = d_sh[:0]
         return Gradients(
             arrays[0].float(), arrays[1].float(), arrays[2].float(), arrays[3].float(),
-            d_sh.float(), d_means2d, d_abs if means2d_abs else None, d_colors,
+            d_sh.float(), d_means2d, d_colors,
             CameraGradients(*d_change.split([3, 3, 2, 2])) if camera else None,
         )  # fmt: skip
 

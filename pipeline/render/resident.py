@@ -98,7 +98,6 @@ class ResidentStep:
 
     Attributes:
         ssim_weight, l2_weight: see ``Backend.l1_ssim``.
-        absolute: the statistics are of ``Gradients.means2d_abs``.
         camera_gradients: compute them.
         embedding: of the photograph, if there is a parameter ``appearance``: the constant SH
             coefficients are those in the photograph (``training.appearance.embedding``).
@@ -111,7 +110,6 @@ class ResidentStep:
     image: ResidentImage
     ssim_weight: float
     l2_weight: float
-    absolute: bool
     camera_gradients: bool
     embedding: tuple[float, ...] | None
     alpha_loss: AlphaChangeLoss

@@ -72,8 +72,6 @@ class RasterOptions:
             are not rendered. Choose it well below the distance of the nearest surface.
         clamp_color_gradient: a colour clamped at 0 has no gradient (3DGS); otherwise gradients that
             would increase it pass.
-        gradients_per_pixel: number of contributing Gaussians of a pixel, from the front, that
-            receive gradients (the limit discussed by Kerbl et al. 2023, section 7.3); 0 for all.
         threads: number of threads, 0 for all. The result does not depend on it.
     """
 
@@ -82,7 +80,6 @@ class RasterOptions:
     antialias: bool = False
     near: float = 0.01
     clamp_color_gradient: bool = False
-    gradients_per_pixel: int = 0
     threads: int = 0
 
 
@@ -198,8 +195,6 @@ class Gradients:
     Attributes:
         sh: without rows if ``backward`` applied it (``ShAdam``).
         means2d: (N, 2) gradient of the projected mean, per pixel.
-        means2d_abs: (N, 2) sum over pixels of the absolute values of each pixel's contribution to
-            ``means2d`` (AbsGS, Ye et al. 2024); None if not requested.
         colors: (N, 3) gradient of the colours before they are clamped at 0; None if not requested.
         camera: None if not requested.
     """
@@ -210,7 +205,6 @@ class Gradients:
     opacity_logits: torch.Tensor
     sh: torch.Tensor
     means2d: torch.Tensor
-    means2d_abs: torch.Tensor | None
     colors: torch.Tensor | None
     camera: CameraGradients | None
 

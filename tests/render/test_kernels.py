@@ -19,7 +19,7 @@ CASES = [
     (2, 500, (71, 50), RasterOptions(antialias=True, sh_degree=1)),
     (3, 200, (33, 17), RasterOptions(sh_degree=0, background=(1.0, 1.0, 1.0))),
     (4, 300, (16, 80), RasterOptions(sh_degree=2, antialias=True, background=(0.0, 0.3, 0.0))),
-    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), gradients_per_pixel=4)),
+    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4))),
     (5, 60, (1, 1), RasterOptions()),
     (6, 250, (130, 3), RasterOptions(near=3.5)),
 ]
@@ -129,29 +129,6 @@ def test_camera_gradients_equal_the_reference(
     assert backend.backward(fwd, d_color).camera is None
 
 
-def test_absolute_gradients_are_summed_over_pixels(backend: Backend) -> None:
-    """AbsGS: sum of |dL/d(mean2d)| of each pixel."""
-    scene, cam, options = random_scene(7, 30, size=0.2), camera(19, 18), RasterOptions()
-    gen = torch.Generator().manual_seed(1)
-    d_color = torch.randn(18, 19, 3, generator=gen)
-    found = backend.backward(backend.forward(*scene, cam, options), d_color)
-    _, projection, image = reference_image(scene, cam, options)
-    per_pixel = (image.color * d_color).sum(-1).reshape(-1)
-    each = torch.eye(len(per_pixel), dtype=torch.float64)
-    (gradients,) = torch.autograd.grad(
-        per_pixel, projection.means2d, each, is_grads_batched=True
-    )  # pixels, Gaussians, 2
-    expected = gradients.abs().sum(0)
-    assert found.means2d_abs is not None
-    assert relative(found.means2d_abs[projection.index], expected) <= 1e-5
-    assert (
-        backend.backward(
-            backend.forward(*scene, cam, options), d_color, means2d_abs=False
-        ).means2d_abs
-        is None
-    )
-
-
 def single(mean: tuple[float, float, float], sigma: float, opacity: float = 0.9) -> Scene:
     logit = math.log(opacity / (1 - opacity))
     sh = torch.full((1, 1, 3), 1.0)
@@ -191,7 +168,6 @@ def test_results_are_bit_identical_for_any_number_of_threads(backend: Backend) -
         for threads in (1, 2, 3):
             fwd = backend.forward(*scene, cam, RasterOptions(threads=threads))
             g = backend.backward(fwd, d_color)
-            assert g.means2d_abs is not None
             loss = backend.l1_ssim(fwd.color, d_color.abs(), 0.2, threads=threads)
             param, m, v = scene[4].clone(), torch.zeros_like(scene[4]), torch.ones_like(scene[4])
             backend.adam_step(param, g.sh, render.DenseAdam(m, v, 1e-2, 3), threads)
@@ -200,7 +176,7 @@ def test_results_are_bit_identical_for_any_number_of_threads(backend: Backend) -
             backend.frame_adam(means, quats, scene[1], g.means, g.quats, adam, threads)
             runs.append([
                 fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii, g.means,
-                g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d, g.means2d_abs,
+                g.log_scales, g.quats, g.opacity_logits, g.sh, g.means2d,
                 loss.grad, torch.tensor([loss.loss, loss.error, loss.ssim]), param, m, v,
                 means, quats, frames,
             ])  # fmt: skip

@@ -60,7 +60,6 @@ STEP = ResidentStep(
     image=IMAGE,
     ssim_weight=0.2,
     l2_weight=0.5,
-    absolute=True,
     camera_gradients=False,
     embedding=None,
     alpha_loss=ALPHA_LOSS,
@@ -78,14 +77,14 @@ AROUND = Surroundings(
 )
 STEPS = {
     "plain": STEP,
-    "world's axes": replace(STEP, adam=replace(ADAM, frames=False), absolute=False),
+    "world's axes": replace(STEP, adam=replace(ADAM, frames=False)),
     "masked": replace(STEP, image=MASKED),
     "gains": replace(STEP, image=FLOATS),
     "cameras": replace(STEP, camera_gradients=True),
     "other losses": replace(STEP, losses=constant_losses),
     "a block": replace(STEP, image=replace(MASKED, surroundings=AROUND), losses=constant_losses),
     "an appearance": replace(STEP, embedding=(0.7, -1.2)),
-    "few gradients": replace(STEP, options=RasterOptions(antialias=True, gradients_per_pixel=3)),
+    "antialiased": replace(STEP, options=RasterOptions(antialias=True)),
 }
 
 
@@ -151,8 +150,7 @@ def by_operators(
         moments = first["appearance"], second["appearance"]
         dense_adam = DenseAdam(*moments, adam.rates["sh0"], eps=adam.eps, **decay)
         backend.adam_step(p["appearance"], d_appearance, dense_adam)
-    change = g.means2d_abs if step.absolute else g.means2d
-    assert change is not None
+    change = g.means2d
     state.gradient_sum.add_(torch.hypot(change[:, 0] * WIDTH / 2, change[:, 1] * HEIGHT / 2))
     state.seen.add_(drawn.radii > 0)
     dense = ["log_scales", "opacity_logits"]

@@ -161,7 +161,6 @@ class CpuBackend(Backend[Projected, Binned]):
         d_alpha: torch.Tensor | None = None,
         d_depth: torch.Tensor | None = None,
         *,
-        means2d_abs: bool = True,
         colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
@@ -173,19 +172,19 @@ class CpuBackend(Backend[Projected, Binned]):
         slot_gradients = ops.blend_backward(
             s.records, s.entries, s.tile_begin, s.block_end, s.view, width, height, s.background,
             fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
-            means2d_abs, s.options.gradients_per_pixel, threads,
+            threads,
         )  # fmt: skip
-        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_colors, d_camera = (
+        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera = (
             ops.project_backward(
                 *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias,
                 s.records, fwd.radii, s.slots, slot_gradients, s.options.clamp_color_gradient,
-                means2d_abs, colors, camera, *_moments(sh_adam, s.inputs[4]), threads,
+                colors, camera, *_moments(sh_adam, s.inputs[4]), threads,
             )
         )  # fmt: skip
         parts = d_camera.split([3, 3, 2, 2]) if camera else None
         return Gradients(
             d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d,
-            d_abs if means2d_abs else None, d_colors if colors else None,
+            d_colors if colors else None,
             None if parts is None else CameraGradients(*parts),
         )  # fmt: skip
 

@@ -141,7 +141,6 @@ class GpuBackend(Backend[Projected, Binned]):
         d_alpha: torch.Tensor | None = None,
         d_depth: torch.Tensor | None = None,
         *,
-        means2d_abs: bool = True,
         colors: bool = False,
         camera: bool = False,
         sh_adam: ShAdam | None = None,
@@ -190,8 +189,7 @@ class GpuBackend(Backend[Projected, Binned]):
             d_sh = d_sh.view(sh.shape)
         return Gradients(
             found["means"], found["log_scales"], found["quats"], found["opacity_logits"][:, 0],
-            d_sh, found["means2d"], found["means2d_abs"] if means2d_abs else None,
-            found["colors"] if colors else None,
+            d_sh, found["means2d"], found["colors"] if colors else None,
             camera_gradients(gpu, space, moments["d_camera"], count) if camera else None,
         )  # fmt: skip
 

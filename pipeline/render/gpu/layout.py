@@ -13,7 +13,7 @@ from pipeline.render.types import RasterCamera, RasterOptions
 TILE = 16  # kTile in constants.h
 RECORD_BYTES = 48  # Record in record.wgsl
 BOX_BYTES = 16  # Box in tile.wgsl
-SLOT_BYTES = 48  # kMoments floats in moments.wgsl
+SLOT_BYTES = 40  # kMoments floats in moments.wgsl
 CAMERA_PARAMETERS = 10  # kCameraParameters in project_backward.wgsl
 ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
 BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
@@ -23,7 +23,7 @@ SH_ADAM, CAMERA = 1, 2  # flags of Options in project_backward.wgsl
 # The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the
 # offsets of the parameters, project_backward.wgsl those of the gradients.
 GEOMETRY = {"means": 3, "log_scales": 3, "quats": 4, "opacity_logits": 1}
-GRADIENTS = GEOMETRY | {"means2d": 2, "means2d_abs": 2, "colors": 3}
+GRADIENTS = GEOMETRY | {"means2d": 2, "colors": 3}
 
 
 def floats(sections: Mapping[str, int]) -> int:
@@ -59,7 +59,7 @@ def pack_view(
         camera.width, camera.height, *tiles_of(camera.width, camera.height),
         count, coefficients, options.sh_degree, flags,
         camera.fx, camera.fy, camera.cx, camera.cy, min_u, min_v, max_u, max_v,
-        *rotation[0], options.near, *rotation[1], options.gradients_per_pixel,
+        *rotation[0], options.near, *rotation[1], 0,
         *rotation[2], 0, *centre, 0, *(options.background or (0.0, 0.0, 0.0)), 0,
     )  # fmt: skip
     return np.frombuffer(packed, np.uint8)

@@ -277,8 +277,7 @@ class GpuTraining(ResidentTraining):
         self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
     ) -> None:
         count = self.scene.count
-        name = "means2d_abs" if step.absolute else "means2d"
-        at, _ = layout.offsets(layout.GRADIENTS, count)[name]
+        at, _ = layout.offsets(layout.GRADIENTS, count)["means2d"]
         half = 0.5 * step.camera.width, 0.5 * step.camera.height
         self.space.run(
             "observe",

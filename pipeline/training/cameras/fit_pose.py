@@ -57,7 +57,7 @@ def fit_pose(
         if loss.loss < least:
             best, least = poses.poses[0].copy(), loss.loss
         d_color = loss.grad * factor
-        gradients = backend.backward(rendered, d_color, means2d_abs=False, camera=True).camera
+        gradients = backend.backward(rendered, d_color, camera=True).camera
         assert gradients is not None
         poses.step(0, gradients, FIT_RATE * FIT_DECAY ** (number / (FIT_STEPS - 1)))
     return replace(view, world_to_camera=best)

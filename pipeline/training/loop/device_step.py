@@ -63,7 +63,6 @@ class DeviceStep(StepEngine):
                 image=self._image(step),
                 ssim_weight=options.ssim_loss_weight,
                 l2_weight=options.experiments.squared_error_loss_weight,
-                absolute=False,
                 camera_gradients=state.cameras.enabled,
                 embedding=embedding,
                 alpha_loss=BLOCK_ALPHA_LOSS,

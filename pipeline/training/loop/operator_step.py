@@ -39,7 +39,6 @@ class OperatorStep(StepEngine):
             color.d_color,
             add(color.d_alpha, others.alpha),
             others.depth,
-            means2d_abs=False,
             colors=appearance is not None,
             camera=state.cameras.enabled,
             sh_adam=state.adam.harmonics(step.adam),

@@ -161,14 +161,12 @@ class Trainer:
         )
 
     def raster_options(self, background: Color) -> RasterOptions:
-        experiments = self.run.options.experiments
         return RasterOptions(
             sh_degree=self.state.gaussians.sh_degree,
             background=background,
             antialias=self.run.options.antialias,
             near=self.scene.near,
-            clamp_color_gradient=experiments.clamp_color_gradient,
-            gradients_per_pixel=experiments.gradients_per_pixel,
+            clamp_color_gradient=self.run.options.experiments.clamp_color_gradient,
             threads=self.run.threads,
         )
 

@@ -126,18 +126,18 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
             d_color.get());
     Array<float> slot_gradients(entries.size * kSlotFloats);
     Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
-    Array<float> d_means2d(2 * n), d_abs(2 * n), d_colors(3 * n);
+    Array<float> d_means2d(2 * n), d_colors(3 * n);
     Array<double> d_camera(kCameraParameters);
     for (const bool everything : {true, false}) {
         blend_backward(records.get(), pairs, view,
                        {color.get(), alpha.get(), depth.get(), d_color.get(),
                         everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
-                        background, everything, everything ? 0 : 3},
+                        background},
                        block_end.get(), threads, slot_gradients.get());
         project_view_backward(
             in, view, threads, records.get(), radii.get(), slots.get(), slot_gradients.get(),
             {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), d_sh.get(),
-             d_means2d.get(), d_abs.get(), everything ? d_colors.get() : nullptr,
+             d_means2d.get(), everything ? d_colors.get() : nullptr,
              everything ? d_camera.get() : nullptr},
             nullptr);
     }
@@ -148,7 +148,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
     project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
                           slot_gradients.get(),
                           {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), nullptr,
-                           d_means2d.get(), d_abs.get(), nullptr, nullptr},
+                           d_means2d.get(), nullptr, nullptr},
                           &sh_adam);
     expect_finite(d_camera, "d_camera");
     for (Array<float>* moments : {&m, &v}) expect_finite(*moments, "moments");
@@ -182,7 +182,7 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
 // The file that test_targets.py writes: these, then the Gaussians' fields, the gradients of color,
 // alpha and depth, and the target of the loss.
 struct Header {
-    int64_t count, degree, width, height, antialias, per_pixel, threads;
+    int64_t count, degree, width, height, antialias, threads;
     double fx, fy, cx, cy, rotation[9], translation[3], near, background[3];
 };
 
@@ -235,16 +235,16 @@ int run_file(const char* input, const char* output) {
 
     Array<float> slot_gradients(entries.size * kSlotFloats);
     Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
-    Array<float> d_means2d(2 * n), d_abs(2 * n), d_loss(3 * pixels);
+    Array<float> d_means2d(2 * n), d_loss(3 * pixels);
     Array<double> d_camera(kCameraParameters);
     blend_backward(records.get(), pairs, view,
                    {color.get(), alpha.get(), depth.get(), d_color.get(), d_alpha.get(),
-                    d_depth.get(), background, true, h.per_pixel},
+                    d_depth.get(), background},
                    block_end.get(), threads, slot_gradients.get());
     project_view_backward(gaussians, view, threads, records.get(), radii.get(), slots.get(),
                           slot_gradients.get(),
                           {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                           d_sh.get(), d_means2d.get(), d_abs.get(), nullptr, d_camera.get()},
+                           d_sh.get(), d_means2d.get(), nullptr, d_camera.get()},
                           nullptr);
     l1_ssim({h.width, h.height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
             d_loss.get());
@@ -253,7 +253,7 @@ int run_file(const char* input, const char* output) {
     adam_step(s.sh.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
     for (Array<float>* result : {&color, &alpha, &depth, &median, &radii, &d_means, &d_scales,
-                                 &d_quats, &d_opacity, &d_sh, &d_means2d, &d_abs, &d_loss, &s.sh})
+                                 &d_quats, &d_opacity, &d_sh, &d_means2d, &d_loss, &s.sh})
         std::fwrite(result->get(), sizeof(float), result->size, out);
     std::fwrite(d_camera.get(), sizeof(double), d_camera.size, out);
     return std::fclose(out) ? 2 : 0;

@@ -31,7 +31,7 @@ COLOR, DEPTH, MEDIAN, RADIUS, GRADIENT = 2e-6, 2e-5, 1e-5, 1e-4, 1e-5
 CASES = [
     (1, 700, (97, 53), RasterOptions(background=(0.2, 0.5, 0.9), threads=2)),
     (2, 500, (71, 50), RasterOptions(antialias=True, background=(0.0, 0.0, 0.0), threads=1)),
-    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), gradients_per_pixel=4, threads=3)),
+    (7, 900, (45, 38), RasterOptions(background=(0.9, 0.1, 0.4), threads=3)),
 ]
 
 
@@ -70,9 +70,9 @@ class Case:
         cam, options = self.cam, self.options
         pose = cam.world_to_camera.double().numpy()
         header = struct.pack(
-            "7q20d",
+            "6q20d",
             *(len(self.scene[0]), 3, cam.width, cam.height),
-            *(options.antialias, options.gradients_per_pixel, options.threads),
+            *(options.antialias, options.threads),
             *(cam.fx, cam.fy, cam.cx, cam.cy, *pose[:3, :3].ravel(), *pose[:3, 3]),
             *(options.near, *(options.background or (0.0, 0.0, 0.0))),
         )
@@ -86,7 +86,7 @@ class Case:
             **{"color": (*pixels, 3), "alpha": pixels, "depth": pixels, "median": pixels},
             **{"radii": (n,)},
             **{name: t.shape for name, t in zip(NAMES, self.scene, strict=True)},
-            **{"means2d": (n, 2), "means2d_abs": (n, 2), "loss": (*pixels, 3)},
+            **{"means2d": (n, 2), "loss": (*pixels, 3)},
             **{"moved": self.scene[4].shape},
         }
         data, found, start = path.read_bytes(), {}, 0

@@ -145,27 +145,26 @@ Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor
                       const Tensor& block_end, const Tensor& view, int64_t width, int64_t height,
                       const Tensor& background, const Tensor& color, const Tensor& alpha,
                       OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
-                      OptionalTensor d_depth, bool absolute, int64_t per_pixel, int64_t threads) {
+                      OptionalTensor d_depth, int64_t threads) {
     Tensor slots = new_floats({entries.size(0), splat::kSlotFloats});
-    splat::blend_backward(
-        records_from(records), pairs_from(entries, tile_begin),
-        view_from(view, width, height, 0, false),
-        {floats(color), floats(alpha), floats(depth), floats(d_color), floats(d_alpha),
-         floats(d_depth), floats(background), absolute, per_pixel},
-        block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
+    splat::blend_backward(records_from(records), pairs_from(entries, tile_begin),
+                          view_from(view, width, height, 0, false),
+                          {floats(color), floats(alpha), floats(depth), floats(d_color),
+                           floats(d_alpha), floats(d_depth), floats(background)},
+                          block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
     return slots;
 }
 
-// Gradients of means, log_scales, quats, opacity_logits, sh, means2d, means2d_abs and the camera's
+// Gradients of means, log_scales, quats, opacity_logits, sh, means2d, colours and the camera's
 // parameters (float64); the last two have no rows if not requested. With exp_avg, exp_avg_sq, last
 // and sh_adam (6 float64: ShAdamSettings), sh is updated in place and its gradient has no rows.
-std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
+std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
     const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
     int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool clamp_color_gradient, bool absolute,
-    bool colors, bool camera, OptionalTensor exp_avg, OptionalTensor exp_avg_sq,
-    OptionalTensor last, OptionalTensor sh_adam, int64_t threads) {
+    const Tensor& slots, const Tensor& slot_gradients, bool clamp_color_gradient, bool colors,
+    bool camera, OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last,
+    OptionalTensor sh_adam, int64_t threads) {
     const int64_t n = means.size(0);
     std::optional<splat::ShAdam> adam;
     if (sh_adam) {
@@ -178,8 +177,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
     Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
            d_quats = new_floats({n, 4});
     Tensor d_opacity = new_floats({n}), d_sh = new_floats({adam ? 0 : n, sh.size(1), 3});
-    Tensor d_means2d = new_floats({n, 2}), d_abs = new_floats({absolute ? n : 0, 2}),
-           d_colors = new_floats({colors ? n : 0, 3});
+    Tensor d_means2d = new_floats({n, 2}), d_colors = new_floats({colors ? n : 0, 3});
     Tensor d_camera =
         new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
     splat::View seen = view_from(view, width, height, sh_degree, antialias);
@@ -191,11 +189,10 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tenso
         floats(slot_gradients),
         {mutable_floats(d_means), mutable_floats(d_scales), mutable_floats(d_quats),
          mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
-         mutable_floats(d_means2d), absolute ? mutable_floats(d_abs) : nullptr,
-         colors ? mutable_floats(d_colors) : nullptr,
+         mutable_floats(d_means2d), colors ? mutable_floats(d_colors) : nullptr,
          camera ? d_camera.mutable_data_ptr<double>() : nullptr},
         adam ? &*adam : nullptr);
-    return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_abs, d_colors, d_camera};
+    return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera};
 }
 
 // loss, error, ssim, (H, W, 3) gradient
@@ -295,17 +292,17 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor block_end, "
         "Tensor view, int width, int height, Tensor background, Tensor color, Tensor alpha, "
-        "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, bool absolute, "
-        "int per_pixel, int threads) -> Tensor");
+        "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, "
+        "int threads) -> Tensor");
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
         "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
         "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool "
         "clamp_color_gradient, "
-        "bool absolute, bool colors, "
+        "bool colors, "
         "bool camera, Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? "
         "sh_adam, "
-        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
         "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, float "
         "l2_weight, int threads) -> (float, float, float, Tensor)");

@@ -20,14 +20,11 @@ void blend_depth(const Record* records, const Pairs& pairs, const View& view, in
                  float* depth, float* median);
 
 // Writes the gradient slots (intersections, kSlotFloats). d_alpha and d_depth may be null; depth is
-// the output of blend_depth, needed with d_depth only. Absolute moments are computed on request.
-// Only the first per_pixel contributing Gaussians of a pixel receive gradients; 0: all.
+// the output of blend_depth, needed with d_depth only.
 struct ImageGradientsIn {
     const float *color, *alpha, *depth;        // outputs of forward
     const float *d_color, *d_alpha, *d_depth;  // their gradients
     const float* background;
-    bool absolute;
-    int64_t per_pixel;
 };
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,

@@ -15,13 +15,14 @@ namespace splat {
 namespace {
 
 constexpr int kSize = 16, kAbreast = kRegisterBytes == 64 ? 4 : 2;
+constexpr int kSums = 12;  // of sum_lanes; the last are zero
+static_assert(kMoments <= kSums);
 
 // Gradients and compositing state of a block's pixels.
 struct BlockTargets {
     Pixels rgb[3], alpha, depth;
     Pixels transmittance;  // 0 once stopped
     Pixels behind;         // S: starts as the whole sum, ends as 0
-    Pixels left;           // number of Gaussians that may still receive gradients, if limited
 
     // Pixels outside the image have zero gradients.
     SPLAT_INLINE void set(int block, const Tile& tile, const View& view,
@@ -53,17 +54,6 @@ struct BlockTargets {
             behind += plane(in.depth) * depth;
         }
         transmittance = tile.start(block);
-        left = broadcast<Pixels>(float(in.per_pixel));
-    }
-
-    // A pixel that has reached the limit of Gaussians has zero gradients from then on.
-    SPLAT_INLINE void count(const Step& s) {
-        left -= keep(s.weight > 0.0f, broadcast<Pixels>(1.0f));
-        const PixelMask more = left > 0.0f;
-        for (Pixels& channel : rgb) channel = keep(more, channel);
-        alpha = keep(more, alpha);
-        depth = keep(more, depth);
-        behind = keep(more, behind);
     }
 };
 
@@ -90,9 +80,9 @@ struct GaussianPairs {
 };
 
 // Adds one Gaussian's moments over one block to the lanes.
-template <bool kDepthGradient, bool kAbsolute, bool kLimited>
+template <bool kDepthGradient>
 SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels alpha,
-                                BlockTargets& t, Pixels (&moments)[12]) {
+                                BlockTargets& t, Pixels (&moments)[kSums]) {
     const auto& g = batch.of(pair);
     const Pixels u = batch.u(pair), w = batch.w(pair);
     const Step s(alpha, t.transmittance);
@@ -112,14 +102,9 @@ SPLAT_INLINE void backward_pair(const Batch<kSize>& batch, uint32_t pair, Pixels
     moments[kVWW] += vw * w;
     for (int c = 0; c < 3; c++) moments[kRed + c] += s.weight * t.rgb[c];
     if (kDepthGradient) moments[kDepth] += s.weight * t.depth;
-    if (kAbsolute) {
-        moments[kAbsX] += abs(vu * g.uu);
-        moments[kAbsY] += abs(vu * g.uw + vw * g.ww);
-    }
-    if (kLimited) t.count(s);
 }
 
-template <bool kDepthGradient, bool kAbsolute, bool kLimited>
+template <bool kDepthGradient>
 void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
@@ -147,11 +132,10 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
             Ahead ahead(records, pairs, view, entry + batch.count, kSize);
             for (int n = 0; n < batch.count; n++) {
                 ahead.fetch();
-                Pixels moments[12] = {};
+                Pixels moments[kSums] = {};
                 for (int i = list.first[n]; i < list.first[n + 1]; i++)
-                    backward_pair<kDepthGradient, kAbsolute, kLimited>(
-                        batch, list.pair[i], list.alpha[i], targets[list.pair[i] % kBlocks],
-                        moments);
+                    backward_pair<kDepthGradient>(batch, list.pair[i], list.alpha[i],
+                                                  targets[list.pair[i] % kBlocks], moments);
                 store(slot(batch.gaussian[n].slot), sum_lanes(moments));
             }
         }
@@ -159,24 +143,12 @@ void backward_tiles(const Record* records, const Pairs& pairs, const View& view,
     });
 }
 
-using BackwardTiles = decltype(&backward_tiles<false, false, false>);
-
-template <bool kLimited>
-BackwardTiles choose(bool depth_gradient, bool absolute) {
-    if (depth_gradient)
-        return absolute ? backward_tiles<true, true, kLimited>
-                        : backward_tiles<true, false, kLimited>;
-    return absolute ? backward_tiles<false, true, kLimited>
-                    : backward_tiles<false, false, kLimited>;
-}
-
 }  // namespace
 
 void blend_backward(const Record* records, const Pairs& pairs, const View& view,
                     const ImageGradientsIn& in, const int32_t* block_end, int threads,
                     float* slot_gradients) {
-    const BackwardTiles run =
-        (in.per_pixel > 0 ? choose<true> : choose<false>)(in.d_depth, in.absolute);
+    const auto run = in.d_depth ? backward_tiles<true> : backward_tiles<false>;
     run(records, pairs, view, in, block_end, threads, slot_gradients);
 }
 

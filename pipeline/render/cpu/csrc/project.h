@@ -16,12 +16,11 @@ struct ProjectCounts {
 ProjectCounts project_view(const Gaussians& in, const View& view, int threads, Record* records,
                            float* radii);
 
-// dL/d(parameter), each shaped as its parameter; means2d and means2d_abs (N, 2); colors (N, 3), of
-// the colours before they are clamped. means2d_abs and colors may be null, and sh if Adam is
-// applied at once. camera: kCameraParameters sums over the Gaussians, may be null. All elements are
-// written.
+// dL/d(parameter), each shaped as its parameter; means2d (N, 2); colors (N, 3), of the colours
+// before they are clamped. colors may be null, and sh if Adam is applied at once. camera:
+// kCameraParameters sums over the Gaussians, may be null. All elements are written.
 struct GaussianGradients {
-    float *means, *log_scales, *quats, *opacity_logits, *sh, *means2d, *means2d_abs, *colors;
+    float *means, *log_scales, *quats, *opacity_logits, *sh, *means2d, *colors;
     double* camera;
 };
 

@@ -24,7 +24,7 @@ SPLAT_INLINE f32x16 sum_slots(const Slots& slots, const float* slot_gradients) {
 // Inputs of a group: fields of the records, and sums of the slots by Moment.
 struct GroupMoments {
     f32x16 uu, uw, ww, rgb[3];
-    f32x16 moment[12];
+    f32x16 moment[kMoments];
 
     // Zeros in the lanes that are not in `drawn`.
     GroupMoments(const Record* records, const Slots* slots, const float* slot_gradients,
@@ -41,7 +41,7 @@ struct GroupMoments {
         uw = record[5];
         ww = record[6];
         for (int c = 0; c < 3; c++) rgb[c] = record[8 + c];
-        for (int m = 0; m < 12; m++) moment[m] = sums[sum_lane(m)];
+        for (int m = 0; m < kMoments; m++) moment[m] = sums[sum_lane(m)];
     }
 
     // The lanes with a gradient: occluded Gaussians have none.
@@ -112,7 +112,6 @@ void write_zeros(const GaussianGradients& out, int64_t first, int count, int64_t
     clear(out.quats, 4);
     clear(out.opacity_logits, 1);
     clear(out.means2d, 2);
-    clear(out.means2d_abs, 2);
     clear(out.colors, 3);
     clear(out.sh, sh_width);
 }
@@ -193,13 +192,9 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         sh_backward(directions(toward), view.sh_degree, d_rgb, sh, d_mean);
         for (int k = 0; k < 3; k++) g.mean[k] += d_mean[k];
 
-        f32x16 absolute[2];
-        for (int k = 0; k < 2; k++) absolute[k] = float(2.0 * kLn2) * moments.moment[kAbsX + k];
         g.each(check);
-        for (f32x16& v : absolute) check(v);
         const auto clear = [&](f32x16& v) { v = keep(sound, v); };
         g.each(clear);
-        for (f32x16& v : absolute) clear(v);
         for (f32x16& v : d_rgb) clear(v);
         for (int k = 0; k < 3 * sh_count(view.sh_degree); k++) clear(sh.value[k]);
 
@@ -211,7 +206,6 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         write_rows(g.quat, group.count, out.quats + 4 * first);
         write_column(g.opacity_logit, group.count, out.opacity_logits + first);
         write_rows(g.means2d, group.count, out.means2d + 2 * first);
-        if (out.means2d_abs) write_rows(absolute, group.count, out.means2d_abs + 2 * first);
         if (out.colors) write_rows(d_rgb, group.count, out.colors + 3 * first);
         sh.to_rows(view.sh_degree);
         if (out.sh) sh.write(view.sh_degree, out.sh + sh_width * first, sh_width, group.count);

@@ -66,7 +66,7 @@ struct Slots {
 
 // One slot of gradients: sums over the pixels of a tile, in the lanes of sum_lanes (shuffle.h). v
 // is dL/d(ln alpha) of a pixel.
-enum Moment { kV, kVU, kVW, kVUU, kVUW, kVWW, kRed, kGreen, kBlue, kDepth, kAbsX, kAbsY };
+enum Moment { kV, kVU, kVW, kVUU, kVUW, kVWW, kRed, kGreen, kBlue, kDepth, kMoments };
 constexpr int kSlotFloats = 16;
 
 }  // namespace splat

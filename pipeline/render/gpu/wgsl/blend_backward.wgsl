@@ -71,7 +71,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
     let stop = range.x + workgroupUniformLoad(&tile_end);
 
     var transmittance = 1.0;
-    var left = select(view.gradients_per_pixel, 0xffffffffu, view.gradients_per_pixel == 0u);
     let mine = local / kPerGaussian;  // the Gaussian whose moments this thread sums
     let part = local % kPerGaussian;
     for (var begin = range.x; begin < stop; begin += kBatch) {
@@ -81,7 +80,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
         for (var k = 0u; k < kBatch; k++) {
             var v = 0.0;
             var weight = 0.0;
-            if (begin + k < range.x + end && left > 0u) {
+            if (begin + k < range.x + end) {
                 let r = batch[k];
                 let alpha = min(alpha_at(r, standardised(r, pixel)), kAlphaMax);
                 if (alpha >= kAlphaMin) {
@@ -91,7 +90,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
                     // A clamped alpha has no gradient.
                     if (alpha < kAlphaMax) { v = weight * e - alpha / (1.0 - alpha) * behind; }
                     transmittance *= 1.0 - alpha;
-                    left--;
                 }
             }
             shared_values[k * kThreads + local] = v;
@@ -119,8 +117,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(local_invocation_id) i
                 sums[kGreen] += weight * d.y;
                 sums[kBlue] += weight * d.z;
                 sums[kDepth] += weight * d.w;
-                sums[kAbsX] += abs(vu * r.uu);
-                sums[kAbsY] += abs(vu * r.uw + vw * r.ww);
             }
         }
         workgroupBarrier();

@@ -10,6 +10,4 @@ const kRed = 6u;
 const kGreen = 7u;
 const kBlue = 8u;
 const kDepth = 9u;
-const kAbsX = 10u;
-const kAbsY = 11u;
-const kMoments = 12u;
+const kMoments = 10u;

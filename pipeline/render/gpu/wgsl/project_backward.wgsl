@@ -62,7 +62,6 @@ struct Gradient {
     quat: vec4<f32>,
     opacity_logit: f32,
     means2d: vec2<f32>,
-    absolute: vec2<f32>,
     rgb: vec3<f32>,
 }
 
@@ -79,9 +78,7 @@ fn write(i: u32, g: Gradient) {
     let means2d = kGeometry * n + 2u * i;
     gradients[means2d] = g.means2d.x;
     gradients[means2d + 1u] = g.means2d.y;
-    gradients[means2d + 2u * n] = g.absolute.x;
-    gradients[means2d + 2u * n + 1u] = g.absolute.y;
-    write_row((kGeometry + 4u) * n + 3u * i, g.rgb);
+    write_row((kGeometry + 2u) * n + 3u * i, g.rgb);
 }
 
 // Without a gradient. SH gradients are zero, and moments stay as they are.
@@ -147,7 +144,6 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
     // and y = L^T d with L = [uu 0; uw ww], so d(ln alpha) / d(centre) = 2 ln 2 L y.
     var g: Gradient;
     g.means2d = 2.0 * kLn2 * vec2(r.uu * m[kVU], r.uw * m[kVU] + r.ww * m[kVW]);
-    g.absolute = 2.0 * kLn2 * vec2(m[kAbsX], m[kAbsY]);
     // inverse(cov) = 2 ln2 L L^T, d = L^-T y: 1/2 inverse(cov) (sum v d d^T) inverse(cov)
     //   = 2 ln2^2 L (sum v y y^T) L^T
     let c = 2.0 * kLn2 * kLn2;
@@ -227,7 +223,7 @@ fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 
     let sound = bounded3(g.mean) && bounded3(g.log_scale) && bounded3(g.quat.xyz)
         && bounded(g.quat.w) && bounded(g.opacity_logit) && bounded3(g.rgb)
-        && bounded3(vec3(g.means2d, 0.0)) && bounded3(vec3(g.absolute, 0.0));
+        && bounded3(vec3(g.means2d, 0.0));
     if (!sound) { g = Gradient(); }
     write(i, g);
     if ((options.flags & kShAdam) != 0u) {

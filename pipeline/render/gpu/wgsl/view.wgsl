@@ -13,7 +13,7 @@ struct View {
     right: vec3<f32>,         // rows of the rotation from the world to the camera
     near: f32,
     down: vec3<f32>,
-    gradients_per_pixel: u32, // 0: no limit
+    unused0: u32,
     forward: vec3<f32>,
     unused: u32,
     centre: vec3<f32>,        // of the camera, in the world

@@ -83,8 +83,8 @@ class Session:
             self.state.restore(found.step, found.arrays, found.values)
         except ValueError as error:
             self.log(
-                f"{self.run.checkpoint_dir}: the checkpoint of step {found.step} is not used, because "
-                f"it is not one of this run: {error}"
+                f"{self.run.checkpoint_dir}: the checkpoint of step {found.step} is not used, "
+                f"because it is not one of this run: {error}"
             )
             return
         if text := other_build(found.values, self.build):

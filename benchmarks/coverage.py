@@ -25,8 +25,7 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import CoverageResult, Place
 from pipeline.config.density import Gradient
 from pipeline.config.experiments import TrainExperiments
-from pipeline.config.schema import Init
-from pipeline.config.settled import TrainOptions
+from pipeline.config.settled import Init, TrainOptions
 from pipeline.coverage.probe_views import Renderer, render_probe
 from pipeline.coverage.trust import trust_map
 from pipeline.coverage.viewpoints import MAX_PROPOSALS, Viewpoint, propose_viewpoints

@@ -6,8 +6,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Features, Init, Matches
-from pipeline.config.settled import Train
+from pipeline.config.settled import Features, Init, Matches, Train
 from pipeline.plan.point_cloud import IN_POSES, IN_PROJECTION, PointCloudFiles
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan
@@ -24,7 +23,6 @@ if TYPE_CHECKING:
     from pipeline.scene.views import View
 
 # Methods that use the point cloud of the scene folder.
-CLOUD_METHODS = ("auto", "points")
 EXPERIMENTS = ("experiments.init", "experiments.matches")
 
 
@@ -73,7 +71,7 @@ def work(job: Job) -> None:
     points = inputs.input_model(job).points
     extra, source, normals = {}, "points", None
     dense = _dense_points(job, points, training, config) if config.method == "dense" else None
-    cloud = read_cloud(job.inputs["inspect"]) if config.method in CLOUD_METHODS else None
+    cloud = read_cloud(job.inputs["inspect"]) if config.method == "points" else None
     placed = None
     if cloud is not None:
         placed = placed_points(cloud, inputs.georeference(job), training, config)

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Matches
+from pipeline.config.settled import Matches
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Matches
+from pipeline.config.settled import Matches
 from pipeline.plan.stage import StageSpec, if_several_jobs
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job

@@ -4,8 +4,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Partition
-from pipeline.config.settled import Train
+from pipeline.config.settled import Partition, Train
 from pipeline.plan.stage import StageSpec, if_blocks
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job

@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Sfm
+from pipeline.config.settled import Sfm
 from pipeline.io.poses.formats import MIN_IMAGES_PER_CAMERA
 from pipeline.plan.stage import StageSpec
 from pipeline.plan.values import StagePlan

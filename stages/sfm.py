@@ -5,7 +5,7 @@ from __future__ import annotations
 
 from typing import TYPE_CHECKING
 
-from pipeline.config.schema import Config, Sfm
+from pipeline.config.settled import Config, Sfm
 from pipeline.plan.stage import StageSpec, unless_posed
 from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
@@ -27,17 +27,19 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def _frame(scan: Scan, config: Config) -> str:
-    wanted, control = config.sfm.georeference, scan.ground_control is not None
-    if wanted in ("auto", "gcp") and control:
+    wanted = config.sfm.georeference
+    if wanted == "gcp" and scan.ground_control is not None:
         return f"georeferenced by the ground control points in {scan.ground_control_text}"
-    if wanted in ("auto", "gps") and scan.num_gps:
+    if wanted == "gps" and scan.num_gps:
         level = sum(photo.gps is not None and photo.gps[2] is None for photo in scan.photos)
         unknown = f" ({level} without an altitude)" if level else ""
         return (
             f"georeferenced by GPS positions of {scan.num_gps} photographs{unknown}, if these "
             "suffice"
         )
-    why = "as configured" if wanted == "none" else "no GPS or ground control points"
+    why = "no GPS or ground control points"
+    if scan.num_gps or scan.ground_control is not None:
+        why = "as configured"
     return f"not georeferenced ({why}): the scene is levelled and scaled to unit size"
 
 

@@ -19,7 +19,7 @@ from benchmarks.judge.truth import Truth, grade
 from benchmarks.judge.world import write
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import JudgeResult
-from pipeline.config.schema import Sfm
+from pipeline.config.settled import Sfm
 from pipeline.io.colmap import read_model
 from pipeline.runtime.isolate import run_isolated
 from pipeline.sfm.attempts import MAX_ATTEMPTS, Attempt, map_until_good

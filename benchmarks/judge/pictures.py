@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
-from pipeline.config.schema import Config, Matches, Sfm
+from pipeline.config.schema import Config
+from pipeline.config.settled import Matches, Sfm
 from pipeline.io.posefiles import truth_folder
 from pipeline.plan.scan import scan
 from pipeline.plan.settle import settle

@@ -21,7 +21,7 @@ from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.results import GrowthResult
 from benchmarks.sfm.measure import cost_of
 from benchmarks.sfm.summary import Cost
-from pipeline.config.schema import Sfm
+from pipeline.config.settled import Sfm
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error

@@ -10,7 +10,7 @@ from typing import Any
 
 from benchmarks.sfm.scenes import Configuration, Scene
 from benchmarks.sfm.summary import REFERENCE, STEPS, Cost, Run
-from pipeline.config.schema import Config
+from pipeline.config.settled import Config
 from pipeline.io.colmap import read_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError

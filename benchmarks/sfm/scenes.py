@@ -10,7 +10,7 @@ from pathlib import Path
 
 from pipeline.config.load import scene_config
 from pipeline.config.presets import PRESETS
-from pipeline.config.schema import Config
+from pipeline.config.settled import Config
 from pipeline.io.colmap import read_model
 from pipeline.io.names import NameIndex
 from pipeline.photos.verify import verify_photos

@@ -56,9 +56,9 @@ class Views(Section):
     max_long_side_px: Pixels = Field(
         800, description="Longer sides are reduced to this length (by area averaging)."
     )
-    masks: Literal["auto", "ignore"] = Field(
-        "auto",
-        description="auto: use masks/ if it exists; pixels with mask value 0 are ignored.",
+    masks: Literal["use", "ignore"] = Field(
+        "use",
+        description="use: pixels that a mask excludes are ignored, if the scene has masks.",
     )
 
 
@@ -183,14 +183,14 @@ class Sfm(Section):
         "group, folder if the photographs are in several folders, or image for collections from "
         "many cameras.",
     )
-    refine_radial: Literal["auto", "no"] = Field(
-        "auto",
-        description="auto: the last bundle adjustment turns SIMPLE_RADIAL cameras into RADIAL ones "
+    refine_radial: bool = Field(
+        True,
+        description="The last bundle adjustment turns SIMPLE_RADIAL cameras into RADIAL ones "
         "if that lowers the error.",
     )
-    refine_principal_point: Literal["auto", "yes", "no"] = Field(
-        "auto",
-        description="auto: refined in the last bundle adjustment and kept if the geometry "
+    refine_principal_point: Literal["if_determined", "yes", "no"] = Field(
+        "if_determined",
+        description="if_determined: refined in the last bundle adjustment and kept if the geometry "
         "determines it; for given poses, only if it is exactly in the image centre.",
     )
     min_registered_share: Share = Field(

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.config.schema import Init
+from pipeline.config.settled import Init
 from pipeline.io.clouds.sampling import thinned
 from pipeline.io.clouds.values import PointCloud
 from pipeline.photos.load import load_view

@@ -139,7 +139,7 @@ def _is_complete(
 
 def uses_masks(config: Config) -> bool:
     """Whether masks in the scene folder are used: not for measures as published."""
-    return config.views.masks == "auto" and config.split.source != "published"
+    return config.views.masks == "use" and config.split.source != "published"
 
 
 def read_all(

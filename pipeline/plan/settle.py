@@ -102,7 +102,8 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
             "matches": {"pairs": value["matches.pairs"]},
             "sfm": {
                 name: value[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")
-            },
+            }
+            | {"georeference": _georeference(scan, config)},
             "init": {
                 "method": method,
                 "max_points": min(config.init.max_points, max(1, budget // 2)),
@@ -236,6 +237,15 @@ def _background(scan: Scan, config: Config) -> Choice:
     if config.train.density.strategy == "original":
         return "black", "black background, as published"
     return "skybox", "a skybox behind the scene: neither alpha nor masks"
+
+
+def _georeference(scan: Scan, config: Config) -> str:
+    wanted = config.sfm.georeference
+    if wanted != "auto":
+        return wanted
+    if scan.ground_control is not None:
+        return "gcp"
+    return "gps" if scan.num_gps else "none"
 
 
 def _device(config: Config, device: Choice) -> Choice:

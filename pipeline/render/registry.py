@@ -23,11 +23,8 @@ def use_device(device: str) -> None:
 
 def make_backend(name: str | None = None) -> Backend:
     """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first;
-    ``auto``, which plans settle, is the processor; None: the default, the processor's unless
-    ``use_device`` was called."""
+    None: the default, the processor's unless ``use_device`` was called."""
     name = name or _default
-    if name == "auto":
-        name = "cpu"
     kind, _, number = name.partition(":")
     if name not in BACKENDS and not DEVICE.fullmatch(name):
         raise ValueError(f"no backend {name!r}; there are {', '.join(BACKENDS)}")

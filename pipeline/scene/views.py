@@ -138,7 +138,7 @@ def load_views(
             View(
                 name=photo.name,
                 image=photo.path,
-                mask=photo.mask if views.masks == "auto" else None,
+                mask=photo.mask if views.masks == "use" else None,
                 width=width,
                 height=height,
                 fx=fx,
@@ -149,7 +149,7 @@ def load_views(
                 is_test=photo.split == "test" if listed else is_test_view(index, every),
                 camera_id=image.camera_id,
                 image_digest=photo.digest,
-                mask_digest=photo.mask_digest if views.masks == "auto" else None,
+                mask_digest=photo.mask_digest if views.masks == "use" else None,
                 has_listed_split=listed,
                 source=photo.source,
             )

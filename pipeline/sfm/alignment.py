@@ -21,7 +21,7 @@ from pipeline.sfm.gcp_frame import Triangulated, from_gcp
 from pipeline.sfm.georeference import Cameras, WorldFrame, level
 from pipeline.sfm.gps_frame import from_gps
 
-Georeference = Literal["auto", "gps", "gcp", "none"]
+Georeference = Literal["gps", "gcp", "none"]
 
 # Smallest angle between the rays of a triangulated ground control point.
 MIN_RAY_ANGLE_DEG = 1.0
@@ -33,8 +33,8 @@ def align_model(
     """Transform ``model`` into a world frame and return that frame.
 
     Args:
-        method: "auto" uses ground control points if there are any, else GPS, else a level frame.
-            "gcp" and "gps" fall back to a level frame with a warning. "none" is the level frame.
+        method: "gcp" falls back to GPS, and "gps" to a level frame, with a warning. "none" is the
+            level frame.
         control: the scene's ``gcp_list.txt``, None without one.
 
     Raises:
@@ -60,7 +60,7 @@ def align_model(
             fix="put the file into the scene folder, or set sfm.georeference: auto",
         )
     positions = {name: photo.gps for name, photo in photos.items() if photo.gps is not None}
-    if method in ("auto", "gcp") and control is not None:
+    if method == "gcp" and control is not None:
         sizes = {name: (photo.width, photo.height) for name, photo in photos.items()}
         points = read_ground_control(control, sizes)
         frame = from_gcp(points, partial(_triangulate, model), cameras, control)

@@ -22,7 +22,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.record import file_digest
 from pipeline.scene.manifest import Manifest, Photo
@@ -64,7 +64,7 @@ class MatchingSettings:
 
 
 def plan_cameras(
-    manifest: Manifest, sfm: schema.Sfm
+    manifest: Manifest, sfm: settled.Sfm
 ) -> tuple[list[pycolmap.Camera], dict[str, int]]:
     """Group the photographs into cameras.
 
@@ -77,10 +77,9 @@ def plan_cameras(
         id.
     """
     members: dict[tuple[tuple[str, ...], int, int, str], list[Photo]] = defaultdict(list)
-    chosen: str = "SIMPLE_RADIAL" if sfm.camera_model == "auto" else sfm.camera_model
     for photo in manifest.photos:
         group = _sharing(photo, sfm.share_cameras)
-        model = "EQUIRECTANGULAR" if photo.panorama else chosen
+        model: str = "EQUIRECTANGULAR" if photo.panorama else sfm.camera_model
         members[group, photo.width, photo.height, model].append(photo)
     cameras, camera_of = [], {}
     for index, ((_, width, height, model), photos) in enumerate(members.items(), start=1):

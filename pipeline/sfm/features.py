@@ -13,7 +13,7 @@ from pathlib import Path
 
 import numpy as np
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.runtime.atomic import link_or_copy
 from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.machine import threads_within
@@ -51,7 +51,7 @@ class FeatureReport:
 
 
 def extract_features(
-    manifest: Manifest, config: schema.Features, out: Path, *, cache: Path, threads: int
+    manifest: Manifest, config: settled.Features, out: Path, *, cache: Path, threads: int
 ) -> FeatureReport:
     """Extract SIFT features of each photograph and write them to ``out`` (see ``keypoint_file``).
 
@@ -71,7 +71,7 @@ def extract_features(
 
 def gather_features(
     manifest: Manifest,
-    config: schema.Features,
+    config: settled.Features,
     parts: Mapping[Path, FeaturesCounters],
     out: Path,
     *,
@@ -95,7 +95,7 @@ def gather_features(
 
 
 def extract_photos(
-    photos: Sequence[Photo], config: schema.Features, out: Path, *, cache: Path, threads: int
+    photos: Sequence[Photo], config: settled.Features, out: Path, *, cache: Path, threads: int
 ) -> FeatureReport:
     """``extract_features`` of some photographs, which removes no files from the cache. Several
     processes may do so at the same time with the same cache."""
@@ -125,7 +125,7 @@ def extract_photos(
     return _report(counts, config, num_cached=len(photos) - len(absent))
 
 
-def _report(counts: dict[str, int], config: schema.Features, num_cached: int = 0) -> FeatureReport:
+def _report(counts: dict[str, int], config: settled.Features, num_cached: int = 0) -> FeatureReport:
     median = int(np.median(list(counts.values()))) if counts else 0
     return FeatureReport(
         counters=FeaturesCounters(counts=counts),
@@ -142,7 +142,7 @@ def _report(counts: dict[str, int], config: schema.Features, num_cached: int = 0
     )
 
 
-def _cache_key(photo: Photo, config: schema.Features) -> str:
+def _cache_key(photo: Photo, config: settled.Features) -> str:
     """Hash of everything that determines the keypoints. Extraction compares the files that it
     decodes with the digests in the key."""
     facts = {
@@ -154,7 +154,7 @@ def _cache_key(photo: Photo, config: schema.Features) -> str:
     return hashlib.sha256(json.dumps(facts, sort_keys=True).encode()).hexdigest()
 
 
-def _prune(cache: Path, manifest: Manifest, config: schema.Features) -> None:
+def _prune(cache: Path, manifest: Manifest, config: settled.Features) -> None:
     used = {f"{_cache_key(photo, config)}.npz" for photo in manifest.photos}
     unused = [file for file in cache.glob("*.npz") if file.name not in used]
     if len(unused) > len(used):
@@ -164,7 +164,7 @@ def _prune(cache: Path, manifest: Manifest, config: schema.Features) -> None:
 
 def _extract_opencv(
     photos: list[Photo],
-    config: schema.Features,
+    config: settled.Features,
     targets: dict[str, Path],
     threads: int,
     progress: Progress,
@@ -202,7 +202,7 @@ def _extract_opencv(
 
 def _extract_colmap(
     photos: list[Photo],
-    config: schema.Features,
+    config: settled.Features,
     targets: dict[str, Path],
     threads: int,
     progress: Progress,

@@ -17,7 +17,7 @@ import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.geometry.similarity import Noise, robust_similarity
 from pipeline.io.poses.formats import colmap_files
 from pipeline.sfm.alignment import transform_model
@@ -50,7 +50,7 @@ class KnownPosesReport:
     decisions: list[str]
 
 
-def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPosesReport:
+def refine_known_poses(sparse: Path, config: settled.Sfm, out: Path) -> KnownPosesReport:
     """Adjust the COLMAP model in ``sparse`` and write it to ``out``, in the same world frame.
 
     If freeing camera parameters does not lower the cost (see ``refine``), the input files are
@@ -67,7 +67,7 @@ def refine_known_poses(sparse: Path, config: schema.Sfm, out: Path) -> KnownPose
     original = _positions(model, anchors)
     refined = refine(
         _longest_tracks(model, tracks, TRACKS_TO_DECIDE),
-        radial=config.refine_radial == "auto",
+        radial=config.refine_radial,
         principal_point=config.refine_principal_point,
         inner_iterations=True,
     )

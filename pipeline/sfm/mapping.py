@@ -14,7 +14,7 @@ from pathlib import Path
 import numpy as np
 import pycolmap
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
@@ -41,7 +41,7 @@ class SfmReport:
 def reconstruct(
     manifest: Manifest,
     database: Path,
-    config: schema.Sfm,
+    config: settled.Sfm,
     out: Path,
     *,
     threads: int,
@@ -56,15 +56,13 @@ def reconstruct(
     Args:
         database: database written by ``match_features``; not changed. ``keypoint_colors.npz``
             beside it gives the points' colours.
-        config: options; ``mapper`` must not be "auto".
+        config: The settled options.
         ground_control: the scene's ``gcp_list.txt``, None without one.
 
     Raises:
         UserError: every attempt failed the quality check (see ``judge``).
     """
     quiet_colmap()
-    if config.mapper == "auto":
-        raise ValueError("the mapper must be chosen, found: auto")
     total = len(manifest.photos)
     with tempfile.TemporaryDirectory(prefix="splatmake-sfm-") as folder:
         # Opening a database can change its bytes: work on a copy.
@@ -85,7 +83,7 @@ def reconstruct(
         if attempt.verdict.grade == "good" or config.refine_principal_point == "yes":
             refined = refine(
                 model,
-                radial=config.refine_radial == "auto",
+                radial=config.refine_radial,
                 principal_point=config.refine_principal_point,
             )
             model = refined.model

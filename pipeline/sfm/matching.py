@@ -15,7 +15,7 @@ import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
@@ -51,7 +51,7 @@ class MatchingScene:
 
     manifest: Manifest
     features: Path
-    sharing: schema.Sfm
+    sharing: settled.Sfm
     seed: int
     experiments: MatchesExperiments = DEFAULT.matches
 
@@ -93,7 +93,7 @@ class ChunkReport:
 
 def match_features(
     scene: MatchingScene,
-    config: schema.Matches,
+    config: settled.Matches,
     out: Path,
     *,
     cache: Path | None = None,
@@ -109,7 +109,7 @@ def match_features(
     number of jobs.
 
     Args:
-        config: options; ``pairs`` must not be "auto".
+        config: The settled options.
         cache: folder for results of pairs that outlives the call.
         chosen: result of ``choose_pairs``; None: the pairs are chosen.
         parts: folders of the jobs that have matched them by ``match_chunk``, in order.
@@ -180,7 +180,7 @@ def match_features(
     )
 
 
-def choose_pairs(scene: MatchingScene, config: schema.Matches) -> PairList:
+def choose_pairs(scene: MatchingScene, config: settled.Matches) -> PairList:
     """Choose the pairs to match, and initial focal lengths by the first of them where cameras need
     one."""
     quiet_colmap()
@@ -249,7 +249,7 @@ def _models(cameras: list[pycolmap.Camera]) -> str:
 
 
 def resolve_pairs(
-    manifest: Manifest, features: Path, config: schema.Matches
+    manifest: Manifest, features: Path, config: settled.Matches
 ) -> tuple[list[choose.Pair], str]:
     """The pairs to match, as indices into the photographs sorted by name, and a sentence about
     them for the log."""

@@ -56,7 +56,7 @@ def refine(
     Args:
         model: not changed.
         radial: SIMPLE_RADIAL cameras may become RADIAL.
-        principal_point: "yes" (always freed), "no", or "auto" (if it lowers the cost).
+        principal_point: "yes" (always freed), "no", or "if_determined" (if it lowers the cost).
         inner_iterations: see ``bundle_adjust``.
     """
     shared = _shared_cameras(model)

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import run_isolated
@@ -47,8 +47,8 @@ def triangulate(
     manifest: Manifest,
     sparse: Path,
     out: Path,
-    features: schema.Features,
-    matches: schema.Matches,
+    features: settled.Features,
+    matches: settled.Matches,
     *,
     threads: int,
     seed: int,
@@ -90,7 +90,7 @@ def triangulate(
 
 
 def _extract(
-    manifest: Manifest, config: schema.Features, out: Path, cache: Path, threads: int
+    manifest: Manifest, config: settled.Features, out: Path, cache: Path, threads: int
 ) -> list[str]:
     from pipeline.sfm.features import extract_features
 
@@ -102,7 +102,7 @@ def _triangulate(
     sparse: Path,
     out: Path,
     features: Path,
-    config: schema.Matches,
+    config: settled.Matches,
     experiments: MatchesExperiments,
     seed: int,
 ) -> TriangulatedPoints:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import InitExperiments
-from pipeline.config.schema import Init
+from pipeline.config.settled import Init
 from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.counters import InitCounters

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.config.experiments import DEFAULT, InitExperiments
-from pipeline.config.schema import Init
+from pipeline.config.settled import Init
 from pipeline.geometry.rotations import rotation_to_quat
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points

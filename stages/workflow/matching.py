@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import TYPE_CHECKING
 
 from pipeline.config.experiments import Experiments
-from pipeline.config.schema import Sfm
+from pipeline.config.settled import Sfm
 from pipeline.runtime.job import Job
 from stages.workflow import inputs
 

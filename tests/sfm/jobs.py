@@ -7,7 +7,7 @@ import hashlib
 from pathlib import Path
 from typing import Any
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.config.experiments import MatchesExperiments
 from pipeline.scene.manifest import Manifest
 
@@ -31,15 +31,15 @@ def match(
     features: Path,
     out: Path,
     pairs: str = "exhaustive",
-    sfm: schema.Sfm | None = None,
+    sfm: settled.Sfm | None = None,
     threads: int = 2,
     min_inliers: int = 15,
 ) -> dict[str, Any]:
     from pipeline.sfm.matching import MatchingScene, match_features
 
     experiments = MatchesExperiments(min_inliers=min_inliers)
-    scene = MatchingScene(manifest, features, sfm or schema.Sfm(), 0, experiments)
-    config = schema.Matches.model_validate({"pairs": pairs})
+    scene = MatchingScene(manifest, features, sfm or settled.Sfm(), 0, experiments)
+    config = settled.Matches.model_validate({"pairs": pairs})
     return flat(match_features(scene, config, out, cache=out.with_name("cache"), threads=threads))
 
 
@@ -47,8 +47,8 @@ def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> 
     """As ``match``, by ``count`` jobs besides."""
     from pipeline.sfm.matching import MatchingScene, choose_pairs, match_chunk, match_features
 
-    config = schema.Matches(pairs="exhaustive")
-    scene = MatchingScene(manifest, features, schema.Sfm(), 0)
+    config = settled.Matches(pairs="exhaustive")
+    scene = MatchingScene(manifest, features, settled.Sfm(), 0)
     chosen = choose_pairs(scene, config)
     parts = [out.with_name(f"match_{number}") for number in range(1, count + 1)]
     cache = out.with_name("cache")
@@ -65,7 +65,7 @@ def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> 
 
 
 def reconstruct(
-    manifest: Manifest, database: Path, config: schema.Sfm, out: Path, threads: int = 2
+    manifest: Manifest, database: Path, config: settled.Sfm, out: Path, threads: int = 2
 ) -> dict[str, Any]:
     from pipeline.sfm import mapping
 
@@ -73,7 +73,7 @@ def reconstruct(
 
 
 def match_and_reconstruct(
-    manifest: Manifest, features: Path, out: Path, config: schema.Sfm, threads: int = 2
+    manifest: Manifest, features: Path, out: Path, config: settled.Sfm, threads: int = 2
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     matched = match(manifest, features, out / "matches", sfm=config, threads=threads)
     database = out / "matches" / "database.db"
@@ -89,7 +89,7 @@ def planned_cameras(
     return {
         sharing: [
             (c.model_name, float(c.mean_focal_length()), bool(c.has_prior_focal_length))
-            for c in plan_cameras(manifest, schema.Sfm.model_validate({"share_cameras": sharing}))[
+            for c in plan_cameras(manifest, settled.Sfm.model_validate({"share_cameras": sharing}))[
                 0
             ]
         ]

@@ -63,7 +63,7 @@ def centred(centres: np.ndarray) -> np.ndarray:
 
 
 def test_gps_aligns_a_model_to_metres():
-    method, centres, warnings = run_isolated(aligned, photos(True), "auto", None)
+    method, centres, warnings = run_isolated(aligned, photos(True), "gps", None)
     true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gps" and not warnings
     np.testing.assert_allclose(centred(centres), centred(true), atol=0.05)
@@ -83,7 +83,7 @@ def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
             lines.append(f"{east} {north} {up} {px} {py} {i}.jpg")
     control = tmp_path / "gcp_list.txt"
     control.write_text("\n".join(lines))
-    method, centres, warnings = run_isolated(aligned, photos(True), "auto", control)
+    method, centres, warnings = run_isolated(aligned, photos(True), "gcp", control)
     true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gcp" and not warnings
     np.testing.assert_allclose(centred(centres), centred(true), atol=1e-3)
@@ -91,7 +91,7 @@ def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
 
 
 def test_without_gps_and_ground_control_the_frame_is_level():
-    method, centres, warnings = run_isolated(aligned, photos(False), "auto", None)
+    method, centres, warnings = run_isolated(aligned, photos(False), "none", None)
     assert method == "level" and not warnings
     assert np.linalg.norm(centres, axis=1).max() == pytest.approx(1.0)
     # y points down.

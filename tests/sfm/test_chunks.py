@@ -9,14 +9,14 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.runtime.isolate import run_isolated
 from pipeline.sfm.chunks import chunk
 from pipeline.sfm.features import extract_features, extract_photos, gather_features
 from pipeline.sfm.pair_list import PairList
 from tests.sfm import corner, jobs
 
-FEATURES = schema.Features(max_features=500)
+FEATURES = settled.Features(max_features=500)
 
 
 @given(count=st.integers(0, 100), number_of_jobs=st.integers(1, 12))

@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.io.recorded import digest_of
 from pipeline.runtime.errors import UserError
 from pipeline.sfm.features import extract_features
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
 from tests.sfm import corner, jobs
 
-CONFIG = schema.Features(max_features=500)
+CONFIG = settled.Features(max_features=500)
 
 
 def extract(folder: Path, photos, config=CONFIG, threads: int = 2):
@@ -62,7 +62,7 @@ def test_a_blob_is_detected_at_its_centre(tmp_path):
     blob = 200 * np.exp(-((x - 100) ** 2 + (y - 80) ** 2) / (2 * 6.0**2))
     photo = saved(tmp_path, "a.png", blob.astype(np.uint8))
     for long_side in (1600, 120):  # at full and at half resolution
-        config = schema.Features(max_long_side_px=long_side)
+        config = settled.Features(max_long_side_px=long_side)
         keypoints = extract(tmp_path, [photo], config)[0]["a.png"]
         nearest = np.linalg.norm(keypoints.xy - [100.5, 80.5], axis=1).min()
         assert nearest < 0.1, long_side
@@ -71,9 +71,9 @@ def test_a_blob_is_detected_at_its_centre(tmp_path):
 
 def test_colmaps_extractor_agrees_on_positions_and_descriptors(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
-    config = schema.Features(max_features=100_000)
+    config = settled.Features(max_features=100_000)
     ours = extract(tmp_path, [photo], config)[0]["a.png"]
-    colmap = schema.Features(backend="colmap", max_features=100_000)
+    colmap = settled.Features(backend="colmap", max_features=100_000)
     theirs = extract(tmp_path, [photo], colmap)[0]["a.png"]
     distance = np.linalg.norm(ours.xy[:, None] - theirs.xy[None], axis=-1)
     close = distance.min(1) < 1.0
@@ -150,7 +150,7 @@ def test_changed_photographs_masks_and_options_are_extracted_again(tmp_path, pix
     photo = saved(tmp_path, "a.png", pixels, **masked(mask))
     assert extract(tmp_path, [photo])[1].num_cached == 0
     assert extract(tmp_path, [photo])[1].num_cached == 1
-    assert extract(tmp_path, [photo], schema.Features(max_features=400))[1].num_cached == 0
+    assert extract(tmp_path, [photo], settled.Features(max_features=400))[1].num_cached == 0
     cv2.imwrite(str(mask), np.eye(*pixels.shape[:2], dtype=np.uint8))
     photo = photo.model_copy(update=masked(mask))
     assert extract(tmp_path, [photo])[1].num_cached == 0
@@ -165,14 +165,14 @@ def test_a_file_changed_since_inspect_is_an_error_and_nothing_is_cached(
     photo = saved(tmp_path, "a.png", pixels, **masked(tmp_path / "mask.png"))
     cv2.imwrite(str(tmp_path / changed), np.roll(pixels, 40, axis=1))  # of the same size
     with pytest.raises(UserError, match=f"{changed}: has changed since the scene was inspected"):
-        extract(tmp_path, [photo], schema.Features(backend=backend))
+        extract(tmp_path, [photo], settled.Features(backend=backend))
     assert not list((tmp_path / "cache").iterdir())
 
 
 def test_the_cache_distinguishes_options_and_is_pruned(tmp_path, pixels):
     photo = saved(tmp_path, "a.png", pixels)
     for limit, cached, stored in ((400, 0, 1), (300, 0, 2), (400, 1, 2), (200, 0, 1)):
-        _, report = extract(tmp_path, [photo], schema.Features(max_features=limit))
+        _, report = extract(tmp_path, [photo], settled.Features(max_features=limit))
         assert (report.num_cached, len(list((tmp_path / "cache").iterdir()))) == (cached, stored)
 
 

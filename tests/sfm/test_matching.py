@@ -16,7 +16,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import upstream
 from pipeline.plan.scan import scan
@@ -31,7 +31,7 @@ from tests.plans import make_plan
 from tests.sfm import corner, jobs
 from tests.tools import need, unsupported
 
-FEATURES = schema.Features(max_features=500)
+FEATURES = settled.Features(max_features=500)
 
 
 def reference(a: np.ndarray, b: np.ndarray) -> near.Neighbours:

@@ -9,7 +9,7 @@ import cv2
 import numpy as np
 import pytest
 
-from pipeline.config import schema
+from pipeline.config import settled
 from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error
 from pipeline.runtime.errors import UserError
@@ -20,8 +20,8 @@ from pipeline.sfm.triangulation import triangulate
 from tests.counters import GOOD
 from tests.sfm import corner, jobs
 
-FEATURES = schema.Features(max_features=1500)
-INCREMENTAL = schema.Sfm(mapper="incremental")
+FEATURES = settled.Features(max_features=1500)
+INCREMENTAL = settled.Sfm(mapper="incremental")
 
 
 def features(folder: Path, photos) -> Path:
@@ -67,7 +67,7 @@ def test_poses_are_accurate_and_files_do_not_depend_on_threads(room, tmp_path):
 @pytest.mark.slow
 def test_global_mapping_is_accurate_and_does_not_depend_on_threads(room, tmp_path):
     _, photos, truth, found = room
-    manifest, config = corner.manifest(photos), schema.Sfm(mapper="global")
+    manifest, config = corner.manifest(photos), settled.Sfm(mapper="global")
     run_isolated(jobs.match, manifest, found, tmp_path / "matches")
     database = tmp_path / "matches" / "database.db"
     before = database.read_bytes()
@@ -188,7 +188,7 @@ def test_known_poses_are_triangulated_and_unchanged(room, tmp_path):
         tmp_path / "given",
         tmp_path / "out",
         FEATURES,
-        schema.Matches(),
+        settled.Matches(),
         threads=2,
         seed=0,
     )
@@ -218,7 +218,7 @@ def test_triangulation_without_matches_gives_no_points(tmp_path):
         tmp_path / "given",
         tmp_path / "out",
         FEATURES,
-        schema.Matches(),
+        settled.Matches(),
         threads=2,
         seed=0,
     )
@@ -243,7 +243,7 @@ def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
     photos, truth = corner.write_scene(tmp_path / "photos", 5)
     # With more features, mapping recovers from the priors by itself.
     found = tmp_path / "features"
-    few = schema.Features(max_features=600)
+    few = settled.Features(max_features=600)
     extract_features(corner.manifest(photos), few, found, cache=tmp_path / "cache", threads=2)
     focals = [150.0, 1900.0, 120.0, 2500.0, 100.0]
     wrong = [

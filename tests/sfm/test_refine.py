@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from pipeline.config.schema import Sfm
+from pipeline.config.settled import Sfm
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import read_model, write_model
 from pipeline.metrics.pose import pose_error

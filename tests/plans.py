@@ -1,7 +1,9 @@
 """Plans for tests: of a scan, and of a scene that needs every stage."""
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
+from pipeline.config import settled
 from pipeline.config.schema import Config
 from pipeline.plan import plan as plans
 from pipeline.plan.record import PlanRecord
@@ -63,8 +65,26 @@ def full_plan(config: Config, scene: str = "fox", skipped: tuple[str, ...] = ())
         for name, spec in STAGES.items()
     }
     return Plan(
-        scene=scene, stages=stages, warnings=[], config=config, facts=FACTS, folder="folder"
+        scene=scene,
+        stages=stages,
+        warnings=[],
+        config=settled_config(config),
+        facts=FACTS,
+        folder="folder",
     )
+
+
+def settled_config(config: Config) -> settled.Config:
+    """The options, with a settled default for each "auto"."""
+    return settled.Config.model_validate(_without_auto(config.model_dump()))
+
+
+def _without_auto(values: dict[str, Any]) -> dict[str, Any]:
+    return {
+        name: _without_auto(value) if isinstance(value, dict) else value
+        for name, value in values.items()
+        if value != "auto"
+    }
 
 
 def record_of(

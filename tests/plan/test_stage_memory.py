@@ -7,7 +7,7 @@ from typing import NamedTuple
 import pytest
 
 from pipeline.config.load import scene_config
-from pipeline.config.schema import Config
+from pipeline.config.settled import Config
 from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.stage_memory import memory_mb, threads_within
 from pipeline.plan.values import Plan

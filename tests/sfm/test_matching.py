@@ -222,7 +222,7 @@ def test_a_corrupt_cache_is_replaced(room, tmp_path):
 
 def run_stages(scene: Path, results: Path) -> dict[str, dict]:
     """run.json of the stages up to matches, run as Snakemake runs them."""
-    config = schema.Config(features=FEATURES)
+    config = settled.Config(features=FEATURES)
     found = scan(scene, "corner", config, cache=None)
     plan = make_plan(found, config, str(scene))
     for stage in ("inspect", "features", "matches"):

@@ -8,7 +8,8 @@ import pytest
 
 from pipeline.config.docs import COUNTERS
 from pipeline.config.options import option_paths, select
-from pipeline.config.schema import Config, Split, Train, Views
+from pipeline.config.schema import Split, Views
+from pipeline.config.settled import Config, Train
 from pipeline.plan.keys import stage_key
 from pipeline.plan.plan import upstream
 from pipeline.plan.record import PlanRecord
@@ -39,7 +40,7 @@ def changed(config: Config, path: str) -> Config:
         candidates += [old + 1, old * 1.5, old / 2, old - 1, 0.25]
     if isinstance(old, tuple):
         candidates.append(old[:1])
-    candidates += [*_literals(type(section).model_fields[option].annotation), 0.5, 1, "another"]
+    candidates += [*_literals(type(section).model_fields[option].annotation), 0.5, 1, "another", "gpu:1"]
     for value in candidates:
         if value == old:
             continue

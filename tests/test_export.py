@@ -12,7 +12,8 @@ import pytest
 import tifffile
 from PIL import Image
 
-from pipeline.config.schema import RENDERED_FORMATS, Config, ExportFormat
+from pipeline.config.schema import RENDERED_FORMATS, ExportFormat
+from pipeline.config.settled import Config
 from pipeline.export.counters import ExportCounters
 from pipeline.export.write import WRITERS
 from pipeline.geometry.cameras import Camera

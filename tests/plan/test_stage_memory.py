@@ -7,12 +7,12 @@ from typing import NamedTuple
 import pytest
 
 from pipeline.config.load import scene_config
-from pipeline.config.settled import Config
+from pipeline.config.schema import Config
 from pipeline.io.posefiles import PoseSummary
 from pipeline.plan.stage_memory import memory_mb, threads_within
 from pipeline.plan.values import Plan
 from stages.workflow.registry import STAGES
-from tests.plans import FACTS
+from tests.plans import FACTS, settled_config
 
 
 class Scene(NamedTuple):
@@ -91,10 +91,11 @@ def plan_of(scene: Scene, config: Config, blocks: int = 1) -> Plan:
         }
     )
     density = config.train.density.model_copy(update={"max_gaussians": scene.gaussians})
-    settled = config.model_copy(
+    settled = settled_config(config)
+    settled = settled.model_copy(
         update={
-            "train": config.train.model_copy(update={"density": density}),
-            "partition": config.partition.model_copy(update={"blocks": blocks}),
+            "train": settled.train.model_copy(update={"density": density}),
+            "partition": settled.partition.model_copy(update={"blocks": blocks}),
         }
     )
     return Plan(scene="x", stages={}, warnings=[], config=settled, facts=facts)

@@ -40,7 +40,13 @@ def changed(config: Config, path: str) -> Config:
         candidates += [old + 1, old * 1.5, old / 2, old - 1, 0.25]
     if isinstance(old, tuple):
         candidates.append(old[:1])
-    candidates += [*_literals(type(section).model_fields[option].annotation), 0.5, 1, "another", "gpu:1"]
+    candidates += [
+        *_literals(type(section).model_fields[option].annotation),
+        0.5,
+        1,
+        "another",
+        "gpu:1",
+    ]
     for value in candidates:
         if value == old:
             continue

@@ -100,6 +100,7 @@ lint: $(VENV)/dev
 	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
 	@$(BIN)/python -m tests.style.words
 	@$(BIN)/python -m tests.rooms --check
+	@$(BIN)/python -m tests.size --check
 
 format: $(VENV)/dev
 	@$(BIN)/ruff check --fix . ; $(BIN)/ruff format . ; $(BIN)/snakefmt Snakefile

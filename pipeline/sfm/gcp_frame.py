@@ -8,7 +8,7 @@ again: a mistake that explains the misfit is named.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -26,7 +26,13 @@ from pipeline.geometry.similarity import (
 from pipeline.io.gcp import GCP_FILE, GroundControl
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import shortened
-from pipeline.scene.georeference import CartesianOrigin, GeographicOrigin, Origin
+from pipeline.scene.georeference import (
+    CartesianOrigin,
+    FrameUncertainty,
+    GeographicOrigin,
+    Origin,
+    Residual,
+)
 from pipeline.sfm.georeference import (
     MIN_POSITIONS,
     WARN_SCALE,
@@ -102,25 +108,13 @@ def from_gcp(
         return _line_text(fit)
     contradiction = _contradiction(cameras, fit.similarity)
     mistake = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
+    if mistake is None and contradiction == "upside down":
+        mistake = _UPSIDE_DOWN
     if mistake is not None:
         raise UserError(
-            f"{mistake.found}: {mistake.evidence}",
+            f"{mistake.found}{mistake.evidence and f': {mistake.evidence}'}",
             file=path,
             fix=f"{mistake.fix}, or set sfm.georeference: gps or none",
-        )
-    if len(placed) > MIN_POSITIONS and np.ptp(places[:, 2]) == 0 and not fit.inliers.all():
-        raise UserError(
-            f"all {len(placed)} points have the height {places[0, 2]:g}, which "
-            f"{int((~fit.inliers).sum())} of them do not have in the photographs",
-            file=path,
-            fix="write the measured heights, or set sfm.georeference: gps or none",
-        )
-    if contradiction == "upside down":
-        raise UserError(
-            "the photographs would be upside down in the frame of the ground control points",
-            file=path,
-            fix="check the order and the signs of the coordinates, or set sfm.georeference: gps or "
-            "none",
         )
     if (reason := undetermined(fit)) is not None:
         return f"of the ground control points, {reason}"
@@ -130,24 +124,6 @@ def from_gcp(
     records = residual_records(names_used, fit.similarity(source) - target, fit.inliers)
     totals = summary(records, fit.observations, fit.freedoms)
     accuracy = uncertainty(fit, "positions")
-    warnings = []
-    if contradiction is not None:
-        warnings.append(
-            "in the frame of the ground control points the photographs are "
-            f"{contradiction}: check the coordinates"
-        )
-    if totals.left_out:
-        outliers = [shortened(record.name, 40) for record in records if not record.used]
-        warnings.append(
-            f"{totals.left_out} ground control points are outliers and are left out: "
-            f"{', '.join(outliers[:5])}"
-        )
-    if accuracy.scale > WARN_SCALE:
-        warnings.append(
-            f"the ground control points determine the scale to {accuracy.scale:.0%} only (standard "
-            "deviation): lengths in metres are as inaccurate"
-        )
-    warnings += control.warnings
     name = shortened(control.projection.text)
     return WorldFrame(
         "gcp",
@@ -160,8 +136,30 @@ def from_gcp(
             f"georeferenced by {totals.used} ground control points ({name}): "
             f"{fit_text(totals, accuracy, 3)}"
         ],
-        warnings=warnings,
+        warnings=[*_warnings(records, accuracy, contradiction), *control.warnings],
     )
+
+
+def _warnings(
+    records: Sequence[Residual], accuracy: FrameUncertainty, contradiction: str | None
+) -> list[str]:
+    warnings = []
+    if contradiction is not None:
+        warnings.append(
+            "in the frame of the ground control points the photographs are "
+            f"{contradiction}: check the coordinates"
+        )
+    if outliers := [shortened(record.name, 40) for record in records if not record.used]:
+        warnings.append(
+            f"{len(outliers)} ground control points are outliers and are left out: "
+            f"{', '.join(outliers[:5])}"
+        )
+    if accuracy.scale > WARN_SCALE:
+        warnings.append(
+            f"the ground control points determine the scale to {accuracy.scale:.0%} only (standard "
+            "deviation): lengths in metres are as inaccurate"
+        )
+    return warnings
 
 
 def _line_text(fit: RobustFit) -> str:
@@ -214,6 +212,13 @@ class _Mistake(NamedTuple):
     fix: str
 
 
+_UPSIDE_DOWN = _Mistake(
+    "the photographs would be upside down in the frame of the ground control points",
+    "",
+    "check the order and the signs of the coordinates",
+)
+
+
 def _mistake(
     control: GroundControl,
     places: Array,
@@ -262,7 +267,16 @@ def _mistake(
         rank = (other_contradiction is not None, round(float(np.log2(after + 1e-9)), 0), number)
         if best is None or rank < best[0]:
             best = rank, _Mistake(what, evidence, fix)
-    return best[1] if best else None
+    if best is not None:
+        return best[1]
+    left_out = int((~fit.inliers).sum())
+    if left_out and len(places) > MIN_POSITIONS and np.ptp(places[:, 2]) == 0:
+        return _Mistake(
+            f"all {len(places)} points have the height {places[0, 2]:g}",
+            f"{left_out} of them do not have it in the photographs",
+            "write the measured heights",
+        )
+    return None
 
 
 def _misfits(first: Array, second: Array, sigma: float) -> tuple[float, float]:

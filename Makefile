@@ -98,7 +98,7 @@ lint: $(VENV)/dev
 	@$(BIN)/mypy
 	@$(BIN)/snakefmt --check Snakefile
 	@$(BIN)/clang-format --dry-run --Werror $$(git ls-files 'pipeline/*/csrc/*')
-	@$(BIN)/python -m tests.style.words
+	@$(BIN)/codespell
 	@$(BIN)/python -m tests.rooms --check
 	@$(BIN)/python -m tests.size --check
 

@@ -114,14 +114,13 @@ class Step:
         def blend_backward() -> None:
             kept["slots"] = kernels.blend_backward(
                 s.records, s.entries, s.tile_begin, s.block_end, view, *size, s.background,
-                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, False, 0,
-                threads,
+                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, threads,
             )  # fmt: skip
 
         def project_backward() -> None:
             kept["gradients"] = kernels.project_backward(
                 *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
-                kept["slots"], False, False, False, False, *moments[4], last, sh_adam, threads,
+                kept["slots"], False, False, False, *moments[4], last, sh_adam, threads,
             )  # fmt: skip
 
         def adam() -> None:

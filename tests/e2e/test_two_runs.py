@@ -98,6 +98,8 @@ def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None
         stdout=subprocess.DEVNULL,
         stderr=subprocess.DEVNULL,
         start_new_session=True,
+        # Tests that run under nohup would hand on that SIGHUP is ignored.
+        preexec_fn=lambda: signal.signal(signal.SIGHUP, signal.SIG_DFL),
     ) as run:
         # Not in the imports before the first step, which may drop an exception.
         wait_until(lambda: progress.is_file() and progress.stat().st_size > 0)

@@ -63,7 +63,7 @@ def test_a_limit_that_is_exceeded_names_the_options(
 ) -> None:
     """The smallest limit of WebGPU is 128 MB for one buffer."""
     monkeypatch.setattr(gpu, "max_bytes", 128 << 20)
-    with pytest.raises(UserError, match=r"slots of gradients: 384 MB; .* holds 134 MB") as error:
+    with pytest.raises(UserError, match=r"slots of gradients: 320 MB; .* holds 134 MB") as error:
         memory_line(gpu, LARGE, cached=0)
     assert "train.density.max_gaussians" in str(error.value.fix)
     with pytest.raises(UserError, match=r"an array: 135 MB"):

@@ -107,7 +107,7 @@ def from_gcp(
     if fit.uncertainty.tilt * usual > MAX_TILT_RAD:
         return _line_text(fit)
     contradiction = _contradiction(cameras, fit.similarity)
-    mistake = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
+    mistake, also = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
     if mistake is None and contradiction == "upside down":
         mistake = _UPSIDE_DOWN
     if mistake is not None:
@@ -136,12 +136,12 @@ def from_gcp(
             f"georeferenced by {totals.used} ground control points ({name}): "
             f"{fit_text(totals, accuracy, 3)}"
         ],
-        warnings=[*_warnings(records, accuracy, contradiction), *control.warnings],
+        warnings=[*_warnings(records, accuracy, contradiction, also), *control.warnings],
     )
 
 
 def _warnings(
-    records: Sequence[Residual], accuracy: FrameUncertainty, contradiction: str | None
+    records: Sequence[Residual], accuracy: FrameUncertainty, contradiction: str | None, also: str
 ) -> list[str]:
     warnings = []
     if contradiction is not None:
@@ -153,6 +153,11 @@ def _warnings(
         warnings.append(
             f"{len(outliers)} ground control points are outliers and are left out: "
             f"{', '.join(outliers[:5])}"
+        )
+    if also and contradiction is None:
+        warnings.append(
+            f"the ground control points would fit as well if {also}: "
+            "check the coordinates, or measure further points"
         )
     if accuracy.scale > WARN_SCALE:
         warnings.append(
@@ -226,8 +231,10 @@ def _mistake(
     pixel: float,
     cameras: Cameras | None,
     given: tuple[RobustFit, str | None],
-) -> _Mistake | None:
+) -> tuple[_Mistake | None, str]:
     """The mistake that explains a bad fit or photographs that are upside down; None if none does.
+    And the first mistake, empty without one, after which the points would fit as well and the
+    photographs would be upright: a triangle is congruent to its mirror image.
 
     Args:
         given: the fit of the coordinates as they are, and its contradiction.
@@ -236,6 +243,7 @@ def _mistake(
     target = _local(control, places)[0]
     first = np.linalg.norm(fit.similarity(source) - target, axis=1)
     best: tuple[tuple[bool, float, int], _Mistake] | None = None
+    also = ""
     for number, (undone, what, fix) in enumerate(_undone(control, places)):
         other_target = _local(control, undone)[0]
         noise = _noise(source, other_target, pixel, fit)
@@ -251,11 +259,11 @@ def _mistake(
             and before > EXPLAINS * after
             and before > EXPLAINS * noise.sigma / 2
         )
-        turns = (
-            contradiction == "upside down"
-            and other_contradiction is None
-            and after <= max(2 * before, 3 * noise.sigma)
-        )
+        fits = other_contradiction is None and after <= max(2 * before, 3 * noise.sigma)
+        turns = contradiction == "upside down" and fits
+        # The unit or the sign of z does not show on flat ground.
+        if fits and not also and (undone[:, :2] != places[:, :2]).any():
+            also = what.replace("seem to be", "were").replace("seem to have", "had")
         if not (turns or (explains and other_contradiction != "upside down")):
             continue
         evidence = (
@@ -268,15 +276,15 @@ def _mistake(
         if best is None or rank < best[0]:
             best = rank, _Mistake(what, evidence, fix)
     if best is not None:
-        return best[1]
+        return best[1], also
     left_out = int((~fit.inliers).sum())
     if left_out and len(places) > MIN_POSITIONS and np.ptp(places[:, 2]) == 0:
         return _Mistake(
             f"all {len(places)} points have the height {places[0, 2]:g}",
             f"{left_out} of them do not have it in the photographs",
             "write the measured heights",
-        )
-    return None
+        ), also
+    return None, also
 
 
 def _misfits(first: Array, second: Array, sigma: float) -> tuple[float, float]:

@@ -31,10 +31,10 @@ from pipeline.mvs.patchmatch import LIBRARY
 from pipeline.runtime.memory import peak_memory_mb
 from pipeline.scene.views import View, camera_views
 
-# Arguments of ``python -m pipeline.demo``, before and after the folder.
+# The module that writes a scene, and its options.
 SCENES = {
-    "demo": ((), ("--size", "640x480")),
-    "town": (("town",), ("--photographs", "40")),
+    "demo": ("pipeline.demo", ("--size", "640x480")),
+    "town": ("benchmarks.town", ("--photographs", "40")),
 }
 EXACT_PINHOLES = ("--poses", "colmap", "--distortion", "none")
 # A pixel is textured if the standard deviation of the grey levels around it is larger.
@@ -46,8 +46,8 @@ LIMITS = (0.005, 0.01, 0.02)
 def write_scene(folder: Path, scene: str) -> None:
     """Write a scene into ``folder``, unless it is there."""
     if not (folder / "sparse").is_dir():
-        kind, options = SCENES[scene]
-        command = [sys.executable, "-m", "pipeline.demo", *kind, str(folder)]
+        module, options = SCENES[scene]
+        command = [sys.executable, "-m", module, str(folder)]
         subprocess.run([*command, *options, *EXACT_PINHOLES], check=True)
 
 

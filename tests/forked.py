@@ -16,7 +16,7 @@ from typing import Any
 PRELOADED = (
     "cv2",
     "laspy",
-    "pipeline.demo.town.write",
+    "benchmarks.town.write",
     "pipeline.demo.write",
     "pipeline.sfm.matching",
     "pipeline.sfm.mapping",

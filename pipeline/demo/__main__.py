@@ -1,4 +1,4 @@
-"""``python -m pipeline.demo FOLDER``: write the demo scene. ``... town FOLDER``: the town."""
+"""``python -m pipeline.demo FOLDER``: write the demo scene."""
 
 from __future__ import annotations
 
@@ -9,32 +9,15 @@ from typing import get_args
 
 from pipeline.demo.cameras import LENSES
 from pipeline.demo.options import picture_size
-from pipeline.demo.town.command import run as run_town
 from pipeline.demo.write import DemoSpec, Format, Poses, write_demo
 from pipeline.runtime.errors import UserError
 
 
 def main(arguments: list[str] | None = None) -> int:
-    arguments = sys.argv[1:] if arguments is None else arguments
-    try:
-        if arguments[:1] == ["town"]:
-            run_town(arguments[1:])
-        else:
-            run_room(arguments)
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        return 2
-    return 0
-
-
-def run_room(arguments: list[str]) -> None:
-    """Raises UserError where options do not go together."""
     default = DemoSpec()
     parser = argparse.ArgumentParser(
         prog="python -m pipeline.demo",
         description="Write the demo scene: photographs of a ray-traced room with exact truth.",
-        epilog="A town of any size: python -m pipeline.demo town FOLDER --photographs N; "
-        "its options: python -m pipeline.demo town --help.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
     )
     add = parser.add_argument
@@ -54,7 +37,12 @@ def run_room(arguments: list[str]) -> None:
     folder, processes = options.pop("folder"), options.pop("processes")
     options["width"], options["height"] = options.pop("size")
     options["points"] = not options.pop("no_points")
-    write_demo(folder, DemoSpec(**options), processes)
+    try:
+        write_demo(folder, DemoSpec(**options), processes)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
 
 
 if __name__ == "__main__":

@@ -16,7 +16,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.solids import Ellipsoid, Prism, Solid
+from benchmarks.town.solids import Ellipsoid, Prism, Solid
 from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]

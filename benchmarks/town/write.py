@@ -11,6 +11,9 @@ from typing import Literal, get_args
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.town.layout import build
+from benchmarks.town.paths import camera_path, cells_of
+from benchmarks.town.view import Capture, capture, photograph
 from pipeline.demo.cameras import LENSES, WIDE, lens
 from pipeline.demo.output import (
     MAX_CHUNK,
@@ -24,9 +27,6 @@ from pipeline.demo.output import (
 )
 from pipeline.demo.render import rays
 from pipeline.demo.sensor import srgb, to_bytes, write_picture
-from pipeline.demo.town.layout import build
-from pipeline.demo.town.paths import camera_path, cells_of
-from pipeline.demo.town.view import Capture, capture, photograph
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
 from pipeline.runtime.atomic import write_json

@@ -8,8 +8,8 @@ from typing import get_args
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Colour, Cover, Finish, Wall
-from pipeline.demo.town.solids import UP, Frame, Prism, Solid, box, prism
+from benchmarks.town.finishes import Colour, Cover, Finish, Wall
+from benchmarks.town.solids import UP, Frame, Prism, Solid, box, prism
 
 Array = NDArray[np.float64]
 

@@ -11,8 +11,8 @@ from itertools import islice
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.town.layout import LENGTH, WIDTH, Cell, spiral
 from pipeline.demo.cameras import look_at
-from pipeline.demo.town.layout import LENGTH, WIDTH, Cell, spiral
 from pipeline.scene.reconstruction import PosedImage
 
 Array = NDArray[np.float64]

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Colour, Finish, Plain, Wall
-from pipeline.demo.town.houses import axes, fresh, pick
-from pipeline.demo.town.solids import UP, Ellipsoid, Frame, Solid, box, prism
+from benchmarks.town.finishes import Colour, Finish, Plain, Wall
+from benchmarks.town.houses import axes, fresh, pick
+from benchmarks.town.solids import UP, Ellipsoid, Frame, Solid, box, prism
 
 Array = NDArray[np.float64]
 

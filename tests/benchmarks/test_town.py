@@ -12,17 +12,17 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from pipeline.demo.__main__ import main
+from benchmarks.town.__main__ import main
+from benchmarks.town.finishes import Finish
+from benchmarks.town.layout import LENGTH, WIDTH, build
+from benchmarks.town.paths import PHOTOGRAPHS_PER_CELL, camera_path, cells_of
+from benchmarks.town.pyramids import pyramid
+from benchmarks.town.solids import Ellipsoid, Prism, Solid, box
+from benchmarks.town.visibility import GROUND, SKY, Grid, Shapes, visible
+from benchmarks.town.write import TownSpec, write_town
 from pipeline.demo.cameras import lens, look_at
 from pipeline.demo.render import rays
 from pipeline.demo.shapes import Box, Sphere
-from pipeline.demo.town.finishes import Finish
-from pipeline.demo.town.layout import LENGTH, WIDTH, build
-from pipeline.demo.town.paths import PHOTOGRAPHS_PER_CELL, camera_path, cells_of
-from pipeline.demo.town.pyramids import pyramid
-from pipeline.demo.town.solids import Ellipsoid, Prism, Solid, box
-from pipeline.demo.town.visibility import GROUND, SKY, Grid, Shapes, visible
-from pipeline.demo.town.write import TownSpec, write_town
 from pipeline.io.colmap import read_model
 from pipeline.plan.sequence import why_ordered
 from pipeline.runtime.errors import UserError
@@ -271,19 +271,19 @@ def test_a_pyramids_level_is_the_mean_of_its_texels() -> None:
 def test_wrong_options_and_foreign_folders(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    assert main(["town", str(tmp_path / "a"), "--photographs", "0"]) == 2
+    assert main([str(tmp_path / "a"), "--photographs", "0"]) == 2
     assert "0 photographs" in capsys.readouterr().err
-    assert main(["town", str(tmp_path / "a"), "--size", "9000x20"]) == 2
+    assert main([str(tmp_path / "a"), "--size", "9000x20"]) == 2
     assert "9000x20" in capsys.readouterr().err and not (tmp_path / "a").exists()
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "holiday.jpg").write_bytes(b"")
     with pytest.raises(UserError, match="no synthetic town"):
         write_town(tmp_path / "mine", SPEC)
-    small = ["town", str(tmp_path / "b"), "--photographs", "1", "--size", "32x24"]
+    small = [str(tmp_path / "b"), "--photographs", "1", "--size", "32x24"]
     small += ["--processes", "1"]
     assert main(small) == 0 and main(small) == 0  # a town may be written over
     assert json.loads((tmp_path / "b" / "town.json").read_text())["photographs"] == 1
     assert len(list((tmp_path / "b" / "depth_gt").iterdir())) == 1
     with pytest.raises(SystemExit):
-        main(["town", "--help"])
+        main(["--help"])
     assert "--photographs" in capsys.readouterr().out

@@ -6,8 +6,8 @@ from itertools import pairwise
 
 import numpy as np
 
-from pipeline.demo.town.canvas import Canvas
-from pipeline.demo.town.finishes import Colour, Finish
+from benchmarks.town.canvas import Canvas
+from benchmarks.town.finishes import Colour, Finish
 
 STOREY = 2.8
 SILL = 0.9

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Finish
+from benchmarks.town.finishes import Finish
 
 Array = NDArray[np.float64]
 Triple = tuple[float, float, float]

@@ -8,14 +8,14 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
+from benchmarks.town.covers import painted
+from benchmarks.town.ground import SKYLIGHT, SUN, SUNLIGHT, Ground, ground_of
+from benchmarks.town.layout import Town
+from benchmarks.town.noise import TILE_SIGMA
+from benchmarks.town.pyramids import Pyramid, pyramid
+from benchmarks.town.solids import Ellipsoid, Face
+from benchmarks.town.visibility import GROUND, Grid, Hits, Shapes, visible
 from pipeline.demo.render import TEXTURE_SIGMA, Rays, developed
-from pipeline.demo.town.covers import painted
-from pipeline.demo.town.ground import SKYLIGHT, SUN, SUNLIGHT, Ground, ground_of
-from pipeline.demo.town.layout import Town
-from pipeline.demo.town.noise import TILE_SIGMA
-from pipeline.demo.town.pyramids import Pyramid, pyramid
-from pipeline.demo.town.solids import Ellipsoid, Face
-from pipeline.demo.town.visibility import GROUND, Grid, Hits, Shapes, visible
 from pipeline.geometry.cameras import Camera
 from pipeline.scene.reconstruction import PosedImage
 

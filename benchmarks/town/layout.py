@@ -11,10 +11,10 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Finish
-from pipeline.demo.town.furniture import PAINTS, border, car, lamp, monument, plain, shrub, tree
-from pipeline.demo.town.houses import Plot, fresh, house, pick
-from pipeline.demo.town.solids import Solid, box
+from benchmarks.town.finishes import Finish
+from benchmarks.town.furniture import PAINTS, border, car, lamp, monument, plain, shrub, tree
+from benchmarks.town.houses import Plot, fresh, house, pick
+from benchmarks.town.solids import Solid, box
 
 Array = NDArray[np.float64]
 Cell = tuple[int, int]

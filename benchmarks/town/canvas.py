@@ -6,8 +6,8 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.finishes import Colour
-from pipeline.demo.town.noise import fractal
+from benchmarks.town.finishes import Colour
+from benchmarks.town.noise import fractal
 
 Floats = NDArray[np.float32]
 

@@ -1,21 +1,22 @@
-"""``python -m pipeline.demo town FOLDER``: write the synthetic town."""
+"""``python -m benchmarks.town FOLDER``: write the synthetic town."""
 
 from __future__ import annotations
 
 import argparse
+import sys
 from pathlib import Path
 from typing import get_args
 
+from benchmarks.town.write import LENS_CHOICES, Order, TownSpec, write_town
 from pipeline.demo.options import picture_size
 from pipeline.demo.output import Poses
-from pipeline.demo.town.write import LENS_CHOICES, Order, TownSpec, write_town
+from pipeline.runtime.errors import UserError
 
 
-def run(arguments: list[str]) -> None:
-    """Raises UserError where the options are wrong."""
+def main(arguments: list[str] | None = None) -> int:
     default = TownSpec()
     parser = argparse.ArgumentParser(
-        prog="python -m pipeline.demo town",
+        prog="python -m benchmarks.town",
         description="Write a synthetic town: photographs of its streets and of flights over them, "
         "with exact cameras and depths. Its area grows with the number of photographs.",
         formatter_class=argparse.ArgumentDefaultsHelpFormatter,
@@ -37,4 +38,13 @@ def run(arguments: list[str]) -> None:
     options = vars(parser.parse_args(arguments))
     folder, processes = options.pop("folder"), options.pop("processes")
     options["width"], options["height"] = options.pop("size")
-    write_town(folder, TownSpec(**options), processes)
+    try:
+        write_town(folder, TownSpec(**options), processes)
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -12,10 +12,10 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.demo.town.layout import LENGTH, ROAD, STREET, WIDTH, Town
-from pipeline.demo.town.noise import TILE_SIGMA, periodic_tile
-from pipeline.demo.town.pyramids import Pyramid, pyramid
-from pipeline.demo.town.solids import Ellipsoid, Solid
+from benchmarks.town.layout import LENGTH, ROAD, STREET, WIDTH, Town
+from benchmarks.town.noise import TILE_SIGMA, periodic_tile
+from benchmarks.town.pyramids import Pyramid, pyramid
+from benchmarks.town.solids import Ellipsoid, Solid
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]

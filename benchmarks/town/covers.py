@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from pipeline.demo.town.canvas import Canvas
-from pipeline.demo.town.finishes import Colour, Finish
-from pipeline.demo.town.walls import paint_wall
+from benchmarks.town.canvas import Canvas
+from benchmarks.town.finishes import Colour, Finish
+from benchmarks.town.walls import paint_wall
 
 TEXEL = 0.02
 ROOF_TEXEL = 0.025

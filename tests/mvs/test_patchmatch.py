@@ -21,11 +21,11 @@ from pipeline.mvs.estimate import (
     normals_of,
 )
 from pipeline.mvs.patchmatch import CostOptions, Picture, matching_cost
-from pipeline.mvs.reference import pixel_cost
 from pipeline.runtime import targets
 from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
 from tests.mvs import planar
+from tests.mvs.reference import pixel_cost
 from tests.tools import unsupported
 
 RANGE = (2.0, 12.0)

@@ -64,7 +64,8 @@ class Uncertainty(NamedTuple):
     Attributes:
         scale: relative to the scale.
         heading: radians, about the vertical axis.
-        tilt: radians, about the horizontal axis that is determined worst.
+        tilt: radians, about the horizontal axis that is determined worst, by the points of which
+            all coordinates were measured.
     """
 
     scale: float
@@ -140,6 +141,12 @@ def robust_similarity(
     observations = int((weight[inliers] > 0).sum())
     sigma = noise.estimate(float((weighted**2).sum()), observations - 7)
     uncertainty = _uncertainty(source[inliers], weight[inliers], similarity, sigma)
+    # A point without a height changes with the tilt by its cosine only. Where the fit is tilted by
+    # mistake, that looks like a measurement of the tilt. A line of heights is none at any tilt.
+    tilt = math.inf
+    if (whole := inliers & (weight > 0).all(axis=1)).any():
+        tilt = _uncertainty(source[whole], weight[whole], similarity, sigma).tilt
+    uncertainty = uncertainty._replace(tilt=max(uncertainty.tilt, tilt))
     return RobustFit(similarity, inliers, sigma, observations, observations - 7, uncertainty)
 
 

@@ -246,3 +246,23 @@ def test_ground_control_on_a_line_or_unobserved_is_rejected(tmp_path):
     reason = from_gcp(control, seen_at(line))
     assert isinstance(reason, str) and "line" in reason
     assert "only 0 of 6" in str(from_gcp(control, lambda seen: None))
+
+
+def test_altitudes_on_one_strip_do_not_determine_the_tilt():
+    """The horizontal positions of the other strip change with the tilt by its cosine only: they
+    are no measurement of it, and a fit that is tilted by mistake must not look certain."""
+    for seed in range(40):
+        rng = np.random.default_rng(seed)
+        across = np.where(np.arange(24) % 2, -35.0, 35.0)
+        true = np.column_stack([np.linspace(-50, 50, 24), across, 55 + 5 * rng.random(24)])
+        measured = true + rng.normal(0, (1.5, 1.5, 4.0), true.shape)
+        cameras, back = scene(true, seed)
+        known = positions(cameras, measured)
+        for name in cameras.names[1::2]:
+            known[name] = (*known[name][:2], None)
+        frame = from_gps(cameras, known)
+        assert isinstance(frame, WorldFrame) and frame.fit is not None
+        turn = frame.similarity.rotation @ back.rotation.T
+        angle = np.arccos(np.clip((np.trace(turn) - 1) / 2, -1, 1))
+        sigma = np.hypot(frame.fit.uncertainty.tilt, frame.fit.uncertainty.heading)
+        assert angle < 3 * sigma, (seed, np.degrees(angle), np.degrees(sigma))

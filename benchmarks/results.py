@@ -12,7 +12,7 @@ from benchmarks.judge.truth import Grade, Truth
 
 # ---- benchmarks.georeference ----
 
-GEOREFERENCE_VERDICTS = ("right", "refused", "stated", "silently wrong")
+GEOREFERENCE_VERDICTS = ("right", "refused", "stated", "warned", "silently wrong")
 
 
 @dataclass(frozen=True)

@@ -2,8 +2,8 @@
 that are few, narrow, incomplete or wrong, in synthetic surveys whose true frame is known.
 
 A case is right if the frame is close to the truth, refused if there is an error or a level frame
-with its reason, and stated if the frame is farther off but the message says so: by a warning, or by
-standard deviations that explain the error. Everything else is silently wrong.
+with its reason, stated if the frame is farther off but the standard deviations in the message
+explain the error, and warned if a warning does. Everything else is silently wrong.
 """
 
 from __future__ import annotations

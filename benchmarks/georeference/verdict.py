@@ -1,4 +1,4 @@
-"""Whether a found frame is right, refused, stated or silently wrong."""
+"""Whether a found frame is right, refused, stated, warned of or silently wrong."""
 
 from __future__ import annotations
 
@@ -49,8 +49,10 @@ def verdict(name: str, found: Found, seed: int) -> GeoreferenceResult:
     elif all(
         error <= limit + SIGMAS * sigma
         for error, limit, sigma in zip(errors, close, stated, strict=True)
-    ) or any(word in said for word in DOUBTS):
+    ):
         outcome = "stated"
+    elif any(word in said for word in DOUBTS):
+        outcome = "warned"
     else:
         outcome = "silently wrong"
     return GeoreferenceResult(name, seed, outcome, said, errors)

@@ -90,8 +90,10 @@ def decode_depth(data: bytes) -> Picture | None:
     """Decode a depth map (PNG or TIFF) as stored; None if that is not possible.
 
     Raises:
-        ValueError: it has more pixels than photographs have.
+        ValueError: it is truncated, or has more pixels than photographs have.
     """
+    if _is_truncated(data):
+        raise ValueError(TRUNCATED)
     if tiff.is_tiff(data):
         layout = tiff.layout_of(data)
         check_size(layout.width, layout.height)

@@ -261,8 +261,9 @@ def _mistake(
         )
         fits = other_contradiction is None and after <= max(2 * before, 3 * noise.sigma)
         turns = contradiction == "upside down" and fits
-        # The unit or the sign of z does not show on flat ground.
-        if fits and not also and (undone[:, :2] != places[:, :2]).any():
+        # The unit or the sign of z does not show on flat ground. A fit to fewer points is no rival.
+        rival = fits and int(other.inliers.sum()) >= int(fit.inliers.sum())
+        if rival and not also and (undone[:, :2] != places[:, :2]).any():
             also = what.replace("seem to be", "were").replace("seem to have", "had")
         if not (turns or (explains and other_contradiction != "upside down")):
             continue

@@ -92,7 +92,7 @@ EXAMPLES: dict[str, tuple[Any, Any, str]] = {
     "georeference": (
         Record[GeoreferenceResult],
         GeoreferenceResult("GPS on a line", 0, "right", "georeferenced", (0.01, 0.1, 1.0, 2.0)),
-        "| GPS | 1 | 1 | 1 | 0 | 0 | 0 |",
+        "| GPS | 1 | 1 | 1 | 0 | 0 | 0 | 0 |",
     ),
     "pose_conventions": (
         Record[PoseResult],

@@ -15,7 +15,7 @@ from pipeline.io.arrays import read_archive, read_array
 from pipeline.io.ply import read_splat_ply
 from pipeline.photos.load import read_mask, read_picture
 from pipeline.runtime.errors import UserError
-from tests.fuzz.campaign import content
+from tests.fuzz.campaign import content, judged
 from tests.fuzz.clouds import las_seeds, read_las_points
 from tests.fuzz.packing import pack_png
 from tests.fuzz.pictures import encoded, noise, tiff
@@ -153,3 +153,12 @@ def test_a_png_with_fewer_rows_than_its_header_says(read, height, tmp_path) -> N
     file.write_bytes(pack_png(bytes(data)))
     with pytest.raises(UserError, match=r"not a readable image|a side of more than"):
         read(file)
+
+
+def test_a_depth_map_with_a_chunk_that_claims_a_gigabyte(tmp_path) -> None:
+    """OpenCV allocates what a PNG file says of the length of a chunk."""
+    data = bytearray(encoded(noise(1), ".png"))
+    chunk = data.index(b"IDAT")
+    data[chunk - 4 : chunk] = struct.pack(">I", 1 << 30)
+    case = {"chunk": {"d.png": bytes(data)}}
+    assert judged(READERS["depth"], case, tmp_path / "files") == {"chunk": ""}

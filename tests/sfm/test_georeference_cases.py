@@ -57,7 +57,7 @@ def test_no_case_is_silently_wrong(name: str) -> None:
         assert result.verdict != "silently wrong", result
         assert NAMED.get(name, "") in result.said, result
         if name in RIGHT:
-            assert result.verdict in ("right", "stated") and found.frame is not None, result
+            assert result.verdict in ("right", "stated", "warned") and found.frame is not None, result
 
 
 def test_a_record_has_forty_cases_or_more() -> None:
@@ -90,7 +90,7 @@ def test_a_used_position_is_never_far_off(
         return
     for residual in frame.residuals:
         if residual.used:
-            assert residual.horizontal_m < 200 and abs(residual.vertical_m or 0.0) < 600
+            assert residual.horizontal_m < 50 and abs(residual.vertical_m or 0.0) < 150
 
 
 @settings(max_examples=25, deadline=None)
@@ -103,15 +103,15 @@ def test_a_used_position_is_never_far_off(
 def test_any_projection_and_either_order(
     seed: int, count: int, code: str | None, swap: bool
 ) -> None:
-    """The other order is refused. Three points can have a frame in which only the orientation of
-    the photographs is odd, which is stated."""
+    """The other order is refused, or warned of: a triangle is congruent to its mirror image, so that
+    only the orientation of the photographs contradicts three points in the other order."""
     header = code or "EPSG:4326"
     order = [1, 0, 2] if swap else [0, 1, 2]
     case = by_control(count, header=header, code=code, change=lambda rows: rows[:, order])
     result = verdict(header, case(np.random.default_rng(seed)), seed)
     assert result.verdict != "silently wrong", result
     if swap:
-        assert result.verdict == "refused" or (count == 3 and result.verdict == "stated"), result
+        assert result.verdict in ("refused", "warned"), result
 
 
 @pytest.mark.parametrize("code", FEET)

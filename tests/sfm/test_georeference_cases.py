@@ -103,7 +103,7 @@ def test_a_used_position_is_never_far_off(
 def test_any_projection_and_either_order(
     seed: int, count: int, code: str | None, swap: bool
 ) -> None:
-    """The other order is refused, or warned of: a triangle is congruent to its mirror image, so only
+    """The other order is refused or warned of: a triangle is congruent to its mirror image, so only
     the orientation of the photographs contradicts three points in the other order."""
     header = code or "EPSG:4326"
     order = [1, 0, 2] if swap else [0, 1, 2]

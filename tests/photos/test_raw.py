@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import struct
 from pathlib import Path
 
 import cv2
@@ -98,6 +99,22 @@ def test_manifest_of_developed_files(tmp_path: Path, light: np.ndarray) -> None:
     (tmp_path / "out").rename(tmp_path / "moved")
     moved = Manifest.read(tmp_path / "moved" / "images.json")
     assert load_rgb(moved.photos[0].path).shape == (32, 48, 3)
+
+
+def test_no_orientation_in_a_raw_file_turns_its_pixels(tmp_path: Path, light: np.ndarray) -> None:
+    """LibRaw turns them by default; the poses are those of the pixels as stored."""
+    pixels = []
+    for orientation in range(1, 9):
+        file = tmp_path / f"{orientation}.dng"
+        write_dng(file, expose(light[:64, :96], 0.0, (0, 0)), TAKEN)
+        data = bytearray(file.read_bytes())
+        at = data.index(struct.pack("<HHIH", 274, 3, 1, 1))
+        data[at + 8] = orientation
+        file.write_bytes(data)
+        report = develop(manifest([file], 96, 64), Decode(), tmp_path / f"{orientation}", threads=1)
+        pixels.append(load_rgb(report.manifest.photos[0].path))
+    assert pixels[0].shape == (64, 96, 3)
+    assert all(np.array_equal(pixels[0], turned) for turned in pixels)
 
 
 def test_damaged_raw_files_are_left_out_and_all_damaged_is_an_error(

@@ -14,6 +14,7 @@ import argparse
 import json
 import sys
 from collections.abc import Sequence
+from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -68,6 +69,7 @@ def scene_record(
         "photographs": first["photographs"],
         "command": command,
         "note": note,
+        "date": date.today().isoformat(),
         "training": training,
         **first["where"],
         "protocol": first["protocol"],

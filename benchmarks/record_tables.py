@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-import statistics
 import textwrap
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
@@ -15,27 +14,21 @@ from benchmarks import markdown
 from benchmarks.budgets import tables as budget_tables
 from benchmarks.judge.truth import Grade
 from benchmarks.markdown import cell
-from benchmarks.measured import Record, Result
+from benchmarks.measured import Record
 from benchmarks.results import (
     GEOREFERENCE_VERDICTS,
     BlocksResult,
     BudgetResult,
-    CoverageResult,
-    DenseResult,
     GeoreferenceResult,
     GrowthResult,
     JudgeResult,
     MemoryResult,
-    MeshResult,
-    PageResult,
     PoseOutcome,
     PoseResult,
     ScalingResult,
     SlurmResult,
     StabilityResult,
     StressResult,
-    VideoFrames,
-    WideResult,
 )
 from benchmarks.sfm import summary
 from pipeline.runtime.errors import UserError
@@ -50,96 +43,9 @@ Stored = Mapping[str, Any]
 """A record as read from JSON."""
 
 
-def results(records: Sequence[Stored], kind: type[Record[Result]]) -> list[Result]:
-    """The results of all records.
-
-    Raises:
-        UserError: a record has other fields.
-    """
-    found: list[Result] = []
-    for record in records:
-        try:
-            found += kind.model_validate(record).results
-        except ValidationError as error:
-            first = error.errors()[0]
-            field = ".".join(map(str, first["loc"]))
-            raise UserError(
-                f"the record of `{record.get('command')}` is not this version's: "
-                f"{field}: {first['msg']}",
-                fix="run its command again",
-            ) from error
-    return found
-
-
-def mesh(records: Sequence[Stored]) -> str:
-    rows = [
-        [
-            *("region", "size (m)", "voxel (mm)", "triangles", "median distance (mm)"),
-            *("90th percentile (mm)", "completeness"),
-        ]
-    ]
-    for result in results(records, Record[MeshResult]):
-        for name, region in (("foreground", result.foreground), ("room", result.room)):
-            rows.append(
-                [
-                    name,
-                    f"{region.size:.1f}",
-                    f"{1e3 * result.voxel_m:.1f}",
-                    f"{result.triangles / 1e3:.0f}k",
-                    f"{1e3 * region.size * region.median:.1f}",
-                    f"{1e3 * region.size * region.p90:.1f}",
-                    f"{region.completeness:.1%}",
-                ]
-            )
-    return markdown.table(rows)
-
-
-def dense(records: Sequence[Stored]) -> str:
-    return dense_table(results(records, Record[DenseResult]))
-
-
-def dense_table(found: Sequence[DenseResult]) -> str:
-    rows = [["scene", "photographs", "median error", "below 0.5, 1, 2 %", "with a depth"]]
-    rows[0] += ["of these below 0.5, 1, 2 %", "points", "CPU s a photograph"]
-    rows[0] += ["instruction set", "peak (MB)"]
-    for r in found:
-        shares = [", ".join(f"{share:.1%}" for share in s) for s in (r.within, r.within_known)]
-        cells = [r.scene, f"{r.photographs}, {r.pixels}", f"{r.median_error:.3%}", shares[0]]
-        cells += [f"{r.completeness:.1%}", shares[1], f"{r.points / 1e6:.2f}M"]
-        cells += [f"{r.cpu_s_per_photograph:.2f}", r.instruction_set, f"{r.peak_mb:.0f}"]
-        rows.append(cells)
-    return markdown.table(rows)
-
-
-def coverage(records: Sequence[Stored]) -> str:
-    """Gains are of the removed views; of random viewpoints, the median over the draws."""
-    rows = [
-        [
-            *("removed views", "trust: test, removed", "PSNR: test, removed (dB)"),
-            *("rank correlation", "distance: proposed, random (m)"),
-            *("nearer than random draws", "gain: proposed, random (dB)"),
-        ]
-    ]
-    for r in results(records, Record[CoverageResult]):
-        gains = [gain["removed"] for gain in r.added_random]
-        rows.append(
-            [
-                r.case,
-                f"{r.trust['test']:.2f}, {r.trust['removed']:.2f}",
-                f"{r.psnr['test']:.2f}, {r.psnr['removed']:.2f}",
-                f"{r.rank_correlation:.2f}",
-                f"{r.first[0]:.2f}, {r.random_first[0]:.2f}",
-                f"{r.better_than_random:.0%}",
-                f"{r.added_first['removed']:+.2f}, "
-                + cell(statistics.median(gains) if gains else None, "+.2f"),
-            ]
-        )
-    return markdown.table(rows)
-
-
-def memory(records: Sequence[Stored]) -> str:
+def memory(found: Sequence[MemoryResult]) -> str:
     rows = [["Gaussians", "views, pixels", "planned (MB)", "peak (MB)", "planned / peak"]]
-    for r in results(records, Record[MemoryResult]):
+    for r in found:
         rows.append(
             [
                 f"{r.most_gaussians / 1e3:.0f}k",
@@ -152,14 +58,8 @@ def memory(records: Sequence[Stored]) -> str:
     return markdown.table(rows)
 
 
-def sfm(records: Sequence[Stored]) -> str:
-    return summary.table(summary.summaries(results(records, Record[summary.Run])))
-
-
-def growth(records: Sequence[Stored]) -> str:
-    return markdown.table(
-        [GROWTH_HEADING, *map(growth_row, results(records, Record[GrowthResult]))]
-    )
+def growth(found: Sequence[GrowthResult]) -> str:
+    return markdown.table([GROWTH_HEADING, *map(growth_row, found)])
 
 
 def growth_row(result: GrowthResult) -> list[str]:
@@ -175,20 +75,12 @@ def growth_row(result: GrowthResult) -> list[str]:
     ]
 
 
-def judge(records: Sequence[Stored]) -> str:
-    return verdicts(results(records, Record[JudgeResult]))
-
-
 def verdicts(found: Sequence[JudgeResult]) -> str:
     """The confusion table of true grades and verdicts."""
     counts = Counter((row.truth.grade, row.verdict) for row in found if row.truth is not None)
     rows = [["truth", *(f"called {grade}" for grade in GRADES)]]
     rows += [[true, *(str(counts[true, called]) for called in GRADES)] for true in GRADES]
     return markdown.table(rows)
-
-
-def stability(records: Sequence[Stored]) -> str:
-    return outcomes(results(records, Record[StabilityResult]))
 
 
 def outcomes(found: Sequence[StabilityResult]) -> str:
@@ -211,39 +103,21 @@ def outcomes(found: Sequence[StabilityResult]) -> str:
     return markdown.table(rows)
 
 
-def page(records: Sequence[Stored]) -> str:
-    rows = [["splats", "view", "PSNR (dB)"]]
-    rows += [[r.file, r.view, f"{r.psnr:.2f}"] for r in results(records, Record[PageResult])]
-    return markdown.table(rows)
-
-
-def raster_stress(records: Sequence[Stored]) -> str:
+def raster_stress(found: Sequence[StressResult]) -> str:
     rows = [
         [
             *("family", "cases", "drawn", "dropped", "not finite", "colour error"),
             *("gradient error: median", "99 %", "worst"),
         ]
     ]
-    for r in results(records, Record[StressResult]):
+    for r in found:
         counts = (r.cases, r.drawn, r.dropped, r.not_finite)
         errors = (r.colour, r.gradient_median, r.gradient_p99, r.gradient_worst)
         rows.append([r.family, *map(str, counts), *(f"{error:.1e}" for error in errors)])
     return markdown.table(rows)
 
 
-def video(records: Sequence[Stored]) -> str:
-    rows = [["video", "frames", "chosen", "sharpness", "of evenly spaced frames", "ratio"]]
-    for r in results(records, Record[VideoFrames]):
-        rows.append(
-            [
-                *(r.video, str(r.frames), str(r.chosen), f"{r.chosen_sharpness:.0f}"),
-                *(f"{r.even_sharpness:.0f}", f"{r.chosen_sharpness / r.even_sharpness:.2f}"),
-            ]
-        )
-    return markdown.table(rows)
-
-
-def blocks(records: Sequence[Stored]) -> str:
+def blocks(found: Sequence[BlocksResult]) -> str:
     rows = [
         [
             *("run", "seed", "photographs", "test views, pixels", "blocks", "PSNR (dB)", "SSIM"),
@@ -257,7 +131,7 @@ def blocks(records: Sequence[Stored]) -> str:
             *("gradient of the error at seams", "ratio"),
         ]
     ]
-    for r in results(records, Record[BlocksResult]):
+    for r in found:
         rows.append(
             [
                 *(r.run, cell(r.seed, "d"), str(r.photographs)),
@@ -274,10 +148,6 @@ def blocks(records: Sequence[Stored]) -> str:
 
 def _pair(values: Sequence[float], form: str) -> str:
     return ", ".join(format(value, form) for value in values)
-
-
-def scaling(records: Sequence[Stored]) -> str:
-    return scaling_table(results(records, Record[ScalingResult]))
 
 
 def scaling_table(found: Sequence[ScalingResult]) -> str:
@@ -313,34 +183,6 @@ def scaling_table(found: Sequence[ScalingResult]) -> str:
     return markdown.table(rows)
 
 
-def wide(records: Sequence[Stored]) -> str:
-    return lenses(results(records, Record[WideResult]))
-
-
-def lenses(found: Sequence[WideResult]) -> str:
-    rows = [
-        [
-            *("lens", "pixels", "photographs", "with a pose", "views", "pixels used"),
-            *("rotation: median, mean, deg", "centre", "PSNR (dB)", "SSIM"),
-        ]
-    ]
-    for r in found:
-        rows.append(
-            [
-                *(r.lens, r.pixels, str(r.photographs), str(r.registered), str(r.views)),
-                cell(r.used_share, ".1%"),
-                f"{r.rotation_median_deg:.4f}, {r.rotation_mean_deg:.4f}",
-                f"{r.centre_relative_median:.3%}",
-                *(f"{r.psnr:.2f}", f"{r.ssim:.4f}"),
-            ]
-        )
-    return markdown.table(rows)
-
-
-def pose_conventions(records: Sequence[Stored]) -> str:
-    return poses_table(results(records, Record[PoseResult]))
-
-
 def poses_table(found: Sequence[PoseResult]) -> str:
     """A row for each scene: the outcomes of its mistakes, and of its right poses."""
     rows = [["scene", "mistakes", "named", "refused otherwise", "warned", "silent", "right poses"]]
@@ -354,10 +196,6 @@ def poses_table(found: Sequence[PoseResult]) -> str:
     return markdown.table(rows)
 
 
-def georeference(records: Sequence[Stored]) -> str:
-    return verdicts_table(results(records, Record[GeoreferenceResult]))
-
-
 def verdicts_table(found: Sequence[GeoreferenceResult]) -> str:
     """A row for each source of a world frame: the verdicts on its cases."""
     rows = [["measured by", "cases", "surveys", *GEOREFERENCE_VERDICTS]]
@@ -366,10 +204,6 @@ def verdicts_table(found: Sequence[GeoreferenceResult]) -> str:
         counts = [sum(r.verdict == verdict for r in own) for verdict in GEOREFERENCE_VERDICTS]
         rows.append([source, str(len({r.case for r in own})), str(len(own)), *map(str, counts)])
     return markdown.table(rows)
-
-
-def slurm(records: Sequence[Stored]) -> str:
-    return slurm_table(results(records, Record[SlurmResult]))
 
 
 def slurm_table(found: Sequence[SlurmResult]) -> str:
@@ -383,33 +217,41 @@ def slurm_table(found: Sequence[SlurmResult]) -> str:
     return markdown.table(rows)
 
 
-def budgets(records: Sequence[Stored]) -> str:
-    return budget_tables.table(results(records, Record[BudgetResult]))
-
-
-def budget_curves(records: Sequence[Stored]) -> str:
-    """PSNR by training time."""
-    return budget_tables.curves(results(records, Record[BudgetResult]))
-
-
-TABLES: dict[str, Callable[[Sequence[Stored]], str]] = {
-    "mesh": mesh,
-    "dense": dense,
-    "coverage": coverage,
-    "memory": memory,
-    "sfm": sfm,
-    "sfm.growth": growth,
-    "judge": judge,
-    "stability": stability,
-    "page": page,
-    "raster_stress": raster_stress,
-    "blocks": blocks,
-    "budgets": budgets,
-    "georeference": georeference,
-    "pose_conventions": pose_conventions,
-    "scaling": scaling,
-    "slurm": slurm,
-    "video": video,
-    "wide": wide,
+#: Kind of table -> the type of the results in its records, and what makes the table.
+TABLES: dict[str, tuple[type[Any], Callable[[Sequence[Any]], str]]] = {
+    "memory": (MemoryResult, memory),
+    "sfm": (summary.Run, lambda found: summary.table(summary.summaries(found))),
+    "sfm.growth": (GrowthResult, growth),
+    "judge": (JudgeResult, verdicts),
+    "stability": (StabilityResult, outcomes),
+    "raster_stress": (StressResult, raster_stress),
+    "blocks": (BlocksResult, blocks),
+    "budgets": (BudgetResult, budget_tables.table),
+    "budget-curves": (BudgetResult, budget_tables.curves),
+    "georeference": (GeoreferenceResult, verdicts_table),
+    "pose_conventions": (PoseResult, poses_table),
+    "scaling": (ScalingResult, scaling_table),
+    "slurm": (SlurmResult, slurm_table),
 }
-"""The table of each benchmark, by the ``benchmark`` of its record."""
+
+
+def table_of(kind: str, records: Sequence[Stored]) -> str:
+    """The table of a kind, of the results of all records.
+
+    Raises:
+        UserError: a record has other fields.
+    """
+    of_result, made = TABLES[kind]
+    found: list[Any] = []
+    for record in records:
+        try:
+            found += Record[of_result].model_validate(record).results  # type: ignore[valid-type]
+        except ValidationError as error:
+            first = error.errors()[0]
+            field = ".".join(map(str, first["loc"]))
+            raise UserError(
+                f"the record of `{record.get('command')}` is not this version's: "
+                f"{field}: {first['msg']}",
+                fix="run its command again",
+            ) from error
+    return made(found)

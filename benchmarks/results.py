@@ -33,112 +33,6 @@ class GeoreferenceResult:
     errors: tuple[float, float, float, float] | None
 
 
-# ---- benchmarks.mesh ----
-
-
-@dataclass(frozen=True)
-class Accuracy:
-    """One region of the scene.
-
-    Attributes:
-        size: the region's, metres.
-        median, p90: distances of the mesh from the true surface, by area, shares of ``size``.
-        completeness: share of the true surface that has mesh within 1 % of ``size``.
-    """
-
-    size: float
-    median: float
-    p90: float
-    completeness: float
-
-
-@dataclass(frozen=True)
-class MeshResult:
-    """Attributes:
-    voxel_m: side of a voxel, metres.
-    seconds: ``wall`` and ``cpu`` time of depth maps and mesh.
-    peak_mb: peak memory of the process, MiB.
-    foreground, room: see ``benchmarks.surface.measure``.
-    """
-
-    triangles: int
-    voxel_m: float
-    voxels: int
-    seconds: dict[str, float]
-    peak_mb: float
-    foreground: Accuracy
-    room: Accuracy
-
-
-# ---- benchmarks.dense ----
-
-
-@dataclass(frozen=True)
-class DenseResult:
-    """Depth maps of a scene; shares are of its textured pixels.
-
-    Attributes:
-        pixels: size of the views.
-        median_error: median relative error of the pixels with a depth.
-        within: share with a relative error below 0.5 %, 1 % and 2 %.
-        completeness: share with a depth.
-        within_known: as ``within``, of the pixels with a depth.
-        points: number of points of the fused cloud.
-        instruction_set: of the kernel.
-        cpu_s_per_photograph: of all passes.
-        peak_mb: peak memory of the process, MiB.
-    """
-
-    scene: str
-    photographs: int
-    pixels: str
-    median_error: float
-    within: list[float]
-    completeness: float
-    within_known: list[float]
-    points: int
-    instruction_set: str
-    cpu_s_per_photograph: float
-    peak_mb: float
-
-
-# ---- benchmarks.coverage ----
-
-Place = list[float]
-"""Distance of a viewpoint from the nearest removed camera, metres, and the angle between their
-viewing directions, degrees."""
-
-
-@dataclass(frozen=True)
-class CoverageResult:
-    """One case. Keys ``test`` and ``removed`` are the test views and the removed views.
-
-    Attributes:
-        trust: mean trust. psnr: mean PSNR before a photograph is added, dB.
-        rank_correlation: of trust and squared error over blocks of all these views.
-        first, best_of_five: of the proposals. random_first, random_best_of_five: medians of random
-            draws from the candidates.
-        better_than_random: share of the random draws whose first viewpoint is farther.
-        added_first, added_random: gain in mean PSNR, dB, from a photograph at the first proposal,
-            and at the first viewpoint of each random draw.
-        surroundings: mean trust of the candidates before and after the proposals, and their number.
-    """
-
-    case: str
-    training_views: int
-    trust: dict[str, float]
-    psnr: dict[str, float]
-    rank_correlation: float
-    first: Place
-    best_of_five: Place
-    random_first: Place
-    random_best_of_five: Place
-    better_than_random: float
-    added_first: dict[str, float]
-    added_random: list[dict[str, float]]
-    surroundings: list[float]
-
-
 # ---- benchmarks.memory ----
 
 
@@ -240,18 +134,6 @@ class StabilityResult:
     right: bool
 
 
-# ---- benchmarks.page ----
-
-
-@dataclass(frozen=True)
-class PageResult:
-    """One view: PSNR between the viewer's render of ``file`` and the rasterizer's, dB."""
-
-    file: str
-    view: str
-    psnr: float
-
-
 # ---- benchmarks.raster_stress ----
 
 
@@ -306,26 +188,6 @@ class GpuResult:
     cpu_frames_per_s: float
     bandwidth: float
     moments_bandwidth: float
-
-
-# ---- benchmarks.video ----
-
-
-@dataclass(frozen=True)
-class VideoFrames:
-    """The choice of frames of a video.
-
-    Attributes:
-        frames, chosen: numbers of frames of the video, and of those chosen.
-        chosen_sharpness, even_sharpness: medians of the variance of the Laplacian at full
-            resolution, of the chosen frames and of as many evenly spaced ones.
-    """
-
-    video: str
-    frames: int
-    chosen: int
-    chosen_sharpness: float
-    even_sharpness: float
 
 
 # ---- benchmarks.blocks ----
@@ -395,39 +257,6 @@ class ScalingResult:
     output_mb: float
 
 
-# ---- benchmarks.wide ----
-
-
-@dataclass(frozen=True)
-class WideResult:
-    """The demo scene, reconstructed from photographs of one lens without poses.
-
-    Attributes:
-        lens: of the photographs.
-        pixels: width and height of a photograph.
-        photographs, registered: numbers, of all photographs and of those with an estimated pose.
-        views: number of pinhole views made of the photographs.
-        rotation_median_deg, rotation_mean_deg: errors of rotations against the true poses.
-        centre_relative_median: errors of camera centres, divided by their root mean square
-            distance from their mean.
-        psnr, ssim: of test views.
-        used_share: share of the photographs' pixels that some view shows; None where photographs
-            are views.
-    """
-
-    lens: str
-    pixels: str
-    photographs: int
-    registered: int
-    views: int
-    rotation_median_deg: float
-    rotation_mean_deg: float
-    centre_relative_median: float
-    psnr: float
-    ssim: float
-    used_share: float | None
-
-
 # ---- benchmarks.slurm ----
 
 
@@ -462,23 +291,19 @@ class BudgetResult:
     """A scene trained for a time.
 
     Attributes:
-        trainer: "splatmake", or the name and version of another program.
-        options: the configuration besides the time; of another program, its command.
-        minutes: the time budget of training.
-        steps: number of optimiser steps.
-        psnr, ssim, lpips: of the test views; ``lpips`` is None where it was not measured.
-        wall_minutes, cpu_minutes: of training, as measured.
-        other_cpu_minutes: of the stages before training; None for another program, which gets
-            their result.
-        threads: of training.
-        load_average: of the last minute at the end of training.
-        test_views: their number. pixels: their sizes.
-        benchmark, published_scene, deviations: see ``PublishedProtocol``; None and empty for
-            scenes of no published benchmark.
+        options: The configuration besides the time.
+        minutes: The time budget of training.
+        steps: The number of optimiser steps.
+        psnr, ssim, lpips: The means over the test views; ``lpips`` is None if it was not measured.
+        wall_minutes, cpu_minutes: The measured time of training.
+        other_cpu_minutes: The CPU time of the stages before training.
+        threads: The number of threads of training.
+        load_average: The load average of the last minute at the end of training.
+        test_views: The number of test views.
+        pixels: The sizes of the test views.
     """
 
     scene: str
-    trainer: str
     options: str
     seed: int
     minutes: float
@@ -489,14 +314,11 @@ class BudgetResult:
     gaussians: int
     wall_minutes: float
     cpu_minutes: float
-    other_cpu_minutes: float | None
+    other_cpu_minutes: float
     threads: int
     load_average: float | None
     test_views: int
     pixels: str
-    benchmark: str | None
-    published_scene: str | None
-    deviations: list[str]
 
 
 # ---- benchmarks.pose_conventions ----

@@ -1,7 +1,7 @@
 """Writes the tables and figures of the docs from stored records: ``python -m benchmarks.tables``.
 
 A table stands below a line ``<!-- KIND: RECORD [RECORD ...] -->``, of records in
-``benchmarks/records``, or ``-`` where there is none yet; a figure within a sentence stands in
+``benchmarks/records``; a figure within a sentence stands in
 ``<!-- figure: RECORD NAME -->...<!-- end -->``. ``--check`` writes nothing and exits with 1 where a
 page and its records differ.
 """
@@ -13,19 +13,17 @@ import re
 import statistics
 import sys
 from collections.abc import Callable, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
 from benchmarks import markdown, record_tables
-from benchmarks.like_for_like import like_for_like
 from benchmarks.raster.tables import steps_table, table
 from benchmarks.record import POSES
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "records"
-NONE = "-"
-"""Stands for the records of a table that has none yet."""
 Record = dict[str, Any]
 
 
@@ -123,7 +121,7 @@ def _headline_of_budgets(record: Record) -> list[list[str]]:
 def sources(records: Sequence[Record]) -> str:
     """Where and how scenes, or the records of benchmarks, were measured."""
     what = "scene" if "scene" in records[0] else "benchmark"
-    rows = [[what, "command", "commit", "processor", "instruction set", "remark"]]
+    rows = [[what, "command", "commit", "date", "processor", "instruction set", "remark"]]
     for record in records:
         processor = f"{record['processor']}, {record['cores']} cores"
         rows.append(
@@ -131,19 +129,12 @@ def sources(records: Sequence[Record]) -> str:
                 record[what],
                 f"`{record['command']}`",
                 record["commit"][:7],
+                record["date"],
                 processor,
                 record["instruction_set"],
                 record["note"],
             ]
         )
-    return markdown.table(rows)
-
-
-def stages(records: Sequence[Record]) -> str:
-    """CPU seconds of each stage of one scene."""
-    (record,) = records
-    run = record["runs"][0]
-    rows = [["stage", "CPU s"], *([name, f"{value:.0f}"] for name, value in run["cpu_s"].items())]
     return markdown.table(rows)
 
 
@@ -166,10 +157,7 @@ KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "scenes": scenes,
     "headline": headline,
     "sources": sources,
-    "stages": stages,
-    "like-for-like": like_for_like,
-    "budget-curves": record_tables.budget_curves,
-    **record_tables.TABLES,
+    **{kind: partial(record_tables.table_of, kind) for kind in record_tables.TABLES},
 }
 MARKER = re.compile(
     rf"<!-- ({'|'.join(map(re.escape, KINDS))}): ([^>]+) -->\n(?:\n(?:\|[^\n]*\n)+)?"
@@ -199,7 +187,7 @@ def rewritten(page: str) -> str:
 
     def fill(match: re.Match[str]) -> str:
         kind, names = match[1], match[2].split()
-        made = KINDS[kind]([read_record(name) for name in names if name != NONE])
+        made = KINDS[kind]([read_record(name) for name in names])
         return f"<!-- {kind}: {' '.join(names)} -->\n\n{made}"
 
     def figure(match: re.Match[str]) -> str:

@@ -6,14 +6,12 @@
 
 The record is written after every point, and finished points of the same machine, checkout and
 options are kept: the same command continues an interrupted one. Budgets count wall time, so nothing
-else should run. With ``--opensplat PROGRAM``, OpenSplat trains the same views from the same points,
-for as many steps as it takes in each time, and its models are measured on the same test views.
+else should run.
 """
 
 from __future__ import annotations
 
 import argparse
-import shutil
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -21,9 +19,8 @@ from typing import Any
 
 import yaml
 
-from benchmarks.budgets import opensplat, tables
-from benchmarks.budgets.opensplat import OpenSplat
-from benchmarks.budgets.points import OURS, Points, Setup, joint_arguments, train
+from benchmarks.budgets import tables
+from benchmarks.budgets.points import Points, Setup, joint_arguments, train
 from benchmarks.measured import measured
 from benchmarks.results import BudgetResult
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
@@ -50,55 +47,22 @@ def parser() -> argparse.ArgumentParser:
         "--config", nargs="+", default=[], metavar="NAME=VALUE", help="options, as of snakemake"
     )
     made.add_argument("--cores", type=int, default=usable_cores())
-    made.add_argument("--opensplat", type=Path, metavar="PROGRAM", help="measure it as well")
     made.add_argument("--note", default="", help="for the record: what else was running")
     return made
 
 
-def run(setup: Setup, points: Points, asked: argparse.Namespace, other: OpenSplat | None) -> None:
+def run(setup: Setup, points: Points, asked: argparse.Namespace) -> None:
     """Measure the points that the record lacks.
 
     Raises:
         UserError: a run fails, or the record holds points of other options.
     """
-    name = other.name if other is not None else ""
     for scene in asked.scenes:
         for seed in asked.seeds:
             for minutes in sorted(asked.minutes):
-                if points.find(scene, seed, minutes, OURS, setup.text) is None:
+                if points.find(scene, seed, minutes, setup.text) is None:
                     warn_of_load(setup.cores)
                     points.add(train(setup, scene, seed, minutes))
-        if other is not None:
-            beside(setup, points, asked, other, name, scene)
-
-
-def beside(
-    setup: Setup,
-    points: Points,
-    asked: argparse.Namespace,
-    other: OpenSplat,
-    name: str,
-    scene: str,
-) -> None:
-    """Measure the points of the other program, once for the first seed: it has no seed."""
-    seed, options = asked.seeds[0], opensplat.options_text(other)
-    missing = [m for m in sorted(asked.minutes) if not points.find(scene, seed, m, name, options)]
-    if not missing:
-        return
-    project = setup.work / "opensplat" / scene
-    opensplat.write_project(setup.results(scene, seed, missing[0]), project)
-    warn_of_load(setup.cores)
-    steps = other.steps_within(project, missing)
-    for minutes in missing:
-        ours = points.find(scene, seed, minutes, OURS, setup.text)
-        assert ours is not None, "the product's points are measured first"
-        results = setup.results(scene, seed, minutes)
-        points.add(opensplat.measure(other, name, steps[minutes], results, project, ours))
-
-
-def program(path: Path) -> Path:
-    """A program by its path, or by its name on the search path."""
-    return path.resolve() if path.exists() else Path(shutil.which(path) or path)
 
 
 def warn_of_load(cores: int) -> None:
@@ -136,10 +100,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
         asked.work.mkdir(parents=True, exist_ok=True)
         options = options_of(asked.config)
         setup = Setup(asked.data.resolve(), asked.work.resolve(), options, asked.cores)
-        other = OpenSplat(program(asked.opensplat), asked.cores) if asked.opensplat else None
         points = Points(asked.json, measured("budgets", asked.note, []))
         points.facts = measured("budgets", asked.note, repeated(points.points, asked))
-        run(setup, points, asked, other)
+        run(setup, points, asked)
     except UserError as error:
         print(f"error: {error}", file=sys.stderr)
         return EXIT_USER_ERROR
@@ -152,8 +115,7 @@ def repeated(points: Sequence[BudgetResult], asked: argparse.Namespace) -> list[
     """Arguments of the command that repeats all points of the record."""
     wanted = {"scenes": asked.scenes, "minutes": asked.minutes, "seeds": asked.seeds}
     config = ["--config", *asked.config] if asked.config else []
-    program = ["--opensplat", "opensplat"] if asked.opensplat else []
-    return [*joint_arguments(points, wanted), "--data", "DATA", *config, *program]
+    return [*joint_arguments(points, wanted), "--data", "DATA", *config]
 
 
 if __name__ == "__main__":

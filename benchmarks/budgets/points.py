@@ -23,7 +23,6 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import read_stage
 
 ROOT = Path(__file__).resolve().parents[2]
-OURS = "splatmake"
 # A record holds points of one machine and checkout.
 SAME = ("commit", "processor", "cores", "instruction_set", "compiler")
 
@@ -96,10 +95,9 @@ def measured_point(setup: Setup, scene: str, seed: int, minutes: float) -> Budge
     before = sum(
         runs[stage]["cpu_s"] for stage in ("inspect", *POSES, "dense", "init") & runs.keys()
     )
-    protocol, published = evaluation.protocol, evaluation.protocol.published
+    protocol = evaluation.protocol
     return BudgetResult(
         scene=scene,
-        trainer=OURS,
         options=setup.text,
         seed=seed,
         minutes=minutes,
@@ -115,9 +113,6 @@ def measured_point(setup: Setup, scene: str, seed: int, minutes: float) -> Budge
         load_average=trained["load_average"],
         test_views=protocol.num_views,
         pixels=", ".join(protocol.resolution),
-        benchmark=published.benchmark if published else None,
-        published_scene=published.scene if published else None,
-        deviations=list(published.deviations) if published else [],
     )
 
 
@@ -156,31 +151,28 @@ class Points:
                 )
         self.points = found.results
 
-    def find(
-        self, scene: str, seed: int, minutes: float, trainer: str, options: str
-    ) -> BudgetResult | None:
+    def find(self, scene: str, seed: int, minutes: float, options: str) -> BudgetResult | None:
         """The finished point, or None.
 
         Raises:
             UserError: it was measured with other options.
         """
         for point in self.points:
-            same = (point.scene, point.seed, point.minutes) == (scene, seed, minutes)
-            if same and point.trainer.split()[0] == trainer.split()[0]:
-                if (point.trainer, point.options) != (trainer, options):
-                    raise UserError(
-                        f"{scene}, {minutes:g} minutes: measured by {point.trainer} with "
-                        f"{point.options}, now {trainer} with {options}",
-                        file=self.path,
-                        fix="name another file for these options",
-                    )
-                return point
+            if (point.scene, point.seed, point.minutes) != (scene, seed, minutes):
+                continue
+            if point.options != options:
+                raise UserError(
+                    f"{scene}, {minutes:g} minutes: measured with {point.options}, now {options}",
+                    file=self.path,
+                    fix="name another file for these options",
+                )
+            return point
         return None
 
     def add(self, point: BudgetResult) -> None:
         """Add a point and write the record."""
         self.points.append(point)
-        self.points.sort(key=lambda p: (p.scene, p.trainer != OURS, p.trainer, p.minutes, p.seed))
+        self.points.sort(key=lambda p: (p.scene, p.minutes, p.seed))
         record = Record[BudgetResult](**self.facts.model_dump(), results=self.points)
         write_json(self.path, record.model_dump(mode="json"))
 

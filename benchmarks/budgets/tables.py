@@ -9,15 +9,13 @@ from benchmarks import markdown
 from benchmarks.results import BudgetResult
 
 _BLOCKS = "▁▂▃▄▅▆▇█"
-Key = tuple[str, str]
-"""Scene and trainer."""
 
 
 def table(points: Sequence[BudgetResult]) -> str:
-    """A row for each scene, trainer and time budget; medians over the seeds."""
+    """A row for each scene and time budget; medians over the seeds."""
     rows = [
         [
-            *("scene", "trainer", "test views, pixels", "minutes", "seeds", "PSNR (dB)", "SSIM"),
+            *("scene", "test views, pixels", "minutes", "seeds", "PSNR (dB)", "SSIM"),
             *("LPIPS", "Gaussians", "steps", "wall, CPU min of training", "CPU min before"),
             *("threads", "load"),
         ]
@@ -29,32 +27,29 @@ def table(points: Sequence[BudgetResult]) -> str:
 
 
 def curves(points: Sequence[BudgetResult]) -> str:
-    """PSNR by time budget: a row for each scene and trainer, and the curve in block characters,
-    from the lowest to the highest value of the scene."""
+    """PSNR by time budget: a row for each scene, and the curve in block characters, from its lowest
+    to its highest value."""
     budgets = sorted({p.minutes for p in points})
-    rows = [["scene", "trainer", *(f"{m:g} min" for m in budgets), "curve of PSNR"]]
+    rows = [["scene", *(f"{m:g} min" for m in budgets), "curve of PSNR"]]
     for group in _groups(points):
-        scene = [p for p in points if p.scene == group[0].scene]
-        medians = {m: _psnr(group, m) for m in budgets}
-        known = [_psnr(_of(scene, trainer), m) for trainer in _trainers(scene) for m in budgets]
-        lowest, highest = _range([value for value in known if value is not None])
-        cells = [markdown.cell(value, ".2f") for value in medians.values()]
-        blocks = "".join(_block(value, lowest, highest) for value in medians.values())
-        rows.append([group[0].scene, group[0].trainer, *cells, blocks])
+        medians = [_psnr(group, m) for m in budgets]
+        known = [value for value in medians if value is not None]
+        cells = [markdown.cell(value, ".2f") for value in medians]
+        blocks = "".join(_block(value, min(known), max(known)) for value in medians)
+        rows.append([group[0].scene, *cells, blocks])
     return markdown.table(_or_dashes(rows))
 
 
 def _row(points: Sequence[BudgetResult]) -> list[str]:
     first = points[0]
     lpips = [p.lpips for p in points if p.lpips is not None]
-    before = [p.other_cpu_minutes for p in points if p.other_cpu_minutes is not None]
     loads = [p.load_average for p in points if p.load_average is not None]
     times = [
         statistics.median(values)
         for values in ([p.wall_minutes for p in points], [p.cpu_minutes for p in points])
     ]
     return [
-        *(first.scene, first.trainer, f"{first.test_views}, {first.pixels}", f"{first.minutes:g}"),
+        *(first.scene, f"{first.test_views}, {first.pixels}", f"{first.minutes:g}"),
         str(len(points)),
         markdown.middle([p.psnr for p in points], "{:.2f}"),
         markdown.middle([p.ssim for p in points], "{:.3f}"),
@@ -62,7 +57,7 @@ def _row(points: Sequence[BudgetResult]) -> list[str]:
         f"{statistics.median(p.gaussians for p in points) / 1e3:.0f}k",
         f"{statistics.median(p.steps for p in points):.0f}",
         f"{times[0]:.1f}, {times[1]:.1f}",
-        markdown.cell(statistics.median(before) if before else None, ".1f"),
+        f"{statistics.median(p.other_cpu_minutes for p in points):.1f}",
         str(first.threads),
         markdown.cell(max(loads) if loads else None, ".1f"),
     ]
@@ -74,28 +69,16 @@ def _or_dashes(rows: list[list[str]]) -> list[list[str]]:
 
 
 def _groups(points: Sequence[BudgetResult]) -> list[list[BudgetResult]]:
-    """The points of each scene and trainer, in the order of the record."""
-    keys: dict[Key, list[BudgetResult]] = {}
+    """The points of each scene, in the order of the record."""
+    scenes: dict[str, list[BudgetResult]] = {}
     for point in points:
-        keys.setdefault((point.scene, point.trainer), []).append(point)
-    return list(keys.values())
-
-
-def _trainers(points: Sequence[BudgetResult]) -> list[str]:
-    return list(dict.fromkeys(p.trainer for p in points))
-
-
-def _of(points: Sequence[BudgetResult], trainer: str) -> list[BudgetResult]:
-    return [p for p in points if p.trainer == trainer]
+        scenes.setdefault(point.scene, []).append(point)
+    return list(scenes.values())
 
 
 def _psnr(points: Sequence[BudgetResult], minutes: float) -> float | None:
     values = [p.psnr for p in points if p.minutes == minutes]
     return statistics.median(values) if values else None
-
-
-def _range(values: Sequence[float]) -> tuple[float, float]:
-    return min(values), max(values)
 
 
 def _block(value: float | None, lowest: float, highest: float) -> str:

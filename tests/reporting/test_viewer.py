@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import io
 import re
+import shutil
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -15,7 +16,6 @@ import pytest
 from numpy.typing import NDArray
 from PIL import Image
 
-from benchmarks.page import FLAGS, chromium
 from pipeline.io.ply import write_splat_ply
 from pipeline.render import RasterOptions
 from pipeline.render.views import render_view
@@ -25,7 +25,13 @@ from pipeline.splats.gaussians import Gaussians
 from tests.reporting.made import gaussians, report, trained
 from tests.tools import need_package
 
-CHROMIUM = chromium()
+FLAGS = (
+    *("--headless=new", "--no-sandbox", "--no-first-run"),
+    *("--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"),
+    *("--disable-background-networking", "--disable-component-update", "--disable-sync"),
+)
+NAMES = ("chromium", "chromium-browser", "chromium-headless-shell", "chrome", "google-chrome")
+CHROMIUM = next(filter(None, map(shutil.which, NAMES)), None)
 SECONDS = 180.0  # a browser on a busy machine; a page is there within one or two on an idle one
 
 Pixels = NDArray[np.uint8]

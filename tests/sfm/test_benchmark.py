@@ -93,12 +93,12 @@ def test_a_run_measures_the_pipeline_and_pycolmap(demo, tmp_path, capsys):
     arguments = [str(demo), "--configs", "pycolmap", "fast/incremental/exhaustive"]
     main([*arguments, "--json", str(tmp_path / "a.json")])
     record = json.loads((tmp_path / "a.json").read_text())
-    reference, ours = record_tables.results([record], Record[Run])
+    reference, ours = Record[Run].model_validate(record).results
     assert (reference.configuration, reference.planned) == ("pycolmap", False)
     assert ours.planned and ours.registered == reference.registered == 6
     summary = summarise([ours])
     assert summary.rotation_deg < 0.3 and summary.centre_permille < 20
     assert all(cost.cpu_s > 0 for run in (reference, ours) for cost in run.costs.values())
-    assert "| demo | **fast/incremental/exhaustive** |" in record_tables.sfm([record])
-    assert record_tables.sfm([record]) in capsys.readouterr().out
+    assert "| demo | **fast/incremental/exhaustive** |" in record_tables.table_of("sfm", [record])
+    assert record_tables.table_of("sfm", [record]) in capsys.readouterr().out
     assert record["command"] == f"python -m benchmarks.sfm {' '.join(arguments)} --json FILE"

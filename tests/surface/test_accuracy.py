@@ -1,14 +1,14 @@
-"""The accuracy measure of the benchmark, and fusion of exact depth maps of the demo scene."""
+"""The measure of a mesh's accuracy, and fusion of exact depth maps of the demo scene."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-import benchmarks.surface as surface
-from benchmarks.surface import FOCUS, Similarity, measure, sample, true_points
+import tests.surface.accuracy as surface
 from pipeline.demo.scene import OBJECTS, ROOM, distance, trace
 from pipeline.surface.mesh import build_mesh
+from tests.surface.accuracy import FOCUS, Similarity, measure, sample, true_points
 from tests.surface.scenes import demo_room
 
 

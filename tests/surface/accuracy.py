@@ -3,17 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from pathlib import PurePosixPath
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
-from benchmarks.results import Accuracy
 from pipeline.demo.scene import OBJECTS, distance, trace
-from pipeline.geometry.similarity import umeyama
-from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
 Array = NDArray[np.float64]
@@ -30,6 +26,22 @@ _SPACING = 0.02
 
 
 @dataclass(frozen=True)
+class Accuracy:
+    """The accuracy of the mesh in a region of the scene.
+
+    Attributes:
+        size: The size of the region, metres.
+        median, p90: Distances of the mesh's samples from the true surface, as shares of ``size``.
+        completeness: The share of the true surface within 1 % of ``size`` of the mesh.
+    """
+
+    size: float
+    median: float
+    p90: float
+    completeness: float
+
+
+@dataclass(frozen=True)
 class Similarity:
     """true = scale * rotation @ found + shift."""
 
@@ -43,14 +55,6 @@ class Similarity:
 
     def undo(self, points: Array) -> Array:
         return np.asarray((points - self.shift) @ self.rotation / self.scale)
-
-
-def align(views: list[View], truth: Reconstruction) -> Similarity:
-    """The similarity that aligns the centres of views to the true ones, by name without suffix."""
-    true = {PurePosixPath(name).stem: posed.centre for name, posed in truth.by_name().items()}
-    found = np.stack([view.centre for view in views])
-    target = np.stack([true[PurePosixPath(view.name).stem] for view in views])
-    return Similarity(*umeyama(found, target))
 
 
 def true_points(views: list[View], frame: Similarity) -> Array:

@@ -8,7 +8,7 @@ BIN := $(VENV)/bin
 
 READERS := tests/io/independent
 
-.PHONY: demo test test-fast test-native test-slurm test-packages lint format docs site viewer setup extension clean
+.PHONY: demo test test-fast test-native test-slurm test-packages lint format docs site viewer lock setup extension clean
 .DEFAULT_GOAL := help
 
 help:
@@ -20,32 +20,38 @@ help:
 	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
 	@echo "make docs   regenerate the generated pages of docs/ and config/config.yaml"
 	@echo "make site   build the docs as a site in build/site; broken links are errors"
+	@echo "make lock   write requirements/ from the ranges in pyproject.toml (needs uv)"
 	@echo "make viewer rebuild the pages' viewer (needs Node 20 or newer)"
 	@echo "make clean  remove results/ and data/demo"
 
 # pip would compile every module to bytecode, which takes longer than the rest of the installation;
 # Python compiles those that are imported, unless this variable forbids it.
 export PYTHONDONTWRITEBYTECODE :=
-PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile -r
+PIP_INSTALL := $(BIN)/pip install --quiet --disable-pip-version-check --no-compile
 
-# A stamp file each: the program's own packages, those of its extras, of the developers, of tests.
-$(VENV)/product: pyproject.toml
+# `make TORCH=cpu ...` takes the build for processors: on Linux, the one of the package index brings
+# gigabytes of CUDA, which nothing here uses.
+TORCH ?=
+TORCH_FROM := $(if $(filter cpu,$(TORCH)),--index-url https://download.pytorch.org/whl/cpu)
+
+# A stamp file each: the program's own packages, and those of its extras. requirements/ has exact
+# versions with digests, of all packages but torch: its builds differ by machine.
+EXTRAS := watch gpu dev test docs slurm
+$(VENV)/product: requirements/product.txt
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "error: Python 3.11 or newer is needed, $$($(PYTHON) --version) found; set PYTHON=..."; exit 2; }
 	@command -v $${CXX:-g++} >/dev/null || { test -z "$$CXX" && command -v clang++ >/dev/null; } || \
 	  { echo "error: no C++ compiler found ($${CXX:-g++, clang++}); install g++, or set CXX"; exit 2; }
 	@test -x $(BIN)/pip || $(PYTHON) -m venv --clear $(VENV) || \
 	  { echo "error: no virtual environment could be made; on Debian and Ubuntu install python3-venv"; exit 2; }
-	@$(BIN)/python -c 'import tomllib; p = tomllib.load(open("pyproject.toml", "rb"))["project"]; \
-	  groups = {"product": p["dependencies"], **p["optional-dependencies"]}; \
-	  [open(f"$(VENV)/{name}.txt", "w").write("\n".join(group)) for name, group in groups.items()]'
 	@echo "installing dependencies into $(VENV) (once; about a minute)"
-	@$(PIP_INSTALL) $@.txt
+	@$(PIP_INSTALL) $(TORCH_FROM) $$(sed -n 's/^ *"\(torch==[0-9.]*\)",$$/\1/p' pyproject.toml)
+	@$(PIP_INSTALL) -r requirements/$(@F).txt
 	@touch $@
 
-$(VENV)/watch $(VENV)/gpu $(VENV)/dev $(VENV)/test $(VENV)/docs $(VENV)/slurm: $(VENV)/product
+$(addprefix $(VENV)/,$(EXTRAS)): $(VENV)/%: requirements/%.txt $(VENV)/product
 	@echo "installing the packages of '$(@F)' into $(VENV)"
-	@$(PIP_INSTALL) $@.txt
+	@$(PIP_INSTALL) -r requirements/$(@F).txt
 	@touch $@
 
 extension: $(VENV)/product
@@ -118,6 +124,16 @@ docs: $(VENV)/product
 
 site: $(VENV)/docs
 	@NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+# Needs uv. Versions stay where the ranges of pyproject.toml allow it; UPGRADE=1 takes the newest.
+# Without torch and what torch alone needs; the extras without the program's own packages.
+LOCK := uv pip compile pyproject.toml --universal --python-version 3.11 --generate-hashes --quiet \
+  --override requirements/no-torch.txt --no-header --no-annotate $(if $(UPGRADE),--upgrade)
+OWN = $$(sed -n 's/^\([^ ]*\)==.*/--no-emit-package \1/p' requirements/product.txt)
+lock:
+	@$(LOCK) -o requirements/product.txt
+	@$(foreach extra,$(EXTRAS),$(LOCK) --extra $(extra) -c requirements/product.txt $(OWN) \
+	  -o requirements/$(extra).txt;)
 
 VIEWER := pipeline/reporting/viewer
 viewer:

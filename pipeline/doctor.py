@@ -244,7 +244,7 @@ def _packages() -> list[Finding]:
     for name, purpose in NEEDED.items():
         version = _version(name)
         if version is None:
-            fix = "make setup, or pip install with the versions of pyproject.toml"
+            fix = "make setup, or pip install -r requirements/product.txt"
             found.append(Finding(name, f"not installed: {purpose}", "missing", fix))
         else:
             found.append(Finding(name, version))

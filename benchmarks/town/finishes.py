@@ -1,35 +1,41 @@
-"""What a face of a solid looks like: the description from which its texture is painted."""
+"""What a face of a solid looks like, and the texture that is painted from it."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+
+import numpy as np
+
+from benchmarks.town.noise import Floats, fractal
 
 Colour = tuple[float, float, float]  # linear RGB albedo
 
-Wall = Literal["plaster", "brick", "boards", "timber", "stone"]
-Cover = Literal["tiles", "slates", "gravel"]
-Plain = Literal["wood", "hedge", "fence", "bark", "car", "cabin", "metal", "sign"]
+TEXEL = 0.025  # metres
+#: The coarsest structure of a texture, metres.
+_COARSEST = 3.0
+#: Rectangles of another brightness, for edges and corners: their number on a square metre, and the
+#: largest side, metres.
+_PATCHES, _LARGEST_PATCH = 0.8, 1.2
 
 
 @dataclass(frozen=True)
 class Finish:
-    """The look of a face. Two finishes with the same seed and size are the same picture.
+    """The look of a face. Two faces with the same finish and size have the same picture."""
 
-    Attributes:
-        kind: material.
-        seed: of everything drawn at random.
-        colour: main colour.
-        accent: colour of doors, shutters and signs.
-        eaves: height of a wall below its gable, metres; windows stand below it. 0: no windows.
-        door: whether the wall has the house's door.
-        shop: a shop window and a sign on the ground floor.
-    """
-
-    kind: Wall | Cover | Plain
     seed: int
     colour: Colour
-    accent: Colour = (0.2, 0.2, 0.2)
-    eaves: float = 0.0
-    door: bool = False
-    shop: bool = False
+
+
+def painted(finish: Finish, width: float, height: float) -> Floats:
+    """(rows, columns, 3) linear albedo of a face of ``width`` times ``height`` metres, from its top
+    left, in texels of ``TEXEL``: noise of all wavelengths, and rectangles."""
+    rng = np.random.default_rng(finish.seed)
+    rows, columns = (max(2, round(side / TEXEL)) for side in (height, width))
+    brightness = 1 + np.float32(0.22) * fractal(rng, rows, columns, 1.0, _COARSEST / TEXEL)
+    for _ in range(rng.poisson(_PATCHES * width * height)):
+        row, column = rng.integers(rows), rng.integers(columns)
+        down, right = (rng.uniform(0.1, _LARGEST_PATCH, 2) / TEXEL).astype(int)
+        part = brightness[row : row + down, column : column + right]
+        part *= np.float32(rng.uniform(0.4, 1.5))
+    brightness = np.maximum(brightness, np.float32(0.2))
+    return np.asarray(brightness[..., None] * np.array(finish.colour, np.float32))

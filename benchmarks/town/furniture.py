@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.town.finishes import Colour, Finish, Plain, Wall
-from benchmarks.town.houses import axes, fresh, pick
+from benchmarks.town.finishes import Colour
+from benchmarks.town.houses import axes, faces, fresh, pick
 from benchmarks.town.solids import UP, Ellipsoid, Frame, Solid, box, prism
 
 Array = NDArray[np.float64]
 
 GREENERY: tuple[Colour, ...] = ((0.07, 0.15, 0.04), (0.10, 0.17, 0.04), (0.05, 0.11, 0.05))
-BORDERS: tuple[Wall | Plain, ...] = ("hedge", "fence", "stone", "brick")
+BORDERS: tuple[Colour, ...] = (
+    *GREENERY,
+    *((0.32, 0.22, 0.13), (0.55, 0.55, 0.52), (0.42, 0.40, 0.36), (0.34, 0.14, 0.09)),
+)
 PAINTS: tuple[Colour, ...] = (
     *((0.45, 0.04, 0.04), (0.05, 0.10, 0.28), (0.55, 0.55, 0.56), (0.04, 0.04, 0.05)),
     *((0.35, 0.33, 0.28), (0.08, 0.22, 0.14), (0.50, 0.34, 0.05), (0.24, 0.28, 0.33)),
 )
-
-
-def plain(
-    rng: np.random.Generator, kind: Wall | Plain, colour: Colour
-) -> Callable[[Array], Finish]:
-    """The same material and colour on all faces, each with a texture of its own."""
-    return lambda _: Finish(kind, fresh(rng), colour)
 
 
 def border(
@@ -35,23 +29,15 @@ def border(
     tall: bool = False,
 ) -> Solid:
     """A hedge, fence or low wall between plots."""
-    kind = BORDERS[rng.choice(len(BORDERS), p=[0.4, 0.3, 0.15, 0.15])]
     height = float(rng.uniform(1.4, 1.8) if tall else rng.uniform(0.6, 1.1))
-    colours: dict[str, tuple[Colour, ...]] = {
-        "hedge": GREENERY,
-        "fence": ((0.32, 0.22, 0.13), (0.55, 0.55, 0.52), (0.2, 0.24, 0.2)),
-        "stone": ((0.42, 0.40, 0.36),),
-        "brick": ((0.34, 0.14, 0.09),),
-    }
-    colour = pick(rng, colours[kind])
-    return box(centre, (*size, height), 0.0, 0.0, plain(rng, kind, colour))
+    return box(centre, (*size, height), 0.0, 0.0, faces(rng, pick(rng, BORDERS)))
 
 
 def tree(rng: np.random.Generator, at: tuple[float, float], scale: float) -> list[Solid]:
     height = float(rng.uniform(2.0, 3.2)) * scale
     colour = pick(rng, GREENERY, 0.3)
     trunk = (0.26, 0.26, height + 0.6)
-    bark = plain(rng, "bark", (0.16, 0.12, 0.09))
+    bark = faces(rng, (0.16, 0.12, 0.09))
     solids: list[Solid] = [box(at, trunk, 0.0, float(rng.uniform(0, 1.5)), bark)]
     for number in range(int(rng.integers(6, 10))):
         radius = float(rng.uniform(0.5, 1.15)) * scale
@@ -79,10 +65,6 @@ def car(rng: np.random.Generator, at: tuple[float, float]) -> list[Solid]:
     along, across = axes(float(rng.normal(0, 0.02) + np.pi * rng.integers(2)))
     roof = float(rng.uniform(1.38, 1.6))
     centre = np.array([*at, 0.0])
-
-    def cabin(normal: Array) -> Finish:
-        return Finish("car" if abs(normal[2]) > 0.9 else "cabin", fresh(rng), colour)
-
     low = [(-length, 0.22), (length, 0.22), (length, 0.68), (length - 0.3, 0.82)]
     low += [(-length + 0.1, 0.88), (-length, 0.8)]
     high = [(-length + 0.35, 0.8), (length - 1.0, 0.8), (length - 1.75, roof)]
@@ -91,29 +73,30 @@ def car(rng: np.random.Generator, at: tuple[float, float]) -> list[Solid]:
     first, wide = centre + half * across, 2 * half
     second = centre + (half - 0.1) * across
     return [
-        prism(low, wide, Frame(first, along, UP, -across), plain(rng, "car", colour)),
-        prism(high, wide - 0.2, Frame(second, along, UP, -across), cabin),
+        prism(low, wide, Frame(first, along, UP, -across), faces(rng, colour)),
+        prism(
+            high,
+            wide - 0.2,
+            Frame(second, along, UP, -across),
+            faces(rng, (0.05, 0.06, 0.07), colour),
+        ),
     ]
 
 
 def lamp(rng: np.random.Generator, x: float, y: float) -> list[Solid]:
     """A lamp post with a sign."""
-    metal = plain(rng, "metal", (0.10, 0.12, 0.12))
-
-    def plate(_: Array) -> Finish:
-        return Finish("sign", fresh(rng), (0.7, 0.7, 0.66), (0.06, 0.12, 0.35))
-
+    metal = faces(rng, (0.10, 0.12, 0.12))
     return [
         box((x, y), (0.12, 0.12, 4.6), 0.0, 0.0, metal),
         box((x, y), (0.5, 0.3, 0.25), 4.6, 0.0, metal),
-        box((x, y), (0.5, 0.14, 0.4), 2.3, float(rng.normal(0, 0.2)), plate),
+        box((x, y), (0.5, 0.14, 0.4), 2.3, float(rng.normal(0, 0.2)), faces(rng, (0.7, 0.7, 0.66))),
     ]
 
 
 def monument(rng: np.random.Generator, at: tuple[float, float]) -> list[Solid]:
     stone, bronze = pick(rng, ((0.46, 0.44, 0.40),)), pick(rng, ((0.2, 0.3, 0.26),))
     return [
-        box(at, (1.8, 1.8, 0.8), 0.0, 0.3, plain(rng, "stone", stone)),
-        box(at, (0.8, 0.8, 2.2), 0.8, 0.3, plain(rng, "stone", stone)),
+        box(at, (1.8, 1.8, 0.8), 0.0, 0.3, faces(rng, stone)),
+        box(at, (0.8, 0.8, 2.2), 0.8, 0.3, faces(rng, stone)),
         Ellipsoid((*at, 3.5), (0.5, 0.5, 0.7), bronze, fresh(rng)),
     ]

@@ -11,9 +11,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.town.finishes import Finish
-from benchmarks.town.furniture import PAINTS, border, car, lamp, monument, plain, shrub, tree
-from benchmarks.town.houses import Plot, fresh, house, pick
+from benchmarks.town.furniture import PAINTS, border, car, lamp, monument, shrub, tree
+from benchmarks.town.houses import FLAT_ROOF, Plot, faces, house, pick
 from benchmarks.town.solids import Solid, box
 
 Array = NDArray[np.float64]
@@ -197,17 +196,9 @@ def _park(rng: np.random.Generator, lot: _Lot, site: _Site) -> None:
             at = x + sign * float(rng.uniform(3.6, 4.4)), lot.deep(STREET + deep)
             site.solids += tree(rng, at, float(rng.uniform(0.8, 1.1)))
         bench = x + sign * 2.6, y + lot.front * 1.2
-        site.solids.append(
-            box(bench, (1.6, 0.5, 0.45), 0.0, 0.0, plain(rng, "wood", (0.3, 0.16, 0.07)))
-        )
+        site.solids.append(box(bench, (1.6, 0.5, 0.45), 0.0, 0.0, faces(rng, (0.3, 0.16, 0.07))))
     kiosk = x + float(rng.uniform(-2, 2)), lot.deep(STREET + 14.0)
-    colour = pick(rng, PAINTS)
-
-    def sides(normal: Array) -> Finish:
-        if abs(normal[2]) > 0.5:
-            return Finish("gravel", fresh(rng), (0.3, 0.3, 0.3))
-        return Finish("boards", fresh(rng), colour, colour, 2.6, True)
-
+    sides = faces(rng, pick(rng, PAINTS), FLAT_ROOF)
     site.solids.append(box(kiosk, (3.6, 2.6, 2.7), 0.0, float(rng.normal(0, 0.1)), sides))
 
 

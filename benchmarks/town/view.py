@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from benchmarks.town.covers import painted
+from benchmarks.town.finishes import TEXEL, painted
 from benchmarks.town.ground import SKYLIGHT, SUN, SUNLIGHT, Ground, ground_of
 from benchmarks.town.layout import Town
 from benchmarks.town.noise import TILE_SIGMA
@@ -37,23 +37,21 @@ LEAF_TEXEL = 0.012
 class Textures:
     """Textures of faces, painted when first seen; the least recently seen are dropped."""
 
-    stored: OrderedDict[int, tuple[Pyramid, float]] = field(default_factory=OrderedDict)
+    stored: OrderedDict[int, Pyramid] = field(default_factory=OrderedDict)
     num_bytes: int = 0
 
-    def of(self, face: Face) -> tuple[Pyramid, float]:
-        """The texture, as square roots of albedo times 255, and the size of a texel, metres."""
+    def of(self, face: Face) -> Pyramid:
+        """The texture, as square roots of albedo times 255."""
         key = id(face)
         if key in self.stored:
             self.stored.move_to_end(key)
             return self.stored[key]
-        canvas = painted(face.finish, face.width, face.height)
-        roots = 255 * np.sqrt(np.clip(canvas.pixels, 0.004, 0.9))
-        texture = pyramid(roots)
-        self.stored[key] = texture, canvas.texel
+        albedo = painted(face.finish, face.width, face.height)
+        texture = self.stored[key] = pyramid(255 * np.sqrt(np.clip(albedo, 0.004, 0.9)))
         self.num_bytes += texture.num_bytes
         while self.num_bytes > TEXTURE_BYTES and len(self.stored) > 1:
-            self.num_bytes -= self.stored.popitem(last=False)[1][0].num_bytes
-        return texture, canvas.texel
+            self.num_bytes -= self.stored.popitem(last=False)[1].num_bytes
+        return texture
 
 
 @dataclass(frozen=True)
@@ -175,8 +173,7 @@ def _irradiance(normal: Array) -> Floats:
 
 
 def _face(textures: Textures, face: Face, rays: _Hit) -> Floats:
-    texture, texel = textures.of(face)
-    scale = np.float32(1 / texel)
+    texture, scale = textures.of(face), np.float32(1 / TEXEL)
     u = rays.position(face.right, face.origin) * scale
     v = rays.position(face.down, face.origin) * scale
     level = np.log2(np.maximum(rays.blur(face.normal) * scale, np.float32(1e-3)))

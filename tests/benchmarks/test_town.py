@@ -200,7 +200,7 @@ def test_cost_of_a_ray_does_not_grow_with_the_town() -> None:
 
 
 def plain(_: object) -> Finish:
-    return Finish("wood", 0, (0.5, 0.5, 0.5))
+    return Finish(0, (0.5, 0.5, 0.5))
 
 
 def test_first_hits_are_those_of_the_shapes_one_by_one() -> None:

@@ -77,10 +77,10 @@ def that_pauses(project: Path) -> Path:
     loop = project / "pipeline/training/loop"
     (loop / "pause.py").write_text(PAUSE)
     text = (loop / "session.py").read_text()
-    advance = "        self.progress.advance("
+    asked = "        if termination.requested():"
     changed = text.replace("CHECKPOINT_SECONDS = 30.0", "CHECKPOINT_SECONDS = 0.0")
-    assert changed != text and changed.count(advance) == 1
-    changed = changed.replace(advance, f"        pause(state.step)\n{advance}")
+    assert changed != text and changed.count(asked) == 1
+    changed = changed.replace(asked, f"        pause(state.step)\n{asked}")
     first = "from pipeline.training.loop.state import"
     changed = changed.replace(first, f"from pipeline.training.loop.pause import pause\n{first}")
     (loop / "session.py").write_text(changed)

@@ -1,4 +1,4 @@
-"""Checkpoints of training.
+"""Checkpoints of training, and the identity of the run that they belong to.
 
 A file is a numpy archive followed by the 32 bytes of its SHA-256; a damaged file is not used. It is
 written under a temporary name, synced and renamed. The last two are kept.
@@ -10,7 +10,7 @@ import hashlib
 import io
 import json
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -18,8 +18,13 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.training.data.inputs import Inputs
+from pipeline.training.run import TrainingRun
+
 KEPT = 2
 PATTERN = "checkpoint_*.npz.sha256"
+# Increment when the contents of checkpoints or their meaning change.
+STATE_VERSION = 20
 
 
 @dataclass
@@ -37,6 +42,30 @@ class Checkpoint:
     identity: str
     arrays: dict[str, NDArray[Any]]
     values: dict[str, Any]
+
+
+def identity_of(inputs: Inputs, run: TrainingRun) -> str:
+    """Digest of everything that determines the result but the pixels, which the key of the stage
+    (in the name of the folder of checkpoints) covers."""
+    digest = hashlib.sha256()
+    views = [
+        (v.name, v.width, v.height, v.fx, v.fy, v.cx, v.cy, v.world_to_camera.tolist(), v.mask)
+        for v in inputs.views
+    ]
+    sizes = (inputs.extent, inputs.size, inputs.seen_share)
+    gains = None if inputs.gains is None else inputs.gains.tolist()
+    embeddings = None if inputs.embeddings is None else inputs.embeddings.tolist()
+    empty = None if inputs.empty_depths is None else inputs.empty_depths.tolist()
+    # Another device can continue: the log says so.
+    options = run.options.model_dump(exclude={"device"})
+    text = json.dumps([STATE_VERSION, options, run.seed, sizes, views, gains, embeddings, empty])
+    digest.update(text.encode())
+    arrays: list[NDArray[Any]] = list(inputs.initial.arrays().values())
+    for known in inputs.depths or ():
+        arrays += [known.xy, known.z, known.weight]
+    for array in arrays:
+        digest.update(array.tobytes())
+    return digest.hexdigest()
 
 
 class _HashingWriter(io.RawIOBase):
@@ -122,3 +151,16 @@ def _load(path: Path) -> Checkpoint | None:
     if not (type(step) is int and step >= 0 and isinstance(identity, str)):
         return None
     return Checkpoint(step, identity, arrays, values) if isinstance(values, dict) else None
+
+
+def other_build(values: Mapping[str, Any], build: Mapping[str, str]) -> str | None:
+    """A line for the log if a checkpoint was made with another build. It is used: results are
+    equal to the last bit only with one build, but of the same quality with any."""
+    before = values.get("built")
+    facts = "{instruction_set} ({compiler})"
+    if not isinstance(before, dict) or before == build or not before.keys() >= build.keys():
+        return None
+    return (
+        f"training continues with {facts.format(**build)} from a checkpoint made with "
+        f"{facts.format(**before)}: the last bits of the result are those of neither alone"
+    )

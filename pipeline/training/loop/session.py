@@ -9,11 +9,10 @@ from pipeline.runtime import termination
 from pipeline.runtime.progress import Progress
 from pipeline.training.checkpoints import checkpoint
 from pipeline.training.checkpoints.checkpoint import Checkpoint
-from pipeline.training.checkpoints.identity import identity_of
 from pipeline.training.data.inputs import Inputs
 from pipeline.training.loop.metrics_log import NAME, MetricsLog
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
-from pipeline.training.loop.step_timer import StepTimer, other_build
+from pipeline.training.loop.step_timer import StepTimer
 from pipeline.training.run import TrainingRun
 
 CHECKPOINT_SECONDS = 30.0
@@ -38,8 +37,10 @@ class Session:
         log: Callable[[str], None],
     ) -> None:
         self.state, self.run, self.log, self.build = state, run, log, dict(build)
-        self.identity = identity_of(inputs, run)
-        self._resume()
+        self.identity = checkpoint.identity_of(inputs, run)
+        found = checkpoint.load_latest(run.checkpoint_dir, self.identity, log)
+        if found is not None:
+            self._resume(found, checkpoint.other_build(found.values, self.build))
         self.started = self.saved = time.monotonic()
         self.seconds_before = state.seconds
         unit = "steps" if run.options.budget_minutes is None else "parts"
@@ -67,18 +68,15 @@ class Session:
         if now - self.saved >= CHECKPOINT_SECONDS and state.clock < last:
             self._save(fetch)
             self.saved = now
-        self.progress.advance(state.clock - before, note=self._note())
-        self.metrics_log.write(state, last, factor, self.progress.seconds_left())
         if termination.requested():
             self._save(fetch)
             self.log(f"terminated after {state.step} steps, which a checkpoint keeps")
             raise termination.Terminated
+        self.progress.advance(state.clock - before, note=self._note())
+        self.metrics_log.write(state, last, factor, self.progress.seconds_left())
 
-    def _resume(self) -> None:
+    def _resume(self, found: Checkpoint, other_build: str | None) -> None:
         # Messages on checkpoints are logged only: they are not part of the result.
-        found = checkpoint.load_latest(self.run.checkpoint_dir, self.identity, self.log)
-        if found is None:
-            return
         try:
             self.state.restore(found.step, found.arrays, found.values)
         except ValueError as error:
@@ -87,8 +85,8 @@ class Session:
                 f"because it is not one of this run: {error}"
             )
             return
-        if text := other_build(found.values, self.build):
-            self.log(text)
+        if other_build:
+            self.log(other_build)
 
     def _save(self, fetch: Callable[[], None]) -> None:
         fetch()

@@ -11,7 +11,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from pipeline.config.settled import TrainOptions
 from pipeline.plan.training_memory import machine_mb, memory_mb
 from pipeline.render import Backend, RasterCamera
 from pipeline.render.views import near_plane, raster_camera
@@ -90,11 +89,12 @@ def load_scene(inputs: Inputs, run: TrainingRun, warn: Warn) -> TrainingScene:
 def read_targets(inputs: Inputs, run: TrainingRun) -> Targets:
     """The pixels of the views, in memory if they fit beside the Gaussians, else in a file; always
     in a file for a scene in blocks, which are chosen to save memory."""
+    store = choose_image_store(inputs, run)
     with freed_memory():
         return Targets(
             inputs.views,
             run.threads,
-            choose_image_store(inputs, run),
+            store,
             inputs.open_layers(run.threads) if inputs.open_layers else None,
         )
 
@@ -132,17 +132,6 @@ def initial_state(
     order = rng.permutation(len(scene.views))
     adam = Adam(gaussians, AdamOptions.of(options), backend)
     return TrainState(gaussians, adam, density, cameras, rng, order, appearance, clock=start)
-
-
-def learning_rate_unit(inputs: Inputs, options: TrainOptions) -> float:
-    """Unit of the means' learning rate, world units; 1 for each Gaussian's own scales."""
-    match options.experiments.means_learning_rate_unit:
-        case "gaussian_scale":
-            return 1.0
-        case "scene_scale":
-            return inputs.size
-        case "camera_extent":
-            return inputs.extent
 
 
 def _without_hidden_views(inputs: Inputs, targets: Targets, warn: Warn) -> Inputs:

@@ -6,7 +6,6 @@ A build is what ``Backend.facts`` returns: the instruction set and the compiler,
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
 
 #: Steps of this process before the measurement (cold caches), and steps of the measurement.
 WARM_UP, MEASURED = 10, 40
@@ -44,16 +43,3 @@ class StepTimer:
             f"{', '.join(self.build.values())}, {self.threads} threads: "
             f"{each:.1f} ms a step, images at {size}"
         )
-
-
-def other_build(values: dict[str, Any], build: Mapping[str, str]) -> str | None:
-    """A line for the log if a checkpoint was made with another build. It is used: results are
-    equal to the last bit only with one build, but of the same quality with any."""
-    before = values.get("built")
-    facts = "{instruction_set} ({compiler})"
-    if not isinstance(before, dict) or before == build or not before.keys() >= build.keys():
-        return None
-    return (
-        f"training continues with {facts.format(**build)} from a checkpoint made with "
-        f"{facts.format(**before)}: the last bits of the result are those of neither alone"
-    )

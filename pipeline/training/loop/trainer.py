@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from pipeline.config.settled import TrainOptions
 from pipeline.render import BACKGROUNDS, Backend, Color, RasterCamera, RasterOptions
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.memory import freed_memory
+from pipeline.training.data.inputs import Inputs
 from pipeline.training.data.step_view import StepView
 from pipeline.training.data.targets import usable_factor
 from pipeline.training.density.floaters import IMAGE_FACTOR, FloaterRemoval
@@ -16,7 +18,7 @@ from pipeline.training.loop.clock import Clock
 from pipeline.training.loop.device_step import DeviceStep
 from pipeline.training.loop.operator_step import OperatorStep
 from pipeline.training.loop.schedule import Schedule, warm_up
-from pipeline.training.loop.setup import TrainingScene, learning_rate_unit
+from pipeline.training.loop.setup import TrainingScene
 from pipeline.training.loop.state import CURVE_RECORDS, TrainState
 from pipeline.training.loop.step import Step, StepEngine, StepResult
 from pipeline.training.optimisers.adam import AdamStep
@@ -33,21 +35,21 @@ class Trainer:
         self, scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
     ) -> None:
         self.scene, self.state, self.run, self.backend = scene, state, run, backend
-        self.schedule = Schedule.of(run.options, scene.inputs.seen_share)
-        self.clock = Clock(self.schedule.steps, run.options.budget_minutes, run.span)
         self.engine = make_engine(scene, state, run, backend)
         self.floaters = floater_removal(scene, run)
         self.rate_unit = learning_rate_unit(scene.inputs, run.options)
-        self.psnr_interval = min(PSNR_INTERVAL, max(1, self.schedule.steps // CURVE_RECORDS))
+        self.psnr_interval = min(PSNR_INTERVAL, max(1, run.steps // CURVE_RECORDS))
+        self.schedule = Schedule.of(run.options, scene.inputs.seen_share)
+        self.clock = Clock(run.steps, run.options.budget_minutes, run.span)
 
     def step(self) -> None:
         """Render a view, compare it with its photograph, update the parameters, and densify or
         prune if due."""
         state = self.state
         steps = self.clock.advance(state)
+        self.raise_sh_degree()
         self.clock.observe(state, self.factor())
         run_length = self.clock.run_length(state)
-        self.raise_sh_degree()
         view = self.next_view()
         rates = self.schedule.learning_rates(
             state.clock, run_length, self.rate_unit, warm_up(self.run.span, state.step)
@@ -74,8 +76,8 @@ class Trainer:
         state = self.state
         state.drop_unseen(len(self.scene.views), self.scene.sky)
         if self.floaters is not None:
-            before = len(state.gaussians)
-            state.gaussians = self.floaters.without_blockers(state.gaussians, self.reduced_views())
+            before, views = len(state.gaussians), self.reduced_views()
+            state.gaussians = self.floaters.without_blockers(state.gaussians, views)
             state.counters.floaters += before - len(state.gaussians)
 
     def next_view(self) -> StepView:
@@ -101,6 +103,8 @@ class Trainer:
         if self.run.is_part:
             self.backend.release_memory()  # The arrays of all Gaussians are copied.
         rate = schedule.means_decay_at(state.clock) * schedule.learning_rate_factor(run_length)
+        limit = schedule.budget_at(state.clock)
+        budget = self.clock.budget(state, limit)
         changed = state.apply(
             state.density.after_step(
                 DensityStep(
@@ -109,7 +113,7 @@ class Trainer:
                     state.rng,
                     steps,
                     noise_rate=rate,
-                    budget=self.clock.budget(state, schedule.budget_at(state.clock)),
+                    budget=budget,
                     prune=faded > 0,
                 )
             )
@@ -126,7 +130,8 @@ class Trainer:
     def fade_floaters(self) -> int:
         """Make floaters transparent, and return their number."""
         assert self.floaters is not None
-        found = self.floaters.fade(self.state.gaussians, self.reduced_views())
+        views = self.reduced_views()
+        found = self.floaters.fade(self.state.gaussians, views)
         self.state.counters.floaters += found
         return found
 
@@ -208,3 +213,14 @@ def floater_removal(scene: TrainingScene, run: TrainingRun) -> FloaterRemoval | 
     if depths is None or not getattr(run.options.density, "remove_floaters", False):
         return None
     return FloaterRemoval(depths, run.steps)
+
+
+def learning_rate_unit(inputs: Inputs, options: TrainOptions) -> float:
+    """Unit of the means' learning rate, world units; 1 for each Gaussian's own scales."""
+    match options.experiments.means_learning_rate_unit:
+        case "gaussian_scale":
+            return 1.0
+        case "scene_scale":
+            return inputs.size
+        case "camera_extent":
+            return inputs.extent

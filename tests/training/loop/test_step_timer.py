@@ -13,7 +13,6 @@ from pipeline.training.loop.step_timer import (
     MEASURED,
     WARM_UP,
     StepTimer,
-    other_build,
 )
 from pipeline.training.loop.train import train
 from pipeline.training.run import TrainingRun
@@ -44,9 +43,9 @@ def test_short_runs_are_measured_unless_they_have_one_step(steps: int) -> None:
 
 
 def test_a_checkpoint_of_another_instruction_set_is_logged() -> None:
-    assert other_build({}, HERE) is None
-    assert other_build({"built": HERE}, HERE) is None
-    text = other_build({"built": ELSEWHERE}, HERE)
+    assert checkpoint.other_build({}, HERE) is None
+    assert checkpoint.other_build({"built": HERE}, HERE) is None
+    text = checkpoint.other_build({"built": ELSEWHERE}, HERE)
     assert text is not None and "x86-64-v3" in text and "x86-64-v4" in text
 
 

@@ -367,8 +367,8 @@ MUTANTS: dict[str, Mutant] = {
     ),
     "other_pairs": Mutant(
         "pipeline/sfm/matching.py",
-        "(part / CHUNK_FILE, chunk(pairs, number, len(parts)))",
-        "(part / CHUNK_FILE, chunk(pairs[::-1], number, len(parts)))",
+        "(part, chunk(pairs, i, len(parts)))",
+        "(part, chunk(pairs[::-1], i, len(parts)))",
         "matches of several jobs taken for those of other pairs",
         ("tests/sfm/test_chunks.py",),
     ),

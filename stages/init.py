@@ -63,7 +63,7 @@ def work(job: Job) -> None:
     from pipeline.io.clouds.stored import read_cloud
     from pipeline.io.colmap import read_model
     from pipeline.photos.cloud import NOT_PLACED, placed_points
-    from pipeline.sfm.triangulation import triangulate
+    from pipeline.sfm.triangulation import TriangulationOptions, triangulate
     from pipeline.splats.first import InitPoints, first_gaussians
 
     config, experiments = job.section(Init), job.section(Experiments)
@@ -84,6 +84,7 @@ def work(job: Job) -> None:
     elif config.method != "random" and len(points) == 0:
         job.decide("the given poses have no points: points are triangulated")
         triangulated = job.scratch / "triangulation"
+        sections = job.section(Features), job.section(Matches)
         manifest = inputs.read_manifest(job, "views")
         if any(view.has_listed_split for view in training):
             manifest = manifest.only({view.name for view in training})
@@ -92,14 +93,11 @@ def work(job: Job) -> None:
             manifest,
             job.inputs["model"] / "sparse" / "0",
             triangulated,
-            job.section(Features),
-            job.section(Matches),
+            TriangulationOptions(*sections, job.seed, experiments.matches),
             threads=job.threads,
-            seed=job.seed,
-            experiments=experiments.matches,
         )
         job.add_messages(report.decisions, report.warnings)
-        points = read_model(triangulated / "sparse" / "0").points
+        points = read_model(triangulated).points
         extra = {"triangulated_points": len(points)}
     first = first_gaussians(
         InitPoints(points, source, normals),

@@ -10,7 +10,7 @@ from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.sfm.counters import MatchCounters
 from stages.workflow import inputs
-from stages.workflow.matching import matching_scene
+from stages.workflow.matching import CHUNK_FILE, matching_scene
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -22,15 +22,16 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
+    from pipeline.sfm.chunks import chunk
     from pipeline.sfm.matching import match_chunk
     from pipeline.sfm.pair_list import PairList
 
+    chosen = PairList.read(job.inputs["pairs"])
     report = match_chunk(
         matching_scene(job),
-        PairList.read(job.inputs["pairs"]),
-        job.number,
-        job.of_jobs,
-        job.out,
+        chosen,
+        chunk(chosen.pairs, job.number, job.of_jobs),
+        job.out / CHUNK_FILE,
         cache=job.cache_of("matches"),
         scratch=job.scratch / "pairs",
         threads=job.threads,

@@ -11,7 +11,7 @@ from pipeline.plan.values import StagePlan
 from pipeline.runtime.job import Job
 from pipeline.sfm.counters import MatchesCounters
 from stages.workflow import inputs
-from stages.workflow.matching import matching_scene
+from stages.workflow.matching import CHUNK_FILE, matching_scene
 
 if TYPE_CHECKING:
     from pipeline.plan.scan import Scan
@@ -26,16 +26,17 @@ def work(job: Job) -> None:
     from pipeline.sfm.matching import match_features
     from pipeline.sfm.pair_list import PairList
 
-    parts = inputs.of_jobs(job, "match")
+    scene, parts = matching_scene(job), inputs.of_jobs(job, "match")
     report = match_features(
-        matching_scene(job),
+        scene,
         job.section(Matches),
-        job.out,
+        job.out / "database.db",
         cache=job.shared_cache,
         threads=job.threads,
         chosen=PairList.read(job.inputs["pairs"]) if parts else None,
-        parts=parts,
+        parts=[part / CHUNK_FILE for part in parts],
     )
+    scene.write_colors(job.out / "keypoint_colors.npz")
     job.record(report.counters, report.decisions, report.warnings)
     if not parts:
         # Not a counter: it depends on earlier runs.

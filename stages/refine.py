@@ -51,10 +51,11 @@ def decide(scan: Scan, settled: Settled) -> StagePlan:
 
 
 def work(job: Job) -> None:
-    from pipeline.sfm.known_poses import refine_known_poses
+    from pipeline.sfm.known_poses import refine_known_poses, write_adjusted
 
-    given = job.inputs["model"]
-    report = refine_known_poses(given / "sparse" / "0", job.section(Sfm), job.out / "sparse" / "0")
+    given = job.inputs["model"] / "sparse" / "0"
+    model, report = refine_known_poses(given, job.section(Sfm))
+    write_adjusted(model, given, job.out / "sparse" / "0")
     job.record(report.counters, report.decisions)
     inputs.copy_georeference(job, "model")
 

@@ -48,16 +48,15 @@ def work(job: Job) -> None:
     from pipeline.sfm.mapping import reconstruct
 
     control = job.inputs["inspect"] / GCP_FILE
-    report = reconstruct(
+    found = reconstruct(
         inputs.read_manifest(job, "photos"),
         job.inputs["matches"] / "database.db",
         job.section(Sfm),
-        job.out,
-        threads=job.threads,
         seed=job.seed,
         ground_control=control if control.is_file() else None,
     )
-    job.record(report.counters, report.decisions, report.warnings)
+    found.write(job.out)
+    job.record(found.report.counters, found.report.decisions, found.report.warnings)
 
 
 SPEC = StageSpec(

@@ -24,8 +24,7 @@ from pipeline.io.colmap import read_model
 from pipeline.runtime.isolate import run_isolated
 from pipeline.sfm.attempts import MAX_ATTEMPTS, Attempt, map_until_good
 from pipeline.sfm.mappers import Mapper
-from pipeline.sfm.models import write_model
-from pipeline.sfm.quiet import quiet_colmap
+from pipeline.sfm.models import quiet_colmap, write_model
 
 # Printed fields of the evidence: name, heading, format.
 SHOWN = (

@@ -88,11 +88,11 @@ def match_folder(folder: Path, work: Path, seed: int) -> Matched:
     manifest = found.manifest
     features = work / "features"
     extract_features(manifest, settled.features, features, cache=work / "cache", threads=1)
-    run_isolated(_match, manifest, features, settled.matches, settled.sfm, work / "matches", seed)
+    run_isolated(_match, manifest, features, settled.matches, settled.sfm, work, seed)
     mapper = settled.sfm.mapper
     assert mapper != "auto"
     return Matched(
-        work / "matches" / "database.db",
+        work / "database.db",
         len(manifest.photos),
         mapper,
         settled.sfm.min_registered_share,
@@ -115,10 +115,11 @@ def _finished(folder: Path, work: Path) -> Matched:
 
 
 def _match(
-    manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, out: Path, seed: int
+    manifest: Manifest, features: Path, matches: Matches, sfm: Sfm, work: Path, seed: int
 ) -> None:
     from pipeline.sfm.matching import MatchingScene, match_features
 
     # No verified pair, which this stage reports. Mapping then finds no model.
     with contextlib.suppress(UserError):
-        match_features(MatchingScene(manifest, features, sfm, seed), matches, out)
+        scene = MatchingScene(manifest, features, sfm, seed)
+        match_features(scene, matches, work / "database.db")

@@ -63,7 +63,7 @@ def make_database(path: Path, count: int, points: int) -> None:
     """
     import pycolmap
 
-    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.models import quiet_colmap
 
     quiet_colmap()
     rng = np.random.default_rng(1)
@@ -125,10 +125,9 @@ def mapping(folder: Path, count: int, mapper: str) -> None:
     ]
     manifest = Manifest(scene="street", photos=tuple(photos))
     config = Sfm.model_validate({"mapper": mapper})
-    report = reconstruct(
-        manifest, folder / "database.db", config, folder / mapper, threads=1, seed=0
-    )
-    verdict = report.counters.verdict
+    found = reconstruct(manifest, folder / "database.db", config, seed=0)
+    found.write(folder / mapper)
+    verdict = found.report.counters.verdict
     if verdict != "good":  # the other mapper has run as well
         raise UserError(f"{mapper} mapping of {count} photographs is {verdict}")
 

@@ -86,13 +86,10 @@ def our_matches(manifest: Manifest, config: Config, folder: Path, threads: int) 
     """As in stages/matches.py."""
     from pipeline.sfm.matching import MatchingScene, match_features
 
-    match_features(
-        MatchingScene(manifest, folder / "features", config.sfm, config.seed),
-        config.matches,
-        folder / "matches",
-        cache=folder / "cache",
-        threads=threads,
-    )
+    scene = MatchingScene(manifest, folder / "features", config.sfm, config.seed)
+    out, cache = folder / "matches", folder / "cache"
+    match_features(scene, config.matches, out / "database.db", cache=cache, threads=threads)
+    scene.write_colors(out / "keypoint_colors.npz")
 
 
 def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) -> None:
@@ -100,7 +97,7 @@ def our_mapping(manifest: Manifest, config: Config, folder: Path, threads: int) 
     from pipeline.sfm.mapping import reconstruct
 
     database = folder / "matches" / "database.db"
-    reconstruct(manifest, database, config.sfm, folder, threads=threads, seed=config.seed)
+    reconstruct(manifest, database, config.sfm, seed=config.seed).write(folder)
 
 
 def reference_features(manifest: Manifest, folder: Path, threads: int) -> None:

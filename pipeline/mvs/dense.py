@@ -41,6 +41,7 @@ from pipeline.mvs.patchmatch import Picture
 from pipeline.mvs.sources import seen_points, select_sources
 from pipeline.photos.load import load_view
 from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.counters import Report
 from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
@@ -69,15 +70,6 @@ class DenseOptions:
     filter: FilterOptions = field(default_factory=FilterOptions)
 
 
-@dataclass(frozen=True)
-class DenseReport:
-    """Counters, decisions and warnings of the dense stage."""
-
-    counters: DenseCounters
-    decisions: list[str]
-    warnings: list[str]
-
-
 def reconstruct(
     views: Sequence[View],
     model: Reconstruction,
@@ -85,7 +77,7 @@ def reconstruct(
     scratch: Path,
     threads: int,
     options: DenseOptions | None = None,
-) -> DenseReport:
+) -> Report[DenseCounters]:
     """Write the depth maps of the views and the fused cloud (``pipeline.mvs.maps``) into ``out``.
 
     Args:
@@ -175,7 +167,7 @@ class _Scene:
             -(-self._options.max_points // len(self._views)),
         )
 
-    def report(self, shares: NDArray[np.float64], cloud: DenseCloud) -> DenseReport:
+    def report(self, shares: NDArray[np.float64], cloud: DenseCloud) -> Report[DenseCounters]:
         """Args: shares: (V, 3) as ``filter`` returns."""
         valid, known, confidence = shares.sum(0).tolist() if len(shares) else (0, 0, 0.0)
         alone = sum(len(sources) == 0 for sources in self._sources)
@@ -203,7 +195,7 @@ class _Scene:
                 "views confirm: surfaces without texture, moving objects, inaccurate poses or too "
                 "little overlap (init.method: points does not use depth maps)"
             )
-        return DenseReport(counters, decisions, warnings)
+        return Report(counters, decisions, warnings)
 
     def _file(self, index: int) -> Path:
         return self._planes / f"{index}.npy"

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Generic, TypeVar
 
 from pydantic import BaseModel, ConfigDict, ValidationError
 
@@ -29,6 +30,23 @@ class NoCounters(StageCounters):
 
 
 C = TypeVar("C", bound=StageCounters)
+
+
+@dataclass(frozen=True)
+class Report(Generic[C]):
+    """The result of a stage's work for its record.
+
+    Attributes:
+        counters: The stage's counters.
+        decisions, warnings: Sentences for the log.
+        num_cached: The number of results found in a cache. It is no counter, because it depends on
+            earlier runs.
+    """
+
+    counters: C
+    decisions: list[str]
+    warnings: list[str] = field(default_factory=list)
+    num_cached: int = 0
 
 
 def read_counters(folder: Path, model: type[C]) -> C:

@@ -11,15 +11,17 @@ import shutil
 import tempfile
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import pycolmap
 
 from pipeline.sfm.counters import AttemptRecord, Mapper
-from pipeline.sfm.database import DEFAULT_FOCAL_FACTOR, share_cameras_by_size
+from pipeline.sfm.database import share_cameras_by_size
 from pipeline.sfm.evidence import collect_evidence
 from pipeline.sfm.judge import Evidence, Verdict, judge
 from pipeline.sfm.mappers import run_mapper
+from pipeline.sfm.models import DEFAULT_FOCAL_FACTOR, uncalibrated
 
 # Initial focal lengths over the longer side that are tried: wide, normal and long lens.
 SWEPT_FOCALS = (0.55, DEFAULT_FOCAL_FACTOR, 2.5)
@@ -29,7 +31,7 @@ FISHEYE_FOCAL = 0.4
 # A lens with a focal length over the longer side below this may be a fisheye.
 FISHEYE_BELOW = 0.6
 
-# Reconstructions of a scene at most.
+# Maximum number of reconstructions of a scene.
 MAX_ATTEMPTS = 4
 
 
@@ -38,9 +40,10 @@ class Attempt:
     """One mapping attempt and its models.
 
     Attributes:
-        models: the models found, largest first.
-        evidence, verdict: quality of the largest model.
-        database: the database that was mapped.
+        change: The difference from the first attempt in words; empty for the first.
+        models: The models found, largest first.
+        evidence, verdict: The quality of the largest model.
+        database: The database that was mapped.
     """
 
     mapper: Mapper
@@ -72,12 +75,12 @@ def map_until_good(
     """Map a scene until a model is good.
 
     Args:
-        database: database of verified matches. It is not changed; changed copies are written
+        database: The database of verified matches. It is not changed; changed copies are written
             beside it.
-        first: mapper of the first attempt.
-        total: number of photographs of the scene.
-        min_share: see ``judge``.
-        budget: maximum number of attempts.
+        first: The mapper of the first attempt.
+        total: The number of photographs of the scene.
+        min_share: The share of registered images below which a model has failed.
+        budget: The maximum number of attempts.
 
     Returns:
         The best attempt and the records of all attempts, in order.
@@ -85,11 +88,8 @@ def map_until_good(
     best = _attempt(database, first, "", total, min_share, seed)
     attempts = [best]
     for mapper, change, prepare in _alternatives(database, first):
-        if (
-            best.verdict.grade == "good"
-            or not best.verdict.worth_retrying
-            or len(attempts) >= budget
-        ):
+        is_final = best.verdict.grade == "good" or not best.verdict.worth_retrying
+        if is_final or len(attempts) >= budget:
             break
         path = database
         if prepare is not None:
@@ -114,18 +114,15 @@ def _alternatives(
     """
     other: Mapper = "global" if first == "incremental" else "incremental"
     yield other, "", None
-    if not _adjustable_cameras(database):
+    if not (initial := _initial_focals(database)):
         return
-
-    def one_camera(path: Path) -> bool:
-        return share_cameras_by_size(database, path)
-
-    yield first, "one camera for all photographs of a size, EXIF ignored", one_camera
-
-    def fisheye(path: Path) -> bool:
-        return _set_cameras(database, path, "OPENCV_FISHEYE", FISHEYE_FOCAL)
-
-    tried = _initial_focal_range(database)
+    yield (
+        first,
+        "one camera for all photographs of a size, EXIF ignored",
+        partial(share_cameras_by_size, database),
+    )
+    fisheye = partial(_set_cameras, database, focal=FISHEYE_FOCAL, model="OPENCV_FISHEYE")
+    tried = [initial[0], initial[-1]]
     estimated = _view_graph_focal(database)
     wide = min(estimated, *tried) < FISHEYE_BELOW
     if wide:
@@ -134,12 +131,8 @@ def _alternatives(
         if any(max(focal / t, t / focal) < SAME_FOCAL_RATIO for t in tried):
             continue
         tried.append(focal)
-
-        def other_focal(path: Path, focal: float = focal) -> bool:
-            return _set_cameras(database, path, None, focal)
-
         change = f"EXIF ignored, initial focal length {focal:.2f} times the longer side"
-        yield first, change, other_focal
+        yield first, change, partial(_set_cameras, database, focal=focal)
     if not wide:
         yield first, "fisheye cameras", fisheye
 
@@ -161,17 +154,12 @@ def _rank(attempt: Attempt) -> tuple[int, float]:
     return grade, e.registered * e.explained_matches * e.agreeing_pairs
 
 
-def _initial_focal_range(database: Path) -> list[float]:
-    """Smallest and largest initial focal length of the cameras, over the longer side."""
-    cameras = _adjustable_cameras(database)
-    found = [c.mean_focal_length() / max(c.width, c.height) for c in cameras]
-    return [float(min(found)), float(max(found))]
-
-
-def _adjustable_cameras(database: Path) -> list[pycolmap.Camera]:
-    """The cameras that have intrinsics: all but those of panoramas."""
+def _initial_focals(database: Path) -> list[float]:
+    """The initial focal lengths over the longer side of all cameras but those of panoramas, which
+    have none; ascending."""
     with pycolmap.Database.open(database) as opened:
-        return [camera for camera in opened.read_all_cameras() if not camera.is_spherical()]
+        cameras = [camera for camera in opened.read_all_cameras() if not camera.is_spherical()]
+    return sorted(float(c.mean_focal_length() / max(c.width, c.height)) for c in cameras)
 
 
 def _view_graph_focal(database: Path) -> float:
@@ -179,36 +167,21 @@ def _view_graph_focal(database: Path) -> float:
     (view graph calibration). Accurate within a factor of two if the images determine it."""
     with tempfile.TemporaryDirectory(dir=database.parent) as folder:
         copy = Path(folder) / "calibrated.db"
-        _set_cameras(database, copy, None, DEFAULT_FOCAL_FACTOR)
+        _set_cameras(database, copy, DEFAULT_FOCAL_FACTOR)
         pycolmap.calibrate_view_graph(
             copy,
             pycolmap.ViewGraphCalibrationOptions(random_seed=0, reestimate_relative_pose=False),
         )
-        return _median_focal(copy)
+        found = _initial_focals(copy)
+        return found[len(found) // 2]
 
 
-def _median_focal(database: Path) -> float:
-    cameras = _adjustable_cameras(database)
-    found = sorted(c.mean_focal_length() / max(c.width, c.height) for c in cameras)
-    return float(found[len(found) // 2])
-
-
-def _set_cameras(source: Path, target: Path, model: str | None, focal: float) -> bool:
+def _set_cameras(source: Path, target: Path, focal: float, model: str | None = None) -> bool:
     """Copy a database; its cameras, except of panoramas, get this model (None: unchanged) and focal
     length (over the longer side), without a prior."""
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
         for camera in database.read_all_cameras():
-            if camera.is_spherical():
-                continue
-            side = max(camera.width, camera.height)
-            database.update_camera(
-                pycolmap.Camera.create_from_model_name(
-                    camera.camera_id,
-                    model or camera.model_name,
-                    focal * side,
-                    camera.width,
-                    camera.height,
-                )
-            )
+            if not camera.is_spherical():
+                database.update_camera(uncalibrated(camera, focal, model))
     return True

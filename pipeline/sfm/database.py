@@ -11,11 +11,11 @@ import shutil
 import sqlite3
 import tempfile
 from collections import defaultdict
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
-from dataclasses import asdict, dataclass
-from functools import lru_cache
+from dataclasses import dataclass
+from functools import cache, cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -26,14 +26,11 @@ from pipeline.config import settled
 from pipeline.runtime.progress import Progress
 from pipeline.runtime.record import file_digest
 from pipeline.scene.manifest import Manifest, Photo
-from pipeline.sfm.fisheye import is_uncalibrated, with_prior
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
+from pipeline.sfm.models import DEFAULT_FOCAL_FACTOR, is_uncalibrated, uncalibrated, with_prior
 from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pair_cache import PairCache
 from pipeline.sfm.pairs import Pair
-
-# COLMAP's default focal length over the longer side without a prior (about 45 degrees).
-DEFAULT_FOCAL_FACTOR = 1.2
 
 # Part of a pair's cache key: increase it when a change of the code changes matches.
 ALGORITHM_VERSION = 1
@@ -48,19 +45,111 @@ CACHED_KEYPOINT_FILES = 200
 BATCH_PAIRS = 256
 
 
-@dataclass(frozen=True)
-class MatchingSettings:
-    """Settings of matching and two-view verification.
+@dataclass(frozen=True, eq=False)
+class MatchingInputs:
+    """The photographs whose pairs are matched and verified. Keypoints are read on demand.
 
     Attributes:
-        max_ratio: of Lowe's ratio test.
-        min_inliers: smallest number of inliers of a verified pair.
-        seed: of RANSAC.
+        cameras: The cameras of the photographs.
+        images: (image id, name, camera id) of each photograph, sorted by id.
+        features: The folder of the keypoint files.
+        max_ratio: The largest ratio of Lowe's ratio test.
+        min_inliers: The smallest number of inliers of a verified pair.
+        seed: The seed of RANSAC.
     """
 
+    cameras: Sequence[pycolmap.Camera]
+    images: Sequence[tuple[int, str, int]]
+    features: Path
     max_ratio: float
     min_inliers: int
     seed: int
+
+    @cached_property
+    def _camera_of(self) -> dict[int, pycolmap.Camera]:
+        """Image id -> the camera that its pairs are verified with."""
+        verified = {c.camera_id: with_prior(c) if is_uncalibrated(c) else c for c in self.cameras}
+        return {image_id: verified[camera_id] for image_id, _, camera_id in self.images}
+
+    @cached_property
+    def keypoints(self) -> Callable[[int], Keypoints]:
+        """Image id -> the keypoints of the photograph."""
+        return lru_cache(CACHED_KEYPOINT_FILES)(
+            lambda image_id: Keypoints.read(self.file(image_id))
+        )
+
+    @cached_property
+    def _digest(self) -> Callable[[int], str]:
+        return cache(lambda image_id: file_digest(self.file(image_id)))
+
+    @cached_property
+    def _names(self) -> dict[int, str]:
+        return {image_id: name for image_id, name, _ in self.images}
+
+    def file(self, image_id: int) -> Path:
+        """The keypoint file of a photograph."""
+        return keypoint_file(self.features, self._names[image_id])
+
+    def colors(self) -> Iterator[tuple[int, NDArray[np.uint8]]]:
+        """The id of each image and the (F, 3) colours of its keypoints, one image at a time."""
+        return ((i, Keypoints.read(self.file(i)).rgb) for i, _, _ in self.images)
+
+    def keys(self, pairs: Sequence[Pair]) -> dict[tuple[int, int], int]:
+        """Image ids of each pair, given by the indices of its images -> its cache key."""
+        ids = [(self.images[i][0], self.images[j][0]) for i, j in pairs]
+        return {pair: self._key(pair) for pair in ids}
+
+    def _key(self, pair: tuple[int, int]) -> int:
+        """Cache key of a pair: a hash of everything the result depends on, 63 bits (a positive
+        SQLite integer)."""
+        options = {"max_ratio": self.max_ratio, "min_inliers": self.min_inliers, "seed": self.seed}
+        facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, options]
+        for image_id in pair:
+            c = self._camera_of[image_id]
+            facts += [self._digest(image_id), c.model_name, c.width, c.height]
+            facts += [c.params.tolist(), c.has_prior_focal_length]
+        digest = hashlib.sha256(repr(facts).encode()).digest()
+        return int.from_bytes(digest[:8], "big") >> 1
+
+    def match(self, pair: tuple[int, int]) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
+        """(M, 2) matches of two images, and their two-view geometry, which is empty if the pair is
+        not verified."""
+        a, b = (self.keypoints(image_id) for image_id in pair)
+        matches = match_descriptors(a.descriptors, b.descriptors, self.max_ratio)
+        if len(matches) < self.min_inliers:
+            return matches, pycolmap.TwoViewGeometry()
+        options = pycolmap.TwoViewGeometryOptions(min_num_inliers=self.min_inliers)
+        options.ransac.random_seed = self.seed
+        options.ransac.max_num_trials = MAX_TRIALS
+        # A geometry with fewer inliers would be rejected below.
+        options.ransac.min_inlier_ratio = self.min_inliers / len(matches)
+        camera_a, camera_b = (self._camera_of[image_id] for image_id in pair)
+        geometry = pycolmap.estimate_two_view_geometry(
+            *(camera_a, a.xy.astype(np.float64), camera_b, b.xy.astype(np.float64)),
+            *(matches, options),
+        )
+        if len(geometry.inlier_matches) < self.min_inliers:
+            return matches, pycolmap.TwoViewGeometry()
+        return matches, geometry
+
+    def write(self, path: Path) -> None:
+        """Write a database of the cameras, images and keypoints."""
+        path.unlink(missing_ok=True)
+        with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
+            for camera in self.cameras:
+                database.write_camera(camera, use_camera_id=True)
+                rig = pycolmap.Rig(rig_id=camera.camera_id)
+                rig.add_ref_sensor(camera.sensor_id)
+                database.write_rig(rig, use_rig_id=True)
+            for image_id, name, camera_id in self.images:
+                image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
+                database.write_image(image, use_image_id=True)
+                frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
+                frame.add_data_id(image.data_id)
+                database.write_frame(frame, use_frame_id=True)
+                found = Keypoints.read(self.file(image_id))
+                table = np.column_stack([found.xy, found.scale, found.orientation])
+                database.write_keypoints(image_id, table.astype(np.float32).reshape(-1, 4))
 
 
 def plan_cameras(
@@ -111,11 +200,8 @@ def _sharing(photo: Photo, share: str) -> tuple[str, ...]:
 
 def build_database(
     path: Path,
-    cameras: Sequence[pycolmap.Camera],
-    images: Sequence[tuple[int, str, int]],
-    features: Path,
+    inputs: MatchingInputs,
     pairs: Sequence[Pair],
-    settings: MatchingSettings,
     *,
     cache: Path | None = None,
     matched: Iterable[tuple[Path, Sequence[Pair]]] = (),
@@ -127,11 +213,9 @@ def build_database(
     ``matched``: pairs are computed independently and written in order.
 
     Args:
-        images: (image id, name, camera id), sorted by id.
-        features: folder of keypoint files.
-        pairs: indices into ``images``, the smaller one first.
-        cache: folder for results of pairs that outlives the call; None for a temporary one.
-        matched: files of ``match_pairs`` with their pairs, which are added to the cache.
+        pairs: Indices into the images, the smaller one first.
+        cache: A folder for results of pairs that outlives the call; None for a temporary one.
+        matched: Files of ``match_pairs`` with their pairs, which are added to the cache.
 
     Returns:
         The number of pairs found in the cache.
@@ -140,13 +224,11 @@ def build_database(
     with tempfile.TemporaryDirectory(prefix="matching-", dir=path.parent) as folder:
         store = Path(folder) if cache is None else cache
         store.mkdir(parents=True, exist_ok=True)
-        inputs = _MatchingInputs(cameras, images, features)
-        keys = inputs.keys(pairs, settings)
+        keys = inputs.keys(pairs)
         with closing(PairCache(store)) as results:
             for file, part in matched:
-                results.add(file, inputs.keys(part, settings))
-            num_cached = _match_missing(inputs, keys, settings, results, Path(folder), threads)
-            path.unlink(missing_ok=True)
+                results.add(file, inputs.keys(part))
+            num_cached = _match_missing(inputs, keys, results, Path(folder), threads)
             inputs.write(path)
             results.copy_to(path, keys)
             results.prune(set(keys.values()))
@@ -155,11 +237,8 @@ def build_database(
 
 def match_pairs(
     path: Path,
-    cameras: Sequence[pycolmap.Camera],
-    images: Sequence[tuple[int, str, int]],
-    features: Path,
+    inputs: MatchingInputs,
     pairs: Sequence[Pair],
-    settings: MatchingSettings,
     *,
     cache: Path,
     scratch: Path,
@@ -169,20 +248,20 @@ def match_pairs(
     without images. ``build_database`` adds them to the scene's database.
 
     Args:
-        cache: as of ``build_database``; it is only read.
-        scratch: folder of the results until they are complete. A call that is repeated finds those
-            of a process that was killed.
+        pairs: Indices into the images, the smaller one first.
+        cache: The folder that ``build_database`` uses; it is only read.
+        scratch: A folder for the results until they are complete. A call that is repeated finds
+            those of a process that was killed.
 
     Returns:
         The numbers of pairs that were found in the cache, and of verified pairs.
     """
     for folder in (path.parent, scratch):
         folder.mkdir(parents=True, exist_ok=True)
-    inputs = _MatchingInputs(cameras, images, features)
-    keys = inputs.keys(pairs, settings)
+    keys = inputs.keys(pairs)
     with closing(PairCache(scratch)) as results:
         results.add_known(cache, keys.values())
-        num_cached = _match_missing(inputs, keys, settings, results, scratch, threads)
+        num_cached = _match_missing(inputs, keys, results, scratch, threads)
         path.unlink(missing_ok=True)
         pycolmap.Database.open(path).close()
         results.copy_to(path, keys)
@@ -224,114 +303,37 @@ def share_cameras_by_size(source: Path, target: Path) -> bool:
     shutil.copyfile(source, target)
     with pycolmap.Database.open(target) as database:
         for camera_id in shared_ids.values():
-            camera = cameras[camera_id]
-            if camera.is_spherical():
-                continue
-            side = max(camera.width, camera.height)
-            shared = pycolmap.Camera.create_from_model_name(
-                camera_id,
-                camera.model_name,
-                DEFAULT_FOCAL_FACTOR * side,
-                camera.width,
-                camera.height,
-            )
-            database.update_camera(shared)
+            if not cameras[camera_id].is_spherical():
+                database.update_camera(uncalibrated(cameras[camera_id]))
     # Every rig has one camera, with the same id; every frame has one image.
     moves = [(new, old) for old, new in merged.items() if new != old]
-    connection = sqlite3.connect(target)
-    try:
-        for table, column in (("images", "camera_id"), ("frames", "rig_id")):
+    unused = [(old,) for _, old in moves]
+    with closing(sqlite3.connect(target)) as connection, connection:
+        for table, column in (
+            ("images", "camera_id"),
+            ("frames", "rig_id"),
+            ("frame_data", "sensor_id"),
+        ):
             statement = f"UPDATE {table} SET {column} = ? WHERE {column} = ?"
             connection.executemany(statement, moves)
-        connection.executemany("UPDATE frame_data SET sensor_id = ? WHERE sensor_id = ?", moves)
-        unused = [(old,) for _, old in moves]
-        connection.executemany("DELETE FROM rigs WHERE rig_id = ?", unused)
-        connection.executemany("DELETE FROM cameras WHERE camera_id = ?", unused)
-        connection.commit()
-    finally:
-        connection.close()
+        for table, column in (("rigs", "rig_id"), ("cameras", "camera_id")):
+            connection.executemany(f"DELETE FROM {table} WHERE {column} = ?", unused)
     return True
 
 
-class _MatchingInputs:
-    """Cameras, images and keypoints to match; keypoints are read on demand."""
-
-    def __init__(
-        self,
-        cameras: Sequence[pycolmap.Camera],
-        images: Sequence[tuple[int, str, int]],
-        features: Path,
-    ):
-        self._cameras, self._images = cameras, images
-        self._verified = {
-            camera.camera_id: with_prior(camera) if is_uncalibrated(camera) else camera
-            for camera in cameras
-        }
-        self._camera_of = {image_id: camera_id for image_id, _, camera_id in images}
-        self._file = {image_id: keypoint_file(features, name) for image_id, name, _ in images}
-        self._digest: dict[int, str] = {}
-        self.keypoints = lru_cache(maxsize=CACHED_KEYPOINT_FILES)(self._read)
-
-    def camera(self, image_id: int) -> pycolmap.Camera:
-        """The camera as pairs are verified with it."""
-        return self._verified[self._camera_of[image_id]]
-
-    def _read(self, image_id: int) -> tuple[NDArray[np.float64], NDArray[np.uint8]]:
-        """(F, 2) positions and (F, 128) descriptors."""
-        found = Keypoints.read(self._file[image_id])
-        return found.xy.astype(np.float64), found.descriptors
-
-    def keys(self, pairs: Sequence[Pair], settings: MatchingSettings) -> dict[tuple[int, int], int]:
-        """Image ids of each pair, given by the indices of its images -> its cache key."""
-        ids = [(self._images[i][0], self._images[j][0]) for i, j in pairs]
-        return {pair: self._key(pair, settings) for pair in ids}
-
-    def _key(self, pair: tuple[int, int], settings: MatchingSettings) -> int:
-        """Cache key of a pair: a hash of everything the result depends on, 63 bits (a positive
-        SQLite integer)."""
-        facts = [ALGORITHM_VERSION, MAX_TRIALS, pycolmap.__version__, asdict(settings)]
-        for image_id in pair:
-            c = self.camera(image_id)
-            if image_id not in self._digest:
-                self._digest[image_id] = file_digest(self._file[image_id])
-            facts += [self._digest[image_id], c.model_name, c.width, c.height]
-            facts += [c.params.tolist(), c.has_prior_focal_length]
-        digest = hashlib.sha256(repr(facts).encode()).digest()
-        return int.from_bytes(digest[:8], "big") >> 1
-
-    def write(self, path: Path) -> None:
-        """Write a database of the cameras, images and keypoints."""
-        with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-            for camera in self._cameras:
-                database.write_camera(camera, use_camera_id=True)
-                rig = pycolmap.Rig(rig_id=camera.camera_id)
-                rig.add_ref_sensor(camera.sensor_id)
-                database.write_rig(rig, use_rig_id=True)
-            for image_id, name, camera_id in self._images:
-                image = pycolmap.Image(name=name, camera_id=camera_id, image_id=image_id)
-                database.write_image(image, use_image_id=True)
-                frame = pycolmap.Frame(frame_id=image_id, rig_id=camera_id)
-                frame.add_data_id(image.data_id)
-                database.write_frame(frame, use_frame_id=True)
-                found = Keypoints.read(self._file[image_id])
-                table = np.column_stack([found.xy, found.scale, found.orientation])
-                database.write_keypoints(image_id, table.astype(np.float32).reshape(-1, 4))
-
-
 def _match_missing(
-    inputs: _MatchingInputs,
+    inputs: MatchingInputs,
     keys: Mapping[tuple[int, int], int],
-    settings: MatchingSettings,
-    cache: PairCache,
+    results: PairCache,
     folder: Path,
     threads: int,
 ) -> int:
-    """Match and verify the pairs (image ids -> key) that the cache lacks and add them to it.
+    """Match and verify the pairs (image ids -> key) that ``results`` lacks and add them to it.
 
     Returns:
-        The number of pairs that it has had already.
+        The number of pairs that it had already.
     """
-    missing = [pair for pair, key in keys.items() if not cache.has(key)]
+    missing = [pair for pair, key in keys.items() if not results.has(key)]
     if not missing:
         return len(keys)
     progress = Progress("matching", len(missing), "pairs")
@@ -342,31 +344,10 @@ def _match_missing(
             path = folder / "batch.db"
             path.unlink(missing_ok=True)
             with pycolmap.Database.open(path) as database, pycolmap.DatabaseTransaction(database):
-                results = pool.map(lambda pair: _match_pair(inputs, pair, settings), batch)
-                for (first, second), (matches, geometry) in zip(batch, results, strict=True):
+                matched = pool.map(inputs.match, batch)
+                for (first, second), (matches, geometry) in zip(batch, matched, strict=True):
                     database.write_matches(first, second, matches)
                     database.write_two_view_geometry(first, second, geometry)
                     progress.advance()
-            cache.add(path, {pair: keys[pair] for pair in batch})
+            results.add(path, {pair: keys[pair] for pair in batch})
     return len(keys) - len(missing)
-
-
-def _match_pair(
-    inputs: _MatchingInputs, pair: tuple[int, int], settings: MatchingSettings
-) -> tuple[NDArray[np.uint32], pycolmap.TwoViewGeometry]:
-    """(M, 2) matches, and their two-view geometry, which is empty if the pair is not verified."""
-    (xy_a, descriptors_a), (xy_b, descriptors_b) = (inputs.keypoints(i) for i in pair)
-    matches = match_descriptors(descriptors_a, descriptors_b, settings.max_ratio)
-    if len(matches) < settings.min_inliers:
-        return matches, pycolmap.TwoViewGeometry()
-    options = pycolmap.TwoViewGeometryOptions(min_num_inliers=settings.min_inliers)
-    options.ransac.random_seed = settings.seed
-    options.ransac.max_num_trials = MAX_TRIALS
-    # A geometry with fewer inliers would be rejected below.
-    options.ransac.min_inlier_ratio = settings.min_inliers / len(matches)
-    geometry = pycolmap.estimate_two_view_geometry(
-        inputs.camera(pair[0]), xy_a, inputs.camera(pair[1]), xy_b, matches, options
-    )
-    if len(geometry.inlier_matches) < settings.min_inliers:
-        return matches, pycolmap.TwoViewGeometry()
-    return matches, geometry

@@ -8,13 +8,13 @@ import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from pipeline.config import settled
 from pipeline.runtime.atomic import link_or_copy
+from pipeline.runtime.counters import Report
 from pipeline.runtime.isolate import run_isolated
 from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import Progress
@@ -35,24 +35,9 @@ _PHOTO_BYTES, _SIFT_BYTES = 7.0, 250.0
 FEW_FEATURES = 100
 
 
-@dataclass(frozen=True)
-class FeatureReport:
-    """Result of the features stage.
-
-    Attributes:
-        num_cached: number of photographs whose keypoints were found in the cache.
-        decisions, warnings: sentences for the log.
-    """
-
-    counters: FeaturesCounters
-    num_cached: int
-    decisions: list[str]
-    warnings: list[str]
-
-
 def extract_features(
     manifest: Manifest, config: settled.Features, out: Path, *, cache: Path, threads: int
-) -> FeatureReport:
+) -> Report[FeaturesCounters]:
     """Extract SIFT features of each photograph and write them to ``out`` (see ``keypoint_file``).
 
     The files depend neither on ``threads`` nor on the content of the cache.
@@ -76,7 +61,7 @@ def gather_features(
     out: Path,
     *,
     cache: Path,
-) -> FeatureReport:
+) -> Report[FeaturesCounters]:
     """Gather the keypoints of several jobs in ``out``: the same files and the same report as of
     ``extract_features``.
 
@@ -96,7 +81,7 @@ def gather_features(
 
 def extract_photos(
     photos: Sequence[Photo], config: settled.Features, out: Path, *, cache: Path, threads: int
-) -> FeatureReport:
+) -> Report[FeaturesCounters]:
     """``extract_features`` of some photographs, which removes no files from the cache. Several
     processes may do so at the same time with the same cache."""
     out.mkdir(parents=True, exist_ok=True)
@@ -125,9 +110,11 @@ def extract_photos(
     return _report(counts, config, num_cached=len(photos) - len(absent))
 
 
-def _report(counts: dict[str, int], config: settled.Features, num_cached: int = 0) -> FeatureReport:
+def _report(
+    counts: dict[str, int], config: settled.Features, num_cached: int = 0
+) -> Report[FeaturesCounters]:
     median = int(np.median(list(counts.values()))) if counts else 0
-    return FeatureReport(
+    return Report(
         counters=FeaturesCounters(counts=counts),
         num_cached=num_cached,
         decisions=[
@@ -245,7 +232,7 @@ def _colmap_sift(
     """File name -> (F, 4) keypoints (x, y, scale, orientation) and (F, 128) descriptors."""
     import pycolmap
 
-    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.models import quiet_colmap
 
     quiet_colmap()
     path = folder / "features.db"

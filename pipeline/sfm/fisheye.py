@@ -7,14 +7,14 @@ focal lengths, the one with the most inliers is taken; mapping refines it.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
-from pathlib import Path
+from collections.abc import Sequence
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipeline.sfm.keypoints import Keypoints, keypoint_file
+from pipeline.sfm.database import MatchingInputs
+from pipeline.sfm.models import is_uncalibrated, set_focal, with_prior
 from pipeline.sfm.nearest import match_descriptors
 from pipeline.sfm.pairs import Pair
 
@@ -27,39 +27,23 @@ MAX_TRIALS = 1000
 Match = tuple[NDArray[np.float64], NDArray[np.float64]]
 
 
-def is_uncalibrated(camera: pycolmap.Camera) -> bool:
-    """Whether the camera is a fisheye lens without a prior of its focal length."""
-    return "FISHEYE" in camera.model_name and not camera.has_prior_focal_length
-
-
-def set_initial_focals(
-    cameras: Sequence[pycolmap.Camera],
-    images: Sequence[tuple[int, str, int]],
-    features: Path,
-    pairs: Sequence[Pair],
-    max_ratio: float,
-    seed: int,
-) -> list[str]:
+def set_initial_focals(inputs: MatchingInputs, pairs: Sequence[Pair]) -> list[str]:
     """Set the focal lengths of fisheye lenses without a prior, in place.
 
     Args:
-        images: (image id, name, camera id).
-        features: folder of keypoint files.
-        pairs: indices into ``images``.
+        pairs: Indices into the images.
 
     Returns:
         Sentences for the log.
     """
     decisions = []
-    for camera in cameras:
-        if not is_uncalibrated(camera):
-            continue
-        own = [p for p in pairs if all(images[i][2] == camera.camera_id for i in p)]
-        matches = _matches(own, images, features, max_ratio)
+    for camera in filter(is_uncalibrated, inputs.cameras):
+        own = [p for p in pairs if all(inputs.images[i][2] == camera.camera_id for i in p)]
+        matches = _matches(inputs, own)
         if not matches:
             continue
         side = max(camera.width, camera.height)
-        inliers = {focal: _inliers(camera, focal * side, matches, seed) for focal in FOCALS}
+        inliers = {focal: _inliers(camera, focal * side, matches, inputs.seed) for focal in FOCALS}
         best = max(FOCALS, key=lambda focal: inliers[focal])
         set_focal(camera, best * side)
         decisions.append(
@@ -69,26 +53,14 @@ def set_initial_focals(
     return decisions
 
 
-def with_prior(camera: pycolmap.Camera) -> pycolmap.Camera:
-    """A copy whose pairs are verified by the essential matrix."""
-    copy = pycolmap.Camera(camera.todict())
-    copy.has_prior_focal_length = True
-    return copy
-
-
-def _matches(
-    pairs: Sequence[Pair], images: Sequence[tuple[int, str, int]], features: Path, max_ratio: float
-) -> list[Match]:
+def _matches(inputs: MatchingInputs, pairs: Sequence[Pair]) -> list[Match]:
     """Matched pixels of the pairs with the most matches; neighbours in the order of names come
     first, as they often overlap."""
-    ordered = sorted(pairs, key=lambda pair: (pair[1] - pair[0], pair))
-    near = ordered[:TRIED_PAIRS]
-    names: Mapping[int, str] = {i: images[i][1] for pair in near for i in pair}
-    found = {i: Keypoints.read(keypoint_file(features, name)) for i, name in names.items()}
     matches = []
-    for a, b in near:
-        chosen = match_descriptors(found[a].descriptors, found[b].descriptors, max_ratio)
-        xy_a, xy_b = found[a].xy[chosen[:, 0]], found[b].xy[chosen[:, 1]]
+    for pair in sorted(pairs, key=lambda pair: (pair[1] - pair[0], pair))[:TRIED_PAIRS]:
+        a, b = (inputs.keypoints(inputs.images[i][0]) for i in pair)
+        chosen = match_descriptors(a.descriptors, b.descriptors, inputs.max_ratio)
+        xy_a, xy_b = a.xy[chosen[:, 0]], b.xy[chosen[:, 1]]
         matches.append((xy_a.astype(np.float64), xy_b.astype(np.float64)))
     matches.sort(key=lambda match: -len(match[0]))
     return [match for match in matches[:USED_PAIRS] if len(match[0]) >= 8]
@@ -109,10 +81,3 @@ def _inliers(camera: pycolmap.Camera, focal: float, matches: list[Match], seed: 
         )
         total += len(geometry.inlier_matches)
     return total
-
-
-def set_focal(camera: pycolmap.Camera, focal: float) -> None:
-    """Set all focal lengths of a camera, pixels."""
-    params = np.array(camera.params)
-    params[list(camera.focal_length_idxs())] = focal
-    camera.params = params.tolist()

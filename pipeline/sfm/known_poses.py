@@ -10,7 +10,6 @@ Imports pycolmap and must not be imported in a process that uses torch (see ``is
 from __future__ import annotations
 
 import shutil
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -20,10 +19,10 @@ from numpy.typing import NDArray
 from pipeline.config import settled
 from pipeline.geometry.similarity import Noise, robust_similarity
 from pipeline.io.poses.formats import colmap_files
+from pipeline.runtime.counters import Report
 from pipeline.sfm.alignment import transform_model
 from pipeline.sfm.counters import RefineCounters
-from pipeline.sfm.models import write_model
-from pipeline.sfm.quiet import quiet_colmap
+from pipeline.sfm.models import quiet_colmap, write_model
 from pipeline.sfm.refine import EXACT, EXACT_PX, Refined, adjust_points, bundle_adjust, refine
 
 # Numbers of the longest tracks of each image that cameras and poses are adjusted to, and that
@@ -42,26 +41,23 @@ ANCHORS = 5000
 Tracks = list[tuple[int, list[int]]]
 
 
-@dataclass(frozen=True)
-class KnownPosesReport:
-    """Result of ``refine_known_poses``. ``decisions`` are sentences for the log."""
+def refine_known_poses(
+    sparse: Path, config: settled.Sfm
+) -> tuple[pycolmap.Reconstruction | None, Report[RefineCounters]]:
+    """Adjust the COLMAP model in ``sparse``, in the same world frame.
 
-    counters: RefineCounters
-    decisions: list[str]
+    The result is deterministic: everything runs on one thread.
 
-
-def refine_known_poses(sparse: Path, config: settled.Sfm, out: Path) -> KnownPosesReport:
-    """Adjust the COLMAP model in ``sparse`` and write it to ``out``, in the same world frame.
-
-    If freeing camera parameters does not lower the cost (see ``refine``), the input files are
-    copied. The result is deterministic: everything runs on one thread.
+    Returns:
+        The adjusted model, and counters and messages. None if freeing camera parameters does not
+        lower the cost (see ``refine``).
     """
     quiet_colmap()
     model = pycolmap.Reconstruction(sparse)
     model.update_point_3d_errors()
     before = float(model.compute_mean_reprojection_error())
     if before < EXACT_PX:
-        return _unchanged(sparse, out, [EXACT], before)
+        return None, _unchanged([EXACT], before)
     tracks = _tracks(model)
     anchors = [number for number, _ in tracks[:ANCHORS]]
     original = _positions(model, anchors)
@@ -73,27 +69,32 @@ def refine_known_poses(sparse: Path, config: settled.Sfm, out: Path) -> KnownPos
     )
     adjusted = _adjust_more_tracks(model, tracks, refined) if refined.freed else refined.model
     if not refined.freed or not _is_finite(adjusted):
-        return _unchanged(sparse, out, refined.decisions, before)
+        return None, _unchanged(refined.decisions, before)
     _copy_parameters(model, adjusted)
     adjust_points(model, loss_px=LOSS_PX, done=adjusted.point3D_ids())
     _align(model, anchors, original)
-    write_model(model, out)
     after = float(model.compute_mean_reprojection_error())
     decision = (
         f"known poses, points and cameras adjusted to their tracks: mean reprojection error "
         f"{before:.3f} px before, {after:.3f} px after"
     )
     counters = RefineCounters(freed=True, error_before_px=before, error_px=after)
-    return KnownPosesReport(counters, [*refined.decisions, decision])
+    return model, Report(counters, [*refined.decisions, decision])
 
 
-def _unchanged(sparse: Path, out: Path, decisions: list[str], error_px: float) -> KnownPosesReport:
-    """Copy the input files."""
+def write_adjusted(model: pycolmap.Reconstruction | None, sparse: Path, out: Path) -> None:
+    """Write the model of ``refine_known_poses`` to ``out``; None: copy the files of ``sparse``."""
     out.mkdir(parents=True, exist_ok=True)
-    for file in colmap_files(sparse):
-        shutil.copy(file, out)
+    if model is not None:
+        write_model(model, out)
+    else:
+        for file in colmap_files(sparse):
+            shutil.copy(file, out)
+
+
+def _unchanged(decisions: list[str], error_px: float) -> Report[RefineCounters]:
     counters = RefineCounters(freed=False, error_before_px=error_px, error_px=error_px)
-    return KnownPosesReport(counters, [*decisions, "known poses are unchanged"])
+    return Report(counters, [*decisions, "known poses are unchanged"])
 
 
 def _adjust_more_tracks(

@@ -10,7 +10,7 @@ import pycolmap
 
 from pipeline.runtime.progress import Progress
 from pipeline.sfm.counters import Mapper
-from pipeline.sfm.fisheye import is_uncalibrated, with_prior
+from pipeline.sfm.models import is_uncalibrated, with_prior
 
 # Smallest number of registered images of a model (2 for a scene of two photographs).
 MIN_MODEL_SIZE = 3

@@ -7,7 +7,8 @@ from __future__ import annotations
 
 import shutil
 import tempfile
-from collections.abc import Mapping
+from collections import Counter
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -15,49 +16,59 @@ import numpy as np
 import pycolmap
 
 from pipeline.config import settled
+from pipeline.runtime.counters import Report
 from pipeline.runtime.errors import UserError
+from pipeline.scene.georeference import Georeference
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm.alignment import align_model
 from pipeline.sfm.attempts import Attempt, map_until_good
 from pipeline.sfm.counters import AttemptRecord, CameraSummary, SfmCounters
 from pipeline.sfm.evidence import collect_evidence, focal_priors
+from pipeline.sfm.judge import Verdict
 from pipeline.sfm.matching import list_names
-from pipeline.sfm.models import Colors, color_points, write_model
-from pipeline.sfm.quiet import quiet_colmap
+from pipeline.sfm.models import Colors, color_points, quiet_colmap, write_model
 from pipeline.sfm.refine import refine
 
 KNOWN_POSES_HINT = "or give known poses (sparse/0, transforms.json)"
 
 
 @dataclass(frozen=True)
-class SfmReport:
-    """Result of the sfm stage. ``decisions`` and ``warnings`` are sentences for the log."""
+class MappedScene:
+    """Result of the sfm stage.
 
-    counters: SfmCounters
-    decisions: list[str]
-    warnings: list[str]
+    Attributes:
+        report: The counters and messages of the stage.
+        models: The models found, with coloured points: the first one is used.
+        georeference: The world frame of the first model.
+    """
+
+    report: Report[SfmCounters]
+    models: list[pycolmap.Reconstruction]
+    georeference: Georeference
+
+    def write(self, out: Path) -> None:
+        """Write the model to ``out/sparse/0``, the other models to ``out/other_models/<n>`` and the
+        world frame to ``out/georeference.json``."""
+        for index, model in enumerate(self.models):
+            write_model(model, out / (f"other_models/{index}" if index else "sparse/0"))
+        self.georeference.write(out)
 
 
 def reconstruct(
     manifest: Manifest,
     database: Path,
     config: settled.Sfm,
-    out: Path,
     *,
-    threads: int,
     seed: int,
     ground_control: Path | None = None,
-) -> SfmReport:
-    """Map a scene, check the model, refine its cameras and georeference it.
-
-    Writes the largest model to ``out/sparse/0``, its world frame to ``out/georeference.json`` and
-    the other models to ``out/other_models/<n>``. The files do not depend on ``threads``.
+) -> MappedScene:
+    """Map a scene, check the model, refine its cameras and georeference it. Runs on one thread.
 
     Args:
-        database: database written by ``match_features``; not changed. ``keypoint_colors.npz``
+        database: The database that ``match_features`` wrote; not changed. ``keypoint_colors.npz``
             beside it gives the points' colours.
         config: The settled options.
-        ground_control: the scene's ``gcp_list.txt``, None without one.
+        ground_control: The scene's ``gcp_list.txt``; None without one.
 
     Raises:
         UserError: every attempt failed the quality check (see ``judge``).
@@ -70,11 +81,7 @@ def reconstruct(
         shutil.copyfile(database, work)
         warnings = _check_complete(manifest, work)
         attempt, attempts = map_until_good(
-            work,
-            config.mapper,
-            total,
-            config.min_registered_share,
-            seed,
+            work, config.mapper, total, config.min_registered_share, seed
         )
         decisions = [_describe(record, total) for record in attempts]
         if attempt.verdict.grade == "failed" or attempt.evidence is None:
@@ -94,36 +101,14 @@ def reconstruct(
             decisions.append("cameras not refined further: the model is weak and would overfit")
         cameras = _camera_summaries(model, focal_priors(attempt.database))
     frame = align_model(model, manifest, config.georeference, ground_control)
-    decisions += frame.decisions
-    warnings += frame.warnings
-    others = attempt.models[1:]
-    folders = [out / "sparse" / "0"]
-    folders += [out / "other_models" / str(index) for index in range(1, len(others) + 1)]
-    colors = _read_colors(database.with_name("keypoint_colors.npz"))
-    for written, model_folder in zip([model, *others], folders, strict=True):
-        if colors is not None:
-            color_points(written, colors)
-        write_model(written, model_folder)
-    georeference = frame.georeference()
-    georeference.write(out)
-
+    models = [model, *attempt.models[1:]]
+    if colors := _read_colors(database.with_name("keypoint_colors.npz")):
+        for each in models:
+            color_points(each, colors)
     registered = {model.image(i).name for i in model.reg_image_ids()}
     missing = [photo.name for photo in manifest.photos if photo.name not in registered]
-    if missing:
-        warnings.append(
-            f"{len(missing)} of {total} photographs have no pose: {list_names(missing)}"
-        )
-    if others:
-        sizes = ", ".join(str(other.num_reg_images()) for other in others)
-        warnings.append(
-            f"the photographs gave {len(attempt.models)} unconnected models: the largest "
-            f"({len(registered)} photographs) is used; the others ({sizes}) are in other_models"
-        )
-    if attempt.verdict.grade == "weak":
-        warnings.append(
-            f"the reconstruction is weak: {'; '.join(attempt.verdict.reasons)} (to improve it: "
-            f"{'; '.join(attempt.verdict.remedies)})"
-        )
+    sizes = [int(other.num_reg_images()) for other in models[1:]]
+    georeference = frame.georeference()
     counters = SfmCounters(
         mapper=attempt.mapper,
         registered=len(registered),
@@ -132,14 +117,33 @@ def reconstruct(
         mean_reprojection_error_px=float(model.compute_mean_reprojection_error()),
         num_points=int(model.num_points3D()),
         mean_track_length=float(model.compute_mean_track_length()),
-        other_models=[int(other.num_reg_images()) for other in others],
+        other_models=sizes,
         cameras=cameras,
         verdict=attempt.verdict.grade,
         evidence=evidence,
         attempts=attempts,
         georeference=georeference.summary(),
     )
-    return SfmReport(counters, decisions, warnings)
+    warnings += [*frame.warnings, *_warnings(counters, attempt.verdict)]
+    return MappedScene(
+        Report(counters, decisions + frame.decisions, warnings), models, georeference
+    )
+
+
+def _warnings(counters: SfmCounters, verdict: Verdict) -> Iterator[str]:
+    if missing := counters.not_registered:
+        yield f"{len(missing)} of {counters.total} photographs have no pose: {list_names(missing)}"
+    if others := counters.other_models:
+        yield (
+            f"the photographs gave {len(others) + 1} unconnected models: the largest "
+            f"({counters.registered} photographs) is used; the others "
+            f"({', '.join(map(str, others))}) are in other_models"
+        )
+    if verdict.grade == "weak":
+        yield (
+            f"the reconstruction is weak: {'; '.join(verdict.reasons)} (to improve it: "
+            f"{'; '.join(verdict.remedies)})"
+        )
 
 
 def _describe(record: AttemptRecord, total: int) -> str:
@@ -165,25 +169,24 @@ def _check_complete(manifest: Manifest, database: Path) -> list[str]:
         UserError: photographs are missing from the database.
     """
     with pycolmap.Database.open(database) as opened:
-        known = {image.name for image in opened.read_all_images()}
-        empty = [
-            image.name
+        counts = {
+            image.name: opened.num_keypoints_for_image(image.image_id)
             for image in opened.read_all_images()
-            if opened.num_keypoints_for_image(image.image_id) == 0
-        ]
-    missing = [photo.name for photo in manifest.photos if photo.name not in known]
+        }
+    empty = sorted(name for name, count in counts.items() if count == 0)
+    missing = [photo.name for photo in manifest.photos if photo.name not in counts]
     if missing:
         raise UserError(
             f"{len(missing)} photographs are not in the database of matches: {list_names(missing)}",
             file=database.name,
             fix="run the features and matches stages again",
         )
-    return [f"no features in {list_names(sorted(empty))}"] if empty else []
+    return [f"no features in {list_names(empty)}"] if empty else []
 
 
-def _read_colors(path: Path) -> Colors | None:
+def _read_colors(path: Path) -> Colors:
     if not path.exists():
-        return None
+        return {}
     with np.load(path) as data:
         return {int(key): data[key] for key in data.files}
 
@@ -192,10 +195,7 @@ def _camera_summaries(
     model: pycolmap.Reconstruction, priors: Mapping[int, float]
 ) -> list[CameraSummary]:
     """The cameras of registered images; ``priors``: camera id -> focal length from EXIF, pixels."""
-    count: dict[int, int] = {}
-    for image_id in model.reg_image_ids():
-        camera_id = model.image(image_id).camera_id
-        count[camera_id] = count.get(camera_id, 0) + 1
+    count = Counter(model.image(image_id).camera_id for image_id in model.reg_image_ids())
     return [
         CameraSummary(
             camera_id=camera_id,

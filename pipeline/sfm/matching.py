@@ -11,32 +11,30 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-import pycolmap
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
 from pipeline.config import settled
 from pipeline.config.experiments import DEFAULT, MatchesExperiments
+from pipeline.runtime.counters import Report
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
 from pipeline.sfm import pairs as choose
 from pipeline.sfm.chunks import chunk
 from pipeline.sfm.counters import MatchCounters, MatchesCounters
 from pipeline.sfm.database import (
-    MatchingSettings,
+    MatchingInputs,
     build_database,
     match_pairs,
     plan_cameras,
     verified_inliers,
 )
-from pipeline.sfm.fisheye import is_uncalibrated, set_focal, set_initial_focals
+from pipeline.sfm.fisheye import set_initial_focals
 from pipeline.sfm.keypoints import Keypoints, keypoint_file
+from pipeline.sfm.models import is_uncalibrated, quiet_colmap, set_focal
 from pipeline.sfm.pair_list import PairList
-from pipeline.sfm.quiet import quiet_colmap
 
 NAMES_SHOWN = 5
-# A COLMAP database with the results of the pairs of one of several jobs.
-CHUNK_FILE = "pairs.db"
 
 
 @dataclass(frozen=True)
@@ -44,9 +42,9 @@ class MatchingScene:
     """The photographs that are matched, and how.
 
     Attributes:
-        features: folder written by ``extract_features``.
-        sharing: options of the sfm stage, of which the camera model and sharing are used.
-        seed: of RANSAC.
+        features: The folder that ``extract_features`` wrote.
+        sharing: Options of the sfm stage, of which the camera model and sharing are used.
+        seed: The seed of RANSAC.
     """
 
     manifest: Manifest
@@ -55,102 +53,81 @@ class MatchingScene:
     seed: int
     experiments: MatchesExperiments = DEFAULT.matches
 
-    def cameras_and_images(self) -> tuple[list[pycolmap.Camera], list[tuple[int, str, int]]]:
-        """The cameras, and (image id, name, camera id) in the order of names."""
+    def inputs(self, focals: Mapping[int, float] | None = None) -> MatchingInputs:
+        """The photographs in the order of their names, with ids from 1.
+
+        Args:
+            focals: Camera id -> initial focal length, pixels, of fisheye lenses without a prior.
+        """
         cameras, camera_of = plan_cameras(self.manifest, self.sharing)
+        for camera in cameras:
+            if camera.camera_id in (focals or {}):
+                set_focal(camera, (focals or {})[camera.camera_id])
         names = sorted(photo.name for photo in self.manifest.photos)
-        return cameras, [(id, name, camera_of[name]) for id, name in enumerate(names, start=1)]
-
-    @property
-    def settings(self) -> MatchingSettings:
+        images = [(id, name, camera_of[name]) for id, name in enumerate(names, start=1)]
         experiments = self.experiments
-        return MatchingSettings(experiments.max_ratio, experiments.min_inliers, self.seed)
+        return MatchingInputs(
+            cameras,
+            images,
+            self.features,
+            experiments.max_ratio,
+            experiments.min_inliers,
+            self.seed,
+        )
 
-
-@dataclass(frozen=True)
-class MatchReport:
-    """Result of the matches stage.
-
-    Attributes:
-        num_cached: number of pairs found in the cache.
-        decisions, warnings: sentences for the log.
-    """
-
-    counters: MatchesCounters
-    num_cached: int
-    decisions: list[str]
-    warnings: list[str]
-
-
-@dataclass(frozen=True)
-class ChunkReport:
-    """Result of a job that matches some of the pairs; attributes as of ``MatchReport``."""
-
-    counters: MatchCounters
-    num_cached: int
-    decisions: list[str]
+    def write_colors(self, path: Path) -> None:
+        """Write image id -> (F, 3) uint8 colours of its keypoints, as by ``np.savez``, with the
+        colours of one image in memory at a time."""
+        with zipfile.ZipFile(path, "w") as archive:
+            for image_id, colors in self.inputs().colors():
+                # By its name, a member gets a fixed date.
+                with archive.open(f"{image_id}.npy", "w", force_zip64=True) as member:
+                    np.lib.format.write_array(member, colors)
 
 
 def match_features(
     scene: MatchingScene,
     config: settled.Matches,
-    out: Path,
+    database: Path,
     *,
     cache: Path | None = None,
     threads: int = 1,
     chosen: PairList | None = None,
     parts: Sequence[Path] = (),
-) -> MatchReport:
+) -> Report[MatchesCounters]:
     """Choose pairs, match them and verify their two-view geometry.
 
-    Writes ``out/database.db`` (COLMAP database: cameras with their priors, images with ids from 1
-    in order of names, keypoints, matches, two-view geometries) and ``out/keypoint_colors.npz``
-    (image id -> (F, 3) uint8). The files depend neither on ``threads`` nor on the cache, nor on the
-    number of jobs.
+    Writes a COLMAP database: cameras with their priors, images with ids from 1 in order of names,
+    keypoints, matches, two-view geometries. It depends neither on ``threads`` nor on the cache, nor
+    on the number of jobs.
 
     Args:
         config: The settled options.
-        cache: folder for results of pairs that outlives the call.
-        chosen: result of ``choose_pairs``; None: the pairs are chosen.
-        parts: folders of the jobs that have matched them by ``match_chunk``, in order.
+        database: The file that is written.
+        cache: A folder for results of pairs that outlives the call.
+        chosen: The result of ``choose_pairs``; None: the pairs are chosen.
+        parts: The databases of the jobs that have matched them by ``match_chunk``, in order.
 
     Raises:
         UserError: no pair of photographs could be verified.
     """
     quiet_colmap()
-    out.mkdir(parents=True, exist_ok=True)
-    if chosen is None:
-        chosen = choose_pairs(scene, config)
-    pairs = chosen.pairs
-    cameras, images = scene.cameras_and_images()
-    _set_focals(cameras, chosen.focals)
-    names = [name for _, name, _ in images]
-    database = out / "database.db"
+    chosen = chosen or choose_pairs(scene, config)
+    pairs, inputs = chosen.pairs, scene.inputs(chosen.focals)
+    matched = [(part, chunk(pairs, i, len(parts))) for i, part in enumerate(parts, start=1)]
     num_cached = build_database(
-        database,
-        cameras,
-        images,
-        scene.features,
-        pairs,
-        scene.settings,
-        cache=cache,
-        matched=[
-            (part / CHUNK_FILE, chunk(pairs, number, len(parts)))
-            for number, part in enumerate(parts, start=1)
-        ],
-        threads=threads,
+        database, inputs, pairs, cache=cache, matched=matched, threads=threads
     )
-    _write_colors(out / "keypoint_colors.npz", scene.features, names)
-
+    names, cameras = [name for _, name, _ in inputs.images], inputs.cameras
     verified = verified_inliers(database)
-    components, isolated = _components(names, list(verified))
     if not verified:
         raise UserError(
             f"no two of the {len(names)} photographs overlap: {len(pairs)} pairs were matched, and "
-            f"none has a two-view geometry with {scene.settings.min_inliers} inliers",
+            f"none has a two-view geometry with {inputs.min_inliers} inliers",
             fix="photograph a static, textured scene from all sides in constant light, each "
             "photograph overlapping the previous one by two thirds",
         )
+    components, isolated = _components(names, list(verified))
     warnings = []
     if len(components) > 1:
         warnings.append(
@@ -158,26 +135,23 @@ def match_features(
             f"largest has {components[0]} of {len(names)}; outside it: {list_names(isolated)}"
         )
     priors = sum(camera.has_prior_focal_length and not camera.is_spherical() for camera in cameras)
-    median = int(np.median(list(verified.values())))
+    models = ", ".join(sorted({camera.model_name for camera in cameras}))
     counters = MatchesCounters(
         num_pairs=len(pairs),
         num_verified=len(verified),
-        median_inliers=median,
+        median_inliers=int(np.median(list(verified.values()))),
         components=components,
         isolated=isolated,
         num_cameras=len(cameras),
     )
-    return MatchReport(
-        counters=counters,
-        num_cached=num_cached,
-        decisions=[
-            *chosen.decisions,
-            f"{len(verified)} of {len(pairs)} pairs verified, with a median of {median} inliers",
-            f"{len(cameras)} camera(s) ({_models(cameras)}) for {len(names)} photographs, "
-            f"{priors} with a focal length from EXIF",
-        ],
-        warnings=warnings,
-    )
+    decisions = [
+        *chosen.decisions,
+        f"{len(verified)} of {len(pairs)} pairs verified, with a median of "
+        f"{counters.median_inliers} inliers",
+        f"{len(cameras)} camera(s) ({models}) for {len(names)} photographs, {priors} with a focal "
+        "length from EXIF",
+    ]
+    return Report(counters, decisions, warnings, num_cached)
 
 
 def choose_pairs(scene: MatchingScene, config: settled.Matches) -> PairList:
@@ -185,14 +159,12 @@ def choose_pairs(scene: MatchingScene, config: settled.Matches) -> PairList:
     one."""
     quiet_colmap()
     pairs, decision = resolve_pairs(scene.manifest, scene.features, config)
-    cameras, images = scene.cameras_and_images()
-    uncalibrated = [camera for camera in cameras if is_uncalibrated(camera)]
-    initial = set_initial_focals(
-        uncalibrated, images, scene.features, pairs, scene.experiments.max_ratio, scene.seed
-    )
+    inputs = scene.inputs()
+    initial = set_initial_focals(inputs, pairs)
+    fisheyes = filter(is_uncalibrated, inputs.cameras)
     return PairList(
         pairs=pairs,
-        focals={camera.camera_id: float(camera.mean_focal_length()) for camera in uncalibrated},
+        focals={camera.camera_id: float(camera.mean_focal_length()) for camera in fisheyes},
         decisions=[decision, *initial],
     )
 
@@ -200,52 +172,30 @@ def choose_pairs(scene: MatchingScene, config: settled.Matches) -> PairList:
 def match_chunk(
     scene: MatchingScene,
     chosen: PairList,
-    number: int,
-    jobs: int,
-    out: Path,
+    pairs: Sequence[choose.Pair],
+    database: Path,
     *,
     cache: Path,
     scratch: Path,
     threads: int = 1,
-) -> ChunkReport:
+) -> Report[MatchCounters]:
     """Match and verify the pairs of one of several jobs. ``match_features`` gathers them.
 
     Args:
-        number: of the job, from 1.
-        jobs: the number of all jobs.
-        cache: as of ``match_features``; it is only read.
-        scratch: folder that a later call with the same arguments finds if this one is killed.
+        chosen: The pairs of all jobs.
+        pairs: The pairs of this job (``chunk``).
+        database: The file that is written, a COLMAP database with the results of the pairs.
+        cache: The folder that ``match_features`` uses; it is only read.
+        scratch: A folder that a later call with the same arguments finds if this one is killed.
     """
     quiet_colmap()
-    cameras, images = scene.cameras_and_images()
-    _set_focals(cameras, chosen.focals)
-    pairs = chunk(chosen.pairs, number, jobs)
+    inputs = scene.inputs(chosen.focals)
     num_cached, num_verified = match_pairs(
-        out / CHUNK_FILE,
-        cameras,
-        images,
-        scene.features,
-        pairs,
-        scene.settings,
-        cache=cache,
-        scratch=scratch,
-        threads=threads,
+        database, inputs, pairs, cache=cache, scratch=scratch, threads=threads
     )
-    return ChunkReport(
-        MatchCounters(num_pairs=len(pairs), num_verified=num_verified),
-        num_cached,
-        [f"{num_verified} of {len(pairs)} pairs verified"],
-    )
-
-
-def _set_focals(cameras: Sequence[pycolmap.Camera], focals: Mapping[int, float]) -> None:
-    for camera in cameras:
-        if camera.camera_id in focals:
-            set_focal(camera, focals[camera.camera_id])
-
-
-def _models(cameras: list[pycolmap.Camera]) -> str:
-    return ", ".join(sorted({camera.model_name for camera in cameras}))
+    counters = MatchCounters(num_pairs=len(pairs), num_verified=num_verified)
+    decisions = [f"{num_verified} of {len(pairs)} pairs verified"]
+    return Report(counters, decisions, num_cached=num_cached)
 
 
 def resolve_pairs(
@@ -299,13 +249,3 @@ def _components(names: list[str], verified: list[tuple[str, str]]) -> tuple[list
     largest = int(sizes.argmax())
     outside = [name for name, own in zip(names, label, strict=True) if own != largest]
     return sorted((int(size) for size in sizes), reverse=True), outside
-
-
-def _write_colors(path: Path, features: Path, names: list[str]) -> None:
-    """As by ``np.savez``, with the colours of one image in memory at a time."""
-    with zipfile.ZipFile(path, "w") as archive:
-        for index, name in enumerate(names, start=1):
-            colors = Keypoints.read(keypoint_file(features, name)).rgb
-            # By its name, a member gets a fixed date.
-            with archive.open(f"{index}.npy", "w", force_zip64=True) as member:
-                np.lib.format.write_array(member, colors)

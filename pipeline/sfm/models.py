@@ -1,17 +1,60 @@
-"""pycolmap reconstructions: build from known poses, colour, write."""
+"""pycolmap's cameras and reconstructions: focal lengths, known poses, colours, files."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pycolmap
 from numpy.typing import NDArray
 
-from pipeline.sfm.keypoints import Keypoints
+Colors = Mapping[int, NDArray[np.uint8]]
 
-Colors = dict[int, NDArray[np.uint8]]
+# COLMAP's default focal length over the longer side without a prior (about 45 degrees).
+DEFAULT_FOCAL_FACTOR = 1.2
+
+
+def quiet_colmap() -> None:
+    """Set pycolmap's log level to fatal errors; its results are checked instead.
+
+    ``pycolmap.bundle_adjustment`` resets the level: call this again after it.
+    """
+    pycolmap.logging.minloglevel = pycolmap.logging.FATAL.value
+
+
+def is_uncalibrated(camera: pycolmap.Camera) -> bool:
+    """Whether the camera is a fisheye lens without a prior of its focal length."""
+    return "FISHEYE" in camera.model_name and not camera.has_prior_focal_length
+
+
+def with_prior(camera: pycolmap.Camera) -> pycolmap.Camera:
+    """A copy whose pairs are verified by the essential matrix."""
+    copy = pycolmap.Camera(camera.todict())
+    copy.has_prior_focal_length = True
+    return copy
+
+
+def set_focal(camera: pycolmap.Camera, focal: float) -> None:
+    """Set all focal lengths of a camera, pixels."""
+    params = np.array(camera.params)
+    params[list(camera.focal_length_idxs())] = focal
+    camera.params = params.tolist()
+
+
+def uncalibrated(
+    camera: pycolmap.Camera, focal: float = DEFAULT_FOCAL_FACTOR, model: str | None = None
+) -> pycolmap.Camera:
+    """The camera with initial parameters and without a prior.
+
+    Args:
+        focal: The focal length over the longer side.
+        model: The camera model; None for that of ``camera``.
+    """
+    width, height = camera.width, camera.height
+    return pycolmap.Camera.create_from_model_name(
+        camera.camera_id, model or camera.model_name, focal * max(width, height), width, height
+    )
 
 
 def posed_model(
@@ -34,13 +77,12 @@ def posed_model(
     return model
 
 
-def read_colors(files: dict[int, Path]) -> Colors:
-    """Read keypoint colours: image id -> keypoint file to image id -> (F, 3) uint8 RGB."""
-    return {image_id: Keypoints.read(file).rgb for image_id, file in files.items()}
-
-
 def color_points(model: pycolmap.Reconstruction, colors: Colors) -> None:
-    """Set each point's colour to the mean colour of its observations."""
+    """Set each point's colour to the mean colour of its observations.
+
+    Args:
+        colors: Image id -> (F, 3) uint8 RGB of its keypoints.
+    """
     for point in model.points3D.values():
         seen = [colors[e.image_id][e.point2D_idx] for e in point.track.elements]
         point.color = np.rint(np.mean(seen, axis=0)).astype(np.uint8)

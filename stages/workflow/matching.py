@@ -13,6 +13,10 @@ if TYPE_CHECKING:
     from pipeline.sfm.matching import MatchingScene
 
 
+# A COLMAP database with the results of the pairs of one of several jobs.
+CHUNK_FILE = "pairs.db"
+
+
 def matching_scene(job: Job) -> MatchingScene:
     """The photographs and features of the job. Imports pycolmap."""
     from pipeline.sfm.matching import MatchingScene

@@ -40,36 +40,43 @@ def match(
     experiments = MatchesExperiments(min_inliers=min_inliers)
     scene = MatchingScene(manifest, features, sfm or settled.Sfm(), 0, experiments)
     config = settled.Matches.model_validate({"pairs": pairs})
-    return flat(match_features(scene, config, out, cache=out.with_name("cache"), threads=threads))
+    cache = out.with_name("cache")
+    report = match_features(scene, config, out / "database.db", cache=cache, threads=threads)
+    scene.write_colors(out / "keypoint_colors.npz")
+    return flat(report)
 
 
 def match_in_jobs(manifest: Manifest, features: Path, out: Path, count: int) -> dict[str, Any]:
     """As ``match``, by ``count`` jobs besides."""
+    from pipeline.sfm.chunks import chunk
     from pipeline.sfm.matching import MatchingScene, choose_pairs, match_chunk, match_features
 
     config = settled.Matches(pairs="exhaustive")
     scene = MatchingScene(manifest, features, settled.Sfm(), 0)
     chosen = choose_pairs(scene, config)
-    parts = [out.with_name(f"match_{number}") for number in range(1, count + 1)]
+    parts = [out.with_name(f"match_{number}.db") for number in range(1, count + 1)]
     cache = out.with_name("cache")
     pairs = cached = 0
     for number, part in enumerate(parts, start=1):
         scratch = out.with_name(f"scratch_{number}")
-        report = match_chunk(
-            *(scene, chosen, number, count, part), cache=cache, scratch=scratch, threads=2
-        )
+        own = chunk(chosen.pairs, number, count)
+        report = match_chunk(scene, chosen, own, part, cache=cache, scratch=scratch, threads=2)
         pairs, cached = pairs + report.counters.num_pairs, cached + report.num_cached
-    whole = match_features(scene, config, out, cache=cache, chosen=chosen, parts=parts)
+    database = out / "database.db"
+    whole = match_features(scene, config, database, cache=cache, chosen=chosen, parts=parts)
+    scene.write_colors(out / "keypoint_colors.npz")
     assert whole.num_cached == pairs == whole.counters.num_pairs, "nothing is left to match"
     return flat(whole) | {"num_cached": cached}
 
 
 def reconstruct(
-    manifest: Manifest, database: Path, config: settled.Sfm, out: Path, threads: int = 2
+    manifest: Manifest, database: Path, config: settled.Sfm, out: Path
 ) -> dict[str, Any]:
     from pipeline.sfm import mapping
 
-    return flat(mapping.reconstruct(manifest, database, config, out, threads=threads, seed=0))
+    found = mapping.reconstruct(manifest, database, config, seed=0)
+    found.write(out)
+    return flat(found.report)
 
 
 def match_and_reconstruct(
@@ -77,7 +84,7 @@ def match_and_reconstruct(
 ) -> tuple[dict[str, Any], dict[str, Any]]:
     matched = match(manifest, features, out / "matches", sfm=config, threads=threads)
     database = out / "matches" / "database.db"
-    return matched, reconstruct(manifest, database, config, out / "sfm", threads)
+    return matched, reconstruct(manifest, database, config, out / "sfm")
 
 
 def planned_cameras(

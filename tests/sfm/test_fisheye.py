@@ -44,17 +44,18 @@ def verified(folder: Path) -> tuple[float, dict[tuple[str, str], int]]:
     """The initial focal length over the longer side, and the inliers of each pair."""
     import pycolmap
 
-    from pipeline.sfm.database import MatchingSettings, build_database, verified_inliers
+    from pipeline.sfm.database import MatchingInputs, build_database, verified_inliers
     from pipeline.sfm.fisheye import set_initial_focals
-    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.models import quiet_colmap
 
     quiet_colmap()
     camera = pycolmap.Camera.create_from_model_name(1, "OPENCV_FISHEYE", 0.5 * SIDE, SIDE, SIDE)
     images = [(i + 1, f"{i}.jpg", 1) for i in range(4)]
     pairs = [(i, j) for i in range(4) for j in range(i + 1, 4)]
-    set_initial_focals([camera], images, folder / "features", pairs, 0.8, 0)
     path = folder / "database.db"
-    build_database(path, [camera], images, folder / "features", pairs, MatchingSettings(0.8, 15, 0))
+    inputs = MatchingInputs([camera], images, folder / "features", 0.8, 15, 0)
+    set_initial_focals(inputs, pairs)
+    build_database(path, inputs, pairs)
     with pycolmap.Database.open(path) as database:
         assert not any(c.has_prior_focal_length for c in database.read_all_cameras())
     return float(camera.mean_focal_length()) / SIDE, verified_inliers(path)

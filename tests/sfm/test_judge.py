@@ -20,7 +20,7 @@ WRONG_BUT_COMPLETE = ("tower_4_bare", "windows")
 def judged(case: str, seed: int, folder: Path) -> dict:
     """True grade, verdict, reasons and evidence of the first mapping attempt of a case."""
     from benchmarks.judge.__main__ import run_made
-    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.models import quiet_colmap
 
     quiet_colmap()
     row = run_made(case, seed, "incremental", 1, folder)

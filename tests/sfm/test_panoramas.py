@@ -16,7 +16,7 @@ def mapped(folder: Path) -> dict[str, Any]:
     import pycolmap
 
     from pipeline.sfm.attempts import map_until_good
-    from pipeline.sfm.quiet import quiet_colmap
+    from pipeline.sfm.models import quiet_colmap
     from pipeline.sfm.refine import refine
 
     quiet_colmap()

@@ -71,9 +71,11 @@ def refined(given: Reconstruction, folder: Path, **options: Any) -> tuple[Any, R
 
 
 def _refine(sparse: Path, config: Sfm, out: Path) -> Any:
-    from pipeline.sfm.known_poses import refine_known_poses
+    from pipeline.sfm.known_poses import refine_known_poses, write_adjusted
 
-    return refine_known_poses(sparse, config, out)
+    model, report = refine_known_poses(sparse, config)
+    write_adjusted(model, sparse, out)
+    return report
 
 
 @pytest.fixture(scope="module")
@@ -89,8 +91,8 @@ def biased(tmp_path_factory) -> Reconstruction:
 def _adjust_fixed(sparse: Path, out: Path) -> None:
     import pycolmap
 
+    from pipeline.sfm.models import quiet_colmap
     from pipeline.sfm.models import write_model as write
-    from pipeline.sfm.quiet import quiet_colmap
     from pipeline.sfm.refine import bundle_adjust
 
     quiet_colmap()
@@ -151,7 +153,7 @@ def _refine_with_limit(tracks: int, sparse: Path, out: Path) -> Any:
     from pipeline.sfm import known_poses
 
     known_poses.TRACKS_PER_IMAGE = tracks
-    return known_poses.refine_known_poses(sparse, Sfm(), out)
+    return _refine(sparse, Sfm(), out)
 
 
 def test_the_result_is_deterministic(biased, tmp_path):

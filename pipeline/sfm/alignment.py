@@ -15,11 +15,11 @@ from pipeline.geometry.up_direction import image_directions, up_direction
 from pipeline.io.gcp import GCP_FILE, read_ground_control
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Manifest
-from pipeline.sfm.bearings import camera_rays
 from pipeline.sfm.frame_comparison import contradictions
 from pipeline.sfm.gcp_frame import Triangulated, from_gcp
 from pipeline.sfm.georeference import Cameras, WorldFrame, level
 from pipeline.sfm.gps_frame import from_gps
+from pipeline.sfm.model_views import camera_rays, pixels_per_radian
 
 Georeference = Literal["gps", "gcp", "none"]
 
@@ -105,7 +105,7 @@ def _triangulate(
         ray = image.cam_from_world().rotation.matrix().T @ local
         centres.append(image.projection_center())
         rays.append(ray / np.linalg.norm(ray))
-        focal.append(_pixels_per_radian(camera))
+        focal.append(pixels_per_radian(camera))
     if len(rays) < 2:
         return None
     d, c = np.array(rays), np.array(centres)
@@ -115,9 +115,3 @@ def _triangulate(
     point = np.asarray(np.linalg.solve(across.sum(0), np.einsum("nij,nj->i", across, c)))
     distances = np.linalg.norm(c - point, axis=1)
     return Triangulated(point, float(np.median(distances / focal)))
-
-
-def _pixels_per_radian(camera: pycolmap.Camera) -> float:
-    if "EQUIRECTANGULAR" in camera.model_name:
-        return float(camera.width / (2 * np.pi))
-    return float(camera.mean_focal_length())

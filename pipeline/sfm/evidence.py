@@ -8,13 +8,12 @@ from typing import cast
 
 import numpy as np
 import pycolmap
-from numpy.typing import NDArray
 from scipy.sparse import coo_matrix
 from scipy.sparse.csgraph import connected_components
 
-from pipeline.sfm.bearings import camera_rays, is_wide
-from pipeline.sfm.consistency import Pairs, measure_consistency
+from pipeline.sfm.consistency import measure_consistency
 from pipeline.sfm.judge import MAX_FOCAL_OFF, Evidence
+from pipeline.sfm.model_views import Floats, ModelView, Pairs, read_views
 
 # Size of the sample of pairs, and of matches of each, that pure rotation is fitted to.
 PARALLAX_PAIRS = 40
@@ -37,48 +36,34 @@ def collect_evidence(model: pycolmap.Reconstruction, database: Path, total: int)
         database: the database that the model was mapped from.
         total: number of photographs of the scene.
     """
-    registered = sorted(model.reg_image_ids())
-    behind, observations, angles = _geometry(model)
-    camera_of = {i: model.image(i).camera_id for i in registered}
-    used = set(camera_of.values())
-    priors = focal_priors(database)
     with pycolmap.Database.open(database) as opened:
         verified = _verified_pairs(opened)
-        pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(registered)}
-        explained = _explained_matches(model, opened, pairs)
-        parallax = _parallax(model, opened, pairs)
-        consistency = measure_consistency(model, opened, pairs)
-    focal = {i: float(model.camera(i).mean_focal_length()) for i in used}
-    side = {i: max(model.camera(i).width, model.camera(i).height) for i in used}
-    relative = [
-        focal[i] / side[i] for i in camera_of.values() if not model.camera(i).is_spherical()
-    ]
-    off = {
-        i: max(focal[i] / prior, prior / max(focal[i], 1e-9))
-        for i, prior in priors.items()
-        if i in used
-    }
-    offs = [off[camera_id] for camera_id in camera_of.values() if camera_id in off]
+        views = read_views(model, opened)
+    pairs = {pair: m for pair, m in verified.items() if set(pair) <= set(views)}
+    behind, observations, angles = _geometry(model, views)
+    consistency = measure_consistency(model, views, pairs)
+    flat = [view for view in views.values() if not view.is_panorama]
+    relative = [view.focal / view.longer_side for view in flat]
+    priors = focal_priors(database)
+    known = [(v.focal, priors[v.camera.camera_id]) for v in flat if v.camera.camera_id in priors]
+    offs = [max(focal / prior, prior / max(focal, 1e-9)) for focal, prior in known]
     focal_off = float(np.median(offs)) if offs else None
+    agrees_with_exif = focal_off is not None and focal_off <= MAX_FOCAL_OFF
     return Evidence(
-        registered=len(registered),
+        registered=len(views),
         total=total,
         reachable=_largest_component(list(verified)),
         points=int(model.num_points3D()),
-        observations_per_image=observations / max(len(registered), 1),
+        observations_per_image=observations / max(len(views), 1),
         mean_track_length=float(model.compute_mean_track_length()),
         reprojection_px=float(model.compute_mean_reprojection_error()),
-        explained_matches=explained,
-        agreeing_matches=consistency.agreeing_matches,
-        agreeing_pairs=consistency.agreeing_pairs,
-        missing_covisibility=consistency.missing_covisibility,
+        explained_matches=_explained_matches(views, pairs),
+        **consistency._asdict(),
         behind_camera=behind,
-        parallax=parallax,
+        parallax=_parallax(views, pairs),
         median_angle_deg=float(np.median(angles)) if len(angles) else 0.0,
         focal_off=focal_off,
-        focal_certainty=(
-            None if _agrees_with_exif(focal_off) or not relative else _focal_certainty(model)
-        ),
+        focal_certainty=None if agrees_with_exif or not relative else _focal_certainty(model),
         focal_relative=float(np.median(relative)) if relative else None,
     )
 
@@ -93,18 +78,17 @@ def focal_priors(database: Path) -> dict[int, float]:
         }
 
 
-def _geometry(model: pycolmap.Reconstruction) -> tuple[float, int, NDArray[np.float64]]:
+def _geometry(
+    model: pycolmap.Reconstruction, views: dict[int, ModelView]
+) -> tuple[float, int, Floats]:
     """Share of the observations behind their camera, number of observations, and (P,) angles in
     degrees of each point: the largest between the first ray of its track and any other."""
     poses, wide = {}, {}
-    for image_id in model.reg_image_ids():
-        image = model.image(image_id)
-        matrix = image.cam_from_world().matrix()
-        poses[image_id] = (matrix[2], image.projection_center())
-        camera = model.camera(image.camera_id)
-        if is_wide(camera):
-            xy = np.array([p.xy for p in image.points2D], np.float64).reshape(-1, 2)
-            wide[image_id] = camera_rays(camera, xy) @ matrix
+    for image_id, view in views.items():
+        matrix = np.column_stack([view.rotation, view.translation])
+        poses[image_id] = (matrix[2], view.centre)
+        if view.is_wide:
+            wide[image_id] = view.rays @ matrix
     behind, observations = 0, 0
     angles = np.zeros(model.num_points3D())
     for index, point in enumerate(model.points3D.values()):
@@ -143,28 +127,17 @@ def _largest_component(pairs: list[tuple[int, int]]) -> int:
     return int(np.bincount(label).max())
 
 
-def _explained_matches(
-    model: pycolmap.Reconstruction,
-    database: pycolmap.Database,
-    pairs: Pairs,
-) -> float:
+def _explained_matches(views: dict[int, ModelView], pairs: Pairs) -> float:
     """Share of the verified matches whose two keypoints are observations of one 3D point."""
-    seen: dict[int, NDArray[np.int64]] = {}
-    for image_id in model.reg_image_ids():
-        points = np.full(database.num_keypoints_for_image(image_id), -1, np.int64)
-        for index, point2D in enumerate(model.image(image_id).points2D):
-            if point2D.has_point3D():
-                points[index] = point2D.point3D_id
-        seen[image_id] = points
     explained, matches = 0, 0
     for (first, second), inliers in pairs.items():
-        a, b = seen[first][inliers[:, 0]], seen[second][inliers[:, 1]]
+        a, b = views[first].observed[inliers[:, 0]], views[second].observed[inliers[:, 1]]
         explained += int(((a == b) & (a >= 0)).sum())
         matches += len(inliers)
     return explained / max(matches, 1)
 
 
-def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs: Pairs) -> float:
+def _parallax(views: dict[int, ModelView], pairs: Pairs) -> float:
     """Residual of the matches under pure rotation, as a share of the longer side.
 
     For each pair the rotation that best aligns the keypoints' rays (Kabsch) gives a median
@@ -172,25 +145,24 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
     pairs, minimised over focal lengths and radial distortions on a grid. Panoramas have neither;
     if most pairs have one, the value is computed from the rays of all.
     """
-    spheres = {i for pair in pairs for i in pair if _is_spherical(model, i)}
+    spheres = {image_id for image_id, view in views.items() if view.is_panorama}
     flat = {pair: matches for pair, matches in pairs.items() if not spheres & set(pair)}
     if len(flat) < len(pairs) / 2:
-        return _sphere_parallax(model, database, pairs)
+        return _sphere_parallax(views, pairs)
     pairs = flat
     if not pairs:
         return 0.0
     chosen = list(pairs)[:: max(1, len(pairs) // PARALLAX_PAIRS)]
-    found: tuple[list[NDArray[np.float64]], list[NDArray[np.float64]]] = ([], [])
+    found: tuple[list[Floats], list[Floats]] = ([], [])
     for pair in chosen:
         matches = pairs[pair]
         # The same number for each pair, so that all pairs form one array; pairs with fewer matches
         # repeat some.
         sample = np.linspace(0, len(matches) - 1, PARALLAX_MATCHES).round().astype(np.intp)
         for image_id, column, side in zip(pair, matches[sample].T, found, strict=True):
-            camera = model.camera(model.image(image_id).camera_id)
-            xy = database.read_keypoints(image_id)[column, :2].astype(np.float64)
-            middle = np.array([camera.width, camera.height]) / 2
-            side.append((xy - middle) / max(camera.width, camera.height))
+            view = views[image_id]
+            middle = np.array([view.camera.width, view.camera.height]) / 2
+            side.append((view.xy[column] - middle) / view.longer_side)
     a, b = (np.stack(side) for side in found)
 
     def residual(focal: float, radial: float) -> float:
@@ -212,24 +184,12 @@ def _parallax(model: pycolmap.Reconstruction, database: pycolmap.Database, pairs
     return best
 
 
-def _is_spherical(model: pycolmap.Reconstruction, image_id: int) -> bool:
-    return bool(model.camera(model.image(image_id).camera_id).is_spherical())
-
-
-def _sphere_parallax(
-    model: pycolmap.Reconstruction, database: pycolmap.Database, pairs: Pairs
-) -> float:
-    """``_parallax`` from rays: angles, as a share of the angle of ``image_side``."""
+def _sphere_parallax(views: dict[int, ModelView], pairs: Pairs) -> float:
+    """``_parallax`` from rays: angles, as a share of the angle of ``ModelView.side``."""
     medians = []
     for first, second in list(pairs)[:: max(1, len(pairs) // PARALLAX_PAIRS)]:
         matches = pairs[first, second]
-        a, b = (
-            camera_rays(
-                model.camera(model.image(i).camera_id),
-                database.read_keypoints(i)[column, :2].astype(np.float64),
-            )
-            for i, column in ((first, matches[:, 0]), (second, matches[:, 1]))
-        )
+        a, b = views[first].rays[matches[:, 0]], views[second].rays[matches[:, 1]]
         good = np.isfinite(a).all(1) & np.isfinite(b).all(1)
         rotated = _rotated_onto(a[good], b[good])
         chord = np.linalg.norm(rotated - b[good], axis=1)
@@ -238,12 +198,12 @@ def _sphere_parallax(
     return float(np.percentile(medians, 75)) / (np.pi / 2)
 
 
-def _undistorted(points: NDArray[np.float64], radial: float) -> NDArray[np.float64]:
+def _undistorted(points: Floats, radial: float) -> Floats:
     """(..., 2) normalized coordinates with one radial term removed, to first order."""
     return points * (1 - radial * (points**2).sum(-1, keepdims=True))
 
 
-def _best_rotated(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _best_rotated(a: Floats, b: Floats) -> Floats:
     """(P, M, 2) normalized coordinates ``a`` of P pairs, rotated by the rotation of each pair that
     best aligns them with ``b``; NaN behind the camera."""
     rays_a, rays_b = (np.concatenate([p, np.ones((*p.shape[:-1], 1))], -1) for p in (a, b))
@@ -254,16 +214,12 @@ def _best_rotated(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.
     return np.asarray(rotated[..., :2] / depth)
 
 
-def _rotated_onto(a: NDArray[np.float64], b: NDArray[np.float64]) -> NDArray[np.float64]:
+def _rotated_onto(a: Floats, b: Floats) -> Floats:
     """(..., M, 3) unit rays ``a``, rotated by the rotation that best aligns them with ``b``
     (Kabsch 1976)."""
     u, _, vt = np.linalg.svd(np.swapaxes(b, -1, -2) @ a)
     vt[..., 2, :] *= (np.linalg.det(u) * np.linalg.det(vt))[..., None]
     return np.asarray(a @ np.swapaxes(u @ vt, -1, -2))
-
-
-def _agrees_with_exif(focal_off: float | None) -> bool:
-    return focal_off is not None and focal_off <= MAX_FOCAL_OFF
 
 
 def _focal_certainty(model: pycolmap.Reconstruction) -> float:

@@ -116,9 +116,9 @@ class Verdict:
 
     Attributes:
         grade: "good", "weak" (usable, with a warning) or "failed".
-        reasons: the defects found, empty for "good".
-        remedies: what to photograph or configure differently, without duplicates.
-        worth_retrying: whether another mapping attempt may give a better model.
+        reasons: The defects found; empty for "good".
+        remedies: What to photograph or configure differently, without duplicates.
+        worth_retrying: Whether another mapping attempt may give a better model.
     """
 
     grade: Grade
@@ -132,9 +132,9 @@ class _Finding:
     """A possible defect of a model.
 
     Attributes:
-        found: whether the model has the defect.
-        worth_retrying: another mapping attempt may remove the defect.
-        prevents_retry: no other attempt is made, whatever the other findings are.
+        found: Whether the model has the defect.
+        worth_retrying: Whether another mapping attempt may remove the defect.
+        prevents_retry: Whether no other attempt is made, whatever the other findings are.
     """
 
     found: bool
@@ -148,8 +148,8 @@ def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
     """Grade a reconstruction.
 
     Args:
-        evidence: statistics of the model; None if the mapper returned no model.
-        min_registered_share: share of registered images below which the model has failed.
+        evidence: The statistics of the model; None if the mapper returned no model.
+        min_registered_share: The share of registered images below which the model has failed.
     """
     if evidence is None:
         return Verdict(
@@ -159,7 +159,9 @@ def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
             True,
         )
     for index, grade in enumerate(("failed", "weak")):
-        found = [f for f in _findings(evidence, index, min_registered_share) if f.found]
+        only = _failures(evidence) if grade == "failed" else _weaknesses(evidence)
+        findings = [*_findings(evidence, index, min_registered_share), *only]
+        found = [finding for finding in findings if finding.found]
         if found:
             return Verdict(
                 grade,  # type: ignore[arg-type]
@@ -171,15 +173,13 @@ def judge(evidence: Evidence | None, min_registered_share: float) -> Verdict:
 
 
 def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Finding]:
-    """The defects that are checked; ``level`` indexes the thresholds: 0 failed, 1 weak."""
+    """The defects that both grades have; ``level`` indexes the thresholds: 0 failed, 1 weak."""
     failed = level == 0
     share = e.registered / e.total
     folded = (
         e.agreeing_pairs < FOLDED_AGREEING and e.missing_covisibility > FOLDED_MISSING_COVISIBILITY
     )
-    off = e.focal_off or 1.0
-    focal_determined = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
-    findings = [
+    return [
         _Finding(
             share < (min_registered_share if failed else MIN_SHARE_GOOD),
             f"{e.registered} of {e.total} photographs got a pose",
@@ -216,23 +216,30 @@ def _findings(e: Evidence, level: int, min_registered_share: float) -> list[_Fin
             prevents_retry=True,
         ),
     ]
-    if failed:
-        return [
-            *findings,
-            _Finding(
-                e.focal_relative is not None
-                and not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
-                f"the focal length is {e.focal_relative or 0:.2f} times the image's longer side",
-                _FOCAL,
-            ),
-            _Finding(
-                e.behind_camera > MAX_BEHIND,
-                f"{e.behind_camera:.0%} of the points are behind their cameras",
-                _MOVE,
-            ),
-        ]
+
+
+def _failures(e: Evidence) -> list[_Finding]:
+    """The defects of failed models alone."""
     return [
-        *findings,
+        _Finding(
+            e.focal_relative is not None
+            and not FOCAL_RANGE[0] <= e.focal_relative <= FOCAL_RANGE[1],
+            f"the focal length is {e.focal_relative or 0:.2f} times the image's longer side",
+            _FOCAL,
+        ),
+        _Finding(
+            e.behind_camera > MAX_BEHIND,
+            f"{e.behind_camera:.0%} of the points are behind their cameras",
+            _MOVE,
+        ),
+    ]
+
+
+def _weaknesses(e: Evidence) -> list[_Finding]:
+    """The defects of weak models alone."""
+    off = e.focal_off or 1.0
+    focal_determined = e.focal_certainty is None or e.focal_certainty >= MIN_FOCAL_CERTAINTY
+    return [
         _Finding(
             off > MAX_FOCAL_OFF and not focal_determined,
             f"the focal length differs from EXIF by a factor of {off:.1f}, and the photographs do "

@@ -68,38 +68,31 @@ def test_panoramas_are_mapped_and_judged_by_their_rays(tmp_path: Path) -> None:
     assert found["error"] < 0.3 and not found["freed"]
 
 
-def turned(folder: Path) -> float:
+def turned() -> float:
     """``_parallax`` of panoramas that were only turned."""
     import numpy as np
     import pycolmap
 
     from pipeline.sfm.evidence import _sphere_parallax
+    from pipeline.sfm.model_views import ModelView
 
     rng = np.random.default_rng(0)
     rays = rng.normal(size=(200, 3))
-    model = pycolmap.Reconstruction()
     camera = pycolmap.Camera(model="EQUIRECTANGULAR", width=1600, height=800, params=[1600, 800])
-    camera.camera_id = 1
-    model.add_camera_with_trivial_rig(camera)
-    with pycolmap.Database.open(folder / "database.db") as database:
-        database.write_camera(camera, use_camera_id=True)
-        for number in (1, 2):
-            turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
-            turn *= np.sign(np.linalg.det(turn))
-            pose = pycolmap.Rigid3d(pycolmap.Rotation3d(turn), np.zeros(3))
-            image = pycolmap.Image(name=str(number), camera_id=1, image_id=number)
-            model.add_image_with_trivial_frame(image, pose)
-            database.write_image(
-                pycolmap.Image(name=str(number), camera_id=1, image_id=number), use_image_id=True
-            )
-            xy = np.asarray(camera.img_from_cam(rays @ turn.T))
-            database.write_keypoints(number, xy.astype(np.float32))
-        matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
-        return _sphere_parallax(model, database, {(1, 2): matches})
+    views = {}
+    for number in (1, 2):
+        turn = np.linalg.qr(rng.normal(size=(3, 3)))[0]
+        turn *= np.sign(np.linalg.det(turn))
+        xy = np.asarray(camera.img_from_cam(rays @ turn.T)).astype(np.float32)
+        views[number] = ModelView(
+            camera, turn, np.zeros(3), xy.astype(np.float64), np.full(len(rays), -1)
+        )
+    matches = np.stack([np.arange(200)] * 2, axis=1).astype(np.uint32)
+    return _sphere_parallax(views, {(1, 2): matches})
 
 
-def test_panoramas_that_only_turn_have_no_parallax(tmp_path: Path) -> None:
-    assert run_isolated(turned, tmp_path) == pytest.approx(0, abs=1e-5)
+def test_panoramas_that_only_turn_have_no_parallax() -> None:
+    assert run_isolated(turned) == pytest.approx(0, abs=1e-5)
 
 
 def covisibility(folded: bool) -> float:
@@ -108,32 +101,30 @@ def covisibility(folded: bool) -> float:
     import numpy as np
     import pycolmap
 
-    from pipeline.sfm.consistency import _missing_covisibility, _View
+    from pipeline.sfm.consistency import _missing_covisibility
+    from pipeline.sfm.model_views import ModelView
 
     rng = np.random.default_rng(0)
     model = pycolmap.Reconstruction()
-    for number, (kind, width, params) in enumerate(
-        [("PINHOLE", 640, [500, 500, 320, 240]), ("EQUIRECTANGULAR", 960, [960, 480])], 1
-    ):
-        camera = pycolmap.Camera(model=kind, width=width, height=480, params=params)
-        camera.camera_id = number
-        model.add_camera_with_trivial_rig(camera)
+    cameras = [
+        pycolmap.Camera(model=kind, width=width, height=480, params=params)
+        for kind, width, params in (
+            ("PINHOLE", 640, [500, 500, 320, 240]),
+            ("EQUIRECTANGULAR", 960, [960, 480]),
+        )
+    ]
     for xyz in rng.uniform(-0.5, 0.5, (600, 3)):
         model.add_point3D(xyz, pycolmap.Track())
     ids = np.array(sorted(model.points3D))
-    views = {}
+    views = []
     for number in range(1, 13):
         angle, panorama = np.radians(2.0 * number), number % 3 == 0
         c, s = np.cos(angle), np.sin(angle)
         rotation = np.array([[c, 0, s], [0, 1, 0], [-s, 0, c]])
-        translation = np.array([0, 0, 3.0])
-        pose = pycolmap.Rigid3d(pycolmap.Rotation3d(rotation), translation)
-        image = pycolmap.Image(name=f"{number}", camera_id=1 + panorama, image_id=number)
-        model.add_image_with_trivial_frame(image, pose)
         own = ids[number % 2 :: 2] if folded and not panorama else ids
-        seen = np.sort(rng.choice(own, len(own) * (1 if panorama else 6) // 10, replace=False))
-        empty = np.zeros((0, 2))
-        views[number] = _View(rotation, translation, empty, None, seen, 640.0, 500.0)
+        seen = rng.choice(own, len(own) * (1 if panorama else 6) // 10, replace=False)
+        pose = rotation, np.array([0, 0, 3.0])
+        views.append(ModelView(cameras[panorama], *pose, np.zeros((len(seen), 2)), seen))
     return _missing_covisibility(model, views)
 
 

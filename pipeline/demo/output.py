@@ -150,7 +150,7 @@ def _visible(
 def transforms(camera: Camera, views: list[PosedImage]) -> dict[str, Any]:
     """nerfstudio's transforms.json: camera to world, x right, y up, z backwards."""
     fx, fy, cx, cy = camera.pinhole
-    rest = [float(v) for v in camera.params[len(camera.intrinsics_names) :]]
+    rest = camera.distortion.tolist()
     fisheye = "FISHEYE" in camera.model
     if camera.is_spherical:
         listed = {"camera_model": camera.model, "w": camera.width, "h": camera.height}

@@ -78,8 +78,7 @@ class Camera:
             return True
         if self.is_spherical:
             return False
-        distortion = self.params[len(self.intrinsics_names) :]
-        return "FISHEYE" not in self.model and not np.any(distortion)
+        return "FISHEYE" not in self.model and not np.any(self.distortion)
 
     @property
     def intrinsics_names(self) -> tuple[str, ...]:
@@ -87,6 +86,11 @@ class Camera:
         and height for a panorama."""
         names = CAMERA_MODELS[self.model][1]
         return names[:3] if names[0] == "f" else names[:4]
+
+    @property
+    def distortion(self) -> NDArray[np.float64]:
+        """(K,) the distortion coefficients, which follow the intrinsics."""
+        return self.params[len(self.intrinsics_names) :]
 
     @property
     def pinhole(self) -> tuple[float, float, float, float]:
@@ -108,7 +112,7 @@ class Camera:
             return Camera(self.model, width, height, np.array([width, height], np.float64))
         sx, sy = width / self.width, height / self.height
         fx, fy, cx, cy = self.pinhole
-        rest = self.params[len(self.intrinsics_names) :]
+        rest = self.distortion
         if self.intrinsics_names[0] == "f" and abs(sx - sy) < 1e-9 * sx:
             params = np.array([fx * sx, cx * sx, cy * sy, *rest])
             return Camera(self.model, width, height, params)

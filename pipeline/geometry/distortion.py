@@ -7,30 +7,34 @@ are there. Normalised coordinates are (x / z, y / z) of a point in the camera's 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Sequence
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.geometry.lens_models import LENS_MODELS
+from pipeline.geometry.lens_models import LENS_MODELS, MAX_ERROR, solve
 
 Array = NDArray[np.float64]
 
-# Newton's method: the maximum number of steps, and the largest error of a solution in normalised
-# coordinates.
-MAX_ITERATIONS = 50
-MAX_ERROR = 1e-9
+# Models whose distorted radius is a polynomial of the angle from the optical axis.
+POLYNOMIAL_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+# Number of intervals of the table that starts Newton's method for their inverse, and of its steps:
+# they converge quadratically from an error of 1e-4 radians.
+TABLE_SIZE, NEWTON_STEPS = 20_000, 4
+# The largest undistorted radius of a perspective camera at which the fold is looked for: tan(87
+# degrees).
+MAX_RADIUS = 20.0
 
 
 def distort(camera: Camera, points: Array) -> Array:
     """Apply the lens distortion: (..., 2) to (..., 2), both in normalised coordinates."""
     if camera.model in LENS_MODELS:
-        return LENS_MODELS[camera.model].distort(points, np.array(_radial(camera)))
-    if "FISHEYE" in camera.model:
+        return LENS_MODELS[camera.model].distort(points, camera.distortion)
+    if camera.model in POLYNOMIAL_FISHEYES:
         radius = np.linalg.norm(points, axis=-1, keepdims=True)
-        theta = np.arctan(radius)
-        scale = theta * _polynomial(theta**2, _radial(camera)) / np.maximum(radius, 1e-12)
+        scale = fisheye_radius(camera, np.arctan(radius)) / np.maximum(radius, 1e-12)
         return np.asarray(np.where(radius > 1e-12, points * scale, points))
     numerator, denominator, (p1, p2) = _perspective(camera)
     x, y = points[..., 0], points[..., 1]
@@ -52,30 +56,15 @@ def undistort(camera: Camera, points: Array) -> Array:
     at 90 degrees or more from the optical axis, which have no normalised coordinates.
     """
     if camera.model in LENS_MODELS:
-        return LENS_MODELS[camera.model].undistort(points, np.array(_radial(camera)))
-    if "FISHEYE" in camera.model:
-        return _undistort_fisheye(camera, points)
-    found = np.array(points, dtype=np.float64)
-    step = 1e-6
-    dx, dy = np.array([step, 0.0]), np.array([0.0, step])
-    with np.errstate(all="ignore"):
-        for _ in range(MAX_ITERATIONS):
-            error = distort(camera, found) - points
-            column_x = distort(camera, found + dx) - distort(camera, found - dx)
-            column_y = distort(camera, found + dy) - distort(camera, found - dy)
-            (a, c), (b, d) = np.moveaxis(column_x, -1, 0), np.moveaxis(column_y, -1, 0)
-            determinant = (a * d - b * c) / (2 * step)
-            move = np.stack(
-                [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]],
-                axis=-1,
-            )
-            found -= move / determinant[..., None]
-            if np.nanmax(np.abs(error), initial=0.0) < MAX_ERROR / 100:
-                break
-        error = np.abs(distort(camera, found) - points).max(axis=-1)
-        # Beyond the fold radius the polynomial decreases, which no real lens does.
-        good = (error < MAX_ERROR) & (np.linalg.norm(found, axis=-1) < fold_radius(camera))
-    found[~good] = np.nan
+        return LENS_MODELS[camera.model].undistort(points, camera.distortion)
+    if camera.model in POLYNOMIAL_FISHEYES:
+        radius = np.linalg.norm(points, axis=-1, keepdims=True)
+        theta = fisheye_angle(camera, radius)
+        scale = np.where(radius > 1e-12, np.tan(theta) / np.maximum(radius, 1e-12), 1.0)
+        return np.where(theta < np.pi / 2 - 1e-6, points * scale, np.nan)
+    found = solve(partial(distort, camera), points)
+    # Beyond the fold radius the polynomial decreases, which no real lens does.
+    found[~(np.linalg.norm(found, axis=-1) < fold_radius(camera))] = np.nan
     return found
 
 
@@ -83,16 +72,40 @@ def fold_radius(camera: Camera) -> float:
     """The largest undistorted radius, in normalised coordinates, up to which the distorted radius
     increases; infinity if it always does."""
     if camera.model in LENS_MODELS:
-        return LENS_MODELS[camera.model].fold_radius(np.array(_radial(camera)))
-    if "FISHEYE" in camera.model:
-        theta = _first_descent(lambda t: t * _polynomial(t**2, _radial(camera)), np.pi / 2)
+        return LENS_MODELS[camera.model].fold_radius(camera.distortion)
+    if camera.model in POLYNOMIAL_FISHEYES:
+        theta = max_fisheye_angle(camera)
         return float(np.tan(theta)) if theta < np.pi / 2 else np.inf
     numerator, denominator, _ = _perspective(camera)
-    limit = 20.0  # tan(87 degrees)
-    radius = _first_descent(
-        lambda r: r * _polynomial(r**2, numerator) / _polynomial(r**2, denominator), limit
-    )
-    return radius if radius < limit else np.inf
+    grid = np.linspace(0.0, MAX_RADIUS, TABLE_SIZE + 1)
+    distorted = grid * _polynomial(grid**2, numerator) / _polynomial(grid**2, denominator)
+    radius = _first_descent(grid, distorted)
+    return radius if radius < MAX_RADIUS else np.inf
+
+
+def fisheye_radius(camera: Camera, theta: Array) -> Array:
+    """The distorted radii, in focal lengths, of angles from the axis of a polynomial fisheye."""
+    return theta * _polynomial(theta**2, camera.distortion)
+
+
+def fisheye_angle(camera: Camera, radius: Array) -> Array:
+    """The inverse of ``fisheye_radius``, radians; NaN beyond ``max_fisheye_angle``."""
+    limit = max_fisheye_angle(camera)
+    table = np.linspace(0.0, limit, TABLE_SIZE + 1)
+    slopes = camera.distortion * np.arange(3, 3 + 2 * len(camera.distortion), 2)
+    theta = np.interp(radius, fisheye_radius(camera, table), table)
+    with np.errstate(all="ignore"):
+        for _ in range(NEWTON_STEPS):
+            step = (fisheye_radius(camera, theta) - radius) / _polynomial(theta**2, slopes)
+            theta = np.clip(theta - np.nan_to_num(step), 0.0, limit)
+        good = np.abs(fisheye_radius(camera, theta) - radius) < MAX_ERROR
+    return np.where(good, theta, np.nan)
+
+
+def max_fisheye_angle(camera: Camera) -> float:
+    """The angle from the axis of a polynomial fisheye, up to pi, at which the distortion folds."""
+    angles = np.linspace(0.0, np.pi, TABLE_SIZE + 1)
+    return _first_descent(angles, fisheye_radius(camera, angles))
 
 
 def project(camera: Camera, points: Array) -> Array:
@@ -108,40 +121,17 @@ def unproject(camera: Camera, xy: Array) -> Array:
     return undistort(camera, (xy - (cx, cy)) / (fx, fy))
 
 
-def _undistort_fisheye(camera: Camera, points: Array) -> Array:
-    coefficients = _radial(camera)
-    slopes = [(2 * i + 3) * k for i, k in enumerate(coefficients)]
-    distorted = np.linalg.norm(points, axis=-1)
-    theta = np.minimum(distorted, np.pi / 2)
-    with np.errstate(all="ignore"):
-        for _ in range(MAX_ITERATIONS):
-            error = theta * _polynomial(theta**2, coefficients) - distorted
-            theta = theta - error / _polynomial(theta**2, slopes)
-            if np.nanmax(np.abs(error), initial=0.0) < MAX_ERROR / 100:
-                break
-        error = np.abs(theta * _polynomial(theta**2, coefficients) - distorted)
-        good = (error < MAX_ERROR) & (theta >= 0) & (theta < np.arctan(fold_radius(camera)))
-        good &= theta < np.pi / 2 - 1e-6
-        scale = np.where(distorted > 1e-12, np.tan(theta) / np.maximum(distorted, 1e-12), 1.0)
-    scale = np.where(good, scale, np.nan)
-    return np.asarray(points * scale[..., None])
-
-
-def _polynomial(t: Array, coefficients: list[float]) -> Array:
+def _polynomial(t: Array, coefficients: Sequence[float] | Array) -> Array:
     """1 + c0 t + c1 t^2 + ..."""
     result = np.zeros_like(t)
-    for c in reversed(coefficients):
+    for c in coefficients[::-1]:
         result = (result + c) * t
     return result + 1.0
 
 
-def _radial(camera: Camera) -> list[float]:
-    return [float(v) for v in camera.params[len(camera.intrinsics_names) :]]
-
-
 def _perspective(camera: Camera) -> tuple[list[float], list[float], tuple[float, float]]:
     """Coefficients of the radial numerator and denominator, and the tangential ones (p1, p2)."""
-    rest = _radial(camera)
+    rest = camera.distortion.tolist()
     if camera.model in ("OPENCV", "FULL_OPENCV"):
         k1, k2, p1, p2 = rest[:4]
         higher = rest[4:]
@@ -149,9 +139,7 @@ def _perspective(camera: Camera) -> tuple[list[float], list[float], tuple[float,
     return rest, [], (0.0, 0.0)
 
 
-def _first_descent(function: Callable[[Array], Array], limit: float) -> float:
-    """The first argument in [0, ``limit``] at which ``function`` stops increasing, on a fine grid;
-    ``limit`` if there is none."""
-    grid = np.linspace(0.0, limit, 20_001)
-    falling = np.flatnonzero(np.diff(function(grid)) <= 0)
-    return float(grid[falling[0]]) if len(falling) else limit
+def _first_descent(arguments: Array, values: Array) -> float:
+    """The first argument at which the values stop increasing; the last one if there is none."""
+    falling = np.flatnonzero(np.diff(values) <= 0)
+    return float(arguments[falling[0] if len(falling) else -1])

@@ -23,8 +23,8 @@ from numpy.typing import NDArray
 Array = NDArray[np.float64]
 _TINY = 1e-12
 _ITERATIONS = 50
-# Largest error of an inverse, as in ``pipeline.geometry.distortion``.
-_MAX_ERROR = 1e-9
+# Largest error of an inverse, in normalised coordinates.
+MAX_ERROR = 1e-9
 
 
 @dataclass(frozen=True)
@@ -183,9 +183,9 @@ def solve(function: Callable[[Array], Array], target: Array) -> Array:
             determinant = (a * d - b * c) / (2 * step)
             move = [d * error[..., 0] - b * error[..., 1], a * error[..., 1] - c * error[..., 0]]
             found -= np.stack(move, axis=-1) / determinant[..., None]
-            if np.nanmax(np.abs(error), initial=0.0) < _MAX_ERROR / 100:
+            if np.nanmax(np.abs(error), initial=0.0) < MAX_ERROR / 100:
                 break
-        good = np.abs(function(found) - target).max(axis=-1) < _MAX_ERROR
+        good = np.abs(function(found) - target).max(axis=-1) < MAX_ERROR
     found[~good] = np.nan
     return found
 

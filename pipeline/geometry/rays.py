@@ -18,14 +18,6 @@ from pipeline.geometry.cameras import Camera
 
 Array = NDArray[np.float64]
 
-# Models whose distorted radius is a polynomial of the angle from the optical axis.
-POLYNOMIAL_FISHEYES = ("OPENCV_FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
-# Number of intervals of the table that starts Newton's method, and of its steps: they converge
-# quadratically from an error of 1e-4 radians.
-TABLE_SIZE, NEWTON_STEPS = 20_000, 4
-# Largest error of a solution, in radians.
-MAX_ERROR = 1e-9
-
 
 def rays(camera: Camera, xy: Array) -> Array:
     """Unit vectors in the camera's frame through pixels: (..., 2) to (..., 3).
@@ -36,7 +28,7 @@ def rays(camera: Camera, xy: Array) -> Array:
     xy = np.asarray(xy, np.float64)
     if camera.is_spherical:
         return _panorama_rays(camera, xy)
-    if camera.model in POLYNOMIAL_FISHEYES:
+    if camera.model in distortion.POLYNOMIAL_FISHEYES:
         return _fisheye_rays(camera, xy)
     plane = distortion.unproject(camera, xy)
     found = np.concatenate([plane, np.ones((*plane.shape[:-1], 1))], axis=-1)
@@ -58,11 +50,11 @@ def pixels(camera: Camera, directions: Array) -> Array:
         return np.stack(
             [(longitude / (2 * np.pi) + 0.5) * width, (0.5 - latitude / np.pi) * height], axis=-1
         )
-    if camera.model in POLYNOMIAL_FISHEYES:
+    if camera.model in distortion.POLYNOMIAL_FISHEYES:
         fx, fy, cx, cy = camera.pinhole
         radius = np.hypot(x, y)
         theta = np.arctan2(radius, z)
-        scale = _distorted(camera, theta) / np.where(radius > 0, radius, 1.0)
+        scale = distortion.fisheye_radius(camera, theta) / np.where(radius > 0, radius, 1.0)
         scale = np.where(theta <= max_angle(camera), scale, np.nan)
         return np.stack([x * scale * fx + cx, y * scale * fy + cy], axis=-1)
     front = z > 0
@@ -76,10 +68,8 @@ def max_angle(camera: Camera) -> float:
     """The largest angle from the optical axis, in radians, at which the model has rays."""
     if camera.is_spherical:
         return float(np.pi)
-    if camera.model in POLYNOMIAL_FISHEYES:
-        angles = np.linspace(0.0, np.pi, TABLE_SIZE + 1)
-        falling = np.flatnonzero(np.diff(_distorted(camera, angles)) <= 0)
-        return float(angles[falling[0]]) if len(falling) else float(np.pi)
+    if camera.model in distortion.POLYNOMIAL_FISHEYES:
+        return distortion.max_fisheye_angle(camera)
     return float(np.arctan(distortion.fold_radius(camera)))
 
 
@@ -98,35 +88,7 @@ def _fisheye_rays(camera: Camera, xy: Array) -> Array:
     fx, fy, cx, cy = camera.pinhole
     plane = (xy - (cx, cy)) / (fx, fy)
     radius = np.hypot(plane[..., 0], plane[..., 1])
-    limit = max_angle(camera)
-    table = np.linspace(0.0, limit, TABLE_SIZE + 1)
-    distorted = _distorted(camera, table)
-    theta = np.interp(radius, distorted, table)
-    with np.errstate(all="ignore"):
-        for _ in range(NEWTON_STEPS):
-            step = (_distorted(camera, theta) - radius) / _slope(camera, theta)
-            theta = np.clip(theta - np.nan_to_num(step), 0.0, limit)
-        good = np.abs(_distorted(camera, theta) - radius) < MAX_ERROR
+    theta = distortion.fisheye_angle(camera, radius)
     sine = np.where(radius > 1e-12, np.sin(theta) / np.maximum(radius, 1e-12), 1.0)
     found = np.concatenate([plane * sine[..., None], np.cos(theta)[..., None]], axis=-1)
-    return np.where(good[..., None], found, np.nan)
-
-
-def _distorted(camera: Camera, theta: Array) -> Array:
-    """The distorted radius in units of the focal length: theta + k1 theta^3 + k2 theta^5 + ..."""
-    total = np.zeros_like(theta)
-    for coefficient in reversed(_coefficients(camera)):
-        total = (total + coefficient) * theta**2
-    return theta * (1.0 + total)
-
-
-def _slope(camera: Camera, theta: Array) -> Array:
-    total = np.zeros_like(theta)
-    coefficients = _coefficients(camera)
-    for power in range(len(coefficients), 0, -1):
-        total = (total + (2 * power + 1) * coefficients[power - 1]) * theta**2
-    return 1.0 + total
-
-
-def _coefficients(camera: Camera) -> list[float]:
-    return [float(v) for v in camera.params[len(camera.intrinsics_names) :]]
+    return np.where(np.isfinite(theta)[..., None], found, np.nan)

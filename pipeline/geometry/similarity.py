@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from typing import NamedTuple
 
@@ -32,6 +32,14 @@ class Similarity:
 
     def __call__(self, points: Array) -> Array:
         return np.asarray(self.scale * points @ self.rotation.T + self.translation)
+
+    def residuals(self, source: Array, target: Array, weight: Array) -> Array:
+        """(N, 3) differences of the transformed points from ``target``, weighted along its axes."""
+        return np.asarray((self(source) - target) * weight)
+
+    def distances(self, source: Array, target: Array, weight: Array) -> Array:
+        """(N,) the lengths of ``residuals``."""
+        return np.asarray(np.linalg.norm(self.residuals(source, target, weight), axis=1))
 
 
 @dataclass(frozen=True)
@@ -114,21 +122,17 @@ def robust_similarity(
     complete = np.flatnonzero((weight > 0).all(axis=1))
     if len(complete) < 3 or _collinear(source[complete]):
         return None
-    best: tuple[float, Similarity] | None = None
-    for chosen in _triples(complete):
-        proposal = Similarity(*umeyama(source[chosen], target[chosen]))
-        if proposal.scale <= 0:
-            continue
-        residuals = np.linalg.norm((proposal(source) - target) * weight, axis=1)
-        score = float(np.median(residuals))
-        if best is None or score < best[0]:
-            best = (score, proposal)
-    if best is None:
+    proposals = (
+        Similarity(*umeyama(source[chosen], target[chosen])) for chosen in _triples(complete)
+    )
+    similarity = least_median(
+        (proposal for proposal in proposals if proposal.scale > 0), source, target, weight
+    )
+    if similarity is None:
         return None
-    similarity = best[1]
     inliers = np.ones(len(source), bool)
     for _ in range(10):
-        residuals = np.linalg.norm((similarity(source) - target) * weight, axis=1)
+        residuals = similarity.distances(source, target, weight)
         near = residuals <= OUTLIER_SIGMAS * spread_of(residuals, weight, noise, 7)
         if near.sum() < 3 or (weight[near] > 0).sum() < 7:
             break
@@ -137,9 +141,8 @@ def robust_similarity(
         if np.allclose(refined(source), similarity(source), rtol=0, atol=1e-9):
             break
         similarity = refined
-    weighted = (similarity(source[inliers]) - target[inliers]) * weight[inliers]
-    observations = int((weight[inliers] > 0).sum())
-    sigma = noise.estimate(float((weighted**2).sum()), observations - 7)
+    kept = source[inliers], target[inliers], weight[inliers]
+    sigma, observations = precision(similarity, *kept, noise, 7)
     uncertainty = _uncertainty(source[inliers], weight[inliers], similarity, sigma)
     # A point without a height changes with the tilt by its cosine only. Where the fit is tilted by
     # mistake, that looks like a measurement of the tilt. A line of heights is none at any tilt.
@@ -148,6 +151,33 @@ def robust_similarity(
         tilt = _uncertainty(source[whole], weight[whole], similarity, sigma).tilt
     uncertainty = uncertainty._replace(tilt=max(uncertainty.tilt, tilt))
     return RobustFit(similarity, inliers, sigma, observations, observations - 7, uncertainty)
+
+
+def least_median(
+    proposals: Iterable[Similarity], source: Array, target: Array, weight: Array
+) -> Similarity | None:
+    """The first of the similarities with the least median residual; None without any."""
+    scored = ((float(np.median(p.distances(source, target, weight))), p) for p in proposals)
+    best = min(scored, key=lambda item: item[0], default=None)
+    return best and best[1]
+
+
+def precision(
+    similarity: Similarity,
+    source: Array,
+    target: Array,
+    weight: Array,
+    noise: Noise,
+    parameters: int,
+) -> tuple[float, int]:
+    """``RobustFit.sigma`` and ``observations`` of a similarity that was fitted to these points.
+
+    Args:
+        parameters: The number of fitted parameters.
+    """
+    observations = int((weight > 0).sum())
+    squares = float((similarity.residuals(source, target, weight) ** 2).sum())
+    return noise.estimate(squares, observations - parameters), observations
 
 
 def spread_of(residuals: Array, weight: Array, noise: Noise, parameters: int) -> float:

@@ -12,6 +12,8 @@ from pipeline.geometry.similarity import (
     Similarity,
     Uncertainty,
     centred,
+    least_median,
+    precision,
     spread_of,
 )
 
@@ -44,37 +46,25 @@ def upright_similarity(
     extent = float(np.linalg.norm(centred(flat), axis=1).max())
     if extent < 1e-9 * max(float(np.abs(source).max()), 1e-300):
         return None
-    best: tuple[float, Similarity] | None = None
-    for pair in _pairs(len(flat)):
-        proposal = _with_height(_least_squares(flat[pair], target[pair]), source, target, known)
-        score = float(np.median(_residuals(proposal, source, target, weight)))
-        if best is None or score < best[0]:
-            best = (score, proposal)
-    assert best is not None
-    similarity = best[1]
+    proposals = (_fitted(source, target, pair, known) for pair in _pairs(len(flat)))
+    similarity = least_median(proposals, source, target, weight)
+    assert similarity is not None
     parameters = 5 if known.any() else 4
     inliers = np.ones(len(source), bool)
     for _ in range(10):
-        residuals = _residuals(similarity, source, target, weight)
+        residuals = similarity.distances(source, target, weight)
         near = residuals <= OUTLIER_SIGMAS * spread_of(residuals, weight, noise, parameters)
         if near.sum() < 2 or (near == inliers).all():
             break
         inliers = near
-        similarity = _fitted(source, target, inliers, known)
-    similarity = _fitted(source, target, inliers, known)
-    weighted = (similarity(source[inliers]) - target[inliers]) * weight[inliers]
-    observations = int((weight[inliers] > 0).sum())
-    sigma = noise.estimate(float((weighted**2).sum()), observations - parameters)
+        similarity = _fitted(source, target, inliers, known & inliers)
+    similarity = _fitted(source, target, inliers, known & inliers)
+    kept = source[inliers], target[inliers], weight[inliers]
+    sigma, observations = precision(similarity, *kept, noise, parameters)
     size = similarity.scale * float(np.linalg.norm(centred(flat[inliers])))
     turn = sigma / max(size, 1e-300)
-    return RobustFit(
-        similarity,
-        inliers,
-        sigma,
-        observations,
-        observations - parameters,
-        Uncertainty(turn, turn, tilt),
-    )
+    freedoms, uncertainty = observations - parameters, Uncertainty(turn, turn, tilt)
+    return RobustFit(similarity, inliers, sigma, observations, freedoms, uncertainty)
 
 
 def _pairs(count: int) -> list[list[int]]:
@@ -82,34 +72,26 @@ def _pairs(count: int) -> list[list[int]]:
     return [[i, j] for i in range(count) for j in range(i + 1, count, step)]
 
 
-def _residuals(similarity: Similarity, source: Array, target: Array, weight: Array) -> Array:
-    return np.asarray(np.linalg.norm((similarity(source) - target) * weight, axis=1))
-
-
 def _fitted(
-    source: Array, target: Array, inliers: NDArray[np.bool_], known: NDArray[np.bool_]
+    source: Array,
+    target: Array,
+    chosen: list[int] | NDArray[np.bool_],
+    known: NDArray[np.bool_],
 ) -> Similarity:
-    flat = source * [1.0, 1.0, 0.0]
-    return _with_height(
-        _least_squares(flat[inliers], target[inliers]), source, target, known & inliers
-    )
+    """The similarity that rotates about z, by least squares in the ground plane.
 
-
-def _with_height(
-    flat: Similarity, source: Array, target: Array, known: NDArray[np.bool_]
-) -> Similarity:
-    """The similarity with the vertical translation of the points of known height; 0 without any."""
-    heights = target[known, 2] - flat.scale * source[known, 2]
-    shift = float(np.median(heights)) if known.any() else 0.0
-    return Similarity(flat.scale, flat.rotation, np.append(flat.translation[:2], shift))
-
-
-def _least_squares(source: Array, target: Array) -> Similarity:
-    """Least squares similarity of the ground plane that rotates about z only."""
-    a, b = centred(source)[:, :2], centred(target)[:, :2]
+    Args:
+        chosen: The points that it is fitted to.
+        known: (N,) the points whose heights give the vertical translation; 0 without any.
+    """
+    means = (source[chosen] * [1.0, 1.0, 0.0]).mean(0), target[chosen].mean(0)
+    a, b = centred(source[chosen])[:, :2], centred(target[chosen])[:, :2]
     dot, cross = float((a * b).sum()), float((a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]).sum())
     size = np.hypot(dot, cross)
     c, s = (dot / size, cross / size) if size > 0 else (1.0, 0.0)
     scale = float(size / max(float((a**2).sum()), 1e-300))
     rotation = np.array([[c, -s, 0.0], [s, c, 0.0], [0.0, 0.0, 1.0]])
-    return Similarity(scale, rotation, target.mean(0) - scale * rotation @ source.mean(0))
+    translation = means[1] - scale * rotation @ means[0]
+    heights = target[known, 2] - scale * source[known, 2]
+    translation[2] = np.median(heights) if known.any() else 0.0
+    return Similarity(scale, rotation, translation)

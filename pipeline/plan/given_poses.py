@@ -347,7 +347,7 @@ def _check_distortion(photo: Photo, camera: Camera, source: str) -> None:
     with np.errstate(all="ignore"):
         undone = np.isfinite(unproject(camera, grid)).all(-1)
     if undone.mean() < 0.1:
-        found = ", ".join(f"{value:g}" for value in camera.params[len(camera.intrinsics_names) :])
+        found = ", ".join(f"{value:g}" for value in camera.distortion)
         raise UserError(
             f"{photo.name}: its given camera has an impossible lens distortion ({camera.model}: "
             f"{found}): it cannot be undone",

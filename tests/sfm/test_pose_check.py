@@ -9,19 +9,21 @@ from __future__ import annotations
 import re
 from collections.abc import Callable
 from dataclasses import replace
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from pipeline.geometry.cameras import Camera
+from pipeline.geometry.epipolar import consistent_matches
 from pipeline.geometry.rays import pixels as project_rays
 from pipeline.geometry.rotations import quat_to_rotation, rotation_from_vector, rotation_to_quat
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.runtime.errors import UserError
 from pipeline.scene.manifest import Photo
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
+from pipeline.sfm.pose_check import matches as pairs
 from pipeline.sfm.pose_check.check import PoseCheck, check_poses
 from pipeline.sfm.pose_check.conventions import OPENGL
 from pipeline.sfm.pose_check.matches import FeatureMatcher
@@ -69,7 +71,7 @@ class SyntheticMatches(FeatureMatcher):
         return first[both], second[both]
 
 
-def ring(camera: Camera, count: int = 24, line: bool = False) -> Scene:
+def ring(camera: Camera, count: int = 10, line: bool = False) -> Scene:
     """Cameras around points at the origin, at different heights, or on a line beside them."""
     rng = np.random.default_rng(2)
     images = {}
@@ -90,6 +92,21 @@ def ring(camera: Camera, count: int = 24, line: bool = False) -> Scene:
         for i in images.values()
     )
     return Reconstruction({1: camera}, images), photos
+
+
+@cache
+def consistent(one: bytes, two: bytes, tolerance: float) -> np.ndarray:
+    return consistent_matches(*(np.frombuffer(b).reshape(-1, 3) for b in (one, two)), tolerance)
+
+
+@pytest.fixture(autouse=True)
+def verified_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Most of the time is the verification of pairs, which many tests have in common."""
+    monkeypatch.setattr(
+        pairs,
+        "consistent_matches",
+        lambda one, two, tolerance: consistent(one.tobytes(), two.tobytes(), tolerance),
+    )
 
 
 @pytest.fixture(scope="module")
@@ -181,7 +198,7 @@ MISTAKES: dict[str, tuple[PoseKind, Callable[[Reconstruction], Reconstruction], 
 @pytest.mark.parametrize("line", [False, True])
 def test_right_poses_are_used(lens: str, line: bool) -> None:
     model, photos = ring(LENSES[lens], line=line)
-    matcher = SyntheticMatches(model)
+    matcher = SyntheticMatches(model, 200)
     for kind in KINDS if lens == "pinhole" else KINDS[:1]:
         found = check_poses(model, photos, kind, Path("poses"), matcher)
         assert "agree with" in found.decisions[0] and not found.warnings
@@ -204,7 +221,7 @@ def test_a_mistake_is_refused_and_named(scene: Scene, name: str, count: int) -> 
 @pytest.mark.parametrize("lens", ["fisheye", "panorama"])
 def test_wide_lenses_are_compared(lens: str) -> None:
     model, photos = ring(LENSES[lens])
-    matcher = SyntheticMatches(model)
+    matcher = SyntheticMatches(model, 200)
     for name in ("axes", "inverse", "shifted"):
         kind, change, cause = MISTAKES[name]
         with pytest.raises(UserError, match=cause):

@@ -8,40 +8,29 @@ again: a mistake that explains the misfit is named.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.geodesy import to_enu
 from pipeline.geometry.similarity import (
     OUTLIER_SIGMAS,
     Noise,
     RobustFit,
-    Similarity,
     robust_similarity,
 )
 from pipeline.io.gcp import GCP_FILE, GroundControl
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import shortened
-from pipeline.scene.georeference import (
-    CartesianOrigin,
-    FrameUncertainty,
-    GeographicOrigin,
-    Origin,
-    Residual,
-)
+from pipeline.scene.georeference import CartesianOrigin, Origin
 from pipeline.sfm.georeference import (
     MIN_POSITIONS,
-    WARN_SCALE,
     Cameras,
     WorldFrame,
-    fit_text,
-    residual_records,
-    summary,
-    uncertainty,
+    fitted_frame,
+    local_frame,
     undetermined,
 )
 
@@ -65,27 +54,25 @@ MAX_TILT_RAD = float(np.radians(5.0))
 EXPLAINS = 3.0
 FOOT_M = 0.3048
 _ON_A_LINE = "the ground control points lie on a line"
-_UP = np.array([0.0, 0.0, 1.0])
 
 
 def from_gcp(
     control: GroundControl,
     triangulate: Callable[[Pixels], Triangulated | None],
-    cameras: Cameras | None = None,
-    path: Path | None = None,
+    cameras: Cameras,
+    path: Path = Path(GCP_FILE),
 ) -> WorldFrame | str:
     """Frame of the ground control points, or the reason why there is none.
 
     Args:
-        triangulate: photograph name -> pixel to the point in the mapper's world, None if it cannot
-            be triangulated.
-        cameras: the photographs' orientations show whether the frame is upside down.
-        path: of the file, for messages.
+        triangulate: Returns the point in the mapper's world that photographs (name -> pixel) see;
+            None if it cannot be triangulated.
+        cameras: The cameras, whose orientations show whether the frame is upside down.
+        path: The file, for messages.
 
     Raises:
         UserError: the coordinates are in another order or unit than the projection's, or mirrored.
     """
-    path = path or Path(GCP_FILE)
     found = [(point, triangulate(point.pixels)) for point in control.points]
     placed = [(point, at) for point, at in found if at is not None]
     if len(placed) < MIN_POSITIONS:
@@ -106,7 +93,7 @@ def from_gcp(
     usual = min(1.0, noise.sigma / max(fit.sigma, 1e-300))
     if fit.uncertainty.tilt * usual > MAX_TILT_RAD:
         return _line_text(fit)
-    contradiction = _contradiction(cameras, fit.similarity)
+    contradiction = cameras.contradiction(fit.similarity)
     mistake, also = _mistake(control, places, source, pixel, cameras, (fit, contradiction))
     if mistake is None and contradiction == "upside down":
         mistake = _UPSIDE_DOWN
@@ -120,36 +107,14 @@ def from_gcp(
         return f"of the ground control points, {reason}"
     if fit.uncertainty.tilt > MAX_TILT_RAD:
         return _line_text(fit)
-    names_used = [point.name for point, _ in placed]
-    records = residual_records(names_used, fit.similarity(source) - target, fit.inliers)
-    totals = summary(records, fit.observations, fit.freedoms)
-    accuracy = uncertainty(fit, "positions")
-    name = shortened(control.projection.text)
-    return WorldFrame(
-        "gcp",
-        fit.similarity,
-        origin=origin,
-        projection=control.projection,
-        residuals=records,
-        fit=fit,
-        decisions=[
-            f"georeferenced by {totals.used} ground control points ({name}): "
-            f"{fit_text(totals, accuracy, 3)}"
-        ],
-        warnings=[*_warnings(records, accuracy, contradiction, also), *control.warnings],
-    )
-
-
-def _warnings(
-    records: Sequence[Residual], accuracy: FrameUncertainty, contradiction: str | None, also: str
-) -> list[str]:
+    names = [point.name for point, _ in placed]
     warnings = []
     if contradiction is not None:
         warnings.append(
             "in the frame of the ground control points the photographs are "
             f"{contradiction}: check the coordinates"
         )
-    if outliers := [shortened(record.name, 40) for record in records if not record.used]:
+    if outliers := [shortened(names[i], 40) for i in np.flatnonzero(~fit.inliers)]:
         warnings.append(
             f"{len(outliers)} ground control points are outliers and are left out: "
             f"{', '.join(outliers[:5])}"
@@ -159,12 +124,14 @@ def _warnings(
             f"the ground control points would fit as well if {also}: "
             "check the coordinates, or measure further points"
         )
-    if accuracy.scale > WARN_SCALE:
-        warnings.append(
-            f"the ground control points determine the scale to {accuracy.scale:.0%} only (standard "
-            "deviation): lengths in metres are as inaccurate"
-        )
-    return warnings
+    frame = WorldFrame(
+        "gcp", fit.similarity, origin, control.projection, fit=fit, warnings=warnings
+    )
+    place = f" ({shortened(control.projection.text)}):"
+    residual = fit.similarity(source) - target
+    frame = fitted_frame(frame, "ground control points", place, names, residual)
+    frame.warnings.extend(control.warnings)
+    return frame
 
 
 def _line_text(fit: RobustFit) -> str:
@@ -175,12 +142,7 @@ def _line_text(fit: RobustFit) -> str:
 def _local(control: GroundControl, places: Array) -> tuple[Array, Origin]:
     """(N, 3) metres around an origin, and the origin."""
     if control.geographic:
-        longitudes = (places[:, 0] - places[0, 0] + 180) % 360 - 180 + places[0, 0]
-        places = np.column_stack([longitudes, places[:, 1:]])
-        latitude, longitude, altitude = np.median(places, axis=0)[[1, 0, 2]].tolist()
-        target = to_enu(places[:, [1, 0, 2]], np.array([latitude, longitude, altitude]))
-        longitude = (longitude + 180) % 360 - 180
-        return target, GeographicOrigin(latitude=latitude, longitude=longitude, altitude=altitude)
+        return local_frame(places[:, [1, 0, 2]])
     # Whole metres: adding the origin to coordinates is exact.
     origin = np.round(np.median(places, axis=0))
     x, y, z = origin.tolist()
@@ -198,12 +160,6 @@ def _noise(source: Array, target: Array, pixel: float, fit: RobustFit | None = N
     else:
         scale = fit.similarity.scale
     return Noise(float(np.hypot(SURVEY_SIGMA_M, MARK_SIGMA_PX * pixel * scale)))
-
-
-def _contradiction(cameras: Cameras | None, similarity: Similarity) -> str | None:
-    if cameras is None or cameras.directions is None:
-        return None
-    return cameras.directions.contradiction(similarity.rotation.T @ _UP)
 
 
 # --- likely mistakes ----------------------------------------------------------------------
@@ -229,7 +185,7 @@ def _mistake(
     places: Array,
     source: Array,
     pixel: float,
-    cameras: Cameras | None,
+    cameras: Cameras,
     given: tuple[RobustFit, str | None],
 ) -> tuple[_Mistake | None, str]:
     """The mistake that explains a bad fit or photographs that are upside down; None if none does.
@@ -250,7 +206,7 @@ def _mistake(
         other = robust_similarity(source, other_target, np.ones(3), noise)
         if other is None or undetermined(other) is not None:
             continue
-        other_contradiction = _contradiction(cameras, other.similarity)
+        other_contradiction = cameras.contradiction(other.similarity)
         second = np.linalg.norm(other.similarity(source) - other_target, axis=1)
         before, after = _misfits(first, second, other.sigma)
         explains = (

@@ -9,18 +9,20 @@ its up direction does not contradict the photographs'.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from pipeline.geometry.geodesy import to_enu
 from pipeline.geometry.similarity import RobustFit, Similarity
-from pipeline.geometry.up_direction import ImageDirections
+from pipeline.geometry.up_direction import Contradiction, ImageDirections
 from pipeline.io.projection import Projection
 from pipeline.runtime.text import shortened
 from pipeline.scene.georeference import (
     FrameUncertainty,
+    GeographicOrigin,
     Georeference,
     Origin,
     Residual,
@@ -50,7 +52,7 @@ class Cameras:
         names: N names.
         centres: (N, 3) camera centres.
         up: (3,) up direction estimated from the orientations, a unit vector.
-        directions: of the photographs; None if nothing is known of their orientations.
+        directions: Directions of the photographs; None if nothing is known of their orientations.
     """
 
     names: list[str]
@@ -58,21 +60,27 @@ class Cameras:
     up: Array
     directions: ImageDirections | None = None
 
+    def contradiction(self, similarity: Similarity) -> Contradiction | None:
+        """How the up direction of a frame contradicts the photographs; None where it does not."""
+        if self.directions is None:
+            return None
+        return self.directions.contradiction(similarity.rotation[2])
+
 
 @dataclass(frozen=True)
 class WorldFrame:
     """World frame of a model.
 
     Attributes:
-        method: source of the frame.
-        similarity: from the mapper's world to this frame.
-        origin: of the frame: geographic (GPS, or geographic GCPs), or in ``projection``; None for
-            "level".
-        projection: the ground control file's, None otherwise.
-        residuals: of each photograph (GPS) or point (GCP).
-        fit: the fit that the similarity is of; None for "level".
-        tilt_from: what determines the tilt.
-        decisions, warnings: sentences for the log.
+        method: The source of the frame.
+        similarity: The transform from the mapper's world to this frame.
+        origin: The frame's origin: geographic (GPS, or geographic GCPs), or in ``projection``; None
+            for "level".
+        projection: The projection of the ground control file; None otherwise.
+        residuals: The residual of each photograph (GPS) or point (GCP).
+        fit: The fit that the similarity belongs to; None for "level".
+        tilt_from: What determines the tilt.
+        decisions, warnings: Sentences for the log.
     """
 
     method: Method
@@ -137,23 +145,62 @@ def uncertainty(fit: RobustFit, tilt_from: Literal["positions", "cameras"]) -> F
     )
 
 
-def fit_text(totals: ResidualSummary, known: FrameUncertainty, digits: int) -> str:
-    """The residuals with the number of observations and of freedoms, and what follows for the
-    frame.
+def fitted_frame(
+    found: WorldFrame, what: str, place: str, names: Sequence[str], residual: Array
+) -> WorldFrame:
+    """A frame with the records of its fit, the sentence about it, and warnings of outliers and of
+    an uncertain scale.
 
     Args:
-        digits: decimals of metres.
+        found: The frame with its fit, without residuals.
+        what: The measurements in words, such as "GPS positions".
+        place: What the sentence says of them.
+        names: The names of the measured photographs or points.
+        residual: (N, 3) residuals; NaN where a height was not measured.
     """
+    fit = found.fit
+    assert fit is not None
+    records = residual_records(names, residual, fit.inliers)
+    totals = summary(records, fit.observations, fit.freedoms)
+    known = uncertainty(fit, found.tilt_from)
+    digits = 3 if found.method == "gcp" else 2
     vertical = ""
     if totals.vertical_median is not None:
         vertical = f", {totals.vertical_median:.{digits}f} m vertical"
     cameras = ", from the cameras" if known.tilt_from == "cameras" else ""
-    return (
-        f"median residual {totals.horizontal_median:.{digits}f} m horizontal{vertical} "
+    decision = (
+        f"georeferenced by {totals.used} {what}{place} median residual "
+        f"{totals.horizontal_median:.{digits}f} m horizontal{vertical} "
         f"({totals.observations} observations, {totals.freedoms} degrees of freedom); standard "
         f"deviations: scale {known.scale:.2g}, heading {known.heading_deg:.2g} degrees, tilt "
         f"{known.tilt_deg:.2g} degrees{cameras}"
     )
+    warnings = list(found.warnings)
+    if known.scale > WARN_SCALE:
+        warnings.append(
+            f"the {what} determine the scale to {known.scale:.0%} only (standard deviation): "
+            "lengths in metres are as inaccurate"
+        )
+    return replace(found, residuals=records, decisions=[decision], warnings=warnings)
+
+
+def local_frame(geodetic: Array) -> tuple[Array, GeographicOrigin]:
+    """(N, 3) metres east, north and up of the median position, and that position.
+
+    Args:
+        geodetic: (N, 3) latitudes and longitudes in degrees, heights in metres; NaN for unknown
+            heights, which are at the median height.
+    """
+    geodetic = geodetic.copy()
+    # Longitudes relative to the first: the scene may span the date line.
+    geodetic[:, 1] = geodetic[0, 1] + (geodetic[:, 1] - geodetic[0, 1] + 180) % 360 - 180
+    measured = np.isfinite(geodetic[:, 2])
+    altitude = float(np.median(geodetic[measured, 2])) if measured.any() else None
+    geodetic[~measured, 2] = altitude or 0.0
+    origin = np.median(geodetic, axis=0)
+    latitude, longitude = float(origin[0]), (float(origin[1]) + 180) % 360 - 180
+    place = GeographicOrigin(latitude=latitude, longitude=longitude, altitude=altitude)
+    return to_enu(geodetic, origin), place
 
 
 def undetermined(fit: RobustFit) -> str | None:
@@ -189,7 +236,7 @@ def level(cameras: Cameras) -> WorldFrame:
 
 
 def residual_records(
-    names: list[str], residual: Array, used: NDArray[np.bool_]
+    names: Sequence[str], residual: Array, used: NDArray[np.bool_]
 ) -> tuple[Residual, ...]:
     """Records of (N, 3) residuals; NaN where a height was not measured."""
     return tuple(

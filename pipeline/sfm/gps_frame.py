@@ -7,26 +7,24 @@ without altitudes, leave the tilt undetermined; it is taken from the orientation
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import replace
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.geodesy import to_enu
-from pipeline.geometry.similarity import Noise, RobustFit, Similarity, centred, robust_similarity
+from pipeline.geometry.similarity import Noise, RobustFit, centred, robust_similarity
 from pipeline.geometry.upright_similarity import upright_similarity
 from pipeline.scene.georeference import GeographicOrigin
 from pipeline.sfm.georeference import (
     CAMERA_TILT_RAD,
     MIN_POSITIONS,
-    WARN_SCALE,
     Cameras,
     WorldFrame,
-    fit_text,
-    residual_records,
+    fitted_frame,
+    local_frame,
     rotation_between,
-    summary,
-    uncertainty,
     undetermined,
 )
 
@@ -83,8 +81,7 @@ def from_gps(cameras: Cameras, positions: Positions) -> WorldFrame | str:
             f"the GPS positions contradict each other, or the poses, by about {fit.sigma:.3g} m: "
             "check the hemispheres (N, S, E, W) and the signs of latitude and longitude"
         )
-    up = fit.similarity.rotation.T @ [0.0, 0.0, 1.0]
-    contradiction = cameras.directions and cameras.directions.contradiction(up)
+    contradiction = cameras.contradiction(fit.similarity)
     if contradiction == "upside down":
         return (
             "the photographs would be upside down. The positions are mirrored: check the "
@@ -102,33 +99,20 @@ def from_gps(cameras: Cameras, positions: Positions) -> WorldFrame | str:
         )
     residual = fit.similarity(centres) - measured.enu
     residual[measured.weight[:, 2] == 0, 2] = np.nan
-    records = residual_records([cameras.names[i] for i in known], residual, fit.inliers)
-    totals = summary(records, fit.observations, fit.freedoms)
-    accuracy = uncertainty(fit, tilt_from)
-    left_out = [record.name for record in records if not record.used]
-    if left_out:
+    names = [cameras.names[i] for i in known]
+    if left_out := [names[i] for i in np.flatnonzero(~fit.inliers)]:
         warnings.append(
             f"{len(left_out)} GPS positions are outliers and are left out (first: {left_out[0]})"
         )
-    if accuracy.scale > WARN_SCALE:
-        warnings.append(
-            f"the GPS positions determine the scale to {accuracy.scale:.0%} only (standard "
-            "deviation): lengths in metres are as inaccurate"
-        )
-    return WorldFrame(
-        "gps",
-        fit.similarity,
-        origin=measured.origin,
-        residuals=records,
-        fit=fit,
-        tilt_from=tilt_from,
-        decisions=[
-            f"georeferenced by {totals.used} GPS positions of {len(cameras.names)} photographs: "
-            f"metres east, north and up of {measured.origin.latitude:.6f}, "
-            f"{measured.origin.longitude:.6f}; {fit_text(totals, accuracy, 2)}"
-        ],
-        warnings=warnings,
+    origin = measured.origin
+    frame = WorldFrame(
+        "gps", fit.similarity, origin, fit=fit, tilt_from=tilt_from, warnings=warnings
     )
+    place = (
+        f" of {len(cameras.names)} photographs: metres east, north and up of "
+        f"{origin.latitude:.6f}, {origin.longitude:.6f};"
+    )
+    return fitted_frame(frame, "GPS positions", place, names, residual)
 
 
 def local_metres(degrees: Array, origin: Array) -> Array:
@@ -140,21 +124,10 @@ def local_metres(degrees: Array, origin: Array) -> Array:
 
 def _local(positions: list[tuple[float, float, float | None]]) -> _Measured:
     geodetic = np.array([[np.nan if v is None else v for v in p] for p in positions], np.float64)
-    # Longitudes relative to the first: the scene may span the date line.
-    geodetic[:, 1] = geodetic[0, 1] + (geodetic[:, 1] - geodetic[0, 1] + 180) % 360 - 180
-    measured = np.isfinite(geodetic[:, 2])
-    altitude = float(np.median(geodetic[measured, 2])) if measured.any() else None
-    geodetic[~measured, 2] = altitude or 0.0
-    origin = np.median(geodetic, axis=0)
-    enu = to_enu(geodetic, origin)
     weight = np.tile([1.0, 1.0, 1.0 / ALTITUDE_RATIO], (len(geodetic), 1))
-    weight[~measured, 2] = 0.0
-    longitude = (float(origin[1]) + 180) % 360 - 180
-    return _Measured(
-        enu,
-        weight,
-        GeographicOrigin(latitude=float(origin[0]), longitude=longitude, altitude=altitude),
-    )
+    weight[np.isnan(geodetic[:, 2]), 2] = 0.0
+    enu, origin = local_frame(geodetic)
+    return _Measured(enu, weight, origin)
 
 
 def _fitted(
@@ -167,7 +140,7 @@ def _fitted(
         upright = _instead(fit, centres, measured, cameras)
         if upright is None:
             return fit, "positions", []
-        angle = np.degrees(np.arccos(np.clip(_up_of(fit) @ cameras.up, -1, 1)))
+        angle = np.degrees(np.arccos(np.clip(fit.similarity.rotation[2] @ cameras.up, -1, 1)))
         text = (
             f"the altitudes of the GPS positions contradict the orientation of the cameras by "
             f"{angle:.0f} degrees: the tilt is estimated from the cameras"
@@ -206,12 +179,8 @@ def _upright(up: Array, centres: Array, measured: _Measured) -> RobustFit | None
     )
     if fit is None:
         return None
-    scale, rotation, translation = (
-        fit.similarity.scale,
-        fit.similarity.rotation @ turn,
-        fit.similarity.translation,
-    )
-    return fit._replace(similarity=Similarity(scale, rotation, translation))
+    rotation = fit.similarity.rotation @ turn
+    return fit._replace(similarity=replace(fit.similarity, rotation=rotation))
 
 
 def _instead(
@@ -220,7 +189,7 @@ def _instead(
     """The fit with the cameras' up direction, if that of ``fit`` differs from it by more than its
     standard deviation explains, and the horizontal positions fit nearly as well: altitudes, which
     drift, are then what is wrong."""
-    angle = float(np.arccos(np.clip(_up_of(fit) @ cameras.up, -1, 1)))
+    angle = float(np.arccos(np.clip(fit.similarity.rotation[2] @ cameras.up, -1, 1)))
     if angle < max(MAX_ANGLE_RAD, 3 * float(np.hypot(fit.uncertainty.tilt, CAMERA_TILT_RAD))):
         return None
     upright = _upright(cameras.up, centres, measured)
@@ -254,11 +223,6 @@ def _in_feet(centres: Array, measured: _Measured, cameras: Cameras) -> bool:
     return abs(factor / FEET_PER_M - 1) < FEET_TOLERANCE and factor - 1 > FEET_SIGMAS * float(
         np.sqrt(variance)
     )
-
-
-def _up_of(fit: RobustFit) -> Array:
-    """(3,) up direction in the mapper's world."""
-    return np.asarray(fit.similarity.rotation[2])
 
 
 def _misfit(fit: RobustFit) -> float:

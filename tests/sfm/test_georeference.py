@@ -220,13 +220,13 @@ def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
     """UTM coordinates are too large for float32: an origin is subtracted. Outliers are left out."""
     rng = np.random.default_rng(5)
     places = rng.uniform((465000, 5246000, 400), (465080, 5246060, 415), (9, 3))
-    _, back = scene(places)
+    cameras, back = scene(places)
     ours = (places - back.translation) @ back.rotation / back.scale
     given_ = places + rng.normal(0, 0.01, places.shape)
     given_[4] += (0, 6.0, 0)
     control = control_of(given_, tmp_path)
 
-    frame = from_gcp(control, seen_at(ours))
+    frame = from_gcp(control, seen_at(ours), cameras)
     assert isinstance(frame, WorldFrame) and frame.projection.text == "EPSG:32632"
     assert isinstance(frame.origin, CartesianOrigin)
     origin = np.array([frame.origin.x, frame.origin.y, frame.origin.z])
@@ -242,10 +242,10 @@ def test_ground_control_gives_projected_metres_around_a_local_origin(tmp_path):
 
 def test_ground_control_on_a_line_or_unobserved_is_rejected(tmp_path):
     line = np.linspace(0, 1, 6)[:, None] * [30.0, 40.0, 1.0]
-    control = control_of(line, tmp_path)
-    reason = from_gcp(control, seen_at(line))
+    control, (cameras, _) = control_of(line, tmp_path), scene(line)
+    reason = from_gcp(control, seen_at(line), cameras)
     assert isinstance(reason, str) and "line" in reason
-    assert "only 0 of 6" in str(from_gcp(control, lambda seen: None))
+    assert "only 0 of 6" in str(from_gcp(control, lambda seen: None, cameras))
 
 
 def test_altitudes_on_one_strip_do_not_determine_the_tilt():

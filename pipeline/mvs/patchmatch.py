@@ -56,11 +56,11 @@ class CostOptions:
     """Parameters of the matching cost.
 
     Attributes:
-        radius: half the side of the window, pixels; every second row and column is used.
-        sigma_color: of the bilateral weights, grey levels.
-        sigma_space: of the bilateral weights, pixels.
-        num_best: the cost of a plane is the mean of this number of lowest costs of sources.
-        min_cosine: smallest cosine of the angle between normal and viewing direction.
+        radius: Half the side of the window, pixels; every second row and column is used.
+        sigma_color: The scale of the bilateral weights in grey levels.
+        sigma_space: The scale of the bilateral weights in pixels.
+        num_best: The cost of a plane is the mean of this number of lowest costs of sources.
+        min_cosine: The smallest cosine of the angle between normal and viewing direction.
     """
 
     radius: int = 5
@@ -75,11 +75,12 @@ class SearchOptions:
     """Parameters of the search at one resolution.
 
     Attributes:
-        depth_range: smallest and largest camera z, world units.
-        iterations: number of times that both colours of the checkerboard are updated.
-        num_random: random planes of each pixel before the first iteration.
-        first_step: size of the first perturbation, pixels of a source; halved in each iteration.
-        seed: of random numbers, with which pixel and iteration are hashed.
+        depth_range: Smallest and largest camera z, world units.
+        iterations: The number of times that both colours of the checkerboard are updated.
+        num_random: The number of random planes of each pixel before the first iteration.
+        first_step: The first perturbation, pixels of a source; halved in each iteration.
+        seed: The seed of random numbers, at most 32 bits, with which pixel and iteration are
+            hashed.
     """
 
     depth_range: tuple[float, float]
@@ -99,30 +100,21 @@ class _Source(ctypes.Structure):
     ]
 
 
+_INTEGERS = "width height num_sources num_best radius iterations num_random"
+_FLOATS = (
+    "sigma_color sigma_space fx fy cx cy min_inverse_depth max_inverse_depth pixel_step min_cosine "
+    "first_step"
+)
+
+
 class _Problem(ctypes.Structure):
     _fields_ = [
         ("grey", ctypes.c_void_p),
         ("valid", ctypes.c_void_p),
-        ("width", ctypes.c_int32),
-        ("height", ctypes.c_int32),
         ("sources", ctypes.POINTER(_Source)),
-        ("num_sources", ctypes.c_int32),
-        ("num_best", ctypes.c_int32),
-        ("radius", ctypes.c_int32),
-        ("sigma_color", ctypes.c_float),
-        ("sigma_space", ctypes.c_float),
-        ("fx", ctypes.c_float),
-        ("fy", ctypes.c_float),
-        ("cx", ctypes.c_float),
-        ("cy", ctypes.c_float),
-        ("min_inverse_depth", ctypes.c_float),
-        ("max_inverse_depth", ctypes.c_float),
-        ("pixel_step", ctypes.c_float),
-        ("min_cosine", ctypes.c_float),
-        ("iterations", ctypes.c_int32),
-        ("num_random", ctypes.c_int32),
-        ("first_step", ctypes.c_float),
+        *((name, ctypes.c_int32) for name in _INTEGERS.split()),
         ("seed", ctypes.c_uint32),
+        *((name, ctypes.c_float) for name in _FLOATS.split()),
     ]
 
 
@@ -136,7 +128,7 @@ def patchmatch(
     """Improve the planes of a view's pixels. Releases the GIL.
 
     Args:
-        sources: at least one.
+        sources: At least one source.
         planes: (3, H, W) inverse depth at the pixel's centre and its gradient per pixel, world
             units; inverse depth 0 for pixels without a plane.
 
@@ -152,24 +144,9 @@ def patchmatch(
     if found.shape != (3, *reference.grey.shape):
         raise ValueError(f"expected planes of shape (3, H, W), found {found.shape}")
     costs = np.empty(reference.grey.shape, np.float32)
-    _library().patchmatch(ctypes.byref(problem), _pointer(found), _pointer(costs))
+    pointers = (array.ctypes.data_as(ctypes.c_void_p) for array in (found, costs))
+    _library().patchmatch(ctypes.byref(problem), *pointers)
     return found, costs
-
-
-def matching_cost(
-    reference: Picture,
-    sources: Sequence[Picture],
-    planes: NDArray[np.float32],
-    depth_range: tuple[float, float],
-    cost: CostOptions,
-) -> NDArray[np.float32]:
-    """(H, W) costs of given planes; 2 for planes that are not allowed. See ``patchmatch``."""
-    search = SearchOptions(depth_range, iterations=0, num_random=0, first_step=0.0, seed=0)
-    problem, _kept = _problem(reference, sources, search, cost)
-    planes = np.ascontiguousarray(planes, np.float32)
-    costs = np.empty(reference.grey.shape, np.float32)
-    _library().matching_cost(ctypes.byref(problem), _pointer(planes), _pointer(costs))
-    return costs
 
 
 def relative_pose(view: View, other: View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -228,17 +205,15 @@ def _problem(
     kept += [grey, valid]
     view, (near, far) = reference.view, search.depth_range
     views = [source.view for source in sources]
+    options = vars(cost) | vars(search)
+    del options["depth_range"]
     problem = _Problem(
         grey=grey.ctypes.data,
         valid=valid.ctypes.data,
-        width=grey.shape[1],
-        height=grey.shape[0],
         sources=array,
+        width=view.width,
+        height=view.height,
         num_sources=len(sources),
-        num_best=cost.num_best,
-        radius=cost.radius,
-        sigma_color=cost.sigma_color,
-        sigma_space=cost.sigma_space,
         fx=view.fx,
         fy=view.fy,
         cx=view.cx,
@@ -246,23 +221,15 @@ def _problem(
         min_inverse_depth=1.0 / far,
         max_inverse_depth=1.0 / near,
         pixel_step=pixel_step(view, views, 2.0 / (1.0 / near + 1.0 / far)),
-        min_cosine=cost.min_cosine,
-        iterations=search.iterations,
-        num_random=search.num_random,
-        first_step=search.first_step,
-        seed=search.seed & 0xFFFFFFFF,
+        **options,
     )
     return problem, kept
-
-
-def _pointer(array: NDArray[np.float32]) -> ctypes.c_void_p:
-    return array.ctypes.data_as(ctypes.c_void_p)
 
 
 @cache
 def _library() -> ctypes.CDLL:
     library = ctypes.CDLL(str(LIBRARY.build().path))
-    library.patchmatch.restype = library.matching_cost.restype = None
+    library.patchmatch.restype = None
     return library
 
 

@@ -20,7 +20,7 @@ from pipeline.mvs.estimate import (
     estimate_planes,
     normals_of,
 )
-from pipeline.mvs.patchmatch import CostOptions, Picture, matching_cost
+from pipeline.mvs.patchmatch import CostOptions, Picture, SearchOptions, patchmatch
 from pipeline.runtime import targets
 from pipeline.runtime.native import compiler
 from pipeline.runtime.targets import Variant
@@ -30,6 +30,11 @@ from tests.tools import unsupported
 
 RANGE = (2.0, 12.0)
 NO_POINTS = np.zeros((0, 3))
+
+
+def matching_cost(reference, sources, planes, depths, options=CostOptions()) -> np.ndarray:
+    search = SearchOptions(depths, iterations=0, num_random=0, first_step=0.0, seed=0)
+    return patchmatch(reference, sources, planes, search, options)[1]
 
 
 def some_planes(count: int) -> np.ndarray:
@@ -78,14 +83,14 @@ def test_the_true_plane_has_the_lowest_cost():
     reference, *sources = planar.pictures()
     truth = planar.true_planes(reference.view)
     inside = np.s_[8:-8, 8:-8]
-    best = matching_cost(reference, sources, truth, RANGE, CostOptions())[inside]
+    best = matching_cost(reference, sources, truth, RANGE)[inside]
     assert np.median(best) < 0.02
     for change in (0.97, 1.03):
         other = truth * np.array([change, 1, 1], np.float32)[:, None, None]
-        cost = matching_cost(reference, sources, other, RANGE, CostOptions())[inside]
+        cost = matching_cost(reference, sources, other, RANGE)[inside]
         assert (cost > best).mean() > 0.98
     tilted = truth * np.array([1, 0, 0], np.float32)[:, None, None]
-    cost = matching_cost(reference, sources, tilted, RANGE, CostOptions())[inside]
+    cost = matching_cost(reference, sources, tilted, RANGE)[inside]
     assert (cost > best).mean() > 0.9
 
 

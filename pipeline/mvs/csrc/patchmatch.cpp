@@ -162,7 +162,6 @@ class Matcher {
                 const size_t i = size_t(y) * p_.width + x;
                 const bool found = *cost_.at(x, y) <= MAX_COST;
                 costs[i] = found ? *cost_.at(x, y) : MAX_COST;
-                if (planes == nullptr) continue;
                 planes[i] = found ? *w_.at(x, y) : 0.0f;
                 planes[size + i] = found ? *wx_.at(x, y) : 0.0f;
                 planes[2 * size + i] = found ? *wy_.at(x, y) : 0.0f;
@@ -428,11 +427,4 @@ extern "C" void patchmatch(const Problem* problem, float* planes, float* costs) 
     matcher.start(problem->num_random);
     for (int k = 0; k < problem->iterations; ++k) matcher.iterate(k);
     matcher.write(planes, costs);
-}
-
-extern "C" void matching_cost(const Problem* problem, const float* planes, float* costs) {
-    mvs::Matcher matcher(*problem);
-    matcher.read(planes);
-    matcher.start(0);
-    matcher.write(nullptr, costs);
 }

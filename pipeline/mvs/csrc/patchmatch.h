@@ -20,26 +20,22 @@ struct Source {
 struct Problem {
     const uint8_t* grey;
     const uint8_t* valid;  // 0: the pixel is excluded; has no plane and no weight in windows.
-    int32_t width, height;
     const Source* sources;
-    int32_t num_sources;
-    int32_t num_best;  // The cost is the mean of this number of lowest costs of sources.
-    int32_t radius;    // Of the window, pixels; every second row and column is used.
+    int32_t width, height, num_sources;
+    int32_t num_best;    // The cost is the mean of this number of lowest costs of sources.
+    int32_t radius;      // Of the window, pixels; every second row and column is used.
+    int32_t iterations;  // 0: the given planes get their costs alone.
+    int32_t num_random;  // Random planes of each pixel before the first iteration.
+    uint32_t seed;
     float sigma_color, sigma_space;  // Of the bilateral weights: grey levels, pixels.
     float fx, fy, cx, cy;
     float min_inverse_depth, max_inverse_depth;
     float pixel_step;  // Change of the inverse depth that moves a point by a pixel in a source.
     float min_cosine;  // Between normal and viewing direction.
-    int32_t iterations;
-    int32_t num_random;  // Random planes of each pixel before the first iteration.
-    float first_step;    // Size of the first perturbation, pixels; halved in each iteration.
-    uint32_t seed;
+    float first_step;  // Size of the first perturbation, pixels; halved in each iteration.
 };
 
 // Improves planes (3, H, W) (w, wx, wy; w = 0: none) in place, and writes their costs (H, W) in
 // [0, 2]: 1 minus the weighted NCC. Pixels that are excluded or have no plane: w = 0, cost 2.
 void patchmatch(const Problem* problem, float* planes, float* costs);
-
-// The costs (H, W) of given planes; 2 for planes that are not allowed.
-void matching_cost(const Problem* problem, const float* planes, float* costs);
 }

@@ -21,7 +21,7 @@ class PlaneMap:
     """Planes of a view's pixels.
 
     Attributes:
-        view: the camera.
+        view: The camera.
         planes: (3, H, W) float32 inverse depth at the pixel's centre and its gradient per pixel;
             inverse depth 0 without a plane.
     """
@@ -35,12 +35,12 @@ class FilterOptions:
     """Parameters of the filter.
 
     Attributes:
-        max_error: largest distance between a pixel and its image after the round trip, pixels.
-        max_depth_error: largest relative difference of depths.
-        min_views: number of other views that must agree. One is enough where the others see
+        max_error: The largest distance between a pixel and its image after the round trip, pixels.
+        max_depth_error: The largest relative difference of depths.
+        min_views: The number of other views that must agree. One is enough where the others see
             nothing behind the point.
-        max_cost: largest matching cost.
-        min_speckle: smaller connected regions are removed, pixels.
+        max_cost: The largest matching cost.
+        min_speckle: The size in pixels below which connected regions are removed.
     """
 
     max_error: float = 1.0
@@ -81,9 +81,7 @@ def compare(
         xy: (N, 2) pixels of the view.
         inverse_depth: (N,) positive.
     """
-    to_other = _projection(view, other.view)
-    back = _projection(other.view, view)
-    at = to_other(xy, inverse_depth)
+    at = _projected(view, other.view, xy, inverse_depth)
     front = at[2] > 1e-12
     scale = np.where(front, at[2], 1.0)
     u, v = at[0] / scale, at[1] / scale
@@ -95,7 +93,7 @@ def compare(
     w = w + (u - column - 0.5) * wx + (v - row - 0.5) * wy
     found &= w > 0
     w = np.where(found, w, 1.0)
-    returned = back(np.column_stack([u, v]), w)
+    returned = _projected(other.view, view, np.column_stack([u, v]), w)
     found &= returned[2] > 1e-12
     scale = np.where(found, returned[2], 1.0)
     dx, dy = returned[0] / scale - xy[:, 0], returned[1] / scale - xy[:, 1]
@@ -109,32 +107,20 @@ def compare(
     return Agreement(agrees, found & behind, w / scale, index)
 
 
-@dataclass(frozen=True)
-class Filtered:
-    """A filtered depth map.
-
-    Attributes:
-        inverse_depth: (H, W) float32 mean of the reference and the views that agree; 0 for removed
-            pixels.
-        confidence: (H, W) float32 in [0, 1]; 0 for removed pixels.
-        num_agreeing: (H, W) uint8 number of other views that agree.
-    """
-
-    inverse_depth: NDArray[np.float32]
-    confidence: NDArray[np.float32]
-    num_agreeing: NDArray[np.uint8]
-
-
 def filtered(
     reference: PlaneMap,
     costs: NDArray[np.float32],
     others: Iterable[PlaneMap],
     options: FilterOptions,
-) -> Filtered:
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
     """Remove pixels that other views do not confirm, and small regions.
 
     Args:
         costs: (H, W) matching costs.
+
+    Returns:
+        (H, W) inverse depth, the mean of the reference and the views that agree, and confidence in
+        [0, 1]; 0 for removed pixels.
     """
     shape = costs.shape
     row, column = np.nonzero(reference.planes[0] > 0)
@@ -155,15 +141,10 @@ def filtered(
     result[row[kept], column[kept]] = (total / (1 + count))[kept]
     speckles = speckle_mask(result, options)
     result[speckles] = 0
-    share = confidence(count, behind, cost)
     trust = np.zeros(shape, np.float32)
-    trust[row, column] = share
-    agreeing = np.zeros(shape, np.uint8)
-    agreeing[row, column] = np.minimum(count, 255)
-    removed = result == 0
-    trust[removed] = 0
-    agreeing[removed] = 0
-    return Filtered(result, trust, agreeing)
+    trust[row, column] = confidence(count, behind, cost)
+    trust[result == 0] = 0
+    return result, trust
 
 
 def confidence(
@@ -202,12 +183,9 @@ def speckle_mask(inverse_depth: NDArray[np.float32], options: FilterOptions) -> 
     return np.asarray((sizes[labels] < options.min_speckle).reshape(height, width))
 
 
-class _projection:
-    """Pixels with inverse depths to homogeneous pixels of another view, (3, N)."""
-
-    def __init__(self, view: View, other: View):
-        self._rotation, self._translation = relative_projection(view, other)
-
-    def __call__(self, xy: NDArray[np.float64], w: NDArray[np.float64]) -> list[NDArray]:
-        r, t = self._rotation, self._translation
-        return [r[k, 0] * xy[:, 0] + r[k, 1] * xy[:, 1] + r[k, 2] + t[k] * w for k in range(3)]
+def _projected(
+    view: View, other: View, xy: NDArray[np.float64], w: NDArray[np.float64]
+) -> list[NDArray]:
+    """Pixels (N, 2) with inverse depths (N,) to homogeneous pixels of another view, (3, N)."""
+    r, t = relative_projection(view, other)
+    return [r[k, 0] * xy[:, 0] + r[k, 1] * xy[:, 1] + r[k, 2] + t[k] * w for k in range(3)]

@@ -7,7 +7,6 @@ not depend on the number of threads. Planes are stored in the scratch folder bet
 
 from __future__ import annotations
 
-import io
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
@@ -40,7 +39,7 @@ from pipeline.mvs.maps import (
 from pipeline.mvs.patchmatch import Picture
 from pipeline.mvs.sources import seen_points, select_sources
 from pipeline.photos.load import load_view
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import written
 from pipeline.runtime.counters import Report
 from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Reconstruction
@@ -127,9 +126,8 @@ class _Scene:
         sources = [self._picture(int(source)) for source in self._sources[index]]
         xyz = self._xyz[self._seen[index]]
         planes, costs = estimate_planes(reference, sources, xyz, index, self._options.stereo)
-        buffer = io.BytesIO()
-        np.save(buffer, np.concatenate([planes, costs[None]]))
-        write_bytes(self._file(index), buffer.getvalue())
+        with written(self._file(index)) as file:
+            np.save(file, np.concatenate([planes, costs[None]]))
 
     def filter(self, index: int) -> tuple[int, int, float]:
         """Write the filtered map of a view; returns the number of valid pixels, of pixels with a
@@ -141,17 +139,14 @@ class _Scene:
             PlaneMap(self._views[other], self._stored(other)[0])
             for other in map(int, self._sources[index])
         )
-        found = filtered(reference, costs, others, self._options.filter)
-        known = found.inverse_depth > 0
-        depth = np.where(known, 1 / np.where(known, found.inverse_depth, 1), 0)
+        inverse, confidence = filtered(reference, costs, others, self._options.filter)
+        known = inverse > 0
+        depth = np.where(known, 1 / np.where(known, inverse, 1), 0)
         normals = np.where(known[..., None], normals_of(planes, view), 0)
-        write_map(
-            self._out,
-            view.name,
-            DenseMap(depth.astype(np.float32), np.asarray(normals, np.float32), found.confidence),
-        )
+        found = DenseMap(depth.astype(np.float32), np.asarray(normals, np.float32), confidence)
+        write_map(self._out, view.name, found)
         valid = self._picture(index).valid
-        return int(valid.sum()), int(known.sum()), float(found.confidence.sum())
+        return int(valid.sum()), int(known.sum()), float(confidence.sum())
 
     def fuse(self, index: int) -> DenseCloud:
         """The points of the cloud that a view contributes."""

@@ -7,14 +7,13 @@ A map has five bytes a pixel: depth as 16-bit logarithm between the map's smalle
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import written
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import rerun
 from pipeline.scene.views import View
@@ -70,15 +69,14 @@ def write_map(folder: Path, name: str, found: DenseMap) -> None:
     logs = np.log(np.where(known, found.depth, 1.0).astype(np.float64))
     code = np.rint((logs - span[0]) / width * _STEPS).clip(0, _STEPS)
     confidence = np.rint(255 * found.confidence.clip(0, 1)).astype(np.uint8)
-    buffer = io.BytesIO()
-    np.savez_compressed(
-        buffer,
-        log_depth=np.where(known, code + 1, 0).astype(np.uint16),
-        span=span,
-        normals=_octahedral(found.normals),
-        confidence=np.where(known, np.maximum(confidence, 1), 0).astype(np.uint8),
-    )
-    write_bytes(_map_file(folder, name), buffer.getvalue())
+    with written(_map_file(folder, name)) as file:
+        np.savez_compressed(
+            file,
+            log_depth=np.where(known, code + 1, 0).astype(np.uint16),
+            span=span,
+            normals=_octahedral(found.normals),
+            confidence=np.where(known, np.maximum(confidence, 1), 0).astype(np.uint8),
+        )
 
 
 def read_map(folder: Path, name: str) -> DenseMap:
@@ -101,9 +99,8 @@ def read_map(folder: Path, name: str) -> DenseMap:
 
 def write_dense_cloud(folder: Path, cloud: DenseCloud) -> None:
     """Write ``points.npz``, atomically and deterministically."""
-    buffer = io.BytesIO()
-    np.savez(buffer, xyz=cloud.xyz, normals=cloud.normals, rgb=cloud.rgb)
-    write_bytes(folder / POINTS, buffer.getvalue())
+    with written(folder / POINTS) as file:
+        np.savez(file, **vars(cloud))
 
 
 def read_dense_cloud(folder: Path) -> DenseCloud:
@@ -112,8 +109,7 @@ def read_dense_cloud(folder: Path) -> DenseCloud:
     Raises:
         UserError: the file is missing or damaged.
     """
-    arrays = _read(folder / POINTS, ("xyz", "normals", "rgb"))
-    return DenseCloud(arrays["xyz"], arrays["normals"], arrays["rgb"])
+    return DenseCloud(**_read(folder / POINTS, ("xyz", "normals", "rgb")))
 
 
 def planes_of(depth: NDArray[np.float32], normals: NDArray[np.float32], view: View) -> NDArray:

@@ -8,7 +8,6 @@ far below what a pixel shows. Exported files have the given values.
 
 from __future__ import annotations
 
-import io
 import math
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -17,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.rotations import quat_to_rotation, rotation_to_quat
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import written
 from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
@@ -97,15 +96,10 @@ class Unrounded:
 
     def write(self, folder: Path) -> None:
         """Write ``unrounded.npz``, atomically and deterministically."""
-        buffer = io.BytesIO()
-        np.savez(
-            buffer,
-            size=np.array([self.rounding.size]),
-            rotations=self.rotations,
-            translations=self.translations,
-            points=self.points,
-        )
-        write_bytes(folder / FILE, buffer.getvalue())
+        arrays = vars(self).copy()
+        size = np.array([arrays.pop("rounding").size])
+        with written(folder / FILE) as file:
+            np.savez(file, size=size, **arrays)
 
     @classmethod
     def read(cls, folder: Path) -> Unrounded:

@@ -93,13 +93,8 @@ def extract_photos(
     if missing:
         progress = Progress("extracting features", len(missing), "photographs")
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv
-        extract(
-            missing,
-            config,
-            {p.name: cache / f"{keys[p.name]}.npz" for p in missing},
-            threads,
-            progress,
-        )
+        targets = {p.name: cache / f"{keys[p.name]}.npz" for p in missing}
+        extract(missing, config, targets, threads, progress)
     counts = {}
     for photo in photos:
         source = cache / f"{keys[photo.name]}.npz"

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import hashlib
-import io
 from dataclasses import dataclass
 from pathlib import Path
 from urllib.parse import quote
@@ -11,7 +10,7 @@ from urllib.parse import quote
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.runtime.atomic import write_bytes
+from pipeline.runtime.atomic import written
 
 
 @dataclass(frozen=True)
@@ -38,16 +37,8 @@ class Keypoints:
 
     def write(self, path: Path) -> None:
         """Write as ``.npz``, atomically and deterministically."""
-        buffer = io.BytesIO()
-        np.savez(
-            buffer,
-            xy=self.xy,
-            scale=self.scale,
-            orientation=self.orientation,
-            descriptors=self.descriptors,
-            rgb=self.rgb,
-        )
-        write_bytes(path, buffer.getvalue())
+        with written(path) as file:
+            np.savez(file, **vars(self))
 
     @staticmethod
     def read(path: Path) -> Keypoints:

@@ -58,40 +58,32 @@ def write_mesh_glb(path: Path, mesh: Mesh, up: NDArray[np.float64]) -> None:
     ]
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
-    body = b""
-    parts = []
     offset = 0
     for i, (array, kind, shape, target) in enumerate(arrays):
-        data = array.tobytes()
-        views.append({"buffer": 0, "byteOffset": offset, "byteLength": len(data), "target": target})
+        size = array.nbytes  # A multiple of 4 bytes, so that all views are aligned.
+        views.append({"buffer": 0, "byteOffset": offset, "byteLength": size, "target": target})
         accessors.append(
             {"bufferView": i, "componentType": kind, "count": len(array), "type": shape}
         )
-        parts.append(data)
-        offset += len(data)  # sizes are multiples of 4 bytes, so all views are aligned
+        offset += size
     accessors[0] |= {
         "min": mesh.vertices.min(axis=0).astype(float).tolist(),
         "max": mesh.vertices.max(axis=0).astype(float).tolist(),
     }
     accessors[2]["normalized"] = True
-    body = b"".join(parts)
+    body = b"".join(array.tobytes() for array, *_ in arrays)
+    primitive = {
+        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
+        "indices": 3,
+        "material": 0,
+    }
     document = {
         "asset": {"version": "2.0", "generator": "splatmake"},
         "extensionsUsed": ["KHR_materials_unlit"],
         "scene": 0,
         "scenes": [{"nodes": [0]}],
         "nodes": [{"mesh": 0, "rotation": _rotation_to_y_up(up)}],
-        "meshes": [
-            {
-                "primitives": [
-                    {
-                        "attributes": {"POSITION": 0, "NORMAL": 1, "COLOR_0": 2},
-                        "indices": 3,
-                        "material": 0,
-                    }
-                ]
-            }
-        ],
+        "meshes": [{"primitives": [primitive]}],
         "materials": [
             {
                 "extensions": {"KHR_materials_unlit": {}},

@@ -29,10 +29,11 @@ from tests.mvs.reference import pixel_cost
 from tests.tools import unsupported
 
 RANGE = (2.0, 12.0)
+COST = CostOptions()
 NO_POINTS = np.zeros((0, 3))
 
 
-def matching_cost(reference, sources, planes, depths, options=CostOptions()) -> np.ndarray:
+def matching_cost(reference, sources, planes, depths, options=COST) -> np.ndarray:
     search = SearchOptions(depths, iterations=0, num_random=0, first_step=0.0, seed=0)
     return patchmatch(reference, sources, planes, search, options)[1]
 

@@ -43,11 +43,8 @@ def quaternions(given: PoseSet, convention: Convention) -> list[Reading]:
             # Translations may have been computed with the wrong rotations.
             flipped: Position = "translation" if form.position == "centre" else "centre"
             kept = replace(convention, position=flipped).raw(given)[1]
-            found.append(
-                Reading(
-                    cause, fix, replace(form, position=flipped).read(given, right, kept), rank + 1
-                )
-            )
+            poses = replace(form, position=flipped).read(given, right, kept)
+            found.append(Reading(cause, fix, poses, rank + 1))
     return found
 
 
@@ -65,16 +62,9 @@ def angles(given: PoseSet, convention: Convention) -> list[Reading]:
             for signs in itertools.product((1.0, -1.0), repeat=3):
                 for zero in (0.0, 90.0, -90.0):
                     angles = degrees[:, list(order)] * signs + (0.0, zero, 0.0)
-                    changes = [order != (0, 1, 2), -1 in signs, zero != 0]
-                    what = [
-                        text
-                        for text, changed in zip(
-                            ("in another order", "of another sign", "counted from another zero"),
-                            changes,
-                            strict=True,
-                        )
-                        if changed
-                    ]
+                    what = ["in another order"] * (order != (0, 1, 2))
+                    what += ["of another sign"] * (-1 in signs)
+                    what += ["counted from another zero"] * (zero != 0)
                     for target, (_, other) in _EULER.items():
                         words = [*what, *(["of rotations in another order"] * (target != name))]
                         if not words:
@@ -94,20 +84,12 @@ def _split_zxy(matrix: Array) -> Array:
     return np.column_stack([heading, pitch, roll])
 
 
-def _join_zxy(angles: Array) -> Array:
-    return _turns(angles * (-1, 1, 1), (2, 0, 1))
-
-
 def _split_xyz(matrix: Array) -> Array:
     """(N, 3) omega, phi and kappa of Rx(omega) Ry(phi) Rz(kappa)."""
     omega = np.arctan2(-matrix[:, 1, 2], matrix[:, 2, 2])
     phi = np.arcsin(np.clip(matrix[:, 0, 2], -1, 1))
     kappa = np.arctan2(-matrix[:, 0, 1], matrix[:, 0, 0])
     return np.column_stack([omega, phi, kappa])
-
-
-def _join_xyz(angles: Array) -> Array:
-    return _turns(angles, (0, 1, 2))
 
 
 def _turns(angles: Array, axes: Sequence[int]) -> Array:
@@ -123,6 +105,6 @@ def _turns(angles: Array, axes: Sequence[int]) -> Array:
 
 
 _EULER: dict[str, tuple[Callable[[Array], Array], Callable[[Array], Array]]] = {
-    "heading, pitch, roll": (_split_zxy, _join_zxy),
-    "omega, phi, kappa": (_split_xyz, _join_xyz),
+    "heading, pitch, roll": (_split_zxy, lambda angles: _turns(angles * (-1, 1, 1), (2, 0, 1))),
+    "omega, phi, kappa": (_split_xyz, lambda angles: _turns(angles, (0, 1, 2))),
 }

@@ -101,6 +101,11 @@ CONVENTIONS: dict[PoseKind, Convention] = {
     "pix4d": Convention("world to camera", "centre", COLMAP),
     "pix4d_angles": Convention("camera to world", "centre", OPENGL),
 }
+# The cause and the fix of translations where centres are expected.
+TRANSLATIONS = (
+    "the positions look like the translations t of world to camera, expected the cameras' centres",
+    "write the centres, -R^T t",
+)
 ANGLES: tuple[PoseKind, ...] = ("realitycapture_csv", "pix4d_angles")
 
 
@@ -158,11 +163,8 @@ def explained(expected: Convention, found: Convention) -> tuple[str, str]:
         )
         fixes.append("transpose the rotations")
     elif moved and found.position == "translation":
-        causes.append(
-            "the positions look like the translations t of world to camera, expected the cameras' "
-            "centres"
-        )
-        fixes.append("write the centres, -R^T t")
+        causes.append(TRANSLATIONS[0])
+        fixes.append(TRANSLATIONS[1])
     elif moved:
         causes.append(
             "the translations look like the cameras' centres C, expected those of world to camera"
@@ -188,8 +190,11 @@ def _axes_fix(expected: Convention, found: Convention) -> str:
         return f"negate {lines[:-1] if one else lines} {which} of the rotations" + (
             " and of the positions' world" if np.linalg.det(change) < 0 else ""
         )
-    parts = []
-    for k in range(3):
-        at = int(np.abs(change[:, k]).argmax())
-        parts.append(f"{'-' if change[at, k] < 0 else ''}{at + 1}")
-    return f"reorder the {lines} of the rotations to {', '.join(parts)}"
+    return f"reorder the {lines} of the rotations to {', '.join(signed_axes(change.T, '123'))}"
+
+
+def signed_axes(axes: Array, names: str) -> list[str]:
+    """The name of the axis that each row of a signed permutation has, with its sign."""
+    columns = np.abs(axes).argmax(axis=1)
+    rows = zip(axes, columns, strict=True)
+    return [f"{'-' if row[at] < 0 else ''}{names[at]}" for row, at in rows]

@@ -18,15 +18,10 @@ def orders(given: PoseSet, names: Sequence[str], rank: int = 1) -> list[Reading]
     orders: list[tuple[str, NDArray[np.int64]]] = []
     for step in (1, -1, 2, -2, 3, -3):
         if abs(step) < count:
-            where = "after" if step > 0 else "before"
-            text = f"{'the' if abs(step) == 1 else f'{abs(step)}'} {where} it"
-            orders.append(
-                (
-                    "each photograph has the pose of the one "
-                    + (text.replace("the ", "") if abs(step) == 1 else text),
-                    np.roll(np.arange(count), step),
-                )
-            )
+            places = f"{abs(step)} " if abs(step) > 1 else ""
+            text = f"{places}{'after' if step > 0 else 'before'} it"
+            order = np.roll(np.arange(count), step)
+            orders.append((f"each photograph has the pose of the one {text}", order))
     orders.append(("the photographs are in reverse order", np.arange(count)[::-1]))
     natural = np.array(sorted(range(count), key=lambda i: _natural_key(names[i])))
     if not np.array_equal(natural, np.arange(count)):

@@ -21,12 +21,14 @@ from pipeline.sfm.pose_check.conventions import (
     CONVENTIONS,
     NAMED,
     OPENGL,
+    TRANSLATIONS,
     Convention,
     Direction,
     PoseSet,
     Position,
     Reading,
     explained,
+    signed_axes,
     signed_permutations,
 )
 from pipeline.sfm.pose_check.intrinsics import intrinsics
@@ -58,7 +60,9 @@ def readings(given: PoseSet, kind: PoseKind, names: Sequence[str]) -> Iterator[R
         simple += angles(given, convention)
     yield from simple
     if convention.position == "centre":
-        yield _translations(given)
+        # COLMAP's translations beside rotations that were converted to the format's axes.
+        centres = -np.einsum("nji,nj->ni", given.rotations, given.centres)
+        yield Reading(*TRANSLATIONS, given.posed(given.rotations, centres), 2)
     yield from _positions(given)
     for axes in _two_mistakes(given, convention):
         yield from (
@@ -73,11 +77,9 @@ def readings(given: PoseSet, kind: PoseKind, names: Sequence[str]) -> Iterator[R
 def translation_centres(given: PoseSet, kind: PoseKind) -> Array:
     """(N, 3) the numbers that a file of ``kind`` would have if it had the other kind of position:
     the cameras' centres if what is there are translations, or the opposite."""
-    return (
-        CONVENTIONS[kind].raw(given)[1]
-        if CONVENTIONS[kind].position == "translation"
-        else (given.translations)
-    )
+    convention = CONVENTIONS[kind]
+    is_translation = convention.position == "translation"
+    return convention.raw(given)[1] if is_translation else given.translations
 
 
 def interpretations(given: PoseSet, convention: Convention) -> list[Reading]:
@@ -101,33 +103,16 @@ def interpretations(given: PoseSet, convention: Convention) -> list[Reading]:
     return found
 
 
-def _translations(given: PoseSet) -> Reading:
-    """COLMAP's translations where the format has the cameras' centres, beside rotations that were
-    converted to the format's axes."""
-    centres = -np.einsum("nji,nj->ni", given.rotations, given.centres)
-    return Reading(
-        "the positions look like the translations t of world to camera, expected the cameras' "
-        "centres",
-        "write the centres, -R^T t",
-        given.posed(given.rotations, centres),
-        2,
-    )
-
-
 def _positions(given: PoseSet) -> list[Reading]:
     """Positions whose world has other axes than that of the rotations."""
     found = []
     for axes in signed_permutations():
         if np.array_equal(axes, np.eye(3)):
             continue
-        words = []
-        for row in axes:
-            at = int(np.abs(row).argmax())
-            words.append(f"{'-' if row[at] < 0 else ''}{'xyz'[at]}")
         mirrored = ", mirrored" if np.linalg.det(axes) < 0 else ""
         cause = (
             "the positions and the rotations look like those of worlds with different axes "
-            f"({', '.join(words)} for x, y, z{mirrored})"
+            f"({', '.join(signed_axes(axes, 'xyz'))} for x, y, z{mirrored})"
         )
         fix = "convert positions and rotations in the same way"
         found.append(Reading(cause, fix, given.posed(given.rotations, given.centres @ axes.T), 4))

@@ -32,7 +32,7 @@ class ImageDirections:
     Attributes:
         top: The direction from the centre to the top of the upright image.
         right: The direction from the centre to the right of the upright image.
-        ahead: along the optical axis.
+        ahead: The direction along the optical axis.
     """
 
     top: Array
@@ -82,7 +82,7 @@ def up_direction(rotations: Array, orientations: Sequence[int]) -> Array:
     same direction, they look down.
 
     Args:
-        rotations, orientations: see ``image_directions``.
+        rotations, orientations: The arguments of ``image_directions``.
 
     Returns:
         (3,). (0, -1, 0) if there are no cameras or their directions cancel: COLMAP's y axis

@@ -57,9 +57,9 @@ class DenseOptions:
     """Parameters of the dense stage.
 
     Attributes:
-        num_sources: number of source views of each view.
-        num_neighbours: number of views that each view is compared with in fusion, at least.
-        max_points: largest number of points of the fused cloud.
+        num_sources: The number of source views of each view.
+        num_neighbours: The least number of views that each view is compared with in fusion.
+        max_points: The largest number of points of the fused cloud.
     """
 
     num_sources: int = 6
@@ -80,9 +80,9 @@ def reconstruct(
     """Write the depth maps of the views and the fused cloud (``pipeline.mvs.maps``) into ``out``.
 
     Args:
-        views: the training views, sorted by name.
-        model: their sparse points.
-        scratch: folder for planes, which a later run with the same inputs finds.
+        views: The training views, sorted by name.
+        model: The model with their sparse points.
+        scratch: A folder for planes, which a later run with the same inputs finds.
 
     Raises:
         UserError: a photograph cannot be read, or the kernel cannot be compiled.

@@ -23,8 +23,8 @@ class Level:
     """The search at one resolution.
 
     Attributes:
-        factor: by which the view is reduced.
-        iterations, num_random, first_step: see ``SearchOptions``.
+        factor: The factor by which the view is reduced.
+        iterations, num_random, first_step: Parameters of ``SearchOptions``.
     """
 
     factor: int
@@ -38,10 +38,10 @@ class StereoOptions:
     """Parameters of the estimation.
 
     Attributes:
-        levels: from coarse to fine; the last one is of the whole resolution.
-        min_side: coarse levels are left out where the shorter side would be smaller, pixels. The
+        levels: The levels from coarse to fine; the last one has the whole resolution.
+        min_side: Coarse levels are left out where the shorter side would be smaller, pixels. The
             first level that is not has the iterations, random planes and step of the coarsest.
-        cost: the matching cost.
+        cost: The parameters of the matching cost.
     """
 
     levels: tuple[Level, ...] = (
@@ -91,9 +91,9 @@ def estimate_planes(
     """Planes and costs of a view's pixels; see ``patchmatch``.
 
     Args:
-        sources: without any, no pixel gets a plane.
+        sources: The source views; without any, no pixel gets a plane.
         xyz: (N, 3) the sparse points that the view sees.
-        seed: of random numbers; different for each view.
+        seed: The seed of random numbers; different for each view.
     """
     shape = reference.grey.shape
     if not sources or not reference.valid.any():

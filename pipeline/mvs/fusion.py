@@ -45,12 +45,12 @@ def fused_points(
     """The points of the cloud that a view contributes.
 
     Args:
-        index: of the view in ``views``.
-        neighbours: indices of the views to compare with.
-        own: the view's filtered map.
+        index: The index of the view in ``views``.
+        neighbours: The indices of the views to compare with.
+        own: The view's filtered map.
         rgb: (H, W, 3) its colours.
-        read: the filtered planes of a view by its index.
-        limit: largest number of points; of more, a random subset is kept.
+        read: Returns the filtered planes of a view by its index.
+        limit: The largest number of points; of more, a random subset is kept.
     """
     view = views[index]
     row, column = np.nonzero(own.confidence >= MIN_CONFIDENCE)

@@ -43,7 +43,7 @@ def surface_points(
     more detail. Sparse points are added where the cloud has holes.
 
     Args:
-        cloud: at least two points.
+        cloud: A cloud of at least two points.
     """
     chosen = np.arange(len(cloud))
     if len(chosen) > OVERSAMPLING * max_points:

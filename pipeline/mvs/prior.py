@@ -47,9 +47,9 @@ def first_planes(
     of the inverse depths of its neighbours.
 
     Args:
-        view: at the size of the planes.
+        view: The view at the size of the planes.
         xyz: (N, 3) the sparse points that it sees.
-        depths: range of depth; points outside are not used.
+        depths: The range of depth; points outside are not used.
     """
     from scipy.spatial import cKDTree
 

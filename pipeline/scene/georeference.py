@@ -176,9 +176,5 @@ class Georeference(JsonFile, GeoreferenceSummary):
         return cls.read(folder).normalization if (folder / cls.file_name).is_file() else IDENTITY
 
     def summary(self) -> GeoreferenceSummary:
-        return GeoreferenceSummary(
-            method=self.method,
-            origin=self.origin,
-            residuals_m=self.residuals_m,
-            uncertainty=self.uncertainty,
-        )
+        fields = GeoreferenceSummary.model_fields
+        return GeoreferenceSummary(**{name: getattr(self, name) for name in fields})

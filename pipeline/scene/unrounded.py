@@ -75,7 +75,7 @@ class Unrounded:
     """Given poses and points before they were rounded, in the given world.
 
     Attributes:
-        rounding: how they were rounded in the scene's world.
+        rounding: How they were rounded in the scene's world.
         rotations: (N, 3, 3) float64, world to camera.
         translations: (N, 3) float64, world to camera.
         points: (P, 3) float64, in the order of the model's points.
@@ -116,7 +116,7 @@ class Unrounded:
         photograph's given centre.
 
         Args:
-            frame: from the given world to the scene's.
+            frame: The transform from the given world to the scene's.
         """
         moved = frame.model_to_given(model)
         if not self.rounding.size:

@@ -20,8 +20,8 @@ class Crop:
     """The part of an image that a view shows, pixels of the whole image at the view's scale.
 
     Attributes:
-        left, top: of the part.
-        full_width, full_height: of the whole image.
+        left, top: The upper left corner of the part.
+        full_width, full_height: The size of the whole image.
     """
 
     left: int
@@ -188,7 +188,8 @@ def camera_views(model: Reconstruction, max_long_side: int | None) -> list[View]
     the names.
 
     Args:
-        max_long_side: in pixels; larger views are reduced to it.
+        max_long_side: The longest side in pixels, to which larger views are reduced; None for no
+            limit.
     """
     folders = {posixpath.dirname(image.name) for image in model.images.values()}
     mixed = len({posixpath.isabs(folder) for folder in folders}) != 1

@@ -12,7 +12,7 @@ def chunk(items: Sequence[T], number: int, jobs: int) -> Sequence[T]:
     """The consecutive items of one job; all chunks have nearly the same length.
 
     Args:
-        number: of the job, from 1.
-        jobs: the number of all jobs.
+        number: The number of the job, from 1.
+        jobs: The number of all jobs.
     """
     return items[(number - 1) * len(items) // jobs : number * len(items) // jobs]

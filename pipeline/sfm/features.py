@@ -43,8 +43,8 @@ def extract_features(
     The files depend neither on ``threads`` nor on the content of the cache.
 
     Args:
-        cache: folder for keypoints that may outlive the results. Unused files are removed if there
-            are more of them than used ones.
+        cache: A folder for keypoints that may outlive the results. Unused files are removed if
+            there are more of them than used ones.
 
     Raises:
         UserError: a photograph or mask cannot be read, or changed since it was inspected.
@@ -66,8 +66,8 @@ def gather_features(
     ``extract_features``.
 
     Args:
-        parts: folder and counters of each job, in order.
-        cache: as of the jobs.
+        parts: The folder and the counters of each job, in order.
+        cache: The folder that the jobs used.
     """
     out.mkdir(parents=True, exist_ok=True)
     counts: dict[str, int] = {}

@@ -29,10 +29,10 @@ class Refined:
     """Result of ``refine``.
 
     Attributes:
-        model: the adjusted model.
-        freed: whether any camera parameter was freed.
-        free_principal_points: ids of the cameras whose principal points were freed.
-        decisions: sentences for the log.
+        model: The adjusted model.
+        freed: Whether any camera parameter was freed.
+        free_principal_points: The ids of the cameras whose principal points were freed.
+        decisions: Sentences for the log.
     """
 
     model: pycolmap.Reconstruction
@@ -54,10 +54,10 @@ def refine(
     Only cameras with enough images are freed.
 
     Args:
-        model: not changed.
-        radial: SIMPLE_RADIAL cameras may become RADIAL.
+        model: The model, which is not changed.
+        radial: Whether SIMPLE_RADIAL cameras may become RADIAL.
         principal_point: "yes" (always freed), "no", or "if_determined" (if it lowers the cost).
-        inner_iterations: see ``bundle_adjust``.
+        inner_iterations: Whether ``bundle_adjust`` uses them.
     """
     shared = _shared_cameras(model)
     best = pycolmap.Reconstruction(model)

@@ -48,7 +48,7 @@ def write_rendered(
 
     Args:
         views: all views, at the size to render.
-        options: of the rasterizer (``Protocol.options``).
+        options: The options of the rasterizer (``Protocol.options``).
         up: (3,) up vector of the world.
         mesh_voxel: side of a voxel, world units; None chooses one.
     """

@@ -55,7 +55,7 @@ def camera_path(views: Sequence[View], depth: float, up: Array) -> list[View]:
     room from inside, a walk), the path goes through the views in the order of their names.
 
     Args:
-        views: at least one.
+        views: At least one view.
         depth: typical distance of the scene from the cameras, world units.
         up: (3,) unit vector, up in the world.
     """
@@ -83,12 +83,7 @@ def describe_path(path: Sequence[View]) -> PathFile:
         convention="world to camera, 4x4 by rows; x right, y down, z forward; pixel centres at "
         "half integers; unit and frame of sparse/0",
         fps=FPS,
-        width=first.width,
-        height=first.height,
-        fx=first.fx,
-        fy=first.fy,
-        cx=first.cx,
-        cy=first.cy,
+        **{name: getattr(first, name) for name in ("width", "height", "fx", "fy", "cx", "cy")},
         world_to_camera=tuple(view.world_to_camera.tolist() for view in path),
     )
 

@@ -2,15 +2,12 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.distortion import distort, fold_radius, project, undistort, unproject
+from pipeline.runtime.isolate import run_isolated
 
 PARAMS = {
     "SIMPLE_PINHOLE": [400, 320, 240],
@@ -45,33 +42,26 @@ def grid() -> np.ndarray:
     return np.stack([x, y], axis=-1).reshape(-1, 2)
 
 
+def by_pycolmap(points: np.ndarray) -> dict[str, tuple[np.ndarray, np.ndarray]]:
+    """Model -> pixels of normalised coordinates, and what these are unprojected to."""
+    import pycolmap
+
+    found = {}
+    for model, params in PARAMS.items():
+        c = pycolmap.Camera(model=model, width=640, height=480, params=params)
+        xy = np.asarray(c.img_from_cam(np.column_stack([points, np.ones(len(points))])))
+        found[model] = xy, np.asarray(c.cam_from_img(xy))
+    return found
+
+
 def test_all_models_project_and_unproject_as_pycolmap_does() -> None:
-    # In another process: pycolmap and cv2 bring conflicting versions of libpng.
-    script = """
-import json, sys, numpy as np, pycolmap
-data = json.load(sys.stdin)
-out = {}
-for model, params in data["params"].items():
-    c = pycolmap.Camera(model=model, width=640, height=480, params=params)
-    rays = np.array([[x, y, 1.0] for x, y in data["points"]])
-    xy = np.asarray(c.img_from_cam(rays))
-    out[model] = [xy.tolist(), np.asarray(c.cam_from_img(xy)).tolist()]
-json.dump(out, sys.stdout)
-"""
     points = grid()
-    process = subprocess.run(
-        [sys.executable, "-c", script],
-        input=json.dumps({"params": PARAMS, "points": points.tolist()}),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    expected = json.loads(process.stdout)
+    expected = run_isolated(by_pycolmap, points)
     assert set(expected) == set(CAMERA_MODELS) - {"EQUIRECTANGULAR"}  # see test_rays.py
     for model, (xy, back) in expected.items():
         np.testing.assert_allclose(project(camera(model), points), xy, atol=1e-8, err_msg=model)
-        ours = unproject(camera(model), np.array(xy))
-        np.testing.assert_allclose(ours, np.array(back)[:, :2], atol=1e-6, err_msg=model)
+        ours = unproject(camera(model), xy)
+        np.testing.assert_allclose(ours, back[:, :2], atol=1e-6, err_msg=model)
         np.testing.assert_allclose(ours, points, atol=1e-8, err_msg=model)
 
 

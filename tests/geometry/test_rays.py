@@ -2,10 +2,6 @@
 
 from __future__ import annotations
 
-import json
-import subprocess
-import sys
-
 import numpy as np
 import pytest
 from hypothesis import given
@@ -13,6 +9,7 @@ from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rays import max_angle, pixels, rays
+from pipeline.runtime.isolate import run_isolated
 from tests.geometry.test_distortion import PARAMS
 
 ALL_PARAMS = PARAMS | {"EQUIRECTANGULAR": [640, 480]}
@@ -47,31 +44,25 @@ def test_every_model_has_a_test_case() -> None:
     assert set(ALL_PARAMS) == set(CAMERA_MODELS)
 
 
+def rays_by_pycolmap(xy: np.ndarray) -> dict[str, np.ndarray]:
+    import pycolmap
+
+    return {
+        model: np.asarray(
+            pycolmap.Camera(model=model, width=640, height=480, params=params).cam_ray_from_img(xy)
+        )
+        for model, params in ALL_PARAMS.items()
+    }
+
+
 def test_rays_agree_with_pycolmaps_cam_ray_from_img() -> None:
-    # In another process: pycolmap and cv2 bring conflicting versions of libpng.
-    script = """
-import json, sys, numpy as np, pycolmap
-data = json.load(sys.stdin)
-out = {}
-for model, params in data["params"].items():
-    c = pycolmap.Camera(model=model, width=640, height=480, params=params)
-    out[model] = np.asarray(c.cam_ray_from_img(np.array(data["xy"]))).tolist()
-json.dump(out, sys.stdout)
-"""
     xy = image_grid().reshape(-1, 2)
-    process = subprocess.run(
-        [sys.executable, "-c", script],
-        input=json.dumps({"params": ALL_PARAMS, "xy": xy.tolist()}),
-        capture_output=True,
-        text=True,
-        check=True,
-    )
-    for model, expected in json.loads(process.stdout).items():
+    for model, expected in run_isolated(rays_by_pycolmap, xy).items():
         # COLMAP's rays of fisheye lenses end at 90 degrees.
         own = rays(camera(model), xy)
         front = own[:, 2] > 0.01 if model != "EQUIRECTANGULAR" else np.ones(len(own), bool)
         assert front.mean() > 0.8
-        np.testing.assert_allclose(own[front], np.array(expected)[front], atol=1e-6)
+        np.testing.assert_allclose(own[front], expected[front], atol=1e-6)
 
 
 def test_the_edges_of_a_panorama_are_behind_the_camera_and_its_rows_at_the_poles() -> None:

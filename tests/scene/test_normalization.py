@@ -23,14 +23,8 @@ def model_at(middle: np.ndarray, size: float, seed: int) -> Reconstruction:
         rotation = quat_to_rotation(rng.normal(size=4))
         centre = middle + size * rng.normal(size=3)
         images[i] = PosedImage(f"{i}.png", 1, rotation, -rotation @ centre)
-    points = Points(
-        middle + size * rng.normal(size=(4, 3)),
-        np.zeros((4, 3), np.uint8),
-        np.zeros(4),
-        np.zeros(5, np.int64),
-        np.zeros(0, np.int64),
-        np.zeros((0, 2)),
-    )
+    xyz = middle + size * rng.normal(size=(4, 3))
+    points = Points.without_tracks(xyz, np.zeros((4, 3), np.uint8))
     return Reconstruction({1: Camera("PINHOLE", 8, 6, np.array([8.0, 8, 4, 3]))}, images, points)
 
 

@@ -14,11 +14,9 @@ from pipeline.scene.views import load_views, scene_extent, view_size
 def make(count: int, camera: Camera | None = None) -> tuple[Manifest, Reconstruction]:
     camera = camera or Camera("PINHOLE", 301, 200, np.array([250.0, 260.0, 150.0, 99.0]))
     names = [f"p{i:02d}.jpg" for i in range(count)]
+    files = [{"path": f"/x/{n}", "digest": n, "mask": f"/m/{n}", "mask_digest": "m"} for n in names]
     photos = [
-        Photo(
-            name=n, path=f"/x/{n}", width=301, height=200, digest=n, mask=f"/m/{n}", mask_digest="m"
-        )
-        for n in names
+        Photo(name=n, width=301, height=200, **file) for n, file in zip(names, files, strict=True)
     ]
     images = {
         i + 1: PosedImage(n, 1, np.eye(3), np.array([-float(i), 0, 0])) for i, n in enumerate(names)
@@ -98,15 +96,21 @@ def test_extent_of_cameras_in_one_place_is_one():
     assert scene_extent(views) == 1.0
 
 
-def test_up_of_cameras_around_a_scene():
-    """Cameras on a circle that look down at the middle of a y-down world: their tilts cancel."""
+def looking_along(*directions: list[float]) -> np.ndarray:
+    """(N, 3, 3) rotations of cameras that are not rolled, in a y-down world."""
     rotations = []
-    for angle in np.arange(0, 2 * np.pi, 0.5 * np.pi):
-        forward = np.array([np.cos(angle), 0.6, np.sin(angle)]) / np.sqrt(1.36)
+    for direction in directions:
+        forward = np.array(direction) / np.linalg.norm(direction)
         right = np.cross([0, 1.0, 0], forward)
         right /= np.linalg.norm(right)
         rotations.append([right, np.cross(forward, right), forward])
-    np.testing.assert_allclose(up_direction(np.array(rotations), [1] * 4), [0, -1, 0], atol=1e-9)
+    return np.array(rotations)
+
+
+def test_up_of_cameras_around_a_scene():
+    """Cameras on a circle that look down at the middle of a y-down world: their tilts cancel."""
+    rotations = looking_along([1, 0.6, 0], [0, 0.6, 1], [-1, 0.6, 0], [0, 0.6, -1])
+    np.testing.assert_allclose(up_direction(rotations, [1] * 4), [0, -1, 0], atol=1e-9)
 
 
 @pytest.mark.parametrize("orientation, quarter_turns", [(1, 0), (8, 1), (3, 2), (6, 3)])
@@ -122,13 +126,9 @@ def test_up_follows_the_exif_orientation(orientation, quarter_turns):
 
 def test_up_of_cameras_with_the_same_tilt():
     """A facade photographed from below: the mean of the columns alone would be tilted too."""
-    rotations = []
-    for angle in np.radians([-30, -10, 10, 30]):
-        forward = np.array([np.sin(angle), -0.5, np.cos(angle)]) / np.sqrt(1.25)
-        right = np.cross([0, 1.0, 0], forward)
-        right /= np.linalg.norm(right)
-        rotations.append([right, np.cross(forward, right), forward])
-    found = up_direction(np.array(rotations), [1] * 4)
+    angles = np.radians([-30, -10, 10, 30])
+    rotations = looking_along(*([np.sin(angle), -0.5, np.cos(angle)] for angle in angles))
+    found = up_direction(rotations, [1] * 4)
     assert np.degrees(np.arccos(found @ [0, -1, 0])) < 4, found
 
 

@@ -17,25 +17,17 @@ from tests.sfm.test_georeference import ORIGIN, geodetic
 COUNT = 8
 # From the frame of ``corner`` (y down) to metres east, north, up, forty times as large.
 TO_ENU = 40.0 * np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+CENTRES = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)])
+TRUE = CENTRES @ TO_ENU.T
 
 
 def photos(with_gps: bool) -> Manifest:
-    centres = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)])
-    places = geodetic(centres @ TO_ENU.T).tolist()
-    return Manifest(
-        scene="corner",
-        photos=tuple(
-            Photo(
-                name=f"{i}.jpg",
-                path="",
-                width=corner.WIDTH,
-                height=corner.HEIGHT,
-                digest="",
-                gps=tuple(places[i]) if with_gps else None,
-            )
-            for i in range(COUNT)
-        ),
-    )
+    size = {"width": corner.WIDTH, "height": corner.HEIGHT}
+    found = [
+        Photo(name=f"{i}.jpg", path="", digest="", gps=tuple(place) if with_gps else None, **size)
+        for i, place in enumerate(geodetic(TRUE).tolist())
+    ]
+    return Manifest(scene="corner", photos=tuple(found))
 
 
 def aligned(manifest: Manifest, method: str, control: Path | None) -> tuple[str, np.ndarray, list]:
@@ -64,9 +56,8 @@ def centred(centres: np.ndarray) -> np.ndarray:
 
 def test_gps_aligns_a_model_to_metres():
     method, centres, warnings = run_isolated(aligned, photos(True), "gps", None)
-    true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gps" and not warnings
-    np.testing.assert_allclose(centred(centres), centred(true), atol=0.05)
+    np.testing.assert_allclose(centred(centres), centred(TRUE), atol=0.05)
 
 
 def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
@@ -84,9 +75,8 @@ def test_ground_control_points_are_triangulated_and_preferred_to_gps(tmp_path):
     control = tmp_path / "gcp_list.txt"
     control.write_text("\n".join(lines))
     method, centres, warnings = run_isolated(aligned, photos(True), "gcp", control)
-    true = np.array([-rotation.T @ shift for rotation, shift in corner.poses(COUNT)]) @ TO_ENU.T
     assert method == "gcp" and not warnings
-    np.testing.assert_allclose(centred(centres), centred(true), atol=1e-3)
+    np.testing.assert_allclose(centred(centres), centred(TRUE), atol=1e-3)
     assert np.abs(centres).max() < 200
 
 
@@ -95,8 +85,7 @@ def test_without_gps_and_ground_control_the_frame_is_level():
     assert method == "level" and not warnings
     assert np.linalg.norm(centres, axis=1).max() == pytest.approx(1.0)
     # y points down.
-    heights = [(-rotation.T @ shift)[1] for rotation, shift in corner.poses(COUNT)]
-    assert np.corrcoef(centres[:, 1], heights)[0, 1] > 0.97
+    assert np.corrcoef(centres[:, 1], CENTRES[:, 1])[0, 1] > 0.97
     assert run_isolated(aligned, photos(True), "none", None)[0] == "level"
 
 

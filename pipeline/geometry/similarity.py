@@ -268,6 +268,11 @@ def centred(points: Array) -> Array:
     return np.asarray(points - points.mean(0))
 
 
+def median_distance(points: Array) -> float:
+    """The median distance of the points from their median."""
+    return float(np.median(np.linalg.norm(points - np.median(points, axis=0), axis=1)))
+
+
 def umeyama(source: Array, target: Array) -> tuple[float, Array, Array]:
     """The similarity ``target ~ scale * R @ source + t`` with the least sum of squared distances.
 

@@ -62,12 +62,11 @@ def measure_consistency(
         views: The registered images.
         pairs: Verified matches of pairs of registered images.
     """
-    agreeing, matches = 0, 0
+    agreeing, matches, strong_pairs_agree = 0, 0, []
     strongest: dict[int, int] = {}
     for pair, inliers in pairs.items():
         for image_id in pair:
             strongest[image_id] = max(strongest.get(image_id, 0), len(inliers))
-    strong_pairs_agree = []
     for (first, second), inliers in pairs.items():
         agree = _matches_agree(views[first], views[second], inliers)
         agreeing += int(agree.sum())

@@ -166,7 +166,10 @@ def _parallax(views: dict[int, ModelView], pairs: Pairs) -> float:
     a, b = (np.stack(side) for side in found)
 
     def residual(focal: float, radial: float) -> float:
-        rays_a, rays_b = (_undistorted(p / focal, radial) for p in (a, b))
+        # Normalised coordinates with one radial term removed, to first order.
+        rays_a, rays_b = (
+            p / focal * (1 - radial * ((p / focal) ** 2).sum(-1, keepdims=True)) for p in (a, b)
+        )
         distances = np.linalg.norm(_best_rotated(rays_a, rays_b) - rays_b, axis=-1) * focal
         medians = np.median(np.nan_to_num(distances, nan=1.0), axis=1)
         return float(np.percentile(medians, 75))
@@ -196,11 +199,6 @@ def _sphere_parallax(views: dict[int, ModelView], pairs: Pairs) -> float:
         angles = 2 * np.arcsin(np.clip(chord / 2, 0, 1))
         medians.append(float(np.median(angles)) if len(angles) else 0.0)
     return float(np.percentile(medians, 75)) / (np.pi / 2)
-
-
-def _undistorted(points: Floats, radial: float) -> Floats:
-    """(..., 2) normalized coordinates with one radial term removed, to first order."""
-    return points * (1 - radial * (points**2).sum(-1, keepdims=True))
 
 
 def _best_rotated(a: Floats, b: Floats) -> Floats:

@@ -19,6 +19,7 @@ from pipeline.geometry.similarity import (
     OUTLIER_SIGMAS,
     Noise,
     RobustFit,
+    median_distance,
     robust_similarity,
 )
 from pipeline.io.gcp import GCP_FILE, GroundControl
@@ -151,13 +152,8 @@ def _local(control: GroundControl, places: Array) -> tuple[Array, Origin]:
 
 def _noise(source: Array, target: Array, pixel: float, fit: RobustFit | None = None) -> Noise:
     """The expected errors, metres. Without a fit, the scale is that of the median distances."""
-    if fit is None:
-        sizes = [
-            float(np.median(np.linalg.norm(p - np.median(p, axis=0), axis=1)))
-            for p in (source, target)
-        ]
-        scale = sizes[1] / max(sizes[0], 1e-300)
-    else:
+    scale = median_distance(target) / max(median_distance(source), 1e-300)
+    if fit is not None:
         scale = fit.similarity.scale
     return Noise(float(np.hypot(SURVEY_SIGMA_M, MARK_SIGMA_PX * pixel * scale)))
 

@@ -17,7 +17,7 @@ import pycolmap
 from numpy.typing import NDArray
 
 from pipeline.config import settled
-from pipeline.geometry.similarity import Noise, robust_similarity
+from pipeline.geometry.similarity import Noise, median_distance, robust_similarity
 from pipeline.io.poses.formats import colmap_files
 from pipeline.runtime.counters import Report
 from pipeline.sfm.alignment import transform_model
@@ -161,7 +161,7 @@ def _align(model: pycolmap.Reconstruction, anchors: list[int], before: NDArray[n
     ``before``."""
     now = _positions(model, anchors)
     # Lower bound on the inlier threshold, far below any relevant misfit.
-    floor = 1e-6 * float(np.median(np.linalg.norm(before - np.median(before, axis=0), axis=1)))
+    floor = 1e-6 * median_distance(before)
     fitted = robust_similarity(now, before, np.ones(3), Noise(floor, count=0, floor=floor))
     if fitted is not None:
         transform_model(model, fitted.similarity)

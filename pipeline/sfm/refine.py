@@ -59,27 +59,27 @@ def refine(
         principal_point: "yes" (always freed), "no", or "if_determined" (if it lowers the cost).
         inner_iterations: Whether ``bundle_adjust`` uses them.
     """
-    shared = _shared_cameras(model)
+    adjustable = {i for i, camera in model.cameras.items() if not camera.is_spherical()}
+    images = Counter(model.image(i).camera_id for i in model.reg_image_ids())
+    shared = {i for i in adjustable if images[i] >= MIN_IMAGES_PER_CAMERA}
     best = pycolmap.Reconstruction(model)
     cost = bundle_adjust(best, inner_iterations=inner_iterations)
+    unchanged = None
     # Ceres' cost is half of the sum of squares.
     if np.sqrt(2 * cost / max(best.compute_num_observations(), 1)) < EXACT_PX:
-        return Refined(best, False, set(), [EXACT])
+        unchanged = EXACT
+    elif not adjustable:
+        unchanged = "panoramas have no intrinsics to refine"
+    elif not shared and principal_point != "yes":
+        unchanged = (
+            f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and principal "
+            "points are unchanged"
+        )
+    if unchanged is not None:
+        return Refined(best, False, set(), [unchanged])
+    shared = shared or adjustable
     decisions: list[str] = []
     freed, free_principal_points = False, set[int]()
-    adjustable = {i for i, camera in model.cameras.items() if not camera.is_spherical()}
-    if not adjustable:
-        text = "panoramas have no intrinsics to refine"
-        return Refined(best, False, set(), [text])
-    if not shared:
-        if principal_point == "yes":
-            shared = adjustable
-        else:
-            text = (
-                f"no camera has {MIN_IMAGES_PER_CAMERA} photographs: distortion models and "
-                "principal points are unchanged"
-            )
-            return Refined(best, False, set(), [text])
     if radial and any(model.camera(i).model_name == "SIMPLE_RADIAL" for i in shared):
         freer = pycolmap.Reconstruction(best)
         for camera_id in shared:
@@ -213,13 +213,6 @@ def _block_order_is_unique(model: pycolmap.Reconstruction) -> bool:
     fewest = min((image.num_points3D for image in images), default=0)
     neighbours = longest + min(longest, len(poses))
     return min(poses.values(), default=0) >= 3 and fewest > neighbours
-
-
-def _shared_cameras(model: pycolmap.Reconstruction) -> set[int]:
-    """Ids of the cameras with enough registered images, without those of panoramas."""
-    ids = [model.image(i).camera_id for i in model.reg_image_ids()]
-    used = [camera_id for camera_id in ids if not model.camera(camera_id).is_spherical()]
-    return {camera_id for camera_id in used if used.count(camera_id) >= MIN_IMAGES_PER_CAMERA}
 
 
 def _make_radial(camera: pycolmap.Camera) -> None:

@@ -28,22 +28,24 @@ def view(centre: Sequence[float], width: int, height: int, name: str = "view") -
     return View(name, "", None, width, height, focal, 1.02 * focal, cx, cy, pose, False)
 
 
+def rays(camera: View) -> NDArray[np.float64]:
+    """(H, W, 3) rays with z = 1 in the camera's frame."""
+    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
+    return np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
+
+
 def depth(camera: View) -> NDArray[np.float64]:
     """(H, W) camera z of the plane."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    world = np.einsum("ji,hwj->hwi", camera.world_to_camera[:3, :3], ray)
+    world = np.einsum("ji,hwj->hwi", camera.world_to_camera[:3, :3], rays(camera))
     return np.asarray((1.0 - NORMAL @ camera.centre) / (world @ NORMAL))
 
 
 def picture(camera: View) -> Picture:
     """The camera's image of a smooth random texture on the plane."""
-    x, y = np.meshgrid(np.arange(camera.width) + 0.5, np.arange(camera.height) + 0.5)
-    ray = np.stack([(x - camera.cx) / camera.fx, (y - camera.cy) / camera.fy, np.ones_like(x)], -1)
-    local = ray * depth(camera)[..., None] - camera.world_to_camera[:3, 3]
+    local = rays(camera) * depth(camera)[..., None] - camera.world_to_camera[:3, 3]
     world = np.einsum("ji,hwj->hwi", camera.world_to_camera[:3, :3], local)
     rng = np.random.default_rng(3)
-    grey = np.full(x.shape, 128.0)
+    grey = np.full((camera.height, camera.width), 128.0)
     for _ in range(24):
         wave = rng.normal(size=3) * 5
         grey += 18 * np.sin(world @ wave + rng.uniform(0, 6))

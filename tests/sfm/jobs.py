@@ -93,15 +93,14 @@ def planned_cameras(
     """``share_cameras`` -> (model, focal length, whether that is a prior) of each camera."""
     from pipeline.sfm.database import plan_cameras
 
-    return {
-        sharing: [
+    found = {}
+    for sharing in sharings:
+        cameras, _ = plan_cameras(manifest, settled.Sfm.model_validate({"share_cameras": sharing}))
+        found[sharing] = [
             (c.model_name, float(c.mean_focal_length()), bool(c.has_prior_focal_length))
-            for c in plan_cameras(manifest, settled.Sfm.model_validate({"share_cameras": sharing}))[
-                0
-            ]
+            for c in cameras
         ]
-        for sharing in sharings
-    }
+    return found
 
 
 def returned(value: Any) -> Any:

@@ -24,11 +24,10 @@ FEATURES = settled.Features(max_features=1500)
 INCREMENTAL = settled.Sfm(mapper="incremental")
 
 
-def features(folder: Path, photos) -> Path:
-    extract_features(
-        corner.manifest(photos), FEATURES, folder / "features", cache=folder / "cache", threads=2
-    )
-    return folder / "features"
+def features(folder: Path, photos, config=FEATURES) -> Path:
+    found, cache = folder / "features", folder / "cache"
+    extract_features(corner.manifest(photos), config, found, cache=cache, threads=2)
+    return found
 
 
 @pytest.fixture(scope="module")
@@ -82,14 +81,12 @@ def test_global_mapping_is_accurate_and_repeatable(room, tmp_path):
 
 @pytest.mark.slow
 def test_of_two_scenes_in_one_folder_the_larger_is_used_with_a_warning(room, tmp_path):
-    folder, photos, _, _ = room
+    _, photos, _, _ = room
     others, _ = corner.write_scene(tmp_path / "photos", 4, seed=2, prefix="other ")
     both = [*photos, *others]
-    extract_features(
-        corner.manifest(both), FEATURES, tmp_path / "f", cache=folder / "cache", threads=2
-    )
+    found = features(tmp_path, both)
     matched, report = run_isolated(
-        jobs.match_and_reconstruct, corner.manifest(both), tmp_path / "f", tmp_path, INCREMENTAL
+        jobs.match_and_reconstruct, corner.manifest(both), found, tmp_path, INCREMENTAL
     )
     assert matched["components"] == [8, 4]
     assert matched["isolated"] == [photo.name for photo in others]
@@ -176,18 +173,20 @@ def test_cameras_are_shared_as_configured_with_median_priors(room):
     assert [focal for _, focal, _ in cameras["image"]] == [300.0, 380.0, 400.0, 480.0]
 
 
+def triangulated(folder: Path, photos):
+    """The report of the triangulation of the model in "given", into "out"."""
+    options = TriangulationOptions(FEATURES, settled.Matches(), seed=0)
+    return triangulate(
+        corner.manifest(photos), folder / "given", folder / "out", options, threads=2
+    )
+
+
 def test_known_poses_are_triangulated_and_unchanged(room, tmp_path):
     _, photos, truth, _ = room
     # Cameras of half the size, as for images_2; one image has no photograph.
     half = replace(truth, cameras={1: corner.camera().resized(200, 150)})
     write_model(tmp_path / "given", half)
-    report = triangulate(
-        corner.manifest(photos[:7]),
-        tmp_path / "given",
-        tmp_path / "out",
-        TriangulationOptions(FEATURES, settled.Matches(), seed=0),
-        threads=2,
-    )
+    report = triangulated(tmp_path, photos[:7])
     model = read_model(tmp_path / "out")
     assert report.num_points == len(model.points) > 500
     assert report.num_images == len(model.images) == 7
@@ -209,13 +208,7 @@ def test_triangulation_without_matches_gives_no_points(tmp_path):
         i: replace(truth.images[i], name=photo.name) for i, photo in enumerate(photos, start=1)
     }
     write_model(tmp_path / "given", replace(truth, images=images))
-    report = triangulate(
-        corner.manifest(photos),
-        tmp_path / "given",
-        tmp_path / "out",
-        TriangulationOptions(FEATURES, settled.Matches(), seed=0),
-        threads=2,
-    )
+    report = triangulated(tmp_path, photos)
     assert report.num_points == 0
     assert len(read_model(tmp_path / "out").images) == 2
 
@@ -236,9 +229,7 @@ def test_two_photographs_are_enough(room, tmp_path):
 def test_sharing_cameras_by_size_recovers_from_wrong_priors(tmp_path):
     photos, truth = corner.write_scene(tmp_path / "photos", 5)
     # With more features, mapping recovers from the priors by itself.
-    found = tmp_path / "features"
-    few = settled.Features(max_features=600)
-    extract_features(corner.manifest(photos), few, found, cache=tmp_path / "cache", threads=2)
+    found = features(tmp_path, photos, settled.Features(max_features=600))
     focals = [150.0, 1900.0, 120.0, 2500.0, 100.0]
     wrong = [
         photo.model_copy(update={"camera_group": photo.name, "focal_px": focal})

@@ -7,15 +7,11 @@ not depend on the number of threads. Planes are stored in the scratch folder bet
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from pathlib import Path
-from typing import TypeVar
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
@@ -39,13 +35,12 @@ from pipeline.mvs.maps import (
 from pipeline.mvs.patchmatch import Picture
 from pipeline.mvs.sources import seen_points, select_sources
 from pipeline.photos.load import load_view
+from pipeline.photos.threads import for_each
 from pipeline.runtime.atomic import written
 from pipeline.runtime.counters import Report
-from pipeline.runtime.progress import Progress
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-T = TypeVar("T")
 # Views whose pixels or maps are in memory at a time, besides those of each thread.
 CACHED_VIEWS = 12
 # Below this share of pixels with a depth, there is a warning.
@@ -88,10 +83,10 @@ def reconstruct(
         UserError: a photograph cannot be read, or the kernel cannot be compiled.
     """
     scene = _Scene(views, model, out, scratch, options or DenseOptions())
-    with _one_thread_of_opencv():
-        _for_all(scene.estimate, len(views), threads, "multi-view stereo")
-        shares = _for_all(scene.filter, len(views), threads, "filtering depth maps")
-        cloud = joined(_for_all(scene.fuse, len(views), threads, "fusing depth maps"))
+    numbers = range(len(views))
+    for_each(scene.estimate, numbers, threads, "multi-view stereo", "views")
+    shares = for_each(scene.filter, numbers, threads, "filtering depth maps", "views")
+    cloud = joined(for_each(scene.fuse, numbers, threads, "fusing depth maps", "views"))
     write_dense_cloud(out, cloud)
     return scene.report(np.array(shares), cloud)
 
@@ -203,30 +198,3 @@ class _Scene:
         view = self._views[index]
         found = read_map(self._out, view.name)
         return PlaneMap(view, planes_of(found.depth, found.normals, view))
-
-
-def _for_all(work: Callable[[int], T], count: int, threads: int, label: str) -> list[T]:
-    """The results for all views, in order."""
-    progress = Progress(label, count, "views")
-    results = []
-    with ThreadPoolExecutor(max_workers=max(threads, 1)) as pool:
-        try:
-            for result in pool.map(work, range(count)):
-                results.append(result)
-                progress.advance()
-        except BaseException:
-            # Do not work on the remaining views after an error.
-            pool.shutdown(cancel_futures=True)
-            raise
-    return results
-
-
-@contextmanager
-def _one_thread_of_opencv() -> Iterator[None]:
-    """Each thread works on a view of its own."""
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        yield
-    finally:
-        cv2.setNumThreads(before)

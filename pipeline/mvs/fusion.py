@@ -82,12 +82,8 @@ def joined(parts: Sequence[DenseCloud]) -> DenseCloud:
     empty = DenseCloud(
         np.zeros((0, 3), np.float32), np.zeros((0, 3), np.float32), np.zeros((0, 3), np.uint8)
     )
-    every = [empty, *parts]
-    return DenseCloud(
-        np.concatenate([part.xyz for part in every]),
-        np.concatenate([part.normals for part in every]),
-        np.concatenate([part.rgb for part in every]),
-    )
+    columns = zip(*(vars(part).values() for part in (empty, *parts)), strict=True)
+    return DenseCloud(*map(np.concatenate, columns))
 
 
 def _rays(view: View, xy: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -7,7 +7,6 @@ import json
 import shutil
 import tempfile
 from collections.abc import Mapping, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -30,6 +29,9 @@ ALGORITHM_VERSION = 3
 # Peak memory per pixel of a photograph while it is decoded, and of the image that SIFT is detected
 # in: its scale space begins with twice the size.
 _PHOTO_BYTES, _SIFT_BYTES = 7.0, 250.0
+
+# What the progress counts.
+PROGRESS = "extracting features", "photographs"
 
 # With fewer keypoints than this, a photograph rarely has a verified pair, and a warning is given.
 FEW_FEATURES = 100
@@ -91,10 +93,9 @@ def extract_photos(
     # One photograph of each key: identical photographs would write the same file concurrently.
     missing = list({keys[photo.name]: photo for photo in absent}.values())
     if missing:
-        progress = Progress("extracting features", len(missing), "photographs")
         extract = _extract_colmap if config.backend == "colmap" else _extract_opencv
         targets = {p.name: cache / f"{keys[p.name]}.npz" for p in missing}
-        extract(missing, config, targets, threads, progress)
+        extract(missing, config, targets, threads)
     counts = {}
     for photo in photos:
         source = cache / f"{keys[photo.name]}.npz"
@@ -149,10 +150,8 @@ def _extract_opencv(
     config: settled.Features,
     targets: dict[str, Path],
     threads: int,
-    progress: Progress,
 ) -> None:
-    import cv2
-
+    from pipeline.photos.threads import for_each
     from pipeline.sfm import sift
 
     sizes = [(photo.width, photo.height) for photo in photos]
@@ -165,21 +164,7 @@ def _extract_opencv(
         picture = sift.DetectionImage(photo, config.max_long_side_px)
         sift.detect(picture, config.max_features).write(targets[photo.name])
 
-    # One thread per photograph (OpenCV releases the GIL) and none within OpenCV: the result does
-    # not depend on the number of threads.
-    before = cv2.getNumThreads()
-    cv2.setNumThreads(1)
-    try:
-        with ThreadPoolExecutor(max_workers=threads) as pool:
-            try:
-                for _ in pool.map(extract, photos):
-                    progress.advance()
-            except BaseException:
-                # Do not extract the remaining photographs after an error.
-                pool.shutdown(cancel_futures=True)
-                raise
-    finally:
-        cv2.setNumThreads(before)
+    for_each(extract, photos, threads, *PROGRESS)
 
 
 def _extract_colmap(
@@ -187,13 +172,13 @@ def _extract_colmap(
     config: settled.Features,
     targets: dict[str, Path],
     threads: int,
-    progress: Progress,
 ) -> None:
     """Extract with COLMAP's SIFT from the same grey images. COLMAP limits the number of features by
     whole octaves, so the ones of the largest scales are selected here."""
     from pipeline.sfm import sift
 
     batch = max(8, 4 * threads)
+    progress = Progress(PROGRESS[0], len(photos), PROGRESS[1])
     for start in range(0, len(photos), batch):
         some = photos[start : start + batch]
         with tempfile.TemporaryDirectory(prefix="splatmake-sift-") as folder:

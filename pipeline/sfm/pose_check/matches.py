@@ -6,13 +6,13 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
-import cv2
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.epipolar import consistent_matches
 from pipeline.geometry.rays import rays
+from pipeline.photos.threads import one_thread_of_opencv
 from pipeline.scene.manifest import Photo
 from pipeline.sfm.sift import DetectionImage, detect
 
@@ -104,13 +104,9 @@ class PairFinder:
 
     def pairs(self) -> Iterator[MatchedPair | None]:
         """For each anchor the pair of the widest motion that was found, or None."""
-        threads = cv2.getNumThreads()
         for anchor in _spread(len(self._photos)):
-            cv2.setNumThreads(1)
-            try:
+            with one_thread_of_opencv():
                 pair = self._best(anchor)
-            finally:
-                cv2.setNumThreads(threads)
             yield pair
 
     def _best(self, anchor: int) -> MatchedPair | None:

@@ -54,6 +54,7 @@ class Attempt:
     database: Path
 
     def record(self, taken: bool) -> AttemptRecord:
+        """The attempt for ``stage.json``; ``taken``: whether its model is used."""
         return AttemptRecord(
             mapper=self.mapper,
             change=self.change,

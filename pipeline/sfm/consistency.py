@@ -129,8 +129,8 @@ def _missing_covisibility(model: pycolmap.Reconstruction, views: list[ModelView]
     point_ids = np.array(sorted(model.points3D), np.int64)
     xyz = np.stack([model.point3D(int(i)).xyz for i in point_ids])
     shares: dict[tuple[bool, bool], list[float]] = {}
-    for pair in proximity_pairs(centres, _axes(views), NEIGHBOURS):
-        for one, other in (views[i] for i in pair), (views[i] for i in pair[::-1]):
+    for i, j in proximity_pairs(centres, _axes(views), NEIGHBOURS):
+        for one, other in ((views[i], views[j]), (views[j], views[i])):
             observed = xyz[np.searchsorted(point_ids, one.points)]
             expected = _expected_visible(one, other, observed)
             if expected.sum() >= MIN_EXPECTED_POINTS:

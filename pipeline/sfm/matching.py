@@ -61,8 +61,8 @@ class MatchingScene:
         """
         cameras, camera_of = plan_cameras(self.manifest, self.sharing)
         for camera in cameras:
-            if camera.camera_id in (focals or {}):
-                set_focal(camera, (focals or {})[camera.camera_id])
+            if focals and camera.camera_id in focals:
+                set_focal(camera, focals[camera.camera_id])
         names = sorted(photo.name for photo in self.manifest.photos)
         images = [(id, name, camera_of[name]) for id, name in enumerate(names, start=1)]
         experiments = self.experiments

@@ -71,7 +71,7 @@ class SyntheticMatches(FeatureMatcher):
         return first[both], second[both]
 
 
-def ring(camera: Camera, count: int = 10, line: bool = False) -> Scene:
+def ring(camera: Camera, count: int = 8, line: bool = False) -> Scene:
     """Cameras around points at the origin, at different heights, or on a line beside them."""
     rng = np.random.default_rng(2)
     images = {}

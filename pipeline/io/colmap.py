@@ -7,26 +7,36 @@ not read: ``images.bin`` stores the pose of every image in all versions of the f
 from __future__ import annotations
 
 from pathlib import Path
+from types import ModuleType
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io import colmap_binary, colmap_text
-from pipeline.io.colmap_records import POINT2D, REMEDY, Keypoints, PointTable, Tracks
+from pipeline.io.colmap_records import POINT2D, Keypoints, PointTable, Tracks, malformed
 from pipeline.runtime.atomic import write_bytes
-from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, Reconstruction
+
+
+def model_files(folder: Path) -> list[Path]:
+    """The files ``cameras``, ``images`` and, if it exists, ``points3D`` of the COLMAP model in
+    ``folder``: the binary ones, else the text files, as in COLMAP. Empty without a model."""
+    for suffix in (".bin", ".txt"):
+        files = [folder / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
+        if files[0].is_file() and files[1].is_file():
+            return [file for file in files if file.is_file()]
+    return []
 
 
 def has_model(folder: Path) -> bool:
     """Whether ``folder`` holds a COLMAP model."""
-    return _suffix(folder) is not None
+    return bool(model_files(folder))
 
 
 def read_model(folder: Path, *, points: bool = True) -> Reconstruction:
     """Read ``cameras``, ``images`` and, if it exists, ``points3D`` from ``folder``.
 
-    Binary files are preferred to text files, as in COLMAP. Points are sorted by id.
+    Points are sorted by id.
 
     Args:
         points: whether to read the points, which take most of the memory and time.
@@ -35,21 +45,23 @@ def read_model(folder: Path, *, points: bool = True) -> Reconstruction:
         UserError: no model, malformed or truncated files, unknown camera models, poses or
             intrinsics that are not finite, images of unknown cameras, tracks of unknown images.
     """
-    suffix = _suffix(folder)
-    if suffix is None:
-        raise UserError(
+    files = model_files(folder)
+    if not files:
+        raise malformed(
+            folder,
             "expected a COLMAP model (cameras and images, both .bin or both .txt), found none",
-            file=folder,
-            fix=REMEDY,
         )
-    form = colmap_binary if suffix == ".bin" else colmap_text
-    cameras = form.read_cameras(folder / f"cameras{suffix}")
-    images, keypoints = form.read_images(folder / f"images{suffix}", cameras)
-    points_file = folder / f"points3D{suffix}"
-    if not points or not points_file.exists():
+    form = format_of(files[0])
+    cameras = form.read_cameras(files[0])
+    images, keypoints = form.read_images(files[1], cameras)
+    if not points or len(files) < 3:
         return Reconstruction(cameras, images)
-    table = form.read_points(points_file)
-    return Reconstruction(cameras, images, _points(points_file, table, keypoints))
+    return Reconstruction(cameras, images, _points(files[2], form.read_points(files[2]), keypoints))
+
+
+def format_of(file: Path) -> ModuleType:
+    """The module that reads a file of a model: binary or text."""
+    return colmap_binary if file.suffix == ".bin" else colmap_text
 
 
 def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> None:
@@ -77,18 +89,11 @@ def write_model(folder: Path, model: Reconstruction, *, text: bool = False) -> N
     write_bytes(folder / f"points3D{suffix}", form.points_bytes(model.points, tracks))
 
 
-def _suffix(folder: Path) -> str | None:
-    for suffix in (".bin", ".txt"):
-        if all((folder / f"{stem}{suffix}").is_file() for stem in ("cameras", "images")):
-            return suffix
-    return None
-
-
 def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float64]]) -> Points:
     """The points sorted by id, with the pixels of their observations."""
     if not np.isfinite(table.xyz).all():
         bad = int(table.ids[~np.isfinite(table.xyz).all(1)][0])
-        raise UserError(f"point {bad}: its position is not finite", file=file, fix=REMEDY)
+        raise malformed(file, f"point {bad}: its position is not finite")
     xy = np.full((len(table.image), 2), np.nan)
     order = np.argsort(table.image, kind="stable")
     numbers, starts = np.unique(table.image[order], return_index=True)
@@ -96,16 +101,12 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
         rows = order[start:stop]
         seen = keypoints.get(int(number))
         if seen is None:
-            raise UserError(
-                f"a track refers to image id {number}, which is not in the model",
-                file=file,
-                fix=REMEDY,
-            )
+            raise malformed(file, f"a track refers to image id {number}, which is not in the model")
         known = rows[table.index[rows] < len(seen)]
         xy[known] = seen[table.index[known]]
     by_id = np.argsort(table.ids, kind="stable")
     if len(by_id) and np.any(np.diff(table.ids[by_id]) == 0):
-        raise UserError("expected unique point ids, found one twice", file=file, fix=REMEDY)
+        raise malformed(file, "expected unique point ids, found one twice")
     length = table.length[by_id]
     old_start = (np.cumsum(table.length) - table.length)[by_id]
     start = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)

@@ -21,9 +21,9 @@ from pipeline.io.colmap_records import (
     add_image,
     make_camera,
     make_image,
+    malformed,
     unknown_model,
 )
-from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 _MODEL_NAMES = {number: name for name, (number, _) in CAMERA_MODELS.items()}
@@ -49,10 +49,10 @@ class _Reader:
     def skip(self, size: int) -> int:
         """Advance by ``size`` bytes; returns the position before."""
         if size > len(self.data) - self.at:
-            raise UserError(
+            raise malformed(
+                self.file,
                 f"the file ends too early: {len(self.data)} bytes, expected at least "
                 f"{self.at + size}",
-                file=self.file,
                 fix=f"the copy was probably cut short: copy it again, or {REMEDY}",
             )
         self.at += size
@@ -73,16 +73,13 @@ class _Reader:
         try:
             return self.data[start:end].decode()
         except UnicodeDecodeError:
-            raise UserError(
-                f"an image name at byte {start} is not UTF-8", file=self.file, fix=REMEDY
-            ) from None
+            raise malformed(self.file, f"an image name at byte {start} is not UTF-8") from None
 
     def check_end(self) -> None:
         if self.at != len(self.data):
-            raise UserError(
+            raise malformed(
+                self.file,
                 f"expected {self.at} bytes, found {len(self.data)}: not a COLMAP file, or damaged",
-                file=self.file,
-                fix=REMEDY,
             )
 
 

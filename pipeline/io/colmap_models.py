@@ -8,8 +8,7 @@ from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
 
-from pipeline.io import colmap_binary, colmap_text
-from pipeline.io.colmap import has_model
+from pipeline.io.colmap import format_of, has_model, model_files
 from pipeline.io.folders import pictures_in
 from pipeline.io.names import NameIndex
 from pipeline.runtime.errors import UserError
@@ -68,9 +67,11 @@ def find_models(folder: Path) -> list[FoundModel]:
     index = NameIndex(pictures_in(folder))
     models = []
     for path in paths:
-        names = _image_names(folder / path)
+        file = model_files(folder / path)[1]
+        state = file.stat()
+        names = _image_names(file, state.st_mtime_ns, state.st_size)
         if names is None:  # A damaged file; if this model is chosen, reading it is an error.
-            images = photographs = _declared_images(folder / path)
+            images = photographs = _declared_images(file)
         else:
             images, photographs = len(names), sum(bool(index.candidates(n)) for n in names)
         models.append(FoundModel(path, images, photographs))
@@ -79,37 +80,24 @@ def find_models(folder: Path) -> list[FoundModel]:
 
 def text_files_beside_binary(model: Path) -> list[str]:
     """The names of the text files of a model that is read from its binary files, sorted."""
-    stems = ("cameras", "images", "points3D")
-    if any(not (model / f"{stem}.bin").is_file() for stem in stems[:2]):
+    if model_files(model)[0].suffix == ".txt":
         return []
-    return [f"{stem}.txt" for stem in stems if (model / f"{stem}.txt").is_file()]
-
-
-def _images_file(model: Path) -> Path:
-    binary = all((model / f"{stem}.bin").is_file() for stem in ("cameras", "images"))
-    return model / ("images.bin" if binary else "images.txt")
-
-
-def _image_names(model: Path) -> tuple[str, ...] | None:
-    """The names of a model's images; None if the file is damaged."""
-    file = _images_file(model)
-    state = file.stat()
-    return _names_in(file, state.st_mtime_ns, state.st_size)
+    texts = [f"{stem}.txt" for stem in ("cameras", "images", "points3D")]
+    return [name for name in texts if (model / name).is_file()]
 
 
 @lru_cache(maxsize=16)
-def _names_in(file: Path, mtime_ns: int, size: int) -> tuple[str, ...] | None:
-    form = colmap_binary if file.suffix == ".bin" else colmap_text
+def _image_names(file: Path, mtime_ns: int, size: int) -> tuple[str, ...] | None:
+    """The names in a model's file of images with this state; None if it is damaged."""
     try:
-        return tuple(form.image_names(file))
+        return tuple(format_of(file).image_names(file))
     except UserError:
         return None
 
 
-def _declared_images(model: Path) -> int:
+def _declared_images(file: Path) -> int:
     """The number of images according to the header of a model's file of images; 0 if it has
     none."""
-    file = _images_file(model)
     with file.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
     if file.suffix == ".bin":

@@ -56,33 +56,35 @@ class PointTable:
     index: NDArray[np.int64]
 
 
+def malformed(file: Path, what: str, fix: str = REMEDY) -> UserError:
+    """The error for a file that is no part of a COLMAP model."""
+    return UserError(what, file=file, fix=fix)
+
+
 def make_camera(
     file: Path, number: int, name: str, width: int, height: int, p: list[float]
 ) -> Camera:
     """The camera with id ``number``, model ``name`` and parameters ``p``, checked."""
     names = CAMERA_MODELS[name][1]
     if len(p) != len(names):
-        raise UserError(
+        raise malformed(
+            file,
             f"camera {number}: {name} has {len(names)} parameters ({', '.join(names)}), "
             f"found {len(p)}",
-            file=file,
-            fix=REMEDY,
         )
     camera = Camera(name, width, height, np.array(p, np.float64))
     if not (0 < width < 2**31 and 0 < height < 2**31):
-        raise UserError(f"camera {number}: impossible size {width}x{height}", file=file, fix=REMEDY)
+        raise malformed(file, f"camera {number}: impossible size {width}x{height}")
     if not np.isfinite(camera.params).all() or min(camera.pinhole[:2]) <= 0:
-        raise UserError(
+        raise malformed(
+            file,
             f"camera {number}: expected finite parameters and a positive focal length, found {p}",
-            file=file,
-            fix=REMEDY,
         )
     if camera.is_spherical and p != [width, height]:
-        raise UserError(
+        raise malformed(
+            file,
             f"camera {number}: expected the image's size {width}x{height} as parameters of "
             f"{name}, found {p}",
-            file=file,
-            fix=REMEDY,
         )
     return camera
 
@@ -94,10 +96,10 @@ def make_image(
     q, t = np.array(quat, np.float64), np.array(translation, np.float64)
     norm = math.hypot(*quat)
     if not (1e-12 < norm < 1e12) or not np.isfinite(t).all():
-        raise UserError(
+        raise malformed(
+            file,
             f"image {name}: expected a finite pose, found quaternion {quat}, "
             f"translation {translation}",
-            file=file,
             fix=f"remove {name} from the model, or set poses: ignore",
         )
     return PosedImage(name, camera_id, quat_to_rotation(q), t)
@@ -112,20 +114,19 @@ def add_image(
 ) -> None:
     """Add the image with id ``number`` to ``images``."""
     if image.camera_id not in cameras:
-        raise UserError(
+        raise malformed(
+            file,
             f"image {image.name} belongs to camera {image.camera_id}, which is not in the model",
-            file=file,
-            fix=REMEDY,
         )
     if number in images:
-        raise UserError(f"expected unique image ids, found {number} twice", file=file, fix=REMEDY)
+        raise malformed(file, f"expected unique image ids, found {number} twice")
     images[number] = image
 
 
 def unknown_model(file: Path, number: int, found: str) -> UserError:
     """The error of camera ``number`` with the unsupported model ``found``."""
-    return UserError(
+    return malformed(
+        file,
         f"camera {number}: unknown camera model {found}; expected {', '.join(CAMERA_MODELS)}",
-        file=file,
         fix="undistort in COLMAP first (colmap image_undistorter), or set poses: ignore",
     )

@@ -20,9 +20,9 @@ from pipeline.io.colmap_records import (
     add_image,
     make_camera,
     make_image,
+    malformed,
     unknown_model,
 )
-from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 
 # A thousand photographs take about 300 MiB; larger models are binary.
@@ -34,7 +34,7 @@ def _lines(file: Path) -> Iterator[tuple[int, str]]:
     try:
         text = read_bounded(file, _MAX_BYTES, fix=REMEDY).decode()
     except UnicodeDecodeError as error:
-        raise UserError(f"expected UTF-8 text: {error}", file=file, fix=REMEDY) from None
+        raise malformed(file, f"expected UTF-8 text: {error}") from None
     for number, line in enumerate(text.split("\n"), 1):
         if not line.startswith("#"):
             yield number, line.strip("\r")
@@ -48,10 +48,8 @@ def _fields(file: Path, number: int, line: str, types: list[Callable[[str], Any]
             return [kind(word) for kind, word in zip(types, words, strict=True)]
         except (ValueError, OverflowError):
             pass
-    raise UserError(
-        f"line {number}: expected a line of a COLMAP {file.name}, found {line[:80]!r}",
-        file=file,
-        fix=REMEDY,
+    raise malformed(
+        file, f"line {number}: expected a line of a COLMAP {file.name}, found {line[:80]!r}"
     )
 
 
@@ -104,10 +102,8 @@ def read_images(
         try:
             keypoints[number] = np.array(_floats(line), np.float64).reshape(-1, 3)[:, :2]
         except ValueError:
-            raise UserError(
-                f"line {line_number}: expected X Y POINT3D_ID triples, found {line[:80]!r}",
-                file=file,
-                fix=REMEDY,
+            raise malformed(
+                file, f"line {line_number}: expected X Y POINT3D_ID triples, found {line[:80]!r}"
             ) from None
     return images, keypoints
 
@@ -139,11 +135,10 @@ def read_points(file: Path) -> PointTable:
             if len(track) % 2 or max(row[4:7]) > 255:
                 raise ValueError(line)
         except ValueError:
-            raise UserError(
+            raise malformed(
+                file,
                 f"line {line_number}: expected a line of a COLMAP points3D.txt, found "
                 f"{line[:80]!r}",
-                file=file,
-                fix=REMEDY,
             ) from None
         rows.append(row)
         tracks.append(track)

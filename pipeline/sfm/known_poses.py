@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from pipeline.config import settled
 from pipeline.geometry.similarity import Noise, median_distance, robust_similarity
-from pipeline.io.poses.formats import colmap_files
+from pipeline.io.colmap import model_files
 from pipeline.runtime.counters import Report
 from pipeline.sfm.alignment import transform_model
 from pipeline.sfm.counters import RefineCounters
@@ -88,7 +88,7 @@ def write_adjusted(model: pycolmap.Reconstruction | None, sparse: Path, out: Pat
     if model is not None:
         write_model(model, out)
     else:
-        for file in colmap_files(sparse):
+        for file in model_files(sparse):
             shutil.copy(file, out)
 
 

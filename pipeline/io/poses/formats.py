@@ -11,7 +11,7 @@ from typing import Any, Literal
 import numpy as np
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.colmap import read_model
+from pipeline.io.colmap import model_files, read_model
 from pipeline.io.colmap_models import find_models
 from pipeline.io.llff import read_poses_bounds, read_rows
 from pipeline.io.poses import (
@@ -95,15 +95,6 @@ def of_frames(
     )
 
 
-def colmap_files(path: Path) -> list[Path]:
-    """The files of the COLMAP model in a folder, without rigs and frames; empty without a model."""
-    for suffix in (".bin", ".txt"):
-        files = [path / f"{stem}{suffix}" for stem in ("cameras", "images", "points3D")]
-        if files[0].is_file() and files[1].is_file():
-            return [file for file in files if file.is_file()]
-    return []
-
-
 def _find_colmap(folder: Path) -> str | None:
     models = find_models(folder)
     return models[0].path if models else None
@@ -177,7 +168,7 @@ FORMATS: tuple[PoseFormat, ...] = (
         kind="colmap",
         names="photos",
         find=_find_colmap,
-        files=colmap_files,
+        files=model_files,
         summarise=_of_colmap,
         read=lambda path, sizes, listed: read_model(path),
     ),

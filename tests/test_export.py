@@ -206,7 +206,7 @@ def test_cameras_and_points_are_exported_in_the_given_world(far_scene):
 
 def read_cameras_without_origin(out: Path) -> Reconstruction:
     frames = read_frames(out / "transforms.json")
-    return read_transforms(out / "transforms.json", {frame.path: (180, 120) for frame in frames})
+    return read_transforms(out / "transforms.json", {frame.name: (180, 120) for frame in frames})
 
 
 def test_gaussians_are_exported_in_the_given_unit_near_the_origin(far_scene):
@@ -246,8 +246,8 @@ def test_formats_without_an_antialias_flag_are_named_in_a_warning(scene):
 def test_transforms_paths_are_relative_to_the_final_folder(scene):
     out, _ = export(scene, formats=["transforms", "points"])
     frames = read_frames(out)
-    assert [(out / frame.path).resolve().is_file() for frame in frames] == [True] * 9
-    model = read_transforms(out, {frame.path: (90, 60) for frame in frames})
+    assert [(out / frame.name).resolve().is_file() for frame in frames] == [True] * 9
+    model = read_transforms(out, {frame.name: (90, 60) for frame in frames})
     (camera,) = model.cameras.values()
     # Of the pictures as they are, not as the model's cameras say.
     assert (camera.width, camera.pinhole) == (90, (50, 50, 45, 30))

@@ -14,6 +14,7 @@ from pipeline.runtime.errors import UserError
 from pipeline.runtime.machine import usable_memory
 
 MIB = 1 << 20
+UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 @contextmanager
@@ -49,6 +50,21 @@ def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=fix) from None
     what = f"expected at most {limit // MIB} MiB, found {size // MIB} MiB"
     raise UserError(what, file=path, fix=fix)
+
+
+def read_text(path: Path, limit: int, *, fix: str) -> str:
+    """The text of a file: UTF-8 with or without byte order mark, or UTF-16, which Windows' tools
+    write.
+
+    Raises:
+        UserError: as ``read_bounded``, or other bytes.
+    """
+    data = read_bounded(path, limit, fix=fix)
+    try:
+        return data.decode("utf-16" if data[:2] in UTF_16_MARKS else "utf-8-sig")
+    except UnicodeDecodeError as error:
+        what = f"expected UTF-8 or UTF-16 text: {error}"
+        raise UserError(what, file=path, fix=fix) from None
 
 
 def memory_share() -> int:

@@ -8,7 +8,7 @@ from pathlib import Path
 
 from pipeline.io import frame_json
 from pipeline.io.colmap import has_model, read_model
-from pipeline.io.names import PICTURE_SUFFIXES, NameIndex
+from pipeline.io.names import PICTURE_SUFFIXES, NameIndex, is_inside
 from pipeline.io.photofile import read_facts
 from pipeline.io.transforms import Frame, find_transforms, read_frames, read_transforms
 from pipeline.runtime.errors import UserError
@@ -47,7 +47,7 @@ def read_cameras(path: Path, *, exported: bool = False) -> Reconstruction:
                     return unit.without_origin().model_to_given(model)
                 return _exported_origin(folder).model_to_scene(model)
     if path.is_file() or find_transforms(path):
-        sizes = {frame.path: _size(frame) for frame in read_frames(path)}
+        sizes = {frame.name: _size(frame) for frame in read_frames(path)}
         return _exported_origin(path).model_to_scene(read_transforms(path, sizes))
     raise UserError(
         "expected a COLMAP model (cameras and images, .bin or .txt, also in sparse/0) or a "
@@ -107,22 +107,17 @@ def choose_views(views: list[View], names: Iterable[str], source: Path) -> list[
 
 def _size(frame: Frame) -> tuple[int, int]:
     """Width and height in pixels from the frame's ``w`` and ``h``, else from its image file."""
-    width, height = frame.fields.get("w"), frame.fields.get("h")
+    fields = frame.fields
+    width, height = fields.values.get("w"), fields.values.get("h")
     if isinstance(width, int | float) and isinstance(height, int | float):
         if not (0 < width < 2**31 and 0 < height < 2**31):  # False for NaN.
-            raise UserError(
-                f"{frame.source}: impossible size {str(width)[:40]}x{str(height)[:40]}",
-                file=frame.file,
-                fix="correct w and h, in pixels",
-            )
+            what = f"impossible size {str(width)[:40]}x{str(height)[:40]}"
+            raise fields.wrong(what, "correct w and h, in pixels")
         return round(width), round(height)
     for suffix in ("", *sorted(PICTURE_SUFFIXES)):
-        picture = frame.file.parent / (frame.path + suffix)
-        if not frame.path.startswith(("/", "../")) and picture.is_file():
+        picture = fields.file.parent / (frame.name + suffix)
+        if is_inside(frame.name) and picture.is_file():
             facts = read_facts(picture)
             return facts.width, facts.height
-    raise UserError(
-        f"{frame.source}: expected the image's size (w and h) or the image, found neither",
-        file=frame.file,
-        fix="add w and h to the file, in pixels",
-    )
+    what = "expected the image's size (w and h) or the image, found neither"
+    raise fields.wrong(what, "add w and h to the file, in pixels")

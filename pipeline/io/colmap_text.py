@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rotations import rotation_to_quat
-from pipeline.io.bounded import MIB, read_bounded
+from pipeline.io.bounded import MIB, read_text
 from pipeline.io.colmap_records import (
     REMEDY,
     Keypoints,
@@ -31,10 +31,7 @@ _MAX_BYTES = 2048 * MIB
 
 def _lines(file: Path) -> Iterator[tuple[int, str]]:
     """Numbered lines without comments; an empty line is an image without keypoints."""
-    try:
-        text = read_bounded(file, _MAX_BYTES, fix=REMEDY).decode()
-    except UnicodeDecodeError as error:
-        raise malformed(file, f"expected UTF-8 text: {error}") from None
+    text = read_text(file, _MAX_BYTES, fix=REMEDY)
     for number, line in enumerate(text.split("\n"), 1):
         if not line.startswith("#"):
             yield number, line.strip("\r")

@@ -9,14 +9,14 @@ from __future__ import annotations
 
 import math
 import re
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
-from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.io.bounded import MIB, read_bounded
+from pipeline.io.bounded import MIB, read_text
 from pipeline.io.names import NameIndex
 from pipeline.io.projection import FIX, MAX_DISTORTION, Projection, read_projection
 from pipeline.runtime.errors import UserError
@@ -35,6 +35,9 @@ _AREA_MARGIN = 6.0
 _PIXEL_MARGIN = 1.0
 
 
+Position = tuple[float, float, float]
+
+
 @dataclass(frozen=True)
 class GroundPoint:
     """A ground control point.
@@ -47,7 +50,7 @@ class GroundPoint:
     """
 
     name: str
-    position: tuple[float, float, float]
+    position: Position
     pixels: Mapping[str, tuple[float, float]]
 
 
@@ -94,11 +97,11 @@ def ground_control_file(folder: Path) -> Path | None:
 
 @dataclass(frozen=True)
 class _Row:
-    """A line of the file: its number, the coordinates as written, the pixel, and the words after
-    them."""
+    """A line of the file: its number, the coordinates as written, the pixel as in ``GroundPoint``,
+    and the words after them."""
 
     line: int
-    position: tuple[float, float, float]
+    position: Position
     pixel: tuple[float, float]
     words: tuple[str, ...]
 
@@ -128,36 +131,23 @@ def read_ground_control(
     if rows:
         _check_coordinates(path, projection, rows)
     warnings: list[str] = []
-    seen: dict[tuple[float, float, float], dict[str, tuple[float, float]]] = {}
-    names: dict[tuple[float, float, float], str] = {}
-    unknown: dict[str, None] = {}
-    repeated, outside = [], []
-    index = NameIndex(sizes)
-    for row in rows:
-        image, label = _image(path, row, index)
-        if image is None:
-            unknown[row.words[0]] = None
-            continue
-        width, height = sizes[image]
-        # OpenDroneMap's pixel centres are integers.
-        px, py = row.pixel[0] + 0.5, row.pixel[1] + 0.5
-        margin = _PIXEL_MARGIN
-        if not (-margin <= px <= width + margin and -margin <= py <= height + margin):
-            outside.append((row, image))
+    seen: dict[Position, dict[str, tuple[float, float]]] = {}
+    names: dict[Position, str] = {}
+    repeated = []
+    found, unknown = _in_scene(path, rows, sizes)
+    for row, image, label in found:
         pixels = seen.setdefault(row.position, {})
-        if image in pixels and pixels[image] != (px, py):
+        if pixels.get(image, row.pixel) != row.pixel:
             repeated.append(row.line)
-        pixels[image] = (px, py)
+        pixels[image] = row.pixel
         names.setdefault(row.position, label or f"gcp{len(names) + 1}")
-    if outside:
-        _outside(path, outside, sizes)
     if repeated:
         warnings.append(
             f"{path.name}: {len(repeated)} lines repeat a point in the same photograph; the last "
             f"position is used (first: line {repeated[0]})"
         )
     if unknown and complete:
-        first = shortened(next(iter(unknown)))
+        first = shortened(unknown[0])
         if not seen:
             raise UserError(
                 f"none of its {len(unknown)} photographs is in the scene (first: {first})",
@@ -168,7 +158,8 @@ def read_ground_control(
             f"{path.name} names {len(unknown)} photographs that are not in the scene "
             f"(first: {first})"
         )
-    twice = _repeated_names(names.values())
+    used = Counter(name for name in names.values() if not re.fullmatch(r"[-+.\d]+", name))
+    twice = sorted(name for name, count in used.items() if count > 1)
     if twice:
         warnings.append(
             f"{path.name}: {len(twice)} names of points have several positions, which are separate "
@@ -189,12 +180,7 @@ def read_ground_control(
 
 def _lines(path: Path) -> list[tuple[int, str]]:
     """Numbers and texts of the lines that are neither empty nor comments."""
-    data = read_bounded(path, MAX_BYTES, fix=_FIX)
-    try:
-        wide = data[:2] in (b"\xff\xfe", b"\xfe\xff")
-        text = data.decode("utf-16" if wide else "utf-8-sig")
-    except UnicodeDecodeError:
-        raise UserError("expected text in UTF-8", file=path, fix=_FIX) from None
+    text = read_text(path, MAX_BYTES, fix=_FIX)
     # Of the characters that ``splitlines`` takes for ends of lines, only these are.
     lines = text.replace("\r\n", "\n").replace("\r", "\n").split("\n")
     if len(lines) > MAX_LINES:
@@ -223,7 +209,44 @@ def _row(path: Path, number: int, line: str) -> _Row:
         raise UserError(f"line {number} is {why}: {shortened(line)}", file=path, fix=_FIX) from None
     if not all(math.isfinite(value) for value in (x, y, z, px, py)):
         raise UserError(f"line {number} is not finite: {shortened(line)}", file=path, fix=_FIX)
-    return _Row(number, (x, y, z), (px, py), words)
+    # OpenDroneMap's pixel centres are integers.
+    return _Row(number, (x, y, z), (px + 0.5, py + 0.5), words)
+
+
+def _in_scene(
+    path: Path, rows: Iterable[_Row], sizes: Mapping[str, tuple[int, int]]
+) -> tuple[list[tuple[_Row, str, str]], list[str]]:
+    """The lines of photographs in the scene, each with the photograph and the point's name; and the
+    names of the other photographs, in the file's order.
+
+    Raises:
+        UserError: a name that may mean several photographs, or a pixel outside of one.
+    """
+    found: list[tuple[_Row, str, str]] = []
+    unknown: dict[str, None] = {}
+    outside: list[tuple[_Row, str]] = []
+    index = NameIndex(sizes)
+    for row in rows:
+        image, label = _image(path, row, index)
+        if image is None:
+            unknown[row.words[0]] = None
+            continue
+        found.append((row, image, label))
+        beyond = np.array(row.pixel) - sizes[image]
+        if max(*beyond, -row.pixel[0], -row.pixel[1]) > _PIXEL_MARGIN:
+            outside.append((row, image))
+    if outside:
+        row, image = outside[0]
+        px, py = (value - 0.5 for value in row.pixel)
+        width, height = sizes[image]
+        raise UserError(
+            f"{len(outside)} pixel positions are outside of their photograph (first: line "
+            f"{row.line}, {px:g} {py:g} in {image} of {width}x{height} pixels)",
+            file=path,
+            fix="write positions in the stored pixels of these files (EXIF orientation not "
+            "applied), not in those of photographs of another size",
+        )
+    return found, list(unknown)
 
 
 def _image(path: Path, row: _Row, index: NameIndex) -> tuple[str | None, str]:
@@ -251,28 +274,7 @@ def _image(path: Path, row: _Row, index: NameIndex) -> tuple[str | None, str]:
     return None, ""
 
 
-def _outside(
-    path: Path, rows: list[tuple[_Row, str]], sizes: Mapping[str, tuple[int, int]]
-) -> None:
-    row, image = rows[0]
-    width, height = sizes[image]
-    raise UserError(
-        f"{len(rows)} pixel positions are outside of their photograph (first: line {row.line}, "
-        f"{row.pixel[0]:g} {row.pixel[1]:g} in {image} of {width}x{height} pixels)",
-        file=path,
-        fix="write positions in the stored pixels of these files (EXIF orientation not applied), "
-        "not in those of photographs of another size",
-    )
-
-
-def _repeated_names(names: Iterable[str]) -> list[str]:
-    listed = sorted(name for name in names if not re.fullmatch(r"[-+.\d]+", name))
-    return sorted({a for a, b in pairwise(listed) if a == b})
-
-
-def _positions(
-    projection: Projection, written: list[tuple[float, float, float]]
-) -> list[tuple[float, float, float]]:
+def _positions(projection: Projection, written: list[Position]) -> list[Position]:
     """Coordinates as written -> ``GroundPoint.position``."""
     if not written:
         return []
@@ -312,7 +314,13 @@ def _check_coordinates(path: Path, projection: Projection, rows: list[_Row]) -> 
                 "WGS84 UTM 32N",
             )
     if projection.contains(written, _AREA_MARGIN):
-        _check_lengths(path, projection, written)
+        distortion = projection.distortion(written)
+        if distortion > MAX_DISTORTION:
+            raise UserError(
+                f"lengths in {projection.name} differ from true lengths by {distortion:.0%} here",
+                file=path,
+                fix="convert the points to the UTM zone of the site, or to longitude and latitude",
+            )
         return
     if projection.contains(swapped, _AREA_MARGIN / 6):
         order = (
@@ -331,16 +339,6 @@ def _check_coordinates(path: Path, projection: Projection, rows: list[_Row]) -> 
             f"the coordinates are impossible in {projection.name} ({shown})",
             file=path,
             fix="check the projection on the first line and the columns",
-        )
-
-
-def _check_lengths(path: Path, projection: Projection, written: np.ndarray) -> None:
-    distortion = projection.distortion(written)
-    if distortion > MAX_DISTORTION:
-        raise UserError(
-            f"lengths in {projection.name} differ from true lengths by {distortion:.0%} here",
-            file=path,
-            fix="convert the points to the UTM zone of the site, or to longitude and latitude",
         )
 
 

@@ -42,6 +42,12 @@ def suffix_of(name: str) -> str:
     return PurePosixPath(name).suffix.lower()
 
 
+def is_inside(name: str) -> bool:
+    """Whether a name in a file of the user is a path below the folder that it is relative to."""
+    path = PurePosixPath(name)
+    return not path.is_absolute() and ".." not in path.parts and "\0" not in name
+
+
 def stem_key(name: str) -> str:
     """The name without a leading "./" and a photograph's suffix, in lower case and in Unicode's
     normal form C.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -13,7 +13,7 @@ from pipeline.io.colmap import has_model
 from pipeline.io.colmap_models import find_models, model_folders, text_files_beside_binary
 from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
-from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, suffix_of
+from pipeline.io.names import PHOTO_SUFFIXES, NameIndex, is_inside, suffix_of
 from pipeline.io.poses.formats import (
     FORMATS,
     MIN_IMAGES_PER_CAMERA,
@@ -164,9 +164,11 @@ def listed_photos(
     entry, path = found
     repeated: list[str] = []
     try:
+        frames: Sequence[PosedFrame] = []
         if entry.kind == "transforms":
-            read_frames(folder / path, repeated)
-        frames = entry.frames(folder / path) if entry.frames is not None else []
+            frames = read_frames(folder / path, repeated)
+        elif entry.frames is not None:
+            frames = entry.frames(folder / path)
     except UserError:
         if poses is not None:
             raise
@@ -189,7 +191,7 @@ def _listing(folder: Path, poses: GivenPoses | None) -> tuple[PoseFormat, str] |
 
 def _existing(
     folder: Path,
-    listed: list[PosedFrame],
+    listed: Sequence[PosedFrame],
     source: str,
     repeated: list[str],
     warnings: list[str],
@@ -199,7 +201,7 @@ def _existing(
     existing = [
         str(PurePosixPath(parent) / name)
         for parent in parents
-        if not parent.startswith(("/", "..")) and (folder / parent).is_dir()
+        if is_inside(parent) and (folder / parent).is_dir()
         for name in os.listdir(folder / parent)
         if suffix_of(name) in PHOTO_SUFFIXES and name[0] != "."
     ]
@@ -226,17 +228,13 @@ def _named_files(folder: Path, named: Mapping[str, str | None]) -> tuple[dict[st
     for photo, name in named.items():
         if name is None:
             continue
-        file = next((n for n in (name, f"{name}.png") if _is_inside(folder, n)), None)
+        names = [name, f"{name}.png"] if is_inside(name) else []
+        file = next((n for n in names if (folder / n).is_file()), None)
         if file is None:
             lost.append(name)
         else:
             found[photo] = file
     return found, sorted(lost)
-
-
-def _is_inside(folder: Path, name: str) -> bool:
-    """Whether ``name`` is a file below ``folder`` by its path; links are followed."""
-    return not name.startswith(("/", "../")) and (folder / name).is_file()
 
 
 def _frame_warnings(source: str, repeated: list[str], noun: str, lost: list[str]) -> list[str]:

@@ -11,16 +11,15 @@ import math
 import os
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.geometry.cameras import Camera
+from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.io.names import first_names
-from pipeline.io.poses.files import checked_name, is_number, read_json
+from pipeline.io.poses.files import FIX, checked_name, is_number, malformed, read_json
 from pipeline.io.poses.frames import (
     FLIP_YZ,
     Lens,
@@ -39,7 +38,6 @@ from pipeline.scene.views import View
 
 SPLITS: tuple[ListedSplit, ...] = ("train", "test", "val")
 _PERSPECTIVE = ("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "FULL_OPENCV")
-_FIX = "correct the file, export it again, or set poses: ignore"
 # Scales of nerfstudio's world relative to COLMAP's. Their cubes are far from a float's range.
 _SCALES = (1e-12, 1e12)
 _LISTS = tuple(f"{name}_filenames" for name in SPLITS)
@@ -55,30 +53,102 @@ _COMPANIONS = (
 
 
 @dataclass(frozen=True)
-class Frame:
-    """A frame of the file.
+class Fields:
+    """The fields of a frame that describe its camera.
 
     Attributes:
-        path: The photograph's path relative to the folder of the json, often without suffix.
-        mask: The path of its mask in the same form, or None.
-        depth: The path of its depth map in the same form, or None.
-        rotation, translation: The pose, world to camera in COLMAP's axes; (3, 3) and (3,) float64.
-        fields: the file's fields, overridden by the frame's.
-        split: the list of the scene's own split that it is in, or None: transforms_train.json and
-            so on, or ``train_filenames`` and so on of nerfstudio.
-        file: the json.
+        file: The json.
         source: "frames[i] (PATH)", for messages.
+        values: The file's fields, overridden by the frame's.
     """
 
-    path: str
-    mask: str | None
-    depth: str | None
-    rotation: NDArray[np.float64]
-    translation: NDArray[np.float64]
-    fields: Mapping[str, Any]
-    split: ListedSplit | None
     file: Path
     source: str
+    values: Mapping[str, Any]
+
+    def wrong(self, what: str, fix: str = FIX) -> UserError:
+        """The error for values that no camera can have."""
+        return malformed(self.file, f"{self.source}: {what}", fix)
+
+    def number(self, name: str, default: float = 0.0) -> float:
+        """The field ``name``, which must be a finite number."""
+        value = self.values.get(name, default)
+        if not is_number(value):
+            raise self.wrong(f"{name} is {str(value)[:40]!r}, expected a finite number")
+        return float(value)
+
+    def focal(self, length: str, angle: str, side: int) -> float | None:
+        """The focal length in pixels from the field ``length``, or from the field of view ``angle``
+        in radians; None without either."""
+        if length in self.values:
+            focal = self.number(length)
+            if focal <= 0:
+                raise self.wrong(f"{length} is {focal}, expected a positive number")
+            return focal
+        if angle not in self.values:
+            return None
+        view = self.number(angle)
+        if not 0 < view < math.pi:
+            what = f"{angle} is {view:g}, expected radians between 0 and pi"
+            if not math.pi <= view < 180:
+                raise self.wrong(what)
+            fix = f"write {math.radians(view):.6g}, or set poses: ignore"
+            raise self.wrong(f"{what}; it looks like degrees", fix)
+        return 0.5 * side / math.tan(0.5 * view)
+
+    def model(self) -> str:
+        """The COLMAP camera model of the intrinsics.
+
+        Raises:
+            UserError: a ``camera_model`` that is not supported.
+        """
+        model = str(self.values.get("camera_model", "")).upper()
+        if model == "OPENCV_FISHEYE" or self.values.get("is_fisheye"):
+            return "OPENCV_FISHEYE"
+        if model == "EQUIRECTANGULAR":
+            return model
+        if model and model not in _PERSPECTIVE:
+            raise self.wrong(
+                f"camera_model {model[:40]} is not supported; expected "
+                f"{', '.join(_PERSPECTIVE)}, OPENCV_FISHEYE or EQUIRECTANGULAR",
+                "convert the photographs to perspective ones, or set poses: ignore",
+            )
+        if any(self.number(name) for name in ("k3", "k4", "k5", "k6")):
+            return "FULL_OPENCV"
+        return (
+            "OPENCV" if any(self.number(name) for name in ("k1", "k2", "p1", "p2")) else "PINHOLE"
+        )
+
+    def camera(self, photo_width: int, photo_height: int) -> Camera:
+        """The camera, of the photograph's size if the fields have none."""
+        width, height = round(self.number("w", photo_width)), round(self.number("h", photo_height))
+        model = self.model()
+        if model == "EQUIRECTANGULAR":
+            if not 0 < width == 2 * height:
+                raise self.wrong(
+                    f"the panorama is {width}x{height} pixels; expected 360 by 180 degrees, "
+                    "twice as wide as high"
+                )
+            return Camera(model, width, height, np.array([width, height], np.float64))
+        fx = self.focal("fl_x", "camera_angle_x", width)
+        fy = self.focal("fl_y", "camera_angle_y", height)
+        if fx is None and fy is None:
+            raise self.wrong("no focal length: expected fl_x or camera_angle_x")
+        point = self.number("cx", width / 2), self.number("cy", height / 2)
+        rest = [self.number(name) for name in CAMERA_MODELS[model][1][4:]]
+        params = [fx or fy or 0.0, fy or fx or 0.0, *point, *rest]
+        return checked_camera(self.file, self.source, model, width, height, params)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Frame(PosedFrame):
+    """A frame of a transforms.json, whose name is relative to the folder of the file.
+
+    Attributes:
+        fields: The fields that describe the camera.
+    """
+
+    fields: Fields
 
     def has_same_pose(self, other: Frame) -> bool:
         """Whether the poses are equal up to the digits that files are printed with."""
@@ -90,7 +160,8 @@ class Frame:
 
     def is_same_camera(self, other: Frame) -> bool:
         """Whether pose and intrinsics are equal."""
-        return self.fields == other.fields and np.array_equal(self.translation, other.translation)
+        same = np.array_equal(self.translation, other.translation)
+        return same and self.fields.values == other.fields.values
 
 
 def find_transforms(folder: Path) -> list[Path]:
@@ -110,48 +181,29 @@ def read_frames(path: Path, repeated: list[str] | None = None) -> list[Frame]:
             files of several splits may list the same frames.
 
     Raises:
-        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses, a
-            path with two poses.
+        UserError: no file, malformed JSON, missing fields, matrices that are not finite poses,
+            camera models that are not supported, a path with two poses.
     """
     files = [path] if path.is_file() else find_transforms(path)
     if not files:
-        raise UserError("expected a transforms.json, found none", file=path, fix=_FIX)
+        raise malformed(path, "expected a transforms.json, found none")
     frames: dict[str, Frame] = {}
     for frame in (frame for file in files for frame in _frames_of(file)):
-        first = frames.setdefault(frame.path, frame)
+        first = frames.setdefault(frame.name, frame)
         if first is frame or first.is_same_camera(frame):
             continue
         if not first.has_same_pose(frame):
-            raise UserError(
-                f"{frame.source} and {first.source} of {first.file.name} are the same photograph "
-                "with different poses",
-                file=frame.file,
-                fix=f"remove one of the two frames of {first_names([frame.path])}, or set poses: "
+            new, old = frame.fields, first.fields
+            raise malformed(
+                new.file,
+                f"{new.source} and {old.source} of {old.file.name} are the same photograph with "
+                "different poses",
+                f"remove one of the two frames of {first_names([frame.name])}, or set poses: "
                 "ignore",
             )
         if repeated is not None:
-            repeated.append(frame.path)
+            repeated.append(frame.name)
     return list(frames.values())
-
-
-def posed_frames(path: Path) -> list[PosedFrame]:
-    """The frames of a file or of the files in a scene folder, with cameras and split.
-
-    Raises:
-        UserError: as ``read_frames``, and for camera models that are not supported.
-    """
-    return [
-        PosedFrame(
-            frame.path,
-            Lens(frame_camera_model(frame), partial(_camera, frame)),
-            frame.rotation,
-            frame.translation,
-            frame.mask,
-            frame.split,
-            frame.depth,
-        )
-        for frame in read_frames(path)
-    ]
 
 
 def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconstruction:
@@ -167,9 +219,9 @@ def read_transforms(path: Path, sizes: Mapping[str, tuple[int, int]]) -> Reconst
         Images named by the keys of ``sizes``, cameras of the file's sizes, no points.
 
     Raises:
-        UserError: as ``posed_frames``, and for intrinsics that are missing or impossible.
+        UserError: as ``read_frames``, and for intrinsics that are missing or impossible.
     """
-    return reconstruct(posed_frames(path), sizes, path)
+    return reconstruct(read_frames(path), sizes, path)
 
 
 @dataclass(frozen=True)
@@ -177,9 +229,9 @@ class PointsEntry:
     """The point cloud that a pose file names.
 
     Attributes:
-        path: relative to the folder of the json; None if it names none.
-        to_world: (4, 4) similarity from the coordinates of the file's matrices, and of its points,
-            to those of ``read_frames``.
+        path: The cloud's path relative to the folder of the json; None if it names none.
+        to_world: The (4, 4) similarity from the coordinates of the file's matrices, and of its
+            points, to those of ``read_frames``.
     """
 
     path: str | None
@@ -195,10 +247,10 @@ def read_points_entry(path: Path) -> PointsEntry:
     frames = read_frames(path)
     if not frames:
         return PointsEntry(None, np.eye(4))
-    fields, file = frames[0].fields, frames[0].file
-    name = fields.get("ply_file_path")
-    named = checked_name(file, name) if isinstance(name, str) and name else None
-    to_world = np.linalg.inv(_applied_transform(file, fields))
+    fields = frames[0].fields
+    name = fields.values.get("ply_file_path")
+    named = checked_name(fields.file, name) if isinstance(name, str) and name else None
+    to_world = np.linalg.inv(_applied_transform(fields.file, fields.values))
     return PointsEntry(named, to_world.astype(np.float64))
 
 
@@ -252,42 +304,16 @@ def write_transforms(
     write_json(path, content)
 
 
-def frame_camera_model(frame: Frame) -> str:
-    """The COLMAP camera model of the frame's intrinsics.
-
-    Raises:
-        UserError: a ``camera_model`` that is not supported.
-    """
-    names = frame.fields
-    model = str(names.get("camera_model", "")).upper()
-    if model == "OPENCV_FISHEYE" or names.get("is_fisheye"):
-        return "OPENCV_FISHEYE"
-    if model == "EQUIRECTANGULAR":
-        return model
-    if model and model not in _PERSPECTIVE:
-        raise UserError(
-            f"{frame.source}: camera_model {model[:40]} is not supported; expected "
-            f"{', '.join(_PERSPECTIVE)}, OPENCV_FISHEYE or EQUIRECTANGULAR",
-            file=frame.file,
-            fix="convert the photographs to perspective ones, or set poses: ignore",
-        )
-    if any(_number(frame, name, 0.0) for name in ("k3", "k4", "k5", "k6")):
-        return "FULL_OPENCV"
-    if any(_number(frame, name, 0.0) for name in ("k1", "k2", "p1", "p2")):
-        return "OPENCV"
-    return "PINHOLE"
-
-
 def _frames_of(file: Path) -> list[Frame]:
     content = read_json(file)
     listed = content.get("frames") if isinstance(content, dict) else None
     if not isinstance(listed, list):
-        raise UserError("expected an object with a list 'frames'", file=file, fix=_FIX)
+        raise malformed(file, "expected an object with a list 'frames'")
     applied = _applied_transform(file, content)
     shared = {key: value for key, value in content.items() if key not in ("frames", *_LISTS)}
     frames = [_frame(file, i, entry, shared, applied) for i, entry in enumerate(listed)]
     split_of = _splits(file, content)
-    return [replace(frame, split=split_of(frame.path)) for frame in frames]
+    return [replace(frame, split=split_of(frame.name)) for frame in frames]
 
 
 def _splits(file: Path, content: Mapping[str, Any]) -> Callable[[str], ListedSplit | None]:
@@ -295,10 +321,9 @@ def _splits(file: Path, content: Mapping[str, Any]) -> Callable[[str], ListedSpl
     whole: dict[str, ListedSplit] = {f"transforms_{name}.json": name for name in SPLITS}
     if file.name in whole:
         return lambda path: whole[file.name]
-    lists = {name: content.get(f"{name}_filenames") for name in SPLITS}
     found: dict[str, ListedSplit] = {}
     for name in SPLITS:
-        listed = lists[name]
+        listed = content.get(f"{name}_filenames")
         for entry in listed if isinstance(listed, list) else []:
             if isinstance(entry, str):
                 found.setdefault(checked_name(file, entry), name)
@@ -308,30 +333,20 @@ def _splits(file: Path, content: Mapping[str, Any]) -> Callable[[str], ListedSpl
 def _frame(
     file: Path, i: int, entry: Any, shared: Mapping[str, Any], applied: NDArray[np.float64]
 ) -> Frame:
-    source = f"frames[{i}]"
-    fields = entry if isinstance(entry, dict) else {}
-    path = _file_name(file, f"{source}.file_path", fields.get("file_path"))
-    source = f"{source} ({path})"
-    matrix = pose_matrix(file, f"{source}.transform_matrix", fields.get("transform_matrix"))
+    own = entry if isinstance(entry, dict) else {}
+    name = _file_name(file, f"frames[{i}].file_path", own.get("file_path"))
+    fields = Fields(file, f"frames[{i}] ({name})", {**shared, **own})
+    where = f"{fields.source}.transform_matrix"
+    matrix = pose_matrix(file, where, own.get("transform_matrix"))
     scale = np.cbrt(max(np.linalg.det(applied[:3, :3]), 1e-300))
     with np.errstate(over="ignore", invalid="ignore"):
         to_world = np.linalg.inv(applied) @ matrix
     # The camera's axes are affected by the rotation of applied_transform only, not by its scale.
     axes = to_world[:3, :3] * scale
-    where = f"{source}.transform_matrix"
     pose = checked_pose(file, where, FLIP_YZ @ axes.T, to_world[:3, 3])
-    mask, depth = (_optional_file(file, source, fields, names) for names in _COMPANIONS)
-    return Frame(
-        path=path,
-        mask=mask,
-        depth=depth,
-        rotation=pose[0],
-        translation=pose[1],
-        fields={**shared, **fields},
-        split=None,
-        file=file,
-        source=source,
-    )
+    mask, depth = (_optional_file(file, fields.source, own, names) for names in _COMPANIONS)
+    lens = Lens(fields.model(), fields.camera)
+    return Frame(name, lens, *pose, mask=mask, depth=depth, fields=fields)
 
 
 def _optional_file(
@@ -345,7 +360,7 @@ def _optional_file(
 def _file_name(file: Path, where: str, value: Any) -> str:
     """``checked_name`` of a field."""
     if not isinstance(value, str) or not value:
-        raise UserError(f"{where}: expected a file name, found {shown(value)}", file=file, fix=_FIX)
+        raise malformed(file, f"{where}: expected a file name, found {shown(value)}")
     return checked_name(file, value, f"{where}: ")
 
 
@@ -356,90 +371,17 @@ def _applied_transform(file: Path, content: Mapping[str, Any]) -> NDArray[np.flo
         applied = pose_matrix(file, "applied_transform", content["applied_transform"])
     scale = content.get("applied_scale", 1.0)
     if not is_number(scale) or not _SMALLEST_SCALE < scale < 1 / _SMALLEST_SCALE:
-        raise UserError(
-            f"applied_scale: expected a positive number, found {shown(scale)}", file=file, fix=_FIX
-        )
+        raise malformed(file, f"applied_scale: expected a positive number, found {shown(scale)}")
     # The largest element of the axes: between their length and its third.
     size = float(np.abs(applied[:3, :3]).max())
     if not (_SCALES[0] <= scale * size <= _SCALES[1] and _SCALES[0] <= size <= _SCALES[1]):
-        raise UserError(
+        raise malformed(
+            file,
             f"applied_scale, applied_transform: expected a scale of {_SCALES[0]:g} to "
             f"{_SCALES[1]:g}, found {scale * size:g}",
-            file=file,
-            fix=_FIX,
         )
     applied[:3] *= scale
     # The determinant is a volume, so it is compared with the axes' length cubed.
     if not np.linalg.det(applied[:3, :3]) > 1e-6 * (scale * size) ** 3:
-        raise UserError("applied_transform: expected a similarity", file=file, fix=_FIX)
+        raise malformed(file, "applied_transform: expected a similarity")
     return applied
-
-
-def _number(frame: Frame, name: str, default: float) -> float:
-    value = frame.fields.get(name, default)
-    if not is_number(value):
-        raise UserError(
-            f"{frame.source}: {name} is {str(value)[:40]!r}, expected a finite number",
-            file=frame.file,
-            fix=_FIX,
-        )
-    return float(value)
-
-
-def _camera(frame: Frame, photo_width: int, photo_height: int) -> Camera:
-    """The frame's camera, with the photograph's size if the frame has none."""
-    width = round(_number(frame, "w", photo_width))
-    height = round(_number(frame, "h", photo_height))
-    if frame_camera_model(frame) == "EQUIRECTANGULAR":
-        if not 0 < width == 2 * height:
-            raise UserError(
-                f"{frame.source}: the panorama is {width}x{height} pixels; expected 360 by 180 "
-                "degrees, twice as wide as high",
-                file=frame.file,
-                fix=_FIX,
-            )
-        return Camera("EQUIRECTANGULAR", width, height, np.array([width, height], np.float64))
-    fx = _focal(frame, "fl_x", "camera_angle_x", width)
-    fy = _focal(frame, "fl_y", "camera_angle_y", height)
-    if fx is None and fy is None:
-        raise UserError(
-            f"{frame.source}: no focal length: expected fl_x or camera_angle_x",
-            file=frame.file,
-            fix=_FIX,
-        )
-    fx, fy = fx or fy or 0.0, fy or fx or 0.0
-    params = [fx, fy, _number(frame, "cx", width / 2), _number(frame, "cy", height / 2)]
-    model = frame_camera_model(frame)
-    rest = {
-        "PINHOLE": (),
-        "OPENCV": ("k1", "k2", "p1", "p2"),
-        "FULL_OPENCV": ("k1", "k2", "p1", "p2", "k3", "k4", "k5", "k6"),
-        "OPENCV_FISHEYE": ("k1", "k2", "k3", "k4"),
-    }[model]
-    params += [_number(frame, name, 0.0) for name in rest]
-    return checked_camera(frame.file, frame.source, model, width, height, params)
-
-
-def _focal(frame: Frame, length: str, angle: str, side: int) -> float | None:
-    """Focal length in pixels from field ``length`` or from field of view ``angle`` in radians."""
-    if length in frame.fields:
-        focal = _number(frame, length, 0.0)
-        if focal <= 0:
-            raise UserError(
-                f"{frame.source}: {length} is {focal}, expected a positive number",
-                file=frame.file,
-                fix=_FIX,
-            )
-        return focal
-    if angle in frame.fields:
-        view = _number(frame, angle, 0.0)
-        if not 0 < view < math.pi:
-            degrees = math.pi <= view < 180
-            raise UserError(
-                f"{frame.source}: {angle} is {view:g}, expected radians between 0 and pi"
-                + ("; it looks like degrees" if degrees else ""),
-                file=frame.file,
-                fix=f"write {math.radians(view):.6g}, or set poses: ignore" if degrees else _FIX,
-            )
-        return 0.5 * side / math.tan(0.5 * view)
-    return None

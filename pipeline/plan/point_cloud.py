@@ -16,6 +16,7 @@ from pipeline.config.schema import Config
 from pipeline.io.clouds.files import CLOUD_SUFFIXES, count_points, is_cloud, read_clouds
 from pipeline.io.clouds.values import PointCloud
 from pipeline.io.fact_cache import FactCache
+from pipeline.io.names import is_inside
 from pipeline.io.posefiles import GivenPoses
 from pipeline.io.transforms import read_points_entry
 from pipeline.plan.given_poses import GivenModel
@@ -168,7 +169,7 @@ def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str
     )
     if name is None:
         return None
-    if not _is_inside(name) or not is_cloud(name) or not (folder / name).is_file():
+    if not is_inside(name) or not is_cloud(name) or not (folder / name).is_file():
         warnings.append(
             f"{poses.path}: its ply_file_path is not used: expected a point cloud in the scene "
             f"folder, found {name[:80]}"
@@ -179,7 +180,7 @@ def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str
 
 def _configured(folder: Path, wanted: str) -> str:
     path = folder / wanted
-    if not _is_inside(wanted) or not path.exists():
+    if not is_inside(wanted) or not path.exists():
         raise UserError(
             f"init.points_file: expected a file or folder in the scene folder, found {wanted!r}",
             file=folder,
@@ -198,11 +199,6 @@ def _is_usable(entry: Path) -> bool:
     """Whether this is a cloud with a name that JSON can hold."""
     name = entry.name
     return entry.is_file() and name[0] != "." and is_plain(name) and is_cloud(name)
-
-
-def _is_inside(name: str) -> bool:
-    path = PurePosixPath(name)
-    return not path.is_absolute() and ".." not in path.parts and "\0" not in name
 
 
 def _files(folder: Path, path: str) -> tuple[str, ...]:

@@ -12,8 +12,7 @@ from PIL import Image
 from pipeline.io.colmap import read_model
 from pipeline.io.exr import read_header
 from pipeline.io.photofile import read_facts
-from pipeline.io.poses.files import read_json
-from pipeline.io.poses.xml import read_xml
+from pipeline.io.poses.files import read_json, read_xml
 from pipeline.io.splat_files import SUFFIXES, read_gaussians
 from pipeline.runtime.errors import UserError
 

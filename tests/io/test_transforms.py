@@ -13,7 +13,6 @@ from pipeline.geometry.distortion import project
 from pipeline.geometry.rotations import quat_to_rotation
 from pipeline.io.transforms import (
     find_transforms,
-    posed_frames,
     read_frames,
     read_transforms,
     write_transforms,
@@ -251,7 +250,7 @@ def test_relative_names_are_valid_if_a_folder_is_a_symbolic_link(tmp_path):
     (tmp_path / "data" / "p0.png").touch()
     file = tmp_path / "results" / "export" / "transforms.json"
     write_transforms(file, views(tmp_path, 1, True), file.parent)
-    assert (file.parent / read_frames(file)[0].path).is_file()
+    assert (file.parent / read_frames(file)[0].name).is_file()
 
 
 @settings(
@@ -264,4 +263,4 @@ def test_damaged_files_give_a_message_or_valid_cameras(tmp_path, data):
     content |= {"train_filenames": ["images/0.png"], "test_filenames": ["images/1.png"]}
     file = tmp_path / "transforms.json"
     file.write_bytes(data.draw(mutated(json.dumps(content))))
-    error_or_valid(posed_frames, file)
+    error_or_valid(read_frames, file)

@@ -1,4 +1,4 @@
-"""Reading of other programs' text files, which are hostile until checked.
+"""Reading of other programs' text, JSON and XML files, which are hostile until checked.
 
 Functions raise a ``UserError`` that names the file.
 """
@@ -10,23 +10,24 @@ import posixpath
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
+from xml.etree.ElementTree import Element
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.bounded import read_bounded
+from pipeline.io import bounded
+from pipeline.io.bounded_xml import parse_xml
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import shown
 
-FIX = "export the file again, or set poses: ignore"
+FIX = "correct the file, export it again, or set poses: ignore"
 # Larger files are no list of cameras: 100,000 photographs take about 100 MiB.
-MAX_BYTES = 256 * 2**20
+_MAX_BYTES = 256 * 2**20
 # Bytes of memory that a JSON file's objects, lists and values take at least, by what begins them.
 _JSON_BYTES = {"{": 240, "[": 90, ",": 40}
 _MAX_JSON_MEMORY = 2 << 30
 _MAX_NAME = 1000
 _HEAD_BYTES = 4096
-_UTF_16_MARKS = (b"\xff\xfe", b"\xfe\xff")
 
 
 def malformed(file: Path, what: str, fix: str = FIX) -> UserError:
@@ -52,20 +53,27 @@ def checked_name(file: Path, name: str, where: str = "") -> str:
 
 
 def read_text(file: Path) -> str:
-    """The file's text: UTF-8 with or without byte order mark, or UTF-16, which Windows' tools
-    write."""
-    data = read_bounded(file, MAX_BYTES, fix=FIX)
+    """The text of a pose file, see ``bounded.read_text``."""
+    return bounded.read_text(file, _MAX_BYTES, fix=FIX)
+
+
+def read_xml(file: Path) -> Element:
+    """The root element of an XML file.
+
+    Raises:
+        UserError: too large, not well-formed, nested too deeply, or with a document type.
+    """
     try:
-        return data.decode("utf-16" if data[:2] in _UTF_16_MARKS else "utf-8-sig")
-    except UnicodeDecodeError as error:
-        raise malformed(file, f"expected UTF-8 or UTF-16 text: {error}") from None
+        return parse_xml(bounded.read_bounded(file, _MAX_BYTES, fix=FIX))
+    except ValueError as error:
+        raise malformed(file, str(error)) from None
 
 
 def read_head(file: Path) -> bytes:
     """The first bytes of a file; as UTF-8 if the file is UTF-16."""
     with file.open("rb") as stream:
         head = stream.read(_HEAD_BYTES)
-    if head[:2] in _UTF_16_MARKS:
+    if head[:2] in bounded.UTF_16_MARKS:
         return head.decode("utf-16", errors="ignore").encode(errors="ignore")
     # XML names its encoding only in its own encoding.
     for start, encoding in ((b"<\0", "utf-16-le"), (b"\0<", "utf-16-be")):

@@ -28,7 +28,7 @@ from pipeline.io.poses import (
 )
 from pipeline.io.poses.frames import PosedFrame, distinct_frames, reconstruct
 from pipeline.io.poses.kinds import PoseKind
-from pipeline.io.transforms import find_transforms, posed_frames
+from pipeline.io.transforms import find_transforms, read_frames
 from pipeline.scene.reconstruction import Reconstruction
 
 _LLFF_FILE = "poses_bounds.npy"
@@ -62,7 +62,7 @@ class PoseFormat:
     files: Callable[[Path], list[Path]]
     summarise: Callable[[Path], dict[str, Any]]
     read: Callable[[Path, Sizes, Sequence[str]], Reconstruction]
-    frames: Callable[[Path], list[PosedFrame]] | None = None
+    frames: Callable[[Path], Sequence[PosedFrame]] | None = None
 
     def prefix(self, base_folder: str) -> str:
         """What precedes photographs' names in the file, if they are in ``base_folder`` of the
@@ -73,7 +73,7 @@ class PoseFormat:
 def of_frames(
     kind: PoseKind,
     find: Callable[[Path], str | None],
-    frames: Callable[[Path], list[PosedFrame]],
+    frames: Callable[[Path], Sequence[PosedFrame]],
     *,
     names: Names = "photos",
     files: Callable[[Path], list[Path]] = lambda path: [path],
@@ -172,7 +172,7 @@ FORMATS: tuple[PoseFormat, ...] = (
         summarise=_of_colmap,
         read=lambda path, sizes, listed: read_model(path),
     ),
-    of_frames("transforms", _find_transforms, posed_frames, names="scene", files=_transforms_files),
+    of_frames("transforms", _find_transforms, read_frames, names="scene", files=_transforms_files),
     PoseFormat(
         kind="llff",
         names="order",

@@ -19,11 +19,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.io.names import stem_key
-from pipeline.io.poses.files import checked_name, find_by_head, malformed, number, numbers
+from pipeline.io.poses.files import checked_name, find_by_head, malformed, number, numbers, read_xml
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_rotation, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 from pipeline.io.poses.matrices import pose_matrix
-from pipeline.io.poses.xml import read_xml
 from pipeline.runtime.text import shown
 
 Array = NDArray[np.float64]

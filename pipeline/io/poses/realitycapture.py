@@ -23,10 +23,17 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_head, read_text
+from pipeline.io.poses.files import (
+    find_by_head,
+    malformed,
+    number,
+    numbers,
+    read_head,
+    read_text,
+    read_xml,
+)
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
-from pipeline.io.poses.xml import read_xml
 
 _REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")

@@ -8,16 +8,14 @@ format". Its points are not read: they are triangulated again.
 from __future__ import annotations
 
 import re
-from functools import partial
 from itertools import islice
 from pathlib import Path
 
 import numpy as np
 
-from pipeline.geometry.cameras import Camera
 from pipeline.io.poses.files import malformed, numbers, read_text
-from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
-from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.io.poses.frames import FLIP_YZ, PosedFrame, make_frame
+from pipeline.io.poses.lenses import Brown, scaled_lens
 from pipeline.runtime.text import shown
 
 _FILES = ("bundle.out", "bundle/bundle.out")
@@ -64,16 +62,10 @@ def frames(path: Path) -> list[PosedFrame]:
         if f == 0:
             continue
         rows = np.stack([numbers(path, where, row, 3) for row in rest])
-        unit = Brown(f, f, 0.0, 0.0, k=(k1, k2))
-        lens = Lens(brown_model(unit), partial(_camera, path, where, unit))
+        lens = scaled_lens(path, where, Brown(f, f, 0.0, 0.0, k=(k1, k2)), lambda *size: 1.0)
         with np.errstate(all="ignore"):
             centre = -rows[:3].T @ rows[3]
         found.append(make_frame(path, name, lens, FLIP_YZ @ rows[:3], centre, where))
     if not found:
         raise malformed(path, "expected an image with a pose, found none")
     return found
-
-
-def _camera(file: Path, where: str, unit: Brown, width: int, height: int) -> Camera:
-    lens = Brown(unit.fx, unit.fy, width / 2, height / 2, k=unit.k)
-    return brown_camera(file, where, width, height, lens)

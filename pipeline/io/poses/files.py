@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import json
 import posixpath
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from pathlib import Path
 from typing import Any
 from xml.etree.ElementTree import Element
@@ -126,6 +126,11 @@ def numbers(file: Path, where: str, value: Any, count: int) -> NDArray[np.float6
     if not isinstance(listed, list | tuple) or len(listed) != count:
         raise malformed(file, f"{where}: expected {count} numbers, found {shown(value)}")
     return np.array([number(file, where, entry) for entry in listed])
+
+
+def first_file(folder: Path, names: Iterable[str]) -> str | None:
+    """The first of ``names`` that is a file in ``folder``; None without any."""
+    return next((name for name in names if (folder / name).is_file()), None)
 
 
 def find_by_head(folder: Path, suffix: str, is_one: Callable[[bytes], bool]) -> str | None:

@@ -26,6 +26,7 @@ from pipeline.io.poses import (
     record3d,
     scannet,
 )
+from pipeline.io.poses.files import first_file
 from pipeline.io.poses.frames import PosedFrame, distinct_frames, reconstruct
 from pipeline.io.poses.kinds import PoseKind
 from pipeline.io.transforms import find_transforms, read_frames
@@ -95,11 +96,6 @@ def of_frames(
     )
 
 
-def _find_colmap(folder: Path) -> str | None:
-    models = find_models(folder)
-    return models[0].path if models else None
-
-
 def _find_transforms(folder: Path) -> str | None:
     files = find_transforms(folder)
     return None if not files else files[0].name if len(files) == 1 else "."
@@ -159,15 +155,11 @@ def _of_frames(frames: Sequence[PosedFrame]) -> dict[str, Any]:
     return {**_without_points(names, len(names), models), "splits": splits}
 
 
-def _of_llff(path: Path) -> dict[str, Any]:
-    return _without_points([], len(read_rows(path)), ["SIMPLE_PINHOLE"])
-
-
 FORMATS: tuple[PoseFormat, ...] = (
     PoseFormat(
         kind="colmap",
         names="photos",
-        find=_find_colmap,
+        find=lambda folder: next((model.path for model in find_models(folder)), None),
         files=model_files,
         summarise=_of_colmap,
         read=lambda path, sizes, listed: read_model(path),
@@ -176,9 +168,9 @@ FORMATS: tuple[PoseFormat, ...] = (
     PoseFormat(
         kind="llff",
         names="order",
-        find=lambda folder: _LLFF_FILE if (folder / _LLFF_FILE).is_file() else None,
+        find=lambda folder: first_file(folder, [_LLFF_FILE]),
         files=lambda path: [path],
-        summarise=_of_llff,
+        summarise=lambda path: _without_points([], len(read_rows(path)), ["SIMPLE_PINHOLE"]),
         # Row i belongs to photograph i, so unreadable photographs count.
         read=lambda path, sizes, listed: read_poses_bounds(path, listed)[0],
     ),

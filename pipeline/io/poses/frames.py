@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
+from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.io.names import match_names
 from pipeline.io.poses.files import checked_name, malformed
 from pipeline.io.poses.matrices import rotation_fault
@@ -161,6 +162,11 @@ def checked_rotation(file: Path, where: str, matrix: Array) -> Array:
             return nearest
     fault, fix = rotation_fault(matrix)
     raise malformed(file, f"{where}: {fault}", fix)
+
+
+def turned(axis: int, degrees: float) -> Array:
+    """The rotation by an angle about the axis x, y or z (0, 1 or 2)."""
+    return rotation_from_vector(np.radians(degrees) * np.eye(3)[axis])
 
 
 def checked_camera(

@@ -12,7 +12,8 @@ The Brown-Conrady model, with the coefficients' names of OpenCV's "Camera Calibr
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
 
@@ -23,7 +24,7 @@ from pipeline.geometry.cameras import Camera
 from pipeline.geometry.lens_fit import MAX_RESIDUAL_PX, fit_camera
 from pipeline.geometry.lens_models import to_angles
 from pipeline.io.poses.files import malformed
-from pipeline.io.poses.frames import checked_camera
+from pipeline.io.poses.frames import Lens, checked_camera
 
 Array = NDArray[np.float64]
 
@@ -91,6 +92,33 @@ def brown_camera(file: Path, where: str, width: float, height: float, lens: Brow
     if _is_exact(lens):
         return camera
     return fitted(file, where, camera, model, rest, lens)
+
+
+def scaled_lens(
+    file: Path,
+    where: str,
+    unit: Brown,
+    scale: Callable[[int, int], float],
+    *,
+    from_centre: bool = True,
+) -> Lens:
+    """The lens of photographs whose size the file does not give.
+
+    Args:
+        unit: The lens in the unit of the file, whose principal point is counted from the image
+            centre, or from the upper left corner without ``from_centre``.
+        scale: The function from a photograph's width and height to the number of pixels of a unit.
+    """
+
+    def camera(width: int, height: int) -> Camera:
+        pixels = scale(width, height)
+        x, y = (width / 2, height / 2) if from_centre else (0.0, 0.0)
+        fx, fy = unit.fx * pixels, unit.fy * pixels
+        cx, cy = x + unit.cx * pixels, y + unit.cy * pixels
+        lens = replace(unit, fx=fx, fy=fy, cx=cx, cy=cy)
+        return brown_camera(file, where, width, height, lens)
+
+    return Lens(brown_model(unit), camera)
 
 
 def brown_model(lens: Brown) -> str:

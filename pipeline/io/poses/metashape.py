@@ -83,7 +83,6 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         largest = used.most_common(1)[0][0]
         cameras = [camera for camera in cameras if camera.get("component_id", "") == largest]
     sensors = {sensor.get("id", ""): sensor for sensor in chunk.iterfind("sensors/sensor")}
-    lenses: dict[str, Lens] = {}
     labels = _labels(chunk, cameras)
     found = []
     for camera in cameras:
@@ -92,8 +91,7 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         sensor = camera.get("sensor_id", "")
         if sensor not in sensors:
             raise malformed(file, f"camera {label}: expected the sensor {shown(sensor)}")
-        if sensor not in lenses:
-            lenses[sensor] = _lens(file, f"sensor {sensor[:40]}", sensors[sensor])
+        lens = _lens(file, f"sensor {sensor[:40]}", sensors[sensor])
         text = camera.findtext("transform", "")
         where = f"camera {label}: transform"
         pose = pose_matrix(file, where, numbers(file, where, text, 16))
@@ -102,7 +100,7 @@ def _of_chunk(file: Path, chunk: Element, cameras: list[Element]) -> list[PosedF
         with np.errstate(all="ignore"):
             moved = similarity.scale * similarity.rotation @ pose[:3, 3] + similarity.translation
         rotation = (similarity.rotation @ axes).T
-        found.append(make_frame(file, label, lenses[sensor], rotation, moved, f"camera {label}"))
+        found.append(make_frame(file, label, lens, rotation, moved, f"camera {label}"))
     return found
 
 

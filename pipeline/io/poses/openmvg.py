@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from pipeline.io.poses.files import malformed, number, numbers, read_json
+from pipeline.io.poses.files import first_file, malformed, number, numbers, read_json
 from pipeline.io.poses.frames import Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 from pipeline.runtime.text import shown
@@ -24,7 +24,7 @@ _COEFFICIENTS = {"disto_k1": 1, "disto_k3": 3, "disto_t2": 5, "fisheye": 4}
 
 
 def find(folder: Path) -> str | None:
-    return _FILE if (folder / _FILE).is_file() else None
+    return first_file(folder, [_FILE])
 
 
 def frames(file: Path) -> list[PosedFrame]:
@@ -37,7 +37,6 @@ def frames(file: Path) -> list[PosedFrame]:
     views, intrinsics, extrinsics = (
         _entries(file, content, name) for name in ("views", "intrinsics", "extrinsics")
     )
-    lenses: dict[int, Lens] = {}
     found = []
     for view in views.values():
         pose, camera = view.get("id_pose"), view.get("id_intrinsic")
@@ -49,14 +48,13 @@ def frames(file: Path) -> list[PosedFrame]:
         if pose not in extrinsics or camera not in intrinsics:
             continue
         where = f"view {shown(name)}"
-        if camera not in lenses:
-            lenses[camera] = _lens(file, f"intrinsic {camera}", intrinsics[camera])
+        lens = _lens(file, f"intrinsic {camera}", intrinsics[camera])
         matrix = extrinsics[pose].get("rotation")
         rows = matrix if isinstance(matrix, list) and len(matrix) == 3 else [None] * 3
         rotation = np.stack([numbers(file, f"{where}: rotation", row, 3) for row in rows])
         centre = numbers(file, f"{where}: center", extrinsics[pose].get("center"), 3)
         path = f"{view.get('local_path') or '.'}/{name}"
-        found.append(make_frame(file, path, lenses[camera], rotation, centre, where))
+        found.append(make_frame(file, path, lens, rotation, centre, where))
     if not found:
         raise malformed(file, "expected views with a pose (extrinsics), found none")
     return found

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.rotations import rotation_from_vector
-from pipeline.io.poses.files import malformed, number, numbers, read_json
+from pipeline.io.poses.files import first_file, malformed, number, numbers, read_json
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 from pipeline.runtime.text import shown
@@ -25,7 +25,7 @@ _KINDS = "perspective, simple_radial, radial, brown, fisheye, fisheye_opencv, fi
 
 
 def find(folder: Path) -> str | None:
-    return next((name for name in _FILES if (folder / name).is_file()), None)
+    return first_file(folder, _FILES)
 
 
 def frames(file: Path) -> list[PosedFrame]:
@@ -45,15 +45,13 @@ def frames(file: Path) -> list[PosedFrame]:
     if not parts:
         raise malformed(file, "expected a list of reconstructions with cameras and shots")
     largest = max(parts, key=lambda part: len(part["shots"]))
-    lenses: dict[str, Lens] = {}
     found = []
     for name, shot in largest["shots"].items():
         where = f"shot {shown(name)}"
         camera = shot.get("camera") if isinstance(shot, dict) else None
         if not isinstance(camera, str) or camera not in largest["cameras"]:
             raise malformed(file, f"{where}: expected one of the file's cameras")
-        if camera not in lenses:
-            lenses[camera] = _lens(file, f"camera {shown(camera)}", largest["cameras"][camera])
+        lens = _lens(file, f"camera {shown(camera)}", largest["cameras"][camera])
         vector = numbers(file, f"{where}: rotation", shot.get("rotation"), 3)
         angle = float(np.linalg.norm(vector))
         if angle > _MAX_ANGLE:
@@ -67,7 +65,7 @@ def frames(file: Path) -> list[PosedFrame]:
         translation = numbers(file, f"{where}: translation", shot.get("translation"), 3)
         with np.errstate(all="ignore"):
             centre = -rotation.T @ translation
-        found.append(make_frame(file, name, lenses[camera], rotation, centre, where))
+        found.append(make_frame(file, name, lens, rotation, centre, where))
     if not found:
         raise malformed(file, "expected a shot, found none")
     return found

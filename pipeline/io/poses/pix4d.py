@@ -44,19 +44,16 @@ def frames(path: Path) -> list[PosedFrame]:
     rows = [line for line in lines[heads[0] + 1 if heads else 0 :] if line]
     if not heads or not rows or len(rows) % _LINES:
         raise malformed(path, f"expected {_LINES} lines for each image after 'camera model ...'")
-    lenses: dict[tuple[str, ...], Lens] = {}
     found = []
     for start in range(0, len(rows), _LINES):
         head, *block = rows[start : start + _LINES]
         *words, width, height = ("", "", *head.split())
         name = " ".join(words).strip()
         where = f"image {shown(name)}"
-        key = (width, height, *block[:5])
-        if key not in lenses:
-            lenses[key] = _lens(path, where, width, height, block)
+        lens = _lens(path, where, width, height, block)
         rotation = np.stack([numbers(path, f"{where}: R", row, 3) for row in block[6:9]])
         centre = numbers(path, f"{where}: t", block[5], 3) + offset
-        found.append(make_frame(path, name, lenses[key], rotation, centre, where))
+        found.append(make_frame(path, name, lens, rotation, centre, where))
     return found
 
 

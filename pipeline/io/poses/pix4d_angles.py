@@ -10,27 +10,22 @@ Camera Parameters defined" and "Yaw, Pitch, Roll and Omega, Phi, Kappa angles".
 from __future__ import annotations
 
 import re
-from functools import partial
 from pathlib import Path
 
-import numpy as np
-
-from pipeline.geometry.cameras import Camera
-from pipeline.geometry.rotations import rotation_from_vector
 from pipeline.io.poses.files import find_by_head, malformed, number, numbers, read_text
-from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
-from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame, turned
+from pipeline.io.poses.lenses import Brown, scaled_lens
 from pipeline.runtime.text import shown
 
 _SUFFIX = "calibrated_external_camera_parameters.txt"
 _CAM_SUFFIX = "pix4d_calibrated_internal_camera_parameters.cam"
-_HEADER = ["imageName", "X", "Y", "Z", "Omega", "Phi", "Kappa"]
+_HEADER = b"imageName X Y Z Omega Phi Kappa".split()
 _SENSOR = re.compile(r"sensor width of ([^\sx]{1,60})x([^\sx]{1,60})mm")
 _FIELDS = ("F", "Px", "Py", "K1", "K2", "K3", "T1", "T2")
 
 
 def find(folder: Path) -> str | None:
-    name = find_by_head(folder, ".txt", lambda head: head.split()[:7] == _header_bytes())
+    name = find_by_head(folder, ".txt", lambda head: head.split()[:7] == _HEADER)
     return name if name is not None and len(files(folder / name)) == 2 else None
 
 
@@ -57,20 +52,11 @@ def frames(path: Path) -> list[PosedFrame]:
         *words, x, y, z, omega, phi, kappa = ("", *[""] * 6, *line.split())
         name = " ".join(words).strip()
         values = numbers(path, f"image {shown(name)}", [x, y, z, omega, phi, kappa], 6)
-        turns = np.eye(3) * np.radians(values[3:])[:, None]
-        to_world = (
-            rotation_from_vector(turns[0])
-            @ rotation_from_vector(turns[1])
-            @ rotation_from_vector(turns[2])
-        )
+        to_world = turned(0, values[3]) @ turned(1, values[4]) @ turned(2, values[5])
         found.append(make_frame(path, name, lens, FLIP_YZ @ to_world.T, values[:3]))
     if not found:
         raise malformed(path, "expected an image in each line, found none")
     return found
-
-
-def _header_bytes() -> list[bytes]:
-    return [word.encode() for word in _HEADER]
 
 
 def _lens(file: Path) -> Lens:
@@ -94,10 +80,4 @@ def _lens(file: Path) -> Lens:
     unit = Brown(
         f / width_mm, f / width_mm, px / width_mm, py / width_mm, k=(k1, k2, k3), p=(t1, t2)
     )
-    return Lens(brown_model(unit), partial(_camera, file, unit))
-
-
-def _camera(file: Path, unit: Brown, width: int, height: int) -> Camera:
-    f, cx, cy = unit.fx * width, unit.cx * width, unit.cy * width
-    lens = Brown(f, f, cx, cy, k=unit.k, p=unit.p)
-    return brown_camera(file, file.name, width, height, lens)
+    return scaled_lens(file, file.name, unit, lambda width, height: width, from_centre=False)

@@ -37,7 +37,6 @@ def frames(path: Path) -> list[PosedFrame]:
         UserError: a malformed file.
     """
     images = f"keyframes/{_FOLDERS[path.name]}"
-    lenses: dict[tuple[float, ...], Lens] = {}
     found = []
     for file in files(path):
         content = read_json(file)
@@ -48,12 +47,10 @@ def frames(path: Path) -> list[PosedFrame]:
             name: number(file, name, content.get(name, ""))
             for name in (*names, "fx", "fy", "cx", "cy", "width", "height")
         }
-        fx, fy, cx, cy, width, height = key = tuple(values[name] for name in list(values)[12:])
-        if key not in lenses:
-            camera = brown_camera(file, file.stem, width, height, Brown(fx, fy, cx, cy))
-            lenses[key] = Lens.fixed(camera)
-        pose = np.array([values[name] for name in names]).reshape(3, 4)
+        *rows, fx, fy, cx, cy, width, height = values.values()
+        camera = brown_camera(file, file.stem, width, height, Brown(fx, fy, cx, cy))
+        pose = np.array(rows).reshape(3, 4)
         rotation = FLIP_YZ @ pose[:, :3].T
         name = f"{images}/{file.stem}"
-        found.append(make_frame(file, name, lenses[key], rotation, pose[:, 3]))
+        found.append(make_frame(file, name, Lens.fixed(camera), rotation, pose[:, 3]))
     return found

@@ -15,12 +15,12 @@ from __future__ import annotations
 
 import csv
 import os
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
 from pipeline.io.poses.files import (
@@ -32,8 +32,8 @@ from pipeline.io.poses.files import (
     read_text,
     read_xml,
 )
-from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, checked_camera, make_frame
-from pipeline.io.poses.lenses import Brown, brown_camera, brown_model
+from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, checked_camera, make_frame, turned
+from pipeline.io.poses.lenses import Brown, scaled_lens
 
 _REQUIRED = ("name", "x", "y", "alt", "heading", "pitch", "roll", "f")
 _OPTIONAL = ("px", "py", "k1", "k2", "k3", "k4", "t1", "t2")
@@ -58,7 +58,6 @@ def csv_frames(file: Path) -> list[PosedFrame]:
     if header is None:
         raise malformed(file, f"expected the columns {', '.join(_REQUIRED)}, found others")
     columns = {name: i for i, name in enumerate(header)}
-    lenses: dict[tuple[float, ...], Lens] = {}
     found = []
     for line, text in enumerate(content.splitlines(), 1):
         row = _cells(text)
@@ -72,14 +71,14 @@ def csv_frames(file: Path) -> list[PosedFrame]:
             text = row[columns[name]].strip() if name in columns else "0"
             return number(file, f"{where}: {name}", text)
 
-        heading, pitch, roll = np.radians([value(n) for n in ("heading", "pitch", "roll")])
-        rotation = FLIP_YZ @ (_rz(-heading) @ _rx(pitch) @ _ry(roll)).T
+        to_world = (
+            turned(2, -value("heading")) @ turned(0, value("pitch")) @ turned(1, value("roll"))
+        )
         centre = np.array([value("x"), value("y"), value("alt")])
-        key = tuple(value(name) for name in ("f", *_OPTIONAL))
-        if key not in lenses:
-            lenses[key] = _lens(file, where, key[0], key[1:3], key[3:7], key[7:9])
+        f, px, py, *k, t1, t2 = (value(name) for name in ("f", *_OPTIONAL))
+        lens = _lens(file, where, Brown(f, f, px, py, k=tuple(k), p=(t1, t2)))
         name = row[columns["name"]].strip()
-        found.append(make_frame(file, name, lenses[key], rotation, centre, where))
+        found.append(make_frame(file, name, lens, FLIP_YZ @ to_world.T, centre, where))
     if not found:
         raise malformed(file, "expected a camera in each line, found none")
     return found
@@ -141,7 +140,7 @@ def _of_xmp(file: Path, name: Path) -> PosedFrame:
             raise malformed(file, "division: expected one coefficient, found several")
         lens = Lens("SIMPLE_DIVISION", partial(_division, file, focal, (u, v), k[0]))
     elif model == "perspective" or model.startswith("brown"):
-        lens = _lens(file, file.name, focal, (u, v), k, t)
+        lens = _lens(file, file.name, Brown(focal, focal, u, v, k=k, p=(t[0], t[1])))
     else:
         raise malformed(
             file,
@@ -156,37 +155,21 @@ def _field(element: Element, name: str) -> str | None:
     return element.get(_XCR + name) or element.findtext(_XCR + name)
 
 
-def _lens(
-    file: Path,
-    where: str,
-    focal: float,
-    point: tuple[float, ...],
-    k: tuple[float, ...],
-    t: tuple[float, ...],
-) -> Lens:
-    """The lens, whose camera depends on the photograph's size."""
-    unit = Brown(focal, focal, point[0], point[1], k=k, p=(t[0], t[1]))
-    return Lens(brown_model(unit), partial(_brown, file, where, unit))
-
-
-def _brown(file: Path, where: str, unit: Brown, width: int, height: int) -> Camera:
-    f, cx, cy = _pixels(unit.fx, (unit.cx, unit.cy), width, height)
-    return brown_camera(file, where, width, height, Brown(f, f, cx, cy, k=unit.k, p=unit.p))
+def _lens(file: Path, where: str, film: Brown) -> Lens:
+    """The lens, whose focal length is that for the film, and whose principal point is in parts of
+    the photograph's longer side."""
+    return scaled_lens(
+        file, where, replace(film, fx=film.fx / _FILM_MM, fy=film.fy / _FILM_MM), max
+    )
 
 
 def _division(
     file: Path, focal: float, point: tuple[float, float], k: float, width: int, height: int
 ) -> Camera:
-    params = (*_pixels(focal, point, width, height), k)
-    return checked_camera(file, file.name, "SIMPLE_DIVISION", width, height, params)
-
-
-def _pixels(
-    focal: float, point: tuple[float, float], width: int, height: int
-) -> tuple[float, float, float]:
-    """Focal length and principal point in pixels."""
     side = max(width, height)
-    return focal / _FILM_MM * side, width / 2 + point[0] * side, height / 2 + point[1] * side
+    x, y = width / 2 + point[0] * side, height / 2 + point[1] * side
+    params = (focal / _FILM_MM * side, x, y, k)
+    return checked_camera(file, file.name, "SIMPLE_DIVISION", width, height, params)
 
 
 def _cells(line: str) -> list[str]:
@@ -210,15 +193,3 @@ def _header(content: str) -> list[str] | None:
         if all(name in names for name in _REQUIRED):
             return names
     return None
-
-
-def _rotation(axis: int, angle: float) -> NDArray[np.float64]:
-    c, s = np.cos(angle), np.sin(angle)
-    i, j = [(1, 2), (2, 0), (0, 1)][axis]
-    matrix = np.eye(3)
-    matrix[i, i] = matrix[j, j] = c
-    matrix[i, j], matrix[j, i] = -s, s
-    return matrix
-
-
-_rx, _ry, _rz = (partial(_rotation, axis) for axis in range(3))

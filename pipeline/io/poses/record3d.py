@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from pipeline.geometry.rotations import quat_to_rotation
-from pipeline.io.poses.files import malformed, number, numbers, read_json
+from pipeline.io.poses.files import first_file, malformed, number, numbers, read_json
 from pipeline.io.poses.frames import FLIP_YZ, Lens, PosedFrame, make_frame
 from pipeline.io.poses.lenses import Brown, brown_camera
 
@@ -24,7 +24,7 @@ _NAMES = ("metadata", "metadata.json")
 def find(folder: Path) -> str | None:
     if not (folder / "rgb").is_dir():
         return None
-    return next((name for name in _NAMES if (folder / name).is_file()), None)
+    return first_file(folder, _NAMES)
 
 
 def frames(file: Path) -> list[PosedFrame]:

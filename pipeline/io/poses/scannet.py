@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import Camera
-from pipeline.io.poses.files import malformed, numbers, read_text
+from pipeline.io.poses.files import first_file, malformed, numbers, read_text
 from pipeline.io.poses.frames import Lens, PosedFrame, checked_camera, make_frame
 from pipeline.io.poses.matrices import pose_matrix
 
@@ -82,4 +82,5 @@ def _camera(file: Path, matrix: NDArray[np.float64], width: int, height: int) ->
 
 
 def _intrinsics(folder: Path) -> Path | None:
-    return next((folder / name for name in _INTRINSICS if (folder / name).is_file()), None)
+    name = first_file(folder, _INTRINSICS)
+    return None if name is None else folder / name

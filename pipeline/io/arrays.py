@@ -51,6 +51,17 @@ def write_chunks(
                     member.write(np.ascontiguousarray(part, "<f4").data)
 
 
+def read_array_header(file: IO[bytes]) -> tuple[tuple[int, ...], bool, np.dtype]:
+    """The shape, whether the first axis varies fastest, and the type of a ``.npy`` file's array.
+
+    Raises:
+        Exception: numpy parses the header as Python source, with exceptions of many types.
+    """
+    read = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
+    shape, fortran, dtype = read[npy.read_magic(file)](file)
+    return shape, fortran, dtype
+
+
 def read_array(data: bytes) -> NDArray:
     """The array of a ``.npy`` file: integers, floats or bools.
 
@@ -63,10 +74,7 @@ def read_array(data: bytes) -> NDArray:
 def _read_array(file: IO[bytes], size: int) -> NDArray:
     """The array of a ``.npy`` file of this size, read in pieces into its memory."""
     try:
-        version = npy.read_magic(file)
-        read_header = {(1, 0): npy.read_array_header_1_0, (2, 0): npy.read_array_header_2_0}
-        shape, fortran, dtype = read_header[version](file)
-    # numpy parses the header as Python source, with exceptions of many types.
+        shape, fortran, dtype = read_array_header(file)
     except Exception:
         raise ValueError("expected an array of numpy (.npy), found no header of one") from None
     if dtype.kind not in "biuf":

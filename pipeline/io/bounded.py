@@ -31,25 +31,34 @@ def opened_regular(path: Path) -> Iterator[BufferedReader]:
         yield file
 
 
-def read_bounded(path: Path, limit: int, *, fix: str) -> bytes:
-    """The bytes of a file.
+@contextmanager
+def opened_bounded(path: Path, limit: int | None = None, *, fix: str) -> Iterator[BufferedReader]:
+    """An open regular file of a bounded size.
 
     Args:
-        limit: largest number of bytes.
-        fix: what to do about a file that cannot be read.
+        limit: The largest number of bytes; None for half of the memory.
+        fix: What to do about a file that cannot be read.
 
     Raises:
         UserError: it cannot be read, is a device or a pipe, or is larger than ``limit``.
     """
+    largest = usable_memory() // 2 if limit is None else limit
     try:
         with opened_regular(path) as file:
             size = os.fstat(file.fileno()).st_size
-            if size <= limit:
-                return file.read(size)
+            if size > largest:
+                reason = " (half of the memory)" if limit is None else ""
+                what = f"expected at most {largest // MIB} MiB{reason}, found {size // MIB} MiB"
+                raise UserError(what, file=path, fix=fix)
+            yield file
     except OSError as error:
         raise UserError(f"cannot be read: {error.strerror}", file=path, fix=fix) from None
-    what = f"expected at most {limit // MIB} MiB, found {size // MIB} MiB"
-    raise UserError(what, file=path, fix=fix)
+
+
+def read_bounded(path: Path, limit: int | None = None, *, fix: str) -> bytes:
+    """The bytes of a file; see ``opened_bounded``."""
+    with opened_bounded(path, limit, fix=fix) as file:
+        return file.read(os.fstat(file.fileno()).st_size)
 
 
 def read_text(path: Path, limit: int, *, fix: str) -> str:
@@ -65,15 +74,3 @@ def read_text(path: Path, limit: int, *, fix: str) -> str:
     except UnicodeDecodeError as error:
         what = f"expected UTF-8 or UTF-16 text: {error}"
         raise UserError(what, file=path, fix=fix) from None
-
-
-def memory_share() -> int:
-    """Largest size in bytes of a file that is read as a whole: half of the memory."""
-    return usable_memory() // 2
-
-
-def too_large(path: Path, size: int) -> UserError:
-    """The error for a file that does not fit into the memory."""
-    what = f"expected a file of at most half of the memory ({memory_share() // MIB} MiB)"
-    fix = "use a machine with more memory, or a smaller file"
-    return UserError(f"{what}, found {size // MIB} MiB", file=path, fix=fix)

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from pipeline.geometry.cameras import CAMERA_MODELS, Camera
 from pipeline.geometry.rotations import rotation_to_quat
-from pipeline.io.bounded import memory_share, read_bounded
+from pipeline.io.bounded import read_bounded
 from pipeline.io.colmap_records import (
     POINT2D,
     REMEDY,
@@ -40,7 +40,7 @@ class _Reader:
 
     def __init__(self, file: Path):
         self.file, self.at = file, 0
-        self.data = read_bounded(file, memory_share(), fix=REMEDY)
+        self.data = read_bounded(file, fix=REMEDY)
 
     def unpack(self, layout: str) -> tuple[int | float, ...]:
         start = self.skip(struct.calcsize("<" + layout))

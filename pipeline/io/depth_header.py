@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import IO
 
 import numpy as np
-from numpy.lib import format as npy
 from PIL import Image
 from pydantic import BaseModel, ConfigDict
 
+from pipeline.io.arrays import read_array_header
 from pipeline.io.bounded import opened_regular
 from pipeline.io.names import suffix_of
 
@@ -65,9 +65,7 @@ def read_depth_header(path: Path) -> DepthHeader | None:
 
 
 def _of_array(file: IO[bytes]) -> DepthHeader:
-    version = npy.read_magic(file)
-    read = npy.read_array_header_1_0 if version == (1, 0) else npy.read_array_header_2_0
-    shape, _, dtype = read(file)
+    shape, _, dtype = read_array_header(file)
     height, width, *rest = shape if len(shape) >= 2 else (0, 0)
     return DepthHeader(
         width=width,

@@ -18,7 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, Field, ValidationError
 
-from pipeline.io.splat_codec import logit, read_file, sigmoid, to_uint8
+from pipeline.io.bounded import read_bounded
+from pipeline.io.splat_codec import FIX, logit, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import Array, GaussianArrays, GaussianSource
@@ -153,7 +154,7 @@ def read_gltf(path: Path) -> Gaussians:
         UserError: the file is missing, truncated or malformed, has no Gaussians, or has
             compressed Gaussians or nodes with transforms.
     """
-    data = read_file(path, "a .glb file")
+    data = read_bounded(path, fix=FIX)
     try:
         text, body = _chunks(data)
         document = _Document.model_validate_json(text)

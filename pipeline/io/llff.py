@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 from pipeline.geometry.cameras import Camera
 from pipeline.io.arrays import read_array
 from pipeline.io.bounded import MIB, read_bounded
+from pipeline.io.poses.files import malformed
 from pipeline.io.poses.matrices import rotation_fault
-from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 
 _MAX_BYTES = 64 * MIB
@@ -43,10 +43,8 @@ def read_poses_bounds(
     """
     rows = read_rows(path)
     if len(rows) != len(names):
-        raise UserError(
-            f"holds {len(rows)} poses, but there are {len(names)} photographs",
-            file=path,
-            fix=_FIX,
+        raise malformed(
+            path, f"holds {len(rows)} poses, but there are {len(names)} photographs", _FIX
         )
     cameras: dict[int, Camera] = {}
     numbers: dict[tuple, int] = {}
@@ -59,13 +57,13 @@ def read_poses_bounds(
             error = np.abs(rotation @ rotation.T - np.eye(3)).max()
         if not error <= 1e-2 or np.linalg.det(rotation) < 0:
             fault, fix = rotation_fault(rotation)
-            raise UserError(f"row {i} ({name}): {fault}", file=path, fix=fix)
+            raise malformed(path, f"row {i} ({name}): {fault}", fix)
         if min(height, width) < 1 or focal <= 0:
-            raise UserError(
+            raise malformed(
+                path,
                 f"row {i} ({name}): expected positive height, width and focal length, found "
                 f"{height:g}, {width:g}, {focal:g}",
-                file=path,
-                fix=_FIX,
+                _FIX,
             )
         camera_id = numbers.setdefault((width, height, focal), len(numbers) + 1)
         params = np.array([focal, width / 2, height / 2])
@@ -83,10 +81,10 @@ def read_rows(path: Path) -> NDArray[np.float64]:
     try:
         rows = np.asarray(read_array(read_bounded(path, _MAX_BYTES, fix=_FIX)), np.float64)
     except ValueError as error:
-        raise UserError(f"not a NumPy array of numbers ({error})", file=path, fix=_FIX) from None
+        raise malformed(path, f"not a NumPy array of numbers ({error})", _FIX) from None
     if rows.ndim != 2 or rows.shape[1] != 17:
-        raise UserError(f"expected N x 17 numbers, found shape {rows.shape}", file=path, fix=_FIX)
+        raise malformed(path, f"expected N x 17 numbers, found shape {rows.shape}", _FIX)
     bad = np.flatnonzero(~np.isfinite(rows).all(1))
     if len(bad):
-        raise UserError(f"row {bad[0]}: holds values that are not finite", file=path, fix=_FIX)
+        raise malformed(path, f"row {bad[0]}: holds values that are not finite", _FIX)
     return rows

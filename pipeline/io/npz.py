@@ -12,6 +12,7 @@ import numpy as np
 
 from pipeline.io.arrays import read_archive, write_chunks
 from pipeline.io.bounded import opened_regular
+from pipeline.io.splat_codec import FIX
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.record import owner_of, rerun
 from pipeline.splats.arrays import NAMES, GaussianArrays, GaussianSource, array_shapes
@@ -62,5 +63,5 @@ def read_gaussian_arrays(path: Path) -> GaussianArrays:
 
 def _wrong(path: Path, what: str) -> UserError:
     folder = owner_of(path)
-    fix = "write the file again, or get an intact copy of it" if folder is None else rerun(folder)
+    fix = FIX if folder is None else rerun(folder)
     return UserError(what, file=path, fix=fix)

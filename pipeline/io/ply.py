@@ -9,7 +9,6 @@ reorder properties, so they are read by name.
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterable, Iterator
 from itertools import chain
 from pathlib import Path
@@ -18,10 +17,10 @@ from typing import Any, BinaryIO
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.bounded import memory_share, opened_regular, too_large
+from pipeline.io.bounded import opened_bounded
 from pipeline.io.ply_header import PlyHeader, read_header, wrong
+from pipeline.io.splat_codec import FIX
 from pipeline.runtime.atomic import write_pieces
-from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import NAMES, GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
@@ -107,29 +106,17 @@ def read_splat_ply(path: Path) -> Gaussians:
         UserError: the file is missing, has no Gaussians, or is shorter or longer than its header
             implies.
     """
-    try:
-        with opened_regular(path) as file:
-            if (size := os.fstat(file.fileno()).st_size) > memory_share():
-                raise too_large(path, size)
-            header = read_header(file, path)
-            rest = sorted(n for n in header.fields if n.startswith("f_rest_"))
-            missing = [name for name in _REQUIRED if name not in header.fields]
-            bands = len(rest) // 3 + 1
-            if not missing:
-                missing = [
-                    n for n in (f"f_rest_{i}" for i in range(len(rest))) if n not in header.fields
-                ]
-            if missing:
-                raise wrong(path, f"expected the properties of Gaussians, found no {missing[0]}")
-            if len(rest) not in (0, 9, 24, 45):
-                raise wrong(path, f"expected 0, 9, 24 or 45 f_rest properties, found {len(rest)}")
-            table = _read_body(file, header, path)
-    except OSError as error:
-        raise UserError(
-            f"expected a PLY file, could not read it: {error.strerror}",
-            file=path,
-            fix="check the path and its permissions",
-        ) from error
+    with opened_bounded(path, fix=FIX) as file:
+        header = read_header(file, path)
+        rest = [name for name in header.fields if name.startswith("f_rest_")]
+        names = [*_REQUIRED, *(f"f_rest_{i}" for i in range(len(rest)))]
+        missing = next((name for name in names if name not in header.fields), None)
+        if missing:
+            raise wrong(path, f"expected the properties of Gaussians, found no {missing}")
+        if len(rest) not in (0, 9, 24, 45):
+            raise wrong(path, f"expected 0, 9, 24 or 45 f_rest properties, found {len(rest)}")
+        table = _read_body(file, header, path)
+    bands = len(rest) // 3 + 1
 
     def columns(names: tuple[str, ...]) -> NDArray[np.float32]:
         return np.stack([table[name].astype(np.float32) for name in names], axis=1)

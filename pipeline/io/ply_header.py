@@ -6,6 +6,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import BinaryIO
 
+from pipeline.io.splat_codec import FIX
 from pipeline.runtime.errors import UserError
 
 _TYPES = {
@@ -23,7 +24,6 @@ _BYTE_ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": 
 _MAX_HEADER = 1 << 16
 # More digits are no number of vertices, and slow to convert.
 _MAX_DIGITS = 15
-_FIX = "write the file again, or get an intact copy of it"
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class PlyHeader:
 
 def wrong(path: Path, what: str) -> UserError:
     """The error for a file that is not the PLY file that was expected."""
-    return UserError(what, file=path, fix=_FIX)
+    return UserError(what, file=path, fix=FIX)
 
 
 def read_header(file: BinaryIO, path: Path) -> PlyHeader:

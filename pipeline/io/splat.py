@@ -13,7 +13,8 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
+from pipeline.io.bounded import read_bounded
+from pipeline.io.splat_codec import FIX, logit_of_byte, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import NAMES, Array, GaussianSource
@@ -59,15 +60,14 @@ def read_splat(path: Path) -> Gaussians:
         UserError: the file is missing, has a size that is not a multiple of 32, or has values
             that are not finite or negative scales.
     """
-    data = read_file(path, "a .splat file")
-    fix = "write the file again, or get an intact copy of it"
+    data = read_bounded(path, fix=FIX)
     if len(data) % _ROW.itemsize:
         what = f"expected a multiple of {_ROW.itemsize} bytes, found {len(data)}"
-        raise UserError(what, file=path, fix=fix)
+        raise UserError(what, file=path, fix=FIX)
     table = np.frombuffer(data, _ROW)
     if not np.isfinite(table["mean"]).all() or not (table["scale"] >= 0).all():
         what = "expected a .splat file, found impossible positions or scales"
-        raise UserError(what, file=path, fix=fix)
+        raise UserError(what, file=path, fix=FIX)
     with np.errstate(divide="ignore"):
         log_scales = np.log(table["scale"])
     return Gaussians.from_arrays(

@@ -1,39 +1,13 @@
-"""Helpers for the file formats of Gaussians: reading files and encoding values in bytes."""
+"""Helpers for the file formats of Gaussians: encoding of values in bytes."""
 
 from __future__ import annotations
 
-import os
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.bounded import memory_share, opened_regular, too_large
-from pipeline.runtime.errors import UserError
-
-
-def read_file(path: Path, kind: str) -> bytes:
-    """The bytes of a file.
-
-    Args:
-        kind: what the error message expects ("an SPZ file").
-
-    Raises:
-        UserError: the file cannot be read, or is larger than half of the memory.
-    """
-    try:
-        with opened_regular(path) as file:
-            size = os.fstat(file.fileno()).st_size
-            if size <= memory_share():
-                return file.read(size)
-    except OSError as error:
-        raise UserError(
-            f"expected {kind}, could not read it: {error.strerror}",
-            file=path,
-            fix="check the path and its permissions",
-        ) from error
-    raise too_large(path, size)
+FIX = "check the path; write the file again, or get an intact copy of it"
 
 
 def to_uint8(values: NDArray[Any]) -> NDArray[np.uint8]:

@@ -17,8 +17,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipeline.io.bounded import opened_regular
-from pipeline.io.splat_codec import logit_of_byte, read_file, sigmoid, to_uint8
+from pipeline.io.bounded import opened_regular, read_bounded
+from pipeline.io.splat_codec import FIX, logit_of_byte, sigmoid, to_uint8
 from pipeline.runtime.atomic import write_pieces
 from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
@@ -61,7 +61,7 @@ def read_spz(path: Path) -> Gaussians:
     Raises:
         UserError: the file cannot be read or is not a valid SPZ file.
     """
-    return decode_spz(read_file(path, "an SPZ file"), file=path)
+    return decode_spz(read_bounded(path, fix=FIX), file=path)
 
 
 def read_antialias(path: Path) -> bool:

@@ -192,7 +192,7 @@ def test_damaged_ascii_is_an_error(tmp_path: Path, change: str) -> None:
 
 
 def test_missing_file_is_an_error(tmp_path: Path) -> None:
-    with pytest.raises(UserError, match="could not read"):
+    with pytest.raises(UserError, match="cannot be read"):
         read_splat_ply(tmp_path / "none.ply")
 
 

@@ -6,8 +6,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.geometry.distortion import project
 from pipeline.geometry.rotations import quat_to_rotation
@@ -20,7 +18,6 @@ from pipeline.io.transforms import (
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
-from tests.io.poses.known import error_or_valid, mutated
 
 SIZES = {"images/a.png": (200, 100)}
 
@@ -251,16 +248,3 @@ def test_relative_names_are_valid_if_a_folder_is_a_symbolic_link(tmp_path):
     file = tmp_path / "results" / "export" / "transforms.json"
     write_transforms(file, views(tmp_path, 1, True), file.parent)
     assert (file.parent / read_frames(file)[0].name).is_file()
-
-
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(st.data())
-def test_damaged_files_give_a_message_or_valid_cameras(tmp_path, data):
-    frames = [frame(path=f"images/{i}.png", k1=0.1 * i) for i in range(2)]
-    content = {"fl_x": 400, "w": 640, "h": 480, "applied_scale": 0.5, "frames": frames}
-    content |= {"train_filenames": ["images/0.png"], "test_filenames": ["images/1.png"]}
-    file = tmp_path / "transforms.json"
-    file.write_bytes(data.draw(mutated(json.dumps(content))))
-    error_or_valid(read_frames, file)

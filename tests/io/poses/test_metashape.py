@@ -6,8 +6,6 @@ import re
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.rotations import quat_to_rotation
@@ -19,9 +17,7 @@ from tests.io.poses.known import (
     UTM,
     WIDTH,
     check_same,
-    error_or_valid,
     known_scene,
-    mutated,
     opencv,
     read,
 )
@@ -194,12 +190,3 @@ def test_messages(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as error:
         metashape.frames(file)
     assert error.value.file == file and error.value.fix
-
-
-@settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
-@given(st.data())
-def test_damaged_files_give_a_message_or_valid_cameras(tmp_path, data):
-    sample = export(known_scene(opencv(), 2), calibration(opencv(-0.1, 0.03, 1e-3, -2e-3)))
-    error_or_valid(metashape.frames, write(tmp_path, data.draw(mutated(sample))))

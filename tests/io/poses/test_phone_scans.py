@@ -6,11 +6,9 @@ import json
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.geometry.rotations import rotation_to_quat
-from pipeline.io.poses import polycam, record3d, scannet
+from pipeline.io.poses import polycam, record3d
 from pipeline.runtime.errors import UserError
 from pipeline.scene.reconstruction import PosedImage, Reconstruction
 from tests.io.poses.known import (
@@ -18,18 +16,13 @@ from tests.io.poses.known import (
     HEIGHT,
     WIDTH,
     check_same,
-    error_or_valid,
     known_scene,
-    mutated,
     opencv,
     read,
 )
 from tests.pictures import picture
 from tests.plan.test_scan import given_model, look, names
 
-DAMAGED = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 FX, FY, CX, CY = opencv().params.tolist()
 
 
@@ -148,29 +141,3 @@ def test_messages(tmp_path, content, message):
     with pytest.raises(UserError, match=message) as error:
         record3d.frames(file)
     assert error.value.file == file
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_record3d(tmp_path, data):
-    sample = record3d_json(known_scene(opencv(), 2))
-    error_or_valid(record3d.frames, write_record3d(tmp_path, data.draw(mutated(sample))))
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_polycam(tmp_path, data):
-    known = known_scene(opencv(), 2, names="{}")
-    write_polycam(tmp_path, known)
-    folder = tmp_path / "keyframes" / "corrected_cameras"
-    (folder / "0.json").write_bytes(data.draw(mutated(polycam_json(known.images[1]))))
-    error_or_valid(polycam.frames, folder)
-
-
-@DAMAGED
-@given(st.data(), st.sampled_from(["pose/0.txt", "intrinsic/intrinsic_color.txt"]))
-def test_damaged_scannet(tmp_path, data, name):
-    write_scannet(tmp_path, known_scene(opencv(), 2, names="{}"))
-    sample = (tmp_path / name).read_text()
-    (tmp_path / name).write_bytes(data.draw(mutated(sample)))
-    error_or_valid(scannet.frames, tmp_path)

@@ -8,8 +8,6 @@ from pathlib import Path
 import cv2
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import Camera
 from pipeline.io.poses import bundler, openmvg, opensfm, pix4d, pix4d_angles
@@ -21,16 +19,11 @@ from tests.io.poses.known import (
     UTM,
     WIDTH,
     check_same,
-    error_or_valid,
     known_scene,
-    mutated,
     opencv,
     read,
 )
 
-DAMAGED = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 CURVED = opencv(-0.1, 0.03, 1e-3, -2e-3)
 K3 = opencv(-0.1, 0.03, 1e-3, -2e-3, 0.01, 0, 0, 0)
 
@@ -289,47 +282,3 @@ def test_several_cameras_of_pix4d_are_an_error(tmp_path):
     file = write_angles(tmp_path, angles_text(known_scene(K3)), 2 * cam_text(K3))
     with pytest.raises(UserError, match=r"expected one camera.*found 2"):
         pix4d_angles.frames(file)
-
-
-# --- hostile files ------------------------------------------------------------------------
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_bundler(tmp_path, data):
-    sample = bundle(known_scene(opencv(), 2))
-    file = write_bundle(tmp_path, data.draw(mutated(sample)), ["a.jpg", "b.jpg"])
-    error_or_valid(bundler.frames, file)
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_opensfm(tmp_path, data):
-    lens = opensfm_camera(K3, "brown", "k1", "k2", "p1", "p2", "k3")
-    file = tmp_path / "reconstruction.json"
-    file.write_bytes(data.draw(mutated(opensfm_json(known_scene(K3, 2), lens))))
-    error_or_valid(opensfm.frames, file)
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_openmvg(tmp_path, data):
-    file = tmp_path / "sfm_data.json"
-    sample = openmvg_json(known_scene(opencv(), 2), disto_k3=[-0.1, 0.03, 0.01])
-    file.write_bytes(data.draw(mutated(sample)))
-    error_or_valid(openmvg.frames, file)
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_pix4d(tmp_path, data):
-    sample = pix4d_text(known_scene(K3, 2), np.zeros(3))
-    error_or_valid(pix4d.frames, write_pix4d(tmp_path, data.draw(mutated(sample))))
-
-
-@DAMAGED
-@given(st.data(), st.booleans())
-def test_damaged_pix4d_angles(tmp_path, data, poses):
-    texts = [angles_text(known_scene(K3, 2)), cam_text(K3)]
-    texts[not poses] = data.draw(mutated(texts[not poses])).decode("utf-8", "replace")
-    error_or_valid(pix4d_angles.frames, write_angles(tmp_path, *texts))

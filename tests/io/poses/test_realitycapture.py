@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 
 from pipeline.geometry.cameras import Camera
 from pipeline.geometry.lens_fit import fit_camera
@@ -20,15 +18,10 @@ from tests.io.poses.known import (
     UTM,
     WIDTH,
     check_same,
-    error_or_valid,
     known_scene,
-    mutated,
     read,
 )
 
-DAMAGED = settings(
-    max_examples=40, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
-)
 HEADER = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2"
 
 
@@ -166,24 +159,6 @@ def test_an_unknown_lens_model_is_an_error(tmp_path):
     write_xmp(tmp_path, known_scene(camera(), names="p{}"), "kannala", "0 0 0 0 0 0")
     with pytest.raises(UserError, match="DistortionModel kannala"):
         xmp_frames(tmp_path / "images")
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_csv(tmp_path, data):
-    file = tmp_path / "cameras.csv"
-    file.write_bytes(data.draw(mutated(csv_text(known_scene(camera(), 2)))))
-    error_or_valid(csv_frames, file)
-
-
-@DAMAGED
-@given(st.data())
-def test_damaged_xmp(tmp_path, data):
-    known = known_scene(camera(), 2, names="p{}")
-    write_xmp(tmp_path, known, "brown3", "-0.1 0.03 0.01 0 0 0")
-    sample = xmp_text(known, known.images[1], "brown3", "-0.1 0.03 0.01 0 0 0")
-    (tmp_path / "images" / "p0.xmp").write_bytes(data.draw(mutated(sample)))
-    error_or_valid(xmp_frames, tmp_path / "images")
 
 
 @pytest.mark.parametrize("form", ["csv", "xmp"])

@@ -80,7 +80,8 @@ def colours_of(image: Image.Image, tags: Mapping[int, Any]) -> Colours:
     """The colours of an image that was opened by PIL.
 
     Args:
-        tags: its EXIF data, with that of the directories Exif and (as a mapping) Interop.
+        tags: The EXIF data of the image, with that of the directories Exif and (as a mapping)
+            Interop.
     """
     mode: Kind = "CMYK" if image.mode == "CMYK" else "L" if _is_grey(image.mode) else "RGB"
     embedded = image.info.get("icc_profile")
@@ -108,15 +109,17 @@ def to_srgb(pixels: Pixels, colours: Colours) -> Pixels:
 
     Args:
         pixels: (H, W) grey, (H, W, 3) RGB or (H, W, 4) CMYK; uint8, or uint16 for grey and RGB.
-        colours: of their file; those without a profile are returned unchanged, CMYK is converted
-            without one.
+        colours: The colours of the file. Without a profile, CMYK is converted by Pillow, and other
+            pixels are returned unchanged.
 
     Returns:
         (H, W) grey or (H, W, 3) RGB of the same dtype.
     """
     profile = colours.profile
     if profile is None:
-        return _without_profile(pixels) if _mode(pixels) == "CMYK" else pixels
+        if _mode(pixels) == "CMYK":
+            return np.asarray(Image.fromarray(pixels, "CMYK").convert("RGB"))
+        return pixels
     if pixels.dtype == np.uint16:
         matrix = icc.read_profile(profile)
         if matrix is not None:
@@ -333,10 +336,6 @@ def _by_matrix(pixels: Pixels, profile: icc.MatrixProfile) -> Pixels:
             light = linear_to_srgb_primaries(linear, profile.matrix)
         out[start : start + _ROWS] = np.rint(srgb_curve(light.clip(0, 1)) * 65535)
     return out
-
-
-def _without_profile(cmyk: Pixels) -> Pixels:
-    return np.asarray(Image.fromarray(cmyk, "CMYK").convert("RGB"))
 
 
 def _mode(pixels: Pixels) -> Kind:

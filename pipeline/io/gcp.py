@@ -43,7 +43,7 @@ class GroundPoint:
     """A ground control point.
 
     Attributes:
-        name: from the file, else "gcp1" and so on in the file's order.
+        name: The name in the file, else "gcp1" and so on in the file's order.
         position: x, y in metres of the projection, or longitude, latitude in degrees on WGS84;
             z in metres.
         pixels: photograph's name -> pixel, COLMAP's convention (the first pixel's centre is 0.5).
@@ -60,9 +60,9 @@ class GroundControl:
 
     Attributes:
         projection: The file's projection; ``points`` are in its metres or degrees.
-        points: those that a photograph of the scene shows.
-        unknown: names of photographs that are not in the scene.
-        warnings: sentences for the user.
+        points: The points that a photograph of the scene shows.
+        unknown: The names of photographs that are not in the scene.
+        warnings: Sentences for the user.
     """
 
     projection: Projection

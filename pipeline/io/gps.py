@@ -34,9 +34,8 @@ FAULTS: Mapping[Fault, str] = {
 }
 # Altitudes of photographs: from the deepest trench to the highest balloon, metres.
 _ALTITUDES = (-12_000.0, 60_000.0)
-# Only the header of long metadata is searched. A search for text, not XML: no entities.
-_MAX_BYTES = 1 << 20
-_VALUE = rb"\s*(?:=\s*[\"']|>)\s*"
+# XMP is searched for text, not parsed as XML: no entities.
+XMP_VALUE = rb"\s*(?:=\s*[\"']|>)\s*"
 _SIGNED = rb"([+-]?[0-9]{1,6}(?:\.[0-9]{1,15})?)"
 
 
@@ -64,7 +63,7 @@ def read_gps(tags: Mapping[int, Any], xmp: bytes = b"") -> Gps:
     found = _from_exif(tags)
     if found.position is not None and found.position[2] is not None:
         return found
-    other = _from_xmp(xmp[:_MAX_BYTES])
+    other = _from_xmp(xmp)
     if found.position is None:
         return found if other is None else Gps(other)
     return Gps((*found.position[:2], other[2])) if other is not None else found
@@ -113,7 +112,7 @@ def _degrees(value: Any) -> float:
     parts = list(value) if isinstance(value, tuple | list) else [value]
     if not 1 <= len(parts) <= 3:
         return math.nan
-    degrees, *rest = (_number(part) for part in parts)
+    degrees, *rest = (number_or_nan(part) for part in parts)
     # Some programs write 0/0 for the seconds.
     fractions = [part if math.isfinite(part) else 0.0 for part in rest]
     if any(not 0 <= part <= 60 for part in fractions) or not math.isfinite(degrees):
@@ -140,11 +139,11 @@ def _signed(degrees: float, reference: Any, letters: str) -> float | None:
 def _altitude(tags: Mapping[int, Any]) -> float | None:
     """Metres above the reference; None if it is missing, no number or impossible. Receivers that
     measure no altitude write exactly 0, which counts as unknown."""
-    altitude, reference = _number(tags.get(_GPS.GPSAltitude)), tags.get(_GPS.GPSAltitudeRef)
+    altitude, reference = number_or_nan(tags.get(_GPS.GPSAltitude)), tags.get(_GPS.GPSAltitudeRef)
     if isinstance(reference, tuple | list) and len(reference) == 1:
         reference = reference[0]
     if isinstance(reference, bytes | str) and len(reference) == 1:
-        reference = ord(reference) if ord(reference) < 4 else _number(reference)
+        reference = ord(reference) if ord(reference) < 4 else number_or_nan(reference)
     # 0 and 2 are above, 1 and 3 below the ellipsoid or the sea; EXIF's default is 0.
     if reference not in (None, 0, 1, 2, 3, "", b""):
         return None
@@ -155,7 +154,7 @@ def _possible(altitude: float) -> float | None:
     return altitude if altitude and _ALTITUDES[0] <= altitude <= _ALTITUDES[1] else None
 
 
-def _number(value: Any) -> float:
+def number_or_nan(value: Any) -> float:
     """``value`` as a float, NaN if it is not a number."""
     try:
         return float(value)
@@ -173,18 +172,18 @@ def _from_xmp(xmp: bytes) -> Position | None:
         return None
     if not _in_range(latitude, longitude) or latitude == longitude == 0:
         return None
-    altitude = re.search(rb"drone-dji:AbsoluteAltitude" + _VALUE + _SIGNED, xmp)
+    altitude = re.search(rb"drone-dji:AbsoluteAltitude" + XMP_VALUE + _SIGNED, xmp)
     return latitude, longitude, _possible(float(altitude[1])) if altitude else None
 
 
 def _drone(xmp: bytes, axis: bytes) -> float | None:
-    found = re.search(rb"drone-dji:Gps" + axis + _VALUE + _SIGNED, xmp)
+    found = re.search(rb"drone-dji:Gps" + axis + XMP_VALUE + _SIGNED, xmp)
     return float(found[1]) if found else None
 
 
 def _adobe(xmp: bytes, axis: bytes, letters: str) -> float | None:
     number = rb"([0-9]{1,3}),([0-9]{1,2}(?:\.[0-9]{1,12})?)(?:,([0-9]{1,2}(?:\.[0-9]{1,12})?))?"
-    found = re.search(rb"exif:GPS" + axis + _VALUE + number + b"([NSEW])", xmp)
+    found = re.search(rb"exif:GPS" + axis + XMP_VALUE + number + b"([NSEW])", xmp)
     if not found or found[4].decode() not in letters:
         return None
     degrees = _degrees([float(part) for part in found.groups()[:3] if part is not None])

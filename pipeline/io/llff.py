@@ -24,9 +24,7 @@ _MAX_BYTES = 64 * MIB
 _FIX = "export the poses again with as many rows as photographs, or set poses: ignore"
 
 
-def read_poses_bounds(
-    path: Path, names: Sequence[str]
-) -> tuple[Reconstruction, NDArray[np.float64]]:
+def read_poses_bounds(path: Path, names: Sequence[str]) -> Reconstruction:
     """Read LLFF poses.
 
     Args:
@@ -34,8 +32,7 @@ def read_poses_bounds(
         names: the photographs, sorted by name: row i belongs to photograph i.
 
     Returns:
-        The reconstruction (SIMPLE_PINHOLE cameras of the file's size, no points) and (N, 2) near
-        and far depths in world units.
+        SIMPLE_PINHOLE cameras of the file's size, no points.
 
     Raises:
         UserError: not a ``poses_bounds.npy``, another number of rows than photographs, values
@@ -69,7 +66,7 @@ def read_poses_bounds(
         params = np.array([focal, width / 2, height / 2])
         cameras[camera_id] = Camera("SIMPLE_PINHOLE", round(width), round(height), params)
         images[i + 1] = PosedImage(name, camera_id, rotation, -rotation @ centre)
-    return Reconstruction(cameras, images), rows[:, 15:]
+    return Reconstruction(cameras, images)
 
 
 def read_rows(path: Path) -> NDArray[np.float64]:

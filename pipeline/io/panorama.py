@@ -9,14 +9,13 @@ from __future__ import annotations
 import re
 from typing import Literal
 
+from pipeline.io.gps import XMP_VALUE
+
 Panorama = Literal["no", "full", "partial", "maybe"]
 """``full``: 360 by 180 degrees. ``partial``: a cropped panorama. ``maybe``: only the aspect ratio
 is that of a panorama."""
 
-# Only the header of long metadata is searched. A search for text, not XML: no entities.
-_MAX_BYTES = 1 << 20
-_VALUE = rb"\s*(?:=\s*[\"']|>)\s*"
-_PROJECTION = re.compile(rb"GPano:ProjectionType" + _VALUE + rb"([A-Za-z]{1,40})")
+_PROJECTION = re.compile(rb"GPano:ProjectionType" + XMP_VALUE + rb"([A-Za-z]{1,40})")
 _NUMBER = rb"([0-9]{1,9})"
 # Cameras whose stitched photographs are panorama spheres of 2:1, some without GPano.
 _CAMERAS = ("ricoh theta", "insta360", "gopro max", "samsung sm-c200", "samsung sm-r210", "lg-r105")
@@ -33,7 +32,6 @@ def panorama_of(xmp: bytes, body: str, width: int, height: int) -> Panorama:
         width, height: pixels.
     """
     sphere = width == 2 * height
-    xmp = xmp[:_MAX_BYTES]
     projection = _PROJECTION.search(xmp)
     if projection is not None:
         if projection[1].lower() != b"equirectangular":
@@ -47,8 +45,10 @@ def panorama_of(xmp: bytes, body: str, width: int, height: int) -> Panorama:
 def _cropped(xmp: bytes) -> bool:
     """Whether the stored area is smaller than the whole sphere."""
     for side in (b"Width", b"Height"):
-        full = re.search(rb"GPano:FullPano" + side + rb"Pixels" + _VALUE + _NUMBER, xmp)
-        stored = re.search(rb"GPano:CroppedAreaImage" + side + rb"Pixels" + _VALUE + _NUMBER, xmp)
+        full = re.search(rb"GPano:FullPano" + side + rb"Pixels" + XMP_VALUE + _NUMBER, xmp)
+        stored = re.search(
+            rb"GPano:CroppedAreaImage" + side + rb"Pixels" + XMP_VALUE + _NUMBER, xmp
+        )
         if full is not None and stored is not None and int(stored[1]) < int(full[1]):
             return True
     return False

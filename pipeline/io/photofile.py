@@ -17,7 +17,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.io import exr, pillow_formats
 from pipeline.io.colour import Colours, colours_of
-from pipeline.io.gps import Fault, Position, read_gps
+from pipeline.io.gps import Fault, Position, number_or_nan, read_gps
 from pipeline.io.names import RAW_SUFFIXES, suffix_of
 from pipeline.io.panorama import Panorama, panorama_of
 from pipeline.io.recorded import MAX_BYTES, digest_of
@@ -30,6 +30,8 @@ MAX_PIXELS = 1 << 29
 # Decoders that hold several copies of the pixels, and the bytes that they take for each.
 _DECODER_BYTES = {"WEBP": 24, "AVIF": 16, "HEIF": 16}
 _MAX_DECODED = 3 << 30
+# Bytes of XMP that are searched.
+_MAX_XMP = 1 << 20
 # The largest side that libpng decodes.
 _MAX_SIDE = 1_000_000
 # The formats of the supported suffixes. PIL recognises a file by its content, and has decoders that
@@ -142,7 +144,7 @@ def opened_image(file: Path | IO[bytes], name: str) -> Image.Image:
 
     Args:
         file: a path, or its bytes.
-        name: of the file; its suffix decides which formats are tried.
+        name: The name of the file; its suffix decides which formats are tried.
 
     Raises:
         OSError: no image of these formats.
@@ -297,9 +299,9 @@ def _quiet() -> Iterator[None]:
 
 
 def _xmp(image: Image.Image) -> bytes:
-    """The XMP packet stored before the pixels; empty without one."""
+    """The header of the XMP packet stored before the pixels; empty without one."""
     found = image.info.get("xmp") or image.info.get("XML:com.adobe.xmp") or b""
-    return found.encode("utf-8", "replace") if isinstance(found, str) else bytes(found)
+    return (found.encode("utf-8", "replace") if isinstance(found, str) else bytes(found))[:_MAX_XMP]
 
 
 def _header_exif(image: Image.Image) -> Image.Exif:
@@ -329,7 +331,7 @@ def _exif_facts(
 ) -> dict[str, Any]:
     orientation = tags.get(_BASE.Orientation, 1)
     make, model = _text(tags.get(_BASE.Make)), _text(tags.get(_BASE.Model))
-    focal_mm = _float(tags.get(_BASE.FocalLength))
+    focal_mm = number_or_nan(tags.get(_BASE.FocalLength))
     gps = read_gps(tags.get(_IFD.GPSInfo) or {}, xmp)
     return {
         "orientation": orientation if orientation in range(1, 9) else 1,
@@ -351,20 +353,20 @@ def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | No
     the aspect ratio differs from EXIF's, the image was cropped by an unknown amount: None.
     """
     longer = max(width, height)
-    taken_width = _float(tags.get(_BASE.ExifImageWidth))
-    taken_height = _float(tags.get(_BASE.ExifImageHeight))
+    taken_width = number_or_nan(tags.get(_BASE.ExifImageWidth))
+    taken_height = number_or_nan(tags.get(_BASE.ExifImageHeight))
     if not (_plausible(taken_width) and _plausible(taken_height)):
         taken_width, taken_height = width, height
     taken_longer, taken_shorter = max(taken_width, taken_height), min(taken_width, taken_height)
     if abs(taken_longer / taken_shorter * min(width, height) / longer - 1) > CROPPED:
         return None
-    equivalent = _float(tags.get(_BASE.FocalLengthIn35mmFilm))
+    equivalent = number_or_nan(tags.get(_BASE.FocalLengthIn35mmFilm))
     if _plausible(equivalent):
         focal = equivalent / FULL_FRAME_DIAGONAL_MM * math.hypot(width, height)
         if _FOCAL_RANGE[0] <= focal / longer <= _FOCAL_RANGE[1]:
             return focal
-    focal_mm = _float(tags.get(_BASE.FocalLength))
-    resolution = _float(tags.get(_BASE.FocalPlaneXResolution))
+    focal_mm = number_or_nan(tags.get(_BASE.FocalLength))
+    resolution = number_or_nan(tags.get(_BASE.FocalPlaneXResolution))
     unit = _MM_PER_UNIT.get(tags.get(_BASE.FocalPlaneResolutionUnit, 2), 25.4)
     if _plausible(focal_mm) and _plausible(resolution):
         focal = focal_mm * resolution / unit * longer / taken_longer
@@ -375,14 +377,6 @@ def focal_pixels(tags: Mapping[int, Any], width: int, height: int) -> float | No
 
 def _plausible(value: float) -> bool:
     return math.isfinite(value) and value > 0
-
-
-def _float(value: Any) -> float:
-    """``value`` as a float, NaN if it is not a number."""
-    try:
-        return float(value)
-    except (TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return math.nan
 
 
 def _body(make: str, model: str) -> str:

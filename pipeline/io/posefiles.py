@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path, PurePosixPath
 
@@ -87,11 +87,16 @@ def find_poses(folder: Path, cache: FactCache) -> GivenPoses | None:
     Raises:
         UserError: the pose files are malformed.
     """
+    found = next(_existing_files(folder), None)
+    return None if found is None else _summary(folder, *found, cache)
+
+
+def _existing_files(folder: Path) -> Iterator[tuple[PoseFormat, str]]:
+    """The formats of which the scene folder has files, and the paths of these."""
     for entry in FORMATS:
         path = entry.find(folder)
         if path is not None:
-            return _summary(folder, entry, path, cache)
-    return None
+            yield entry, path
 
 
 def incomplete_models(folder: Path) -> list[str]:
@@ -131,9 +136,8 @@ def other_pose_files(folder: Path, poses: GivenPoses | None) -> list[Path]:
     """The pose files that are not used, because those of ``poses`` come first."""
     used = set(pose_files(folder / poses.path, poses.kind)) if poses is not None else set()
     found: list[Path] = []
-    for entry in FORMATS:
-        path = entry.find(folder) if entry.kind != "colmap" else None
-        if path is not None:
+    for entry, path in _existing_files(folder):
+        if entry.kind != "colmap":
             found += [file for file in entry.files(folder / path) if file not in used]
     return found
 
@@ -158,10 +162,14 @@ def listed_photos(
         poses: None if poses are not used; then a malformed file is no error, and adds no warning.
         warnings: warnings are added to this list.
     """
-    found = _listing(folder, poses)
-    if found is None:
+    if poses is not None:
+        entry, path = poses.format, poses.path
+    elif (found := next(_existing_files(folder), None)) is not None:
+        entry, path = found
+    else:
         return None
-    entry, path = found
+    if entry.names != "scene":
+        return None
     repeated: list[str] = []
     try:
         frames: Sequence[PosedFrame] = []
@@ -176,17 +184,6 @@ def listed_photos(
     name = "transforms*.json" if entry.kind == "transforms" else path
     warnings = warnings if poses is not None else []
     return _existing(folder, frames, name, repeated, warnings)
-
-
-def _listing(folder: Path, poses: GivenPoses | None) -> tuple[PoseFormat, str] | None:
-    """The format that lists the photographs, and the path of its files."""
-    if poses is not None:
-        return (poses.format, poses.path) if poses.format.names == "scene" else None
-    for entry in FORMATS:
-        path = entry.find(folder)
-        if path is not None:
-            return (entry, path) if entry.names == "scene" else None
-    return None
 
 
 def _existing(

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import re
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from pyproj import CRS
 
 Array = NDArray[np.float64]
-Kind = Literal["geographic", "projected"]
 _UTM = re.compile(r"WGS\s*[-_]?\s*84\s*[/,]?\s*UTM\s*(?:zone)?\s*(\d{1,2})\s*([A-Z]?)", re.I)
 _WGS84 = re.compile(r"WGS\s*[-_]?\s*84", re.I)
 # Longer texts are no name of a projection; WKT of compound systems has some thousand characters.
@@ -40,7 +39,7 @@ class Projection:
     Attributes:
         text: The projection as the user wrote it.
         name: PROJ's name; ``text`` where it has none.
-        kind: The kind of the coordinates.
+        geographic: Whether coordinates are longitude and latitude, otherwise easting and northing.
         unit: name of the horizontal coordinates' unit.
         horizontal: metres per unit of a projected system; degrees per unit of a geographic one.
         vertical: metres per unit of heights.
@@ -53,7 +52,7 @@ class Projection:
 
     text: str
     name: str
-    kind: Kind
+    geographic: bool
     unit: str
     horizontal: float
     vertical: float
@@ -61,10 +60,6 @@ class Projection:
     axes: tuple[str, str]
     area: tuple[float, float, float, float] | None
     crs: CRS = field(compare=False, repr=False)
-
-    @property
-    def geographic(self) -> bool:
-        return self.kind == "geographic"
 
     @property
     def horizontal_vertical(self) -> tuple[float, float]:
@@ -168,7 +163,7 @@ def read_projection(text: str) -> Projection:
     return Projection(
         text=text,
         name=crs.name if crs.name not in ("", "unknown", "undefined") else text,
-        kind="geographic" if geographic else "projected",
+        geographic=geographic,
         unit=str(axes[0].unit_name),
         horizontal=1.0 if abs(horizontal - 1.0) < 1e-12 else horizontal,
         vertical=(1.0 if geographic else horizontal) if vertical is None else vertical,

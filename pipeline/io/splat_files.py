@@ -6,7 +6,6 @@ import contextlib
 import math
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
 
 from pipeline.io.frame_json import Frame
 from pipeline.io.gltf import read_gltf, write_gltf
@@ -19,22 +18,16 @@ from pipeline.runtime.errors import UserError
 from pipeline.splats.arrays import GaussianSource
 from pipeline.splats.gaussians import Gaussians
 
-_READERS: dict[str, Callable[[Path], Gaussians]] = {
-    ".ply": read_splat_ply,
-    ".spz": read_spz,
-    ".splat": read_splat,
-    ".glb": read_gltf,
-    ".npz": read_npz,
+_Format = tuple[Callable[[Path], Gaussians], Callable[[Path, GaussianSource], None]]
+# The reader and the writer of each format.
+_FORMATS: dict[str, _Format] = {
+    ".ply": (read_splat_ply, write_splat_ply),
+    ".spz": (read_spz, write_spz),
+    ".splat": (read_splat, write_splat),
+    ".glb": (read_gltf, write_gltf),
+    ".npz": (read_npz, write_npz),
 }
-_WRITERS: dict[str, Callable[[Path, GaussianSource], None]] = {
-    ".ply": write_splat_ply,
-    ".spz": write_spz,
-    ".splat": write_splat,
-    ".glb": write_gltf,
-    ".npz": write_npz,
-}
-T = TypeVar("T")
-SUFFIXES = tuple(_READERS)
+SUFFIXES = tuple(_FORMATS)
 # Replaces infinite logarithms and logits by finite ones; exp(-30) is negligible.
 _LARGE = 30.0
 
@@ -55,7 +48,8 @@ def read_gaussians(path: Path, warnings: list[str]) -> Gaussians:
     Raises:
         UserError: an unknown suffix, a file that cannot be read, or no valid Gaussians.
     """
-    gaussians = _by_suffix(_READERS, path)(path)
+    read, _ = _format_of(path)
+    gaussians = read(path)
     warnings += losses_of_reading(path)
     finite = {
         name: tensor.nan_to_num(nan=math.nan, posinf=_LARGE, neginf=-_LARGE)
@@ -94,7 +88,7 @@ def write_gaussians(path: Path, gaussians: GaussianSource, *, antialias: bool = 
     Raises:
         UserError: an unknown suffix, or Gaussians that the format cannot hold.
     """
-    write = _by_suffix(_WRITERS, path)
+    _, write = _format_of(path)
     if write is write_spz:
         write_spz(path, gaussians, antialias=antialias)
     else:
@@ -115,15 +109,15 @@ def is_antialiased(path: Path) -> bool:
 
 def check_suffix(path: Path) -> None:
     """Raise a ``UserError`` if ``path`` has no suffix of a supported format."""
-    _by_suffix(_WRITERS, path)
+    _format_of(path)
 
 
-def _by_suffix(table: dict[str, T], path: Path) -> T:
+def _format_of(path: Path) -> _Format:
     suffix = path.suffix.lower()
-    if suffix not in table:
+    if suffix not in _FORMATS:
         raise UserError(
-            f"expected a file of Gaussians ({', '.join(table)}), found the suffix {suffix!r}",
+            f"expected a file of Gaussians ({', '.join(_FORMATS)}), found the suffix {suffix!r}",
             file=path,
             fix="give the file one of these suffixes",
         )
-    return table[suffix]
+    return _FORMATS[suffix]

@@ -180,7 +180,7 @@ def decode_spz(data: bytes, file: str | Path | None = None) -> Gaussians:
     logits are infinite, are clamped by a quarter of a quantisation step.
 
     Args:
-        file: for error messages.
+        file: The file that error messages name.
 
     Raises:
         UserError: not an SPZ file, another version, truncated, or inconsistent with its header.

@@ -161,7 +161,7 @@ def _table(data: bytes, kinds: str) -> list[tuple[int, ...]]:
     """The rows of a table behind a version and the number of rows.
 
     Args:
-        kinds: those of a row's numbers, as of ``struct``.
+        kinds: The types of a row's numbers, in the letters of ``struct``.
     """
     (rows,) = struct.unpack_from(">I", data, 4)
     size = struct.calcsize(f">{kinds}")

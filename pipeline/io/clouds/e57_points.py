@@ -64,15 +64,11 @@ def read_e57(path: Path) -> Chunks:
 def _header(file: BinaryIO) -> tuple[Pages, list[_Scan]]:
     pages = Pages(file)
     scans = list(_scans(pages.root()))
-    _check_count(sum(scan.points.count for scan in scans), file.seek(0, 2))
-    return pages, scans
-
-
-def _check_count(claimed: int, size: int) -> None:
-    """Check the number of points: coordinates that are constant take no bytes, so that a small file
-    may claim any number, and take days to read."""
+    claimed, size = sum(scan.points.count for scan in scans), file.seek(0, 2)
+    # Coordinates that are constant take no bytes: a small file may claim any number of points.
     if claimed > _POINTS_PER_BYTE * size:
         raise ValueError(f"expected points, found a header of {claimed} in {size} bytes")
+    return pages, scans
 
 
 def _scans(root: Element) -> Iterator[_Scan]:

@@ -45,7 +45,7 @@ class PoseFormat:
     """A format of pose files.
 
     Attributes:
-        kind: its name in records.
+        kind: The name of the format in records.
         names: what the names of images refer to. "photos": the folder of the photographs;
             "scene": the scene folder, so that the file lists the photographs; "order": the file
             has no names, its rows are the photographs sorted by name.
@@ -172,7 +172,7 @@ FORMATS: tuple[PoseFormat, ...] = (
         files=lambda path: [path],
         summarise=lambda path: _without_points([], len(read_rows(path)), ["SIMPLE_PINHOLE"]),
         # Row i belongs to photograph i, so unreadable photographs count.
-        read=lambda path, sizes, listed: read_poses_bounds(path, listed)[0],
+        read=lambda path, sizes, listed: read_poses_bounds(path, listed),
     ),
     of_frames("metashape", metashape.find, metashape.frames),
     of_frames("realitycapture_csv", realitycapture.find_csv, realitycapture.csv_frames),

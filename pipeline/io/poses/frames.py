@@ -59,7 +59,7 @@ class PosedFrame:
     Attributes:
         name: the photograph, as in ``PosedImage.name``, or relative to the scene folder
             (``PoseFormat.names``); suffix and leading folders may be missing.
-        lens: its intrinsics.
+        lens: The intrinsics.
         rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
         mask: file of its mask, relative to the scene folder, or None.
         depth: file of its depth map, likewise.
@@ -139,7 +139,7 @@ def make_frame(
         name: the photograph's name in the file.
         rotation: (3, 3) world to camera, COLMAP's axes, with the errors of printing.
         centre: (3,) the camera's centre in the world.
-        where: for messages; default: the name.
+        where: What messages call the frame; the name by default.
     """
     name = checked_name(file, name)
     return PosedFrame(name, lens, *checked_pose(file, where or name, rotation, centre))

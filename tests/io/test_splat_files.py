@@ -9,6 +9,8 @@ import sys
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
 from pipeline.io.splat_files import SUFFIXES, read_gaussians, write_gaussians
 from pipeline.runtime.errors import UserError
@@ -38,6 +40,34 @@ def test_an_archive_of_something_else_is_an_error(tmp_path, change) -> None:
     np.savez(tmp_path / "a.npz", **(sample(5).arrays() | change))
     with pytest.raises(UserError, match="Gaussians"):
         read_gaussians(tmp_path / "a.npz", [])
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+def test_every_truncation_is_an_error_that_names_the_file(tmp_path, suffix) -> None:
+    path = tmp_path / f"a{suffix}"
+    write_gaussians(path, sample(1, 0))
+    whole = path.read_bytes()
+    for length in range(0, len(whole), 11):
+        path.write_bytes(whole[:length])
+        with pytest.raises(UserError, match="expected") as caught:
+            read_gaussians(path, [])
+        assert caught.value.file == path
+
+
+@pytest.mark.parametrize("suffix", SUFFIXES)
+@settings(max_examples=100, derandomize=True, deadline=None)
+@given(data=st.data())
+def test_damaged_files_are_read_or_user_errors(tmp_path_factory, suffix, data) -> None:
+    path = tmp_path_factory.mktemp("damaged") / f"a{suffix}"
+    write_gaussians(path, sample(1, 0))
+    content = bytearray(path.read_bytes())
+    for _ in range(data.draw(st.integers(1, 4))):
+        content[data.draw(st.integers(0, len(content) - 1))] = data.draw(st.integers(0, 255))
+    path.write_bytes(content)
+    try:
+        assert len(read_gaussians(path, [])) >= 1
+    except UserError as error:
+        assert error.file == path
 
 
 def test_an_unknown_suffix_is_an_error(tmp_path) -> None:

@@ -15,16 +15,17 @@ from pipeline.io.clouds.text_points import read_text
 from pipeline.io.clouds.values import Chunks, PointCloud, damaged
 from pipeline.runtime.isolate import Limits, OverLimitError, ProcessDied, run_limited
 
-_READERS: dict[str, Callable[[Path], Chunks]] = {
-    ".ply": read_ply,
-    ".las": read_las,
-    ".laz": read_las,
-    ".e57": read_e57,
-    ".xyz": read_text,
-    ".csv": read_text,
-    ".pts": read_text,
+# The function that reads a file's points, and the one that reads their number from its header.
+_FORMATS: dict[str, tuple[Callable[[Path], Chunks], Callable[[Path], int] | None]] = {
+    ".ply": (read_ply, count_ply),
+    ".las": (read_las, count_las),
+    ".laz": (read_las, count_las),
+    ".e57": (read_e57, count_e57),
+    ".xyz": (read_text, None),
+    ".csv": (read_text, None),
+    ".pts": (read_text, None),
 }
-CLOUD_SUFFIXES = tuple(_READERS)
+CLOUD_SUFFIXES = tuple(_FORMATS)
 # Bytes of memory; a tenth of them suffices for files of any size.
 _MEMORY = 2 << 30
 # The least time of a file, and the slowest that its bytes are read: a tenth of the usual speed.
@@ -35,7 +36,7 @@ MAX_POINTS = 1_000_000
 
 def is_cloud(name: str) -> bool:
     """Whether a file has the suffix of a point cloud."""
-    return Path(name).suffix.lower() in _READERS
+    return Path(name).suffix.lower() in _FORMATS
 
 
 def count_points(path: Path) -> int | None:
@@ -44,13 +45,9 @@ def count_points(path: Path) -> int | None:
     Raises:
         UserError: a damaged header.
     """
-    suffix = path.suffix.lower()
+    _, count = _FORMATS[path.suffix.lower()]
     try:
-        if suffix == ".ply":
-            return count_ply(path)
-        if suffix == ".e57":
-            return count_e57(path)
-        return count_las(path) if suffix in (".las", ".laz") else None
+        return count(path) if count else None
     except OSError as error:
         raise damaged(path, f"cannot be read: {error.strerror}") from None
 
@@ -92,8 +89,9 @@ def _read(path: Path, limit: int) -> PointCloud:
 
 def _sampled(path: Path, limit: int) -> PointCloud:
     sampler = VoxelSampler(limit)
+    read, _ = _FORMATS[path.suffix.lower()]
     try:
-        for chunk in _READERS[path.suffix.lower()](path):
+        for chunk in read(path):
             sampler.add(chunk)
     except OSError as error:
         raise damaged(path, f"cannot be read: {error.strerror or error}") from None

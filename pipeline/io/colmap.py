@@ -94,25 +94,26 @@ def _points(file: Path, table: PointTable, keypoints: dict[int, NDArray[np.float
     if not np.isfinite(table.xyz).all():
         bad = int(table.ids[~np.isfinite(table.xyz).all(1)][0])
         raise malformed(file, f"point {bad}: its position is not finite")
-    xy = np.full((len(table.image), 2), np.nan)
-    order = np.argsort(table.image, kind="stable")
-    numbers, starts = np.unique(table.image[order], return_index=True)
+    tracks = table.tracks
+    xy = np.full((len(tracks.image), 2), np.nan)
+    order = np.argsort(tracks.image, kind="stable")
+    numbers, starts = np.unique(tracks.image[order], return_index=True)
     for number, start, stop in zip(numbers, starts, [*starts[1:], len(order)], strict=False):
         rows = order[start:stop]
         seen = keypoints.get(int(number))
         if seen is None:
             raise malformed(file, f"a track refers to image id {number}, which is not in the model")
-        known = rows[table.index[rows] < len(seen)]
-        xy[known] = seen[table.index[known]]
+        known = rows[tracks.index[rows] < len(seen)]
+        xy[known] = seen[tracks.index[known]]
     by_id = np.argsort(table.ids, kind="stable")
     if len(by_id) and np.any(np.diff(table.ids[by_id]) == 0):
         raise malformed(file, "expected unique point ids, found one twice")
-    length = table.length[by_id]
-    old_start = (np.cumsum(table.length) - table.length)[by_id]
+    length = tracks.length[by_id]
+    old_start = (np.cumsum(tracks.length) - tracks.length)[by_id]
     start = np.concatenate([[0], np.cumsum(length)]).astype(np.int64)
     rows = np.repeat(old_start - start[:-1], length) + np.arange(start[-1])
     return Points(
-        table.xyz[by_id], table.rgb[by_id], table.error[by_id], start, table.image[rows], xy[rows]
+        table.xyz[by_id], table.rgb[by_id], table.error[by_id], start, tracks.image[rows], xy[rows]
     )
 
 

@@ -160,9 +160,7 @@ def read_points(file: Path) -> PointTable:
         table["xyz"].astype(np.float64),
         table["rgb"].copy(),
         table["error"].astype(np.float64),
-        length,
-        track["image"].astype(np.int64),
-        track["index"].astype(np.int64),
+        Tracks(length, track["image"].astype(np.int64), track["index"].astype(np.int64)),
     )
 
 

@@ -26,11 +26,12 @@ Keypoints = dict[int, NDArray[np.void]]
 
 @dataclass(frozen=True)
 class Tracks:
-    """The tracks of P points, concatenated, for writing.
+    """The tracks of P points, concatenated.
 
     Attributes:
-        length: (P,) number of observations of each point.
-        image, index: (M,) image id, and index among the image's keypoints, of each observation.
+        length: (P,) the number of observations of each point.
+        image, index: (M,) the image id of each observation, and its index among the image's
+            keypoints.
     """
 
     length: NDArray[np.int64]
@@ -43,17 +44,18 @@ class PointTable:
     """The content of ``points3D``, in the file's order.
 
     Attributes:
-        ids: (P,). xyz: (P, 3) world. rgb: (P, 3). error: (P,) pixels.
-        length, image, index: the tracks, as in ``Tracks``.
+        ids: (P,) the points' ids.
+        xyz: (P, 3) the positions in the world.
+        rgb: (P, 3) the colours.
+        error: (P,) the reprojection errors in pixels.
+        tracks: The tracks of the points.
     """
 
     ids: NDArray[np.int64]
     xyz: NDArray[np.float64]
     rgb: NDArray[np.uint8]
     error: NDArray[np.float64]
-    length: NDArray[np.int64]
-    image: NDArray[np.int64]
-    index: NDArray[np.int64]
+    tracks: Tracks
 
 
 def malformed(file: Path, what: str, fix: str = REMEDY) -> UserError:

@@ -145,9 +145,7 @@ def read_points(file: Path) -> PointTable:
         np.array([row[1:4] for row in rows], np.float64).reshape(-1, 3),
         np.array([row[4:7] for row in rows], np.uint8).reshape(-1, 3),
         np.array([row[7] for row in rows], np.float64),
-        np.array([len(track) // 2 for track in tracks], np.int64),
-        flat[:, 0],
-        flat[:, 1],
+        Tracks(np.array([len(track) // 2 for track in tracks], np.int64), *flat.T),
     )
 
 

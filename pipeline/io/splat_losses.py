@@ -12,10 +12,6 @@ from pipeline.splats.arrays import GaussianSource
 
 # A smaller share of Gaussians that a format cannot represent is no loss that can be seen.
 TOLERATED_SHARE = 0.05
-#: Suffixes of formats that record whether the Gaussians were trained with opacity compensation.
-WITH_ANTIALIAS = (".spz",)
-#: Suffixes of formats without spherical harmonics above degree 0.
-WITHOUT_HARMONICS = (".splat",)
 
 
 def losses(path: Path, gaussians: GaussianSource) -> list[str]:
@@ -45,12 +41,12 @@ def losses(path: Path, gaussians: GaussianSource) -> list[str]:
                 f"{path.name}: {clamped:.0%} of the Gaussians have colours outside of [0, 1], "
                 "which are clamped. Use a PLY or SPZ file to keep them"
             )
-    if suffix in WITHOUT_HARMONICS and gaussians.sh_degree > 0:
-        found.append(
-            f"{path.name}: the format holds no spherical harmonics: colours that depend on the "
-            f"direction of view (degree {gaussians.sh_degree}) are left out. Use a PLY or SPZ file "
-            "to keep them"
-        )
+        if gaussians.sh_degree > 0:
+            found.append(
+                f"{path.name}: the format holds no spherical harmonics: colours that depend on the "
+                f"direction of view (degree {gaussians.sh_degree}) are left out. Use a PLY or SPZ "
+                "file to keep them"
+            )
     return found
 
 
@@ -62,8 +58,8 @@ def losses_of_reading(path: Path) -> list[str]:
 
 def unmarked(files: Sequence[str]) -> list[str]:
     """The warning that ``files`` do not record the opacity compensation of the training; empty if
-    all of their formats record it."""
-    names = [name for name in files if Path(name).suffix.lower() not in WITH_ANTIALIAS]
+    all of them are SPZ files, which record it."""
+    names = [name for name in files if Path(name).suffix.lower() != ".spz"]
     if not names:
         return []
     return [

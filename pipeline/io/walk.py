@@ -84,7 +84,9 @@ def walk(
         below: list[os.DirEntry[str]] = []
         for entry in entries:
             if not entry.is_dir():
-                is_plain_file = entry.is_file() or (entry.is_symlink() and not _exists(entry.path))
+                is_plain_file = entry.is_file() or (
+                    entry.is_symlink() and not os.path.exists(entry.path)
+                )
                 (files if is_plain_file else special).append(entry.name)
             elif enter(entry.name):
                 below.append(entry)
@@ -101,14 +103,6 @@ def walk(
                 notes.append(f"{child}/ is not used: it is {_MAX_DEPTH} folders deep")
             else:
                 stack.append((child, target, str(child) if entry.is_symlink() else link))
-
-
-def _exists(path: str) -> bool:
-    try:
-        os.stat(path)
-    except OSError:
-        return False
-    return True
 
 
 def _contains(folder: str, other: str) -> bool:

@@ -74,23 +74,15 @@ class PosedFrame:
     split: ListedSplit | None = None
     depth: str | None = None
 
-    def is_repeated(self, other: PosedFrame) -> bool:
-        """Whether the pose is that of ``other``."""
-        return np.array_equal(self.rotation, other.rotation) and np.array_equal(
-            self.translation, other.translation
-        )
-
 
 def distinct_frames(frames: Iterable[PosedFrame]) -> list[PosedFrame]:
     """The frames without those that repeat the name and pose of an earlier one."""
-    found: dict[str, list[PosedFrame]] = {}
-    distinct = []
+    # Adding 0 turns -0 into 0, so that equal poses have equal bytes.
+    found: dict[tuple[str, bytes, bytes], PosedFrame] = {}
     for frame in frames:
-        same = found.setdefault(frame.name, [])
-        if not any(frame.is_repeated(other) for other in same):
-            same.append(frame)
-            distinct.append(frame)
-    return distinct
+        pose = (frame.rotation + 0.0).tobytes(), (frame.translation + 0.0).tobytes()
+        found.setdefault((frame.name, *pose), frame)
+    return list(found.values())
 
 
 def reconstruct(

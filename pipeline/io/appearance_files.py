@@ -37,7 +37,7 @@ def read_appearance(folder: Path, gaussians: int) -> Appearance | None:
     """Read the files of a stage's folder; None if it has none.
 
     Args:
-        gaussians: number of Gaussians of the scene.
+        gaussians: The number of Gaussians of the scene.
 
     Raises:
         UserError: a file is damaged, or the files are of different scenes.

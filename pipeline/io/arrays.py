@@ -39,7 +39,7 @@ def write_chunks(
     """Write a ``.npz`` file of float32 arrays as numpy does, atomically and deterministically.
 
     Args:
-        arrays: name -> shape, and the array in parts along its first axis.
+        arrays: Name -> the shape of the array, and its parts along the first axis.
     """
     # Deterministic: entries that are opened by name have a fixed date.
     with written(path) as file, zipfile.ZipFile(file, "w") as archive:

@@ -63,8 +63,8 @@ class Colours:
     Attributes:
         profile: the ICC profile by which they are converted to sRGB; None if they are used as
             sRGB.
-        name: name of the colour space that is converted; empty for sRGB.
-        fault: why the colours are used as sRGB although the file says something else; empty
+        name: The name of the colour space that is converted; empty for sRGB.
+        fault: Why the colours are used as sRGB although the file says something else; empty
             otherwise.
     """
 
@@ -315,7 +315,7 @@ def linear_to_srgb_primaries(
     """(..., 3) linear light with sRGB's primaries, of which values may be below 0 or above 1.
 
     Args:
-        to_xyz: (3, 3) of the light's primaries (``icc.matrix_of``).
+        to_xyz: The (3, 3) matrix of the light's primaries (``icc.matrix_of``).
     """
     matrix = np.linalg.solve(icc.matrix_of(icc.SRGB), to_xyz).astype(np.float32)
     red, green, blue = light[..., 0], light[..., 1], light[..., 2]

@@ -32,7 +32,7 @@ class ExrHeader:
     Attributes:
         width, height: The size in pixels.
         alpha: Whether there is an alpha channel.
-        to_srgb: (3, 3) matrix from the linear colours to linear sRGB; None if they are those.
+        to_srgb: The (3, 3) matrix from the colours to linear sRGB; None if they are sRGB.
         fault: Why the colours are used as sRGB although the file says something else; empty
             otherwise.
     """

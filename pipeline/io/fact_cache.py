@@ -25,7 +25,7 @@ class FactCache:
     """JSON values by file and kind. An unreadable or unwritable cache file is ignored.
 
     Args:
-        path: the JSON file; None: cache in memory only.
+        path: The JSON file; None for a cache in memory only.
     """
 
     def __init__(self, path: Path | None):
@@ -46,7 +46,7 @@ class FactCache:
         times and inode.
 
         Args:
-            model: type of the values, whose JSON it can read.
+            model: The type of the values, whose JSON it can read.
         """
         status = os.stat(path)
         # cp -p and rsync preserve the modification time, but nothing sets the change time. Some

@@ -91,11 +91,11 @@ def describe_frame(
     """The content of ``frame.json``.
 
     Args:
-        views: all views of the scene.
-        up: (3,) up direction in the world.
-        files: names of the exported files.
+        views: All views of the scene.
+        up: The up direction (3,) in the world.
+        files: The names of the exported files.
         georeference: None for given poses in their own world.
-        given_world: files whose coordinates are those of the given poses' world.
+        given_world: The files whose coordinates are those of the given poses' world.
     """
     centres = np.stack([view.centre for view in views])
     x, y, z = (_rounded(value) for value in centres.mean(0))

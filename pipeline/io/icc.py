@@ -44,8 +44,8 @@ class MatrixProfile:
     """A profile of curves and a matrix.
 
     Attributes:
-        matrix: (3, 3) linear RGB to CIE XYZ, white at D50.
-        curves: (3, 65536) float32 linear light of each 16-bit value.
+        matrix: The (3, 3) matrix from linear RGB to CIE XYZ, white at D50.
+        curves: The (3, 65536) float32 linear light of each 16-bit value.
     """
 
     matrix: NDArray[np.float64]

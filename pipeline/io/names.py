@@ -177,8 +177,8 @@ class Ambiguity:
     """Names in a file and photographs, of which one of either is too many.
 
     Attributes:
-        listed: names in the file; the same name twice if the file lists it twice.
-        photos: the photographs that they may mean.
+        listed: The names in the file; the same name twice if the file lists it twice.
+        photos: The photographs that they may mean.
     """
 
     listed: tuple[str, ...]
@@ -209,8 +209,8 @@ class Matches:
     """Photographs and their names in a file.
 
     Attributes:
-        names: photograph -> its name in the file.
-        ambiguous: the names of which it is unknown what they mean; they are not in ``names``.
+        names: Photograph -> its name in the file.
+        ambiguous: The names of which it is unknown what they mean; they are not in ``names``.
     """
 
     names: dict[str, str]

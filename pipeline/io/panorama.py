@@ -29,7 +29,7 @@ def panorama_of(xmp: bytes, body: str, width: int, height: int) -> Panorama:
     Args:
         xmp: the file's XMP packet, empty without one.
         body: the camera's make and model from EXIF.
-        width, height: pixels.
+        width, height: The size in pixels.
     """
     sphere = width == 2 * height
     projection = _PROJECTION.search(xmp)

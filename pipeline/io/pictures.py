@@ -55,7 +55,7 @@ def decode_photograph(data: bytes, name: str) -> Picture:
 
     Args:
         data: the file's bytes.
-        name: name of the file; its suffix decides which formats are tried.
+        name: The name of the file; its suffix decides which formats are tried.
 
     Raises:
         ValueError: no picture that can be decoded, with the reason.

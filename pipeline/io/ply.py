@@ -69,9 +69,9 @@ def write_points_ply(
     uchar red, green, blue.
 
     Args:
-        xyz, rgb: (P, 3).
-        normals: (P, 3) or None.
-        double: write float64 positions, for coordinates that do not fit into float32.
+        xyz, rgb: The positions and the colours, (P, 3).
+        normals: The normals, (P, 3), or None.
+        double: Whether positions are float64, for coordinates that do not fit into float32.
     """
     columns = [("double", "f8", _POSITION, xyz) if double else ("float", "f4", _POSITION, xyz)]
     if normals is not None:

@@ -31,10 +31,10 @@ class PlyHeader:
     """The header of a PLY file whose first element is ``vertex``.
 
     Attributes:
-        count: number of vertices.
-        fields: property name -> numpy type code.
-        byte_order: "<", ">", or "" for ASCII.
-        more: whether other elements follow.
+        count: The number of vertices.
+        fields: The name of each property -> numpy's code of its type.
+        byte_order: The sign "<" or ">"; "" for ASCII.
+        more: Whether other elements follow.
     """
 
     count: int

@@ -67,9 +67,9 @@ class GivenPoses(PoseSummary):
     """The poses in a scene folder.
 
     Attributes:
-        names: photographs' names in the pose files; empty for LLFF, which goes by order.
-        lost: photographs that the pose files list without a pose.
-        splits: name -> the list of the scene's own split that it is in; empty without a split.
+        names: The photographs' names in the pose files; empty for LLFF, which goes by order.
+        lost: The photographs that the pose files list without a pose.
+        splits: Name -> the list of the scene's own split that it is in; empty without a split.
     """
 
     names: tuple[str, ...]
@@ -159,8 +159,9 @@ def listed_photos(
     """The existing photographs that the pose files list, or None if there are none.
 
     Args:
-        poses: None if poses are not used; then a malformed file is no error, and adds no warning.
-        warnings: warnings are added to this list.
+        poses: The given poses; None if they are not used: then a malformed file is no error, and
+            adds no warning.
+        warnings: The list that warnings are added to.
     """
     if poses is not None:
         entry, path = poses.format, poses.path

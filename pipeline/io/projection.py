@@ -40,14 +40,14 @@ class Projection:
         text: The projection as the user wrote it.
         name: PROJ's name; ``text`` where it has none.
         geographic: Whether coordinates are longitude and latitude, otherwise easting and northing.
-        unit: name of the horizontal coordinates' unit.
-        horizontal: metres per unit of a projected system; degrees per unit of a geographic one.
-        vertical: metres per unit of heights.
-        vertical_known: whether the system says the unit of heights. Where it does not, heights are
+        unit: The name of the horizontal coordinates' unit.
+        horizontal: The metres per unit of a projected system, the degrees of a geographic one.
+        vertical: The metres per unit of heights.
+        vertical_known: Whether the system says the unit of heights. Where it does not, heights are
             in the unit of projected coordinates, and in metres beside geographic ones.
-        axes: directions of the first two coordinates.
-        area: west, south, east, north in degrees; None if unknown.
-        crs: PROJ's object.
+        axes: The directions of the first two coordinates.
+        area: The area's west, south, east and north in degrees; None if it is unknown.
+        crs: PROJ's object for the system.
     """
 
     text: str

@@ -24,9 +24,9 @@ class TiffLayout:
     """How the pixels of the first image are stored.
 
     Attributes:
-        width, height: pixels as stored.
-        bits: bits of the widest channel.
-        samples: number of channels.
+        width, height: The size as stored, in pixels.
+        bits: The number of bits of the widest channel.
+        samples: The number of channels.
         whole: whether the values are unsigned integers.
         separate: whether each channel is stored in a plane of its own.
         inverted: whether 0 is white.

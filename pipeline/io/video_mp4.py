@@ -33,8 +33,8 @@ class _Entry:
     """A track while its atoms are read.
 
     Attributes:
-        durations: numbers of frames, and the duration of each of them.
-        edits: durations on the movie's clock, and starts on the track's.
+        durations: The numbers of frames, and the duration of each of them.
+        edits: The durations on the movie's clock, and starts on the track's.
     """
 
     place: int

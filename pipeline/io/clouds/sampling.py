@@ -121,8 +121,8 @@ def voxel_keys(
     """A hash of the voxel of side ``voxel`` that each point is in.
 
     Args:
-        xyz: (N, 3) finite; fewer than 2^62 voxels from the origin.
-        grid: (N,) which of several grids each point belongs to.
+        xyz: The (N, 3) finite points, fewer than 2^62 voxels from the origin.
+        grid: The number (N,) of the grid that each point belongs to.
     """
     # Two of a million voxels have the same hash with a probability of 1e-7.
     key = np.zeros(len(xyz), np.uint64) if grid is None else grid * np.uint64(_MIX[0])

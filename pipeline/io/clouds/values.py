@@ -22,9 +22,9 @@ class Chunk(NamedTuple):
     """Consecutive points of a file.
 
     Attributes:
-        xyz: (N, 3) float64, as stored: may be not finite.
-        colour: (N, 3) float32 red, green, blue, or None.
-        full: the value of full intensity, None if the format does not define it: then the values
+        xyz: The (N, 3) float64 positions as stored, which may be not finite.
+        colour: The (N, 3) float32 red, green and blue, or None.
+        full: The value of full intensity, None if the format does not define it: then the values
             of the whole file decide.
     """
 
@@ -38,11 +38,11 @@ class PointCloud:
     """A point cloud, subsampled.
 
     Attributes:
-        xyz: (N, 3) float64, finite, in the file's coordinates.
-        rgb: (N, 3) uint8; black where there is no colour.
-        coloured: (N,) bool, whether a point has a colour.
-        num_read: number of points in the files.
-        num_invalid: number of points whose coordinates are not finite.
+        xyz: The (N, 3) finite float64 positions in the file's coordinates.
+        rgb: The (N, 3) uint8 colours, black where there is none.
+        coloured: Whether each point has a colour, (N,) bool.
+        num_read: The number of points in the files.
+        num_invalid: The number of points whose coordinates are not finite.
     """
 
     xyz: NDArray[np.float64]

@@ -39,7 +39,7 @@ def checked_name(file: Path, name: str, where: str = "") -> str:
     ``file`` if it is absolute and inside of it.
 
     Args:
-        where: precedes the message.
+        where: The text that precedes the message.
     """
     plain = posixpath.normpath(name.replace("\\", "/"))
     if not name or len(name) > _MAX_NAME or any(len(p) > 240 for p in plain.split("/")):

@@ -57,13 +57,13 @@ class PosedFrame:
     """A photograph's pose in a file of another program.
 
     Attributes:
-        name: the photograph, as in ``PosedImage.name``, or relative to the scene folder
+        name: The photograph, as in ``PosedImage.name``, or relative to the scene folder
             (``PoseFormat.names``); suffix and leading folders may be missing.
         lens: The intrinsics.
-        rotation, translation: world to camera, COLMAP's axes; (3, 3) and (3,) float64.
-        mask: file of its mask, relative to the scene folder, or None.
-        depth: file of its depth map, likewise.
-        split: the list of the scene's own split that it is in; None if the scene has no split.
+        rotation, translation: The pose, world to camera in COLMAP's axes; (3, 3) and (3,) float64.
+        mask: The mask's file relative to the scene folder, or None.
+        depth: The depth map's file relative to the scene folder, or None.
+        split: The list of the scene's own split that it is in; None if the scene has no split.
     """
 
     name: str
@@ -128,9 +128,9 @@ def make_frame(
     """A frame, checked.
 
     Args:
-        name: the photograph's name in the file.
-        rotation: (3, 3) world to camera, COLMAP's axes, with the errors of printing.
-        centre: (3,) the camera's centre in the world.
+        name: The photograph's name in the file.
+        rotation: The (3, 3) rotation, world to camera in COLMAP's axes, as exact as it is printed.
+        centre: The camera's centre (3,) in the world.
         where: What messages call the frame; the name by default.
     """
     name = checked_name(file, name)

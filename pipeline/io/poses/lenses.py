@@ -34,9 +34,9 @@ class Brown:
     """A lens of the Brown-Conrady model, see above; pixels, and coefficients without unit.
 
     Attributes:
-        k: the radial coefficients, up to four.
-        p: p1 and p2.
-        p_radial: p3 and p4.
+        k: The radial coefficients, up to four.
+        p: The tangential coefficients p1 and p2.
+        p_radial: The coefficients p3 and p4.
     """
 
     fx: float
@@ -68,8 +68,8 @@ def brown_camera(file: Path, where: str, width: float, height: float, lens: Brow
     """The camera with this lens, of the simplest model that holds it.
 
     Args:
-        width, height: pixels.
-        where: the camera, for messages.
+        width, height: The size in pixels.
+        where: What messages call the camera.
 
     Raises:
         UserError: impossible intrinsics, or a lens that no model of COLMAP describes to within

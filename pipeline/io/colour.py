@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import contextlib
 import io
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any, Literal
@@ -221,15 +221,22 @@ def _codes(image: Image.Image) -> tuple[int, int] | None:
 def _chunk_of_png(image: Image.Image) -> tuple[int, int] | None:
     """The chunk cICP, which precedes the pixels and which Pillow does not read."""
     head = _head(image)
-    at = 8
-    while at + 12 <= len(head):
-        length, kind = int.from_bytes(head[at : at + 4], "big"), head[at + 4 : at + 8]
-        if kind == b"cICP" and length == 4:
-            return head[at + 8], head[at + 9]
+    for kind, start, end in png_chunks(head):
+        if kind == b"cICP" and end - start == 4:
+            return head[start], head[start + 1]
         if kind == b"IDAT":
             break
-        at += 12 + length
     return None
+
+
+def png_chunks(data: bytes) -> Iterator[tuple[bytes, int, int]]:
+    """The kind of each chunk of a PNG file, and where its content begins and, if ``data`` is whole,
+    ends (PNG specification, section 5)."""
+    at = 8
+    while at + 12 <= len(data):
+        end = at + 8 + int.from_bytes(data[at : at + 4], "big")
+        yield data[at + 4 : at + 8], at + 8, end
+        at = end + 4
 
 
 def _box_of_avif(image: Image.Image) -> tuple[int, int] | None:

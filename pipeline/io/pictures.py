@@ -266,17 +266,11 @@ def _jpeg_is_complete(data: bytes) -> bool:
 
 
 def _png_is_complete(data: bytes) -> bool:
-    """Whether every chunk up to IEND is present with a correct checksum (PNG specification,
-    section 5)."""
-    at = 8
-    while at + 12 <= len(data):
-        length = int.from_bytes(data[at : at + 4], "big")
-        end = at + 8 + length
-        if end + 4 > len(data):
+    """Whether every chunk up to IEND is present with a correct checksum."""
+    for kind, start, end in colour.png_chunks(data):
+        stored = data[end : end + 4]
+        if len(stored) < 4 or zlib.crc32(data[start - 4 : end]) != int.from_bytes(stored, "big"):
             return False
-        if zlib.crc32(data[at + 4 : end]) != int.from_bytes(data[end : end + 4], "big"):
-            return False
-        if data[at + 4 : at + 8] == b"IEND":
+        if kind == b"IEND":
             return True
-        at = end + 4
     return False

@@ -19,6 +19,7 @@ from pathlib import Path
 
 import torch
 
+from benchmarks.kernel_times import profiled
 from benchmarks.measured import add_record_options, measured, write_record
 from benchmarks.raster.scenes import Scene, size_of, synthetic, trained
 from benchmarks.results import GpuResult
@@ -26,7 +27,6 @@ from pipeline.render import RasterOptions, make_backend
 from pipeline.render.calibration import StepScene, training_step
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.device import Gpu
-from pipeline.render.gpu.profile import profiled
 from pipeline.runtime.errors import UserError
 
 # The kernels of each phase of a step, in order.

@@ -166,7 +166,7 @@ def _describe(library: native.NativeLibrary) -> str:
 
 
 def _rasterizer() -> Sequence[native.NativeLibrary]:
-    from pipeline.render.libraries import native_libraries
+    from pipeline.render.registry import native_libraries
 
     return native_libraries()
 

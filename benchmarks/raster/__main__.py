@@ -129,7 +129,8 @@ def _report(step: Step, turns: list[Turn], peak: Peak, library: Library) -> dict
         operators[name] = found
         print(line)
     return {
-        "scene": step.scene.name, "gaussians": step.scene.count, "size": list(step.state.size),
+        "scene": step.scene.name, "gaussians": step.scene.count,
+        "size": list(step.state.projected.size),
         "threads": step.threads, "turns": len(turns), "pairs": pairs, "block_pairs": blocks,
         "block_pixels": block_pixels(step),
         "tile_pairs": step.drawn.num_intersections, "operators": operators, "error": asdict(error),

@@ -9,7 +9,7 @@ import torch
 
 from benchmarks.raster.measure import BACKGROUND, Step
 from benchmarks.raster.scenes import synthetic
-from pipeline.render import RasterOptions, backward, forward, reference
+from pipeline.render import RasterOptions, make_backend, reference
 
 WINDOW = 32  # pixels
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
@@ -37,7 +37,7 @@ def accuracy(step: Step) -> Accuracy:
     w, h = min(WINDOW, camera.width), min(WINDOW, camera.height)
     left, top = (camera.width - w) // 2, (camera.height - h) // 2
     options = RasterOptions(background=BACKGROUND)
-    centres = step.state.records[:, :4].view(torch.float64)
+    centres = step.state.projected.records[:, :4].view(torch.float64)
     middle = torch.tensor([left + w / 2, top + h / 2])
     extent = torch.tensor([w / 2, h / 2])
     near = ((centres - middle).abs() < extent + step.drawn.radii[:, None] + 1).all(1)
@@ -55,7 +55,7 @@ def accuracy(step: Step) -> Accuracy:
     d_window = torch.randn(h, w, 3, generator=torch.Generator().manual_seed(2)) * certain[..., None]
     d_color = torch.zeros(camera.height, camera.width, 3)
     d_color[window] = d_window
-    gradients = backward(step.drawn, d_color)
+    gradients = make_backend("cpu").backward(step.drawn, d_color)
     expected = torch.autograd.grad((image.color * d_window).sum(), inputs)
     relative = [
         float((getattr(gradients, name)[rows] - value).norm() / value.norm().clamp(min=1e-30))
@@ -74,17 +74,17 @@ class ReferenceRatio:
 
 
 def reference_ratio(threads: int) -> ReferenceRatio:
-    scene = synthetic(1000, 96, 54, 5.0)
+    backend, scene = make_backend("cpu"), synthetic(1000, 96, 54, 5.0)
     options = RasterOptions(background=BACKGROUND, threads=threads)
     weight = torch.rand(54, 96, 3, generator=torch.Generator().manual_seed(3))
 
     def in_torch() -> None:
         means, scales, quats, logits, sh = (g.clone().requires_grad_() for g in scene.gaussians)
-        out = reference.render(means, scales, quats, logits, sh, scene.camera, options)
-        (out.color * weight).sum().backward()
+        _, image = reference.render(means, scales, quats, logits, sh, scene.camera, options)
+        (image.color * weight).sum().backward()
 
     def in_kernels() -> None:
-        backward(forward(*scene.gaussians, scene.camera, options), weight)
+        backend.backward(backend.forward(*scene.gaussians, scene.camera, options), weight)
 
     before = torch.get_num_threads()
     torch.set_num_threads(threads)

@@ -9,7 +9,7 @@ from typing import Any
 
 from benchmarks.raster.measure import BACKGROUND, MIN_TURNS, Spread
 from benchmarks.raster.scenes import Scene
-from pipeline.render import RasterOptions, forward
+from pipeline.render import RasterOptions, make_backend
 
 
 @dataclass(frozen=True)
@@ -41,6 +41,7 @@ HEADER = f"{'threads':>8} {'frames/s':>9} {'ms':>9} {'quartiles':>17} {'CPU ms':
 def drawings(scene: Scene, threads: Sequence[int], seconds: float) -> list[Drawing]:
     """Measure the numbers of threads in alternation, for ``seconds`` in total."""
     options = [RasterOptions(background=BACKGROUND, threads=n) for n in threads]
+    forward = make_backend("cpu").forward
     drawn = [forward(*scene.gaussians, view, options[0]) for view in scene.views]
     visible = sum(d.num_visible for d in drawn) / len(drawn)
     tile_pairs = sum(d.num_intersections for d in drawn) / len(drawn)

@@ -14,7 +14,7 @@ from benchmarks.raster.peak import Calibration, Peak
 from benchmarks.raster.scenes import Scene
 from pipeline.config.experiments import DEFAULT
 from pipeline.config.schema import Train
-from pipeline.render import RasterOptions, forward
+from pipeline.render import RasterOptions, make_backend
 from pipeline.render.cpu import build
 
 BACKGROUND = (0.1, 0.2, 0.3)
@@ -83,55 +83,54 @@ class Step:
         kernels: Any = torch.ops.splatmake
         options = RasterOptions(background=BACKGROUND, threads=threads)
         self.scene, self.threads = scene, threads
-        self.drawn = forward(*scene.gaussians, scene.camera, options)
+        self.drawn = make_backend("cpu").forward(*scene.gaussians, scene.camera, options)
         self.state = s = self.drawn.state
-        size, view = s.size, s.view
+        p = s.projected
         gen = torch.Generator().manual_seed(1)
-        target = torch.rand(size[1], size[0], 3, generator=gen)
-        params = [g.clone() for g in s.inputs]
+        target = torch.rand(*self.drawn.color.shape, generator=gen)
+        params = [g.clone() for g in p.inputs]
         moments = [(torch.zeros_like(p), torch.zeros_like(p)) for p in params]
         turns = torch.zeros(scene.count, 3), torch.zeros(scene.count, 3)
         last = torch.zeros(scene.count, dtype=torch.int32)
         # Learning rates of 0, so that every repeat renders the same.
-        rate, rates = torch.zeros(1, dtype=torch.float64), torch.zeros(2, dtype=torch.float64)
-        sh_adam = torch.tensor([0, 0, 0.9, 0.999, 1e-15, 1], dtype=torch.float64)
+        rate = torch.tensor([1, 0.8, 0.999, 1e-15, 0], dtype=torch.float64)
+        rates = torch.tensor([1, 0.8, 0.999, 1e-15, 0, 0], dtype=torch.float64)
         loss_of = (self.drawn.color, target, None, SSIM_WEIGHT, SQUARED_ERROR_WEIGHT, threads)
         self.d_color = kernels.l1_ssim(*loss_of)[3]
         kept: dict[str, Any] = {}
 
         def project() -> None:
-            kernels.project(*s.inputs, view, *size, 3, False, threads)
+            kernels.project(*p.inputs, p.view, threads)
 
         def bin_() -> None:
-            kernels.bin(s.records, self.drawn.radii, view, *size, threads)
+            kernels.bin(p.records, p.radii, p.view, threads)
 
         def blend() -> None:
-            kernels.blend(s.records, s.entries, s.tile_begin, view, *size, s.background, threads)
+            kernels.blend(p.records, s.entries, s.tile_begin, p.view, threads)
 
         def loss() -> None:
             kernels.l1_ssim(*loss_of)
 
         def blend_backward() -> None:
             kept["slots"] = kernels.blend_backward(
-                s.records, s.entries, s.tile_begin, s.block_end, view, *size, s.background,
-                self.drawn.color, self.drawn.alpha, None, self.d_color, None, None, threads,
+                p.records, s.entries, s.tile_begin, s.block_end, p.view, self.drawn.color,
+                self.drawn.alpha, None, self.d_color, None, None, threads,
             )  # fmt: skip
 
         def project_backward() -> None:
             kept["gradients"] = kernels.project_backward(
-                *s.inputs, view, *size, 3, False, s.records, self.drawn.radii, s.slots,
-                kept["slots"], False, False, False, *moments[4], last, sh_adam, threads,
+                *p.inputs, p.view, p.records, p.radii, s.slots, kept["slots"], False, False,
+                *moments[4], last, rates, threads,
             )  # fmt: skip
 
         def adam() -> None:
-            betas = 0.8, 0.999, 1e-15
             d_means, d_log_scales, d_quats, d_opacity_logits = kept["gradients"][:4]
             kernels.frame_adam(
-                params[0], params[2], params[1], d_means, d_quats, *moments[0], *turns, rates, 1,
-                *betas, threads,
+                params[0], params[2], params[1], d_means, d_quats, *moments[0], *turns, rates,
+                threads,
             )  # fmt: skip
             for k, grad in ((1, d_log_scales), (3, d_opacity_logits)):
-                kernels.adam_step(params[k], grad, *moments[k], rate, 1, *betas, threads)
+                kernels.adam_step(params[k], grad, *moments[k], rate, threads)
 
         self.operators: dict[str, Callable[[], None]] = {
             "projection, SH": project,
@@ -146,10 +145,10 @@ class Step:
     def costs(self, pairs: int) -> dict[str, Cost]:
         """Lower bounds, given the number of contributing (pixel, Gaussian) pairs: the operations of
         useful lanes (a multiply-add is two), and every array read or written once."""
-        n, pixels = self.scene.count, self.state.size[0] * self.state.size[1]
+        n, pixels = self.scene.count, self.drawn.alpha.numel()
         visible, tiles = int((self.drawn.radii > 0).sum()), self.drawn.num_intersections
-        row = 4 * sum(g[0].numel() for g in self.state.inputs) if n else 0
-        sh = 4 * self.state.inputs[4][0].numel() if n else 0
+        row = 4 * sum(g[0].numel() for g in self.scene.gaussians) if n else 0
+        sh = 4 * self.scene.gaussians[4][0].numel() if n else 0
         record, entry, slot = 64, 12, 64
         # 8 blurs (5 forward, 3 of the gradient) of 6 taps, twice: 17 operations; some 30 beside
         loss = 3 * pixels * (8 * 2 * 17 + 30)
@@ -218,7 +217,7 @@ def block_pairs(step: Step) -> int:
 def contributing_pairs(step: Step) -> int:
     """Number of contributing (pixel, Gaussian) pairs of the image, computed in torch by tile."""
     state = step.state
-    width, height = state.size
+    width, height = state.projected.size
     tiles_x, tiles_y = -(-width // 16), -(-height // 16)
     begin = state.tile_begin
     counts = begin.diff()
@@ -228,7 +227,8 @@ def contributing_pairs(step: Step) -> int:
     left = ((x < width) & (y < height)).float()
     counts, first = counts[order], begin[:-1][order]
     assert len(order) == tiles_x * tiles_y
-    centres, fields = state.records[:, :4].view(torch.float64), state.records[:, 4:8]
+    records = state.projected.records
+    centres, fields = records[:, :4].view(torch.float64), records[:, 4:8]
     pairs = 0
     for rank in range(int(counts[0]) if len(counts) else 0):
         tiles = int((counts > rank).sum())

@@ -44,7 +44,7 @@ class Versus:
 
 def write_scene(step: Step, path: Path) -> None:
     drawn = step.drawn.radii.numpy() > 0
-    records = step.state.records.numpy()[drawn]
+    records = step.state.projected.records.numpy()[drawn]
     centres = records[:, :4].copy().view(np.float64)
     uu, uw, ww, log2_opacity = records[:, 4:8].T.astype(np.float64)
     scale = 2 / np.log2(np.e)  # records store the root of the inverse covariance times log2(e) / 2
@@ -52,7 +52,7 @@ def write_scene(step: Step, path: Path) -> None:
     rows = np.column_stack(
         [centres, conic, np.exp2(log2_opacity), records[:, 8:11], records[:, 11]]
     )
-    width, height = step.state.size
+    width, height = step.state.projected.size
     head = struct.pack("<3i", width, height, len(rows))
     path.write_bytes(head + rows.astype("<f4").tobytes())
 

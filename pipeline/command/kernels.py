@@ -11,7 +11,7 @@ import sys
 from pathlib import Path
 
 from pipeline.mvs import patchmatch
-from pipeline.render.libraries import native_libraries
+from pipeline.render.registry import native_libraries
 from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 from pipeline.runtime.native import build_targets
 from pipeline.sfm import nearest

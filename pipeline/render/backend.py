@@ -18,12 +18,13 @@ from pipeline.render import checks
 from pipeline.render.checks import Parameters
 from pipeline.render.resident import ResidentTraining
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
-    DenseAdam,
     Forward,
-    FrameAdam,
+    FrameMoments,
     Gradients,
     LossResult,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
@@ -166,7 +167,12 @@ class Backend(ABC, Generic[Projected, Binned]):
 
     @abstractmethod
     def adam_step(
-        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
+        self,
+        param: torch.Tensor,
+        grad: torch.Tensor,
+        moments: Moments,
+        rates: AdamRates,
+        threads: int = 0,
     ) -> None:
         """One step of Adam, in place, as ``torch.optim.Adam``.
 
@@ -182,7 +188,8 @@ class Backend(ABC, Generic[Projected, Binned]):
         log_scales: torch.Tensor,
         d_means: torch.Tensor,
         d_quats: torch.Tensor,
-        adam: FrameAdam,
+        moments: FrameMoments,
+        rates: AdamRates,
         threads: int = 0,
     ) -> None:
         """One step of Adam over ``means`` (N, 3) and ``quats`` (N, 4), in place, in the local frame

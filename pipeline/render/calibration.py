@@ -11,17 +11,12 @@ import torch
 
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
-from pipeline.render.resident import (
-    GaussianAdam,
-    Optimised,
-    ResidentImage,
-    ResidentStep,
-    ResidentTraining,
-)
+from pipeline.render.resident import Optimised, ResidentImage, ResidentStep, ResidentTraining
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
-    DenseAdam,
-    FrameAdam,
+    FrameMoments,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
@@ -32,12 +27,14 @@ GAUSSIANS, WIDTH, HEIGHT = 100_000, 640, 480
 STEPS = 5
 SSIM_WEIGHT = 0.2
 NAMES = ("means", "log_scales", "quats", "opacity_logits", "sh")
+DENSE = ("log_scales", "opacity_logits")
+# Learning rates of zero: the step can be repeated.
+RATE, TWO_RATES = AdamRates(0.0, 1), AdamRates((0.0, 0.0), 1)
 
 
 @dataclass(frozen=True)
 class StepScene:
-    """The inputs of a step: Gaussians (see ``Parameters``), a camera and its photograph, (H, W, 3)
-    uint8."""
+    """The inputs of a step: Gaussians, a camera and its photograph (H, W, 3) uint8."""
 
     gaussians: Parameters
     camera: RasterCamera
@@ -45,7 +42,7 @@ class StepScene:
 
 
 def step_seconds(backend: Backend, gaussians: int = GAUSSIANS, steps: int = STEPS) -> float:
-    """Median time of a training step of a made scene, in seconds."""
+    """Median time of a training step of a synthetic scene, in seconds."""
     step = training_step(backend, made_scene(gaussians))
     step()  # Compiles kernels and allocates memory.
     times = []
@@ -78,7 +75,7 @@ def made_scene(count: int) -> StepScene:
 
 
 def training_step(backend: Backend, scene: StepScene) -> Callable[[], object]:
-    """A step that can be repeated: its learning rates are zero."""
+    """Return a function that makes a step, which can be repeated."""
     training = backend.resident()
     if training is None:
         return _by_operators(backend, scene, _optimised(scene))
@@ -99,7 +96,6 @@ def _resident(
     training: ResidentTraining, scene: StepScene, state: Optimised
 ) -> Callable[[], object]:
     training.load(state)
-    rates = dict.fromkeys((*NAMES[:4], "sh0", "shN"), 0.0)
     step = ResidentStep(
         camera=scene.camera,
         options=RasterOptions(),
@@ -110,27 +106,23 @@ def _resident(
         embedding=None,
         alpha_loss=AlphaChangeLoss(0.0, 0.0, 0.0),
         losses=None,
-        adam=GaussianAdam(rates, 1, True, 0.9, 0.999, 1e-15, 1e-15),
+        adam={"frames": TWO_RATES, "sh": TWO_RATES, **dict.fromkeys(DENSE, RATE)},
     )
     return lambda: training.step(step)
 
 
 def _by_operators(backend: Backend, scene: StepScene, state: Optimised) -> Callable[[], object]:
-    first, second = state.first, state.second
-    means, log_scales, quats, opacity_logits, _ = scene.gaussians
-    moments = first["means"], second["means"], first["quats"], second["quats"]
-    harmonics = ShAdam(first["sh"], second["sh"], state.last, 0.0, 0.0, 1)
-    dense = {
-        name: DenseAdam(first[name], second[name], 0.0, 1)
-        for name in ("log_scales", "opacity_logits")
-    }
+    means, log_scales, quats, _, _ = scene.gaussians
+    moments = {name: Moments(state.first[name], state.second[name]) for name in NAMES}
+    harmonics = ShAdam(moments["sh"], state.last, TWO_RATES)
+    frames = FrameMoments(moments["means"], moments["quats"])
 
     def step() -> None:
         drawn = backend.forward(*scene.gaussians, scene.camera, RasterOptions())
         loss = backend.l1_ssim(drawn.color, scene.target, SSIM_WEIGHT)
         g = backend.backward(drawn, loss.grad, sh_adam=harmonics)
-        backend.frame_adam(means, quats, log_scales, g.means, g.quats, FrameAdam(*moments, 0, 0, 1))
-        backend.adam_step(log_scales, g.log_scales, dense["log_scales"])
-        backend.adam_step(opacity_logits, g.opacity_logits, dense["opacity_logits"])
+        backend.frame_adam(means, quats, log_scales, g.means, g.quats, frames, TWO_RATES)
+        for name in DENSE:
+            backend.adam_step(state.parameters[name], getattr(g, name), moments[name], RATE)
 
     return step

@@ -4,7 +4,14 @@ from __future__ import annotations
 
 import torch
 
-from pipeline.render.types import DenseAdam, FrameAdam, RasterCamera, ShAdam, Surroundings
+from pipeline.render.types import (
+    AdamRates,
+    FrameMoments,
+    Moments,
+    RasterCamera,
+    ShAdam,
+    Surroundings,
+)
 
 MAX_IMAGE_SIDE = 1 << 16
 
@@ -132,51 +139,55 @@ def layers(
 
 def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
     """Raise ValueError if the moments do not fit ``sh`` or the rates are invalid."""
-    for tensor in (adam.exp_avg, adam.exp_avg_sq):
+    for tensor in (adam.moments.exp_avg, adam.moments.exp_avg_sq):
         if tensor.dtype != torch.float32 or tensor.shape != sh.shape or not tensor.is_contiguous():
             raise ValueError("sh_adam: moments must be float32, contiguous and shaped as sh")
     if adam.last.dtype != torch.int32 or adam.last.shape != sh.shape[:1]:
         raise ValueError(f"sh_adam: last must be int32 of shape ({len(sh)},)")
-    values = [adam.dc_rate, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
-    if adam.step < 1 or not torch.tensor(values, dtype=torch.float64).isfinite().all():
-        raise ValueError(f"sh_adam: step {adam.step} must be at least 1 and the rates finite")
+    _check_rates("sh_adam", adam.rates, count=2)
 
 
-def check_adam(param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam) -> None:
+def check_adam(param: torch.Tensor, grad: torch.Tensor, moments: Moments, rates: AdamRates) -> None:
     """Raise ValueError if the arguments of ``adam_step`` are invalid."""
-    exp_avg, exp_avg_sq, lr, step = adam.exp_avg, adam.exp_avg_sq, adam.lr, adam.step
-    shared = tuple(exp_avg_sq.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
-    for tensor in (param, grad, exp_avg, exp_avg_sq):
+    second = moments.exp_avg_sq
+    shared = tuple(second.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
+    for tensor in (param, grad, moments.exp_avg, second):
         if tensor.dtype != torch.float32 or not tensor.is_contiguous():
             raise ValueError("adam_step: tensors must be float32 and contiguous")
-        if tensor.shape != param.shape and not (shared and tensor is exp_avg_sq):
+        if tensor.shape != param.shape and not (shared and tensor is second):
             raise ValueError(f"adam_step: shapes differ, {param.shape} and {tensor.shape}")
-    if shared and not isinstance(lr, int | float):
-        raise ValueError(f"adam_step: rows that share a moment have one lr, found {lr}")
-    rates = torch.atleast_1d(torch.tensor(lr, dtype=torch.float64))
-    if step < 1 or not len(rates) or not rates.isfinite().all():
-        raise ValueError(f"adam_step: step {step} must be at least 1 and lr {lr} finite")
+    if shared and not isinstance(rates.lr, int | float):
+        raise ValueError(f"adam_step: rows that share a moment have one lr, found {rates.lr}")
+    _check_rates("adam_step", rates)
 
 
 def check_frame_adam(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    d_means: torch.Tensor,
-    d_quats: torch.Tensor,
-    adam: FrameAdam,
+    parameters: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
+    gradients: tuple[torch.Tensor, torch.Tensor],
+    moments: FrameMoments,
+    rates: AdamRates,
 ) -> None:
-    """Raise ValueError if the arguments of ``frame_adam`` are invalid."""
-    moments = (adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg, adam.rotation_avg_sq)
-    fours = (quats, d_quats)
-    for tensor in (means, log_scales, d_means, *moments, *fours):
-        if tensor.dtype != torch.float32 or not tensor.is_contiguous():
-            raise ValueError("frame_adam: tensors must be float32 and contiguous")
-        width = 4 if any(tensor is four for four in fours) else 3
-        if tensor.shape != (len(means), width):
-            raise ValueError(
-                f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
-            )
-    rates = torch.tensor([adam.mean_rate, adam.rotation_rate], dtype=torch.float64)
-    if adam.step < 1 or not rates.isfinite().all():
-        raise ValueError(f"frame_adam: step {adam.step} must be at least 1 and rates finite")
+    """Raise ValueError if the arguments of ``frame_adam`` are invalid: means, quaternions and log
+    scales; the gradients of the first two; and their moments."""
+    (means, quats, log_scales), (d_means, d_quats) = parameters, gradients
+    threes = [means, log_scales, d_means, *vars(moments.means).values()]
+    threes += vars(moments.rotations).values()
+    for width, tensors in ((3, threes), (4, [quats, d_quats])):
+        for tensor in tensors:
+            if tensor.dtype != torch.float32 or not tensor.is_contiguous():
+                raise ValueError("frame_adam: tensors must be float32 and contiguous")
+            if tensor.shape != (len(means), width):
+                raise ValueError(
+                    f"frame_adam: expected ({len(means)}, {width}), found {tuple(tensor.shape)}"
+                )
+    _check_rates("frame_adam", rates, count=2)
+
+
+def _check_rates(operator: str, rates: AdamRates, count: int | None = None) -> None:
+    found = torch.tensor([*rates.rates, rates.beta1, rates.beta2, rates.eps], dtype=torch.float64)
+    if rates.step < 1 or not found.isfinite().all():
+        raise ValueError(
+            f"{operator}: step {rates.step} must be at least 1 and lr {rates.lr} finite"
+        )
+    if len(rates.rates) != count and (count is not None or not rates.rates):
+        raise ValueError(f"{operator}: expected {count or 'any'} rates, found {rates.lr}")

@@ -11,7 +11,6 @@ N Gaussians, V visible ones among them, an image of H x W pixels.
 
 from __future__ import annotations
 
-import math
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,12 +19,8 @@ import torch.nn.functional as F
 
 from pipeline.render.types import (
     AlphaChangeLoss,
-    DenseAdam,
-    FrameAdam,
     RasterCamera,
     RasterOptions,
-    RenderOutput,
-    ShAdam,
     Surroundings,
 )
 
@@ -248,7 +243,7 @@ class Blend:
 
     Attributes:
         color: (H, W, 3), including the background.
-        alpha, depth, median_depth: (H, W), see ``RenderOutput``.
+        alpha, depth, median_depth: (H, W), see ``Forward``.
         margin: (H, W) smallest relative distance of a pixel to a threshold of the method (alpha at
             1/255 and at its maximum, transmittance at its minimum). If it is small, different
             rounding may change the pixel.
@@ -318,6 +313,19 @@ def blend(
     )  # fmt: skip
 
 
+def draw(
+    means: torch.Tensor,
+    sh: torch.Tensor,
+    projection: Projection,
+    camera: RasterCamera,
+    options: RasterOptions,
+) -> Blend:
+    """Composite projected Gaussians with the means (N, 3) and SH coefficients (N, K, 3)."""
+    visible, clamp = projection.index, options.clamp_color_gradient
+    colors = sh_colors(means[visible], sh[visible], camera, options.sh_degree, clamp)
+    return blend(projection, colors, camera, options)
+
+
 def render(
     means: torch.Tensor,
     log_scales: torch.Tensor,
@@ -326,21 +334,10 @@ def render(
     sh: torch.Tensor,
     camera: RasterCamera,
     options: RasterOptions,
-) -> RenderOutput:
-    """Render a view, differentiable by autograd. Same signature as ``pipeline.render.render``."""
+) -> tuple[Projection, Blend]:
+    """Render a view, differentiable by autograd."""
     projection = project(means, log_scales, quats, opacity_logits, sh, camera, options)
-    colors = sh_colors(
-        means[projection.index],
-        sh[projection.index],
-        camera,
-        options.sh_degree,
-        options.clamp_color_gradient,
-    )
-    image = blend(projection, colors, camera, options)
-    return RenderOutput(
-        image.color, image.alpha, image.depth, image.median_depth, projection.radii,
-        len(projection.index), projection.num_dropped,
-    )  # fmt: skip
+    return projection, draw(means, sh, projection, camera, options)
 
 
 SSIM_WINDOW, SSIM_SIGMA = 11, 1.5
@@ -410,80 +407,3 @@ def alpha_change_loss(
     change = alpha - around.alpha.to(alpha.dtype) / 255
     beyond = (change - loss.growth).clamp(min=0) + (-loss.fade - change).clamp(min=0)
     return loss.weight * beyond.square().mean()
-
-
-def adam_step(param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam) -> None:
-    """Adam (Kingma & Ba 2015, algorithm 1), in place; see ``DenseAdam``."""
-    pattern = torch.atleast_1d(torch.tensor(adam.lr, dtype=param.dtype))
-    repeats = -(-param.numel() // len(pattern))
-    rates = pattern.repeat(repeats)[: param.numel()].view(param.shape)
-    adam.exp_avg.mul_(adam.beta1).add_(grad, alpha=1 - adam.beta1)
-    squares = grad.square()
-    if adam.exp_avg_sq.shape != grad.shape:
-        squares = squares.mean(1, keepdim=True)
-    adam.exp_avg_sq.mul_(adam.beta2).add_(squares, alpha=1 - adam.beta2)
-    denominator = adam.exp_avg_sq.sqrt() / math.sqrt(1 - adam.beta2**adam.step) + adam.eps
-    param.sub_(rates / (1 - adam.beta1**adam.step) * adam.exp_avg / denominator)
-
-
-def frame_adam(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    d_means: torch.Tensor,
-    d_quats: torch.Tensor,
-    adam: FrameAdam,
-) -> None:
-    """Adam over means (N, 3) and quaternions (N, 4) in the local frame of each Gaussian, in place.
-    All tensors have the same float type.
-
-    The mean is parametrised as mean = R S y with S = diag(scales); the gradient with respect to y
-    is S R^T dL/dmean. In y, the Fisher information of the mean of N(mean, R S S R^T) is the
-    identity, so the gradient is the natural gradient (Amari 1998). A quaternion q is updated to
-    q (1 + t_x i + t_y j + t_z k), where t are half the rotation angles about the local axes. R, S
-    and q are those before the step.
-    """
-    norm = quats.norm(dim=1, keepdim=True)
-    valid = norm.square() >= QUAT_NORM2_MIN
-    identity = torch.tensor([1.0, 0.0, 0.0, 0.0], dtype=quats.dtype)
-    unit = torch.where(valid, quats / norm.where(valid, torch.ones_like(norm)), identity)
-    frame = rotation_from_quat(unit) * log_scales.exp()[:, None, :]
-    w, x, y, z = unit.unbind(1)
-    tangents = torch.stack(
-        [torch.stack(t, 1) for t in ((-x, w, z, -y), (-y, -z, w, x), (-z, y, -x, w))], 2
-    )  # (N, 4, 3): q i, q j, q k
-    tangents = torch.where(valid[..., None], tangents * norm[..., None], 0.0)
-    for param, grad, axes, exp_avg, exp_avg_sq, rate in (
-        (means, d_means, frame, adam.mean_avg, adam.mean_avg_sq, adam.mean_rate),
-        (quats, d_quats, tangents, adam.rotation_avg, adam.rotation_avg_sq, adam.rotation_rate),
-    ):
-        local = torch.zeros_like(exp_avg)
-        local_grad = torch.einsum("nij,ni->nj", axes, grad)
-        decay = adam.beta1, adam.beta2, adam.eps
-        adam_step(local, local_grad, DenseAdam(exp_avg, exp_avg_sq, rate, adam.step, *decay))
-        param.add_(torch.einsum("nij,nj->ni", axes, local))
-
-
-def sh_adam(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
-    """Adam over the SH coefficients (N, K, 3) of the Gaussians with a gradient, ``updated`` (N,)
-    bool; in place. All tensors but ``adam.last`` have the type of ``sh``.
-
-    First the n skipped steps with zero gradient are applied: they multiply the moments by beta1^n
-    and beta2^n and change the parameter by m / sqrt(v) times r + r^2 + ... + r^n, where
-    r = beta1 / sqrt(beta2), with the bias corrections and rates of the current step. Then follows
-    an ordinary step.
-    """
-    rows = torch.nonzero(updated)[:, 0]
-    missed = (adam.step - 1 - adam.last[rows]).to(sh.dtype)[:, None, None]
-    rates = torch.full(sh.shape[1:], adam.rate, dtype=sh.dtype)
-    rates[0] = adam.dc_rate
-    ratio = adam.beta1 / math.sqrt(adam.beta2)
-    drift = ratio * (1 - ratio**missed) / (1 - ratio)
-    m, v, p = adam.exp_avg[rows], adam.exp_avg_sq[rows], sh[rows]
-    scale = math.sqrt(1 - adam.beta2**adam.step)
-    p -= rates / (1 - adam.beta1**adam.step) * drift * m / (v.sqrt() / scale + adam.eps)
-    m, v = m * adam.beta1**missed, v * adam.beta2**missed
-    decay = adam.beta1, adam.beta2, adam.eps
-    adam_step(p, grad[rows], DenseAdam(m, v, rates.flatten().tolist(), adam.step, *decay))
-    sh[rows], adam.exp_avg[rows], adam.exp_avg_sq[rows] = p, m, v
-    adam.last[rows] = adam.step

@@ -6,20 +6,22 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import cast
 
 import torch
 
-from pipeline.render import checks, reference
+from pipeline.render import checks, reference, reference_adam
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
     CameraGradients,
-    DenseAdam,
     Forward,
-    FrameAdam,
+    FrameMoments,
     Gradients,
     LossResult,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
@@ -34,14 +36,14 @@ class Projected:
     """The visible Gaussians on the image plane, with an autograd graph in float64.
 
     Attributes:
-        parameters: the input parameters.
-        leaves: their float64 copies, which require gradients.
+        parameters: The input parameters.
+        leaves: Their float64 copies, which require gradients.
         change: (10,) zeros that require gradients.
         camera: ``reference.perturbed`` of the input camera and ``change``.
     """
 
     parameters: Parameters
-    leaves: list[torch.Tensor]
+    leaves: Parameters
     change: torch.Tensor
     camera: RasterCamera
     options: RasterOptions
@@ -70,26 +72,20 @@ class ReferenceBackend(Backend[Projected, Projected]):
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
-        leaves = [tensor.double().requires_grad_() for tensor in parameters]
+        leaves = cast(Parameters, tuple(t.double().requires_grad_() for t in parameters))
         change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
         perturbed = reference.perturbed(camera, change)
-        means, log_scales, quats, opacity_logits, sh = leaves
-        projection = reference.project(
-            means, log_scales, quats, opacity_logits, sh, perturbed, options
-        )
+        projection = reference.project(*leaves, perturbed, options)
         return Projected(parameters, leaves, change, perturbed, options, projection)
 
     def subset_of(self, projected: Projected, subset: Subset) -> Projected:
-        whole = projected.projection
-        rows = subset.which[whole.index]
+        whole = vars(projected.projection)
+        rows = subset.which[whole["index"]]
+        of_visible = ("index", "means2d", "conics", "depths", "opacities")
         projection = reference.Projection(
-            index=whole.index[rows],
-            means2d=whole.means2d[rows],
-            conics=whole.conics[rows],
-            depths=whole.depths[rows],
-            opacities=whole.opacities[rows],
-            radii=torch.where(subset.which, whole.radii, 0.0),
-            num_dropped=whole.num_dropped,
+            **{name: whole[name][rows] for name in of_visible},
+            radii=torch.where(subset.which, whole["radii"], 0.0),
+            num_dropped=whole["num_dropped"],
         )
         options = replace(projected.options, background=subset.background)
         return replace(projected, projection=projection, options=options)
@@ -98,20 +94,12 @@ class ReferenceBackend(Backend[Projected, Projected]):
         return projected
 
     def blend(self, binned: Projected) -> Forward:
-        leaves, camera, options = binned.leaves, binned.camera, binned.options
+        means, _, _, _, sh = binned.leaves
         projection = binned.projection
-        visible = projection.index
-        colors = reference.sh_colors(
-            leaves[0][visible],
-            leaves[4][visible],
-            camera,
-            options.sh_degree,
-            options.clamp_color_gradient,
-        )
-        image = reference.blend(projection, colors, camera, options)
+        image = reference.draw(means, sh, projection, binned.camera, binned.options)
         return Forward(
             image.color.detach().float(), image.alpha.detach().float(), binned.radii,
-            len(visible), projection.num_dropped, image.pairs,
+            len(projection.index), projection.num_dropped, image.pairs,
             lambda: (image.depth.detach().float(), image.median_depth.float()),
             State(binned, image),
         )  # fmt: skip
@@ -201,12 +189,16 @@ class ReferenceBackend(Backend[Projected, Projected]):
         return color.grad.float(), change.grad.float()
 
     def adam_step(
-        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
+        self,
+        param: torch.Tensor,
+        grad: torch.Tensor,
+        moments: Moments,
+        rates: AdamRates,
+        threads: int = 0,
     ) -> None:
-        checks.check_adam(param, grad, adam)
-        with _in_double(param, adam.exp_avg, adam.exp_avg_sq) as (p, first, second):
-            precise = replace(adam, exp_avg=first, exp_avg_sq=second)
-            reference.adam_step(p, grad.double(), precise)
+        checks.check_adam(param, grad, moments, rates)
+        with _in_double(param, *vars(moments).values()) as (p, *doubles):
+            reference_adam.adam_step(p, grad.double(), Moments(*doubles), rates)
 
     def frame_adam(
         self,
@@ -215,29 +207,23 @@ class ReferenceBackend(Backend[Projected, Projected]):
         log_scales: torch.Tensor,
         d_means: torch.Tensor,
         d_quats: torch.Tensor,
-        adam: FrameAdam,
+        moments: FrameMoments,
+        rates: AdamRates,
         threads: int = 0,
     ) -> None:
-        checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
-        moments = (adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg, adam.rotation_avg_sq)
-        with _in_double(means, quats, *moments) as (m, q, *doubles):
-            mean, mean_sq, rotation, rotation_sq = doubles
-            precise = replace(
-                adam,
-                mean_avg=mean,
-                mean_avg_sq=mean_sq,
-                rotation_avg=rotation,
-                rotation_avg_sq=rotation_sq,
-            )
-            gradients = d_means.double(), d_quats.double()
-            reference.frame_adam(m, q, log_scales.double(), *gradients, precise)
+        parameters, gradients = (means, quats, log_scales), (d_means, d_quats)
+        checks.check_frame_adam(parameters, gradients, moments, rates)
+        tensors = *vars(moments.means).values(), *vars(moments.rotations).values()
+        with _in_double(means, quats, *tensors) as (m, q, *doubles):
+            precise = FrameMoments(Moments(*doubles[:2]), Moments(*doubles[2:]))
+            d_m, d_q = d_means.double(), d_quats.double()
+            reference_adam.frame_adam(m, q, log_scales.double(), d_m, d_q, precise, rates)
 
 
 def _step_sh(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
     checks.check_sh_adam(adam, sh)
-    with _in_double(sh, adam.exp_avg, adam.exp_avg_sq) as (p, first, second):
-        precise = replace(adam, exp_avg=first, exp_avg_sq=second)
-        reference.sh_adam(p, grad, updated, precise)
+    with _in_double(sh, *vars(adam.moments).values()) as (p, *doubles):
+        reference_adam.sh_adam(p, grad, updated, replace(adam, moments=Moments(*doubles)))
 
 
 @contextmanager

@@ -1,4 +1,5 @@
-"""The backends by name, and the default one. Importing this module does not import torch."""
+"""The backends by name, the default one, and the libraries that they compile. Importing this
+module does not import torch."""
 
 from __future__ import annotations
 
@@ -8,6 +9,7 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from pipeline.render.backend import Backend
+    from pipeline.runtime.native import NativeLibrary
 
 BACKENDS = ("cpu", "gpu", "reference")
 DEVICE = re.compile(r"cpu|gpu(:\d+)?")
@@ -22,8 +24,8 @@ def use_device(device: str) -> None:
 
 
 def make_backend(name: str | None = None) -> Backend:
-    """The backend of this name, one of ``BACKENDS``; ``gpu:N`` is another GPU than the first;
-    None: the default, the processor's unless ``use_device`` was called."""
+    """Return the backend of this name, one of ``BACKENDS`` or ``gpu:N`` for the GPU number N. The
+    default is the processor's, unless ``use_device`` was called."""
     name = name or _default
     kind, _, number = name.partition(":")
     if name not in BACKENDS and not DEVICE.fullmatch(name):
@@ -45,3 +47,15 @@ def _backend(kind: str, number: int) -> Backend:
     from pipeline.render.reference_backend import ReferenceBackend
 
     return ReferenceBackend()
+
+
+def native_libraries() -> list[NativeLibrary]:
+    """One library for each backend that is compiled, for tools that report on them or compile them
+    beforehand.
+
+    Raises:
+        UserError: torch is not installed.
+    """
+    from pipeline.render.cpu import build
+
+    return [build.library()]

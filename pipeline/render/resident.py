@@ -10,6 +10,7 @@ from typing import Protocol
 import torch
 
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
     CameraGradients,
     RasterCamera,
@@ -39,11 +40,12 @@ class Optimised:
     Attributes:
         parameters: means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,) and sh
             (N, K, 3), by name; and ``appearance`` (N, E, 3) if colours depend on the photograph.
-        first, second: Adam's moments by the names of the parameters. With ``GaussianAdam.frames``
-            those of quats are (N, 3); without, second moments of means and quats are (N, 1).
+        first, second: Adam's moments by the names of the parameters. If means and rotations are
+            updated in the local frames, the moments of quats are (N, 3); otherwise the second
+            moments of means and quats are (N, 1).
         last: (N,) int32, see ``ShAdam``.
-        gradient_sum, seen: (N,) float32, sums over the steps of the norm of the 2D mean's gradient
-            in normalised device coordinates, and of visibility.
+        gradient_sum, seen: (N,) float32, the sums over the steps of the norm of the 2D mean's
+            gradient in normalised device coordinates, and of visibility.
     """
 
     parameters: Mapping[str, torch.Tensor]
@@ -55,34 +57,14 @@ class Optimised:
 
 
 @dataclass(frozen=True)
-class GaussianAdam:
-    """Adam of one step.
-
-    Attributes:
-        rates: learning rates of means, log_scales, quats, opacity_logits, sh0 and shN.
-        step: number of the step, from 1.
-        frames: update means and rotations in the local frames (``FrameAdam``).
-        eps: of all parameters, but of the means without ``frames``: ``means_eps``.
-    """
-
-    rates: Mapping[str, float]
-    step: int
-    frames: bool
-    beta1: float
-    beta2: float
-    eps: float
-    means_eps: float
-
-
-@dataclass(frozen=True)
 class ResidentImage:
     """A training image.
 
     Attributes:
-        key: images of the same key are the same; None: not to be kept on the device.
-        target, mask: as of ``Backend.l1_ssim``.
-        gain: factors of the rendered colours.
-        surroundings: of a part of a scene, else None.
+        key: Images of the same key are the same; an image without a key is not kept on the device.
+        target, mask: As of ``Backend.l1_ssim``.
+        gain: Factors of the rendered colours.
+        surroundings: The surroundings of a part of a scene, or None.
     """
 
     key: tuple[int, int] | None
@@ -97,12 +79,14 @@ class ResidentStep:
     """The inputs of a step.
 
     Attributes:
-        ssim_weight, l2_weight: see ``Backend.l1_ssim``.
-        camera_gradients: compute them.
-        embedding: of the photograph, if there is a parameter ``appearance``: the constant SH
-            coefficients are those in the photograph (``training.appearance.embedding``).
-        alpha_loss: on alpha, if the image has surroundings.
-        losses: other losses, which are computed on the CPU; None: none.
+        ssim_weight, l2_weight: See ``Backend.l1_ssim``.
+        camera_gradients: Whether to compute the gradients of the camera.
+        embedding: The photograph's embedding, if there is a parameter ``appearance``: the constant
+            SH coefficients are those in the photograph (``training.appearance.embedding``).
+        alpha_loss: The loss on alpha, which applies if the image has surroundings.
+        losses: Other losses, which are computed on the CPU, or None.
+        adam: The rates of each parameter by its name. ``frames`` has those of means and rotations
+            in the local frames (``Backend.frame_adam``), instead of ``means`` and ``quats``.
     """
 
     camera: RasterCamera
@@ -114,14 +98,14 @@ class ResidentStep:
     embedding: tuple[float, ...] | None
     alpha_loss: AlphaChangeLoss
     losses: HostLosses | None
-    adam: GaussianAdam
+    adam: Mapping[str, AdamRates]
 
 
 @dataclass(frozen=True)
 class StepResult:
-    """Of one step: ``loss`` as ``LossResult.loss``; ``squared_error``, the mean squared difference
-    of the unmasked values; ``embedding``, the gradient of the embedding; the others as of
-    ``Forward`` and ``Gradients``."""
+    """The result of one step: ``loss`` as in ``LossResult``, ``squared_error``, the mean squared
+    difference of the unmasked values, and ``embedding``, the gradient of the embedding. ``Forward``
+    and ``Gradients`` document the other fields."""
 
     loss: float
     squared_error: float
@@ -133,13 +117,13 @@ class StepResult:
 
 @dataclass(frozen=True)
 class TrainingSize:
-    """What the memory of a training depends on.
+    """The numbers on which the memory of a training depends.
 
     Attributes:
-        gaussians: at most.
-        sh_coefficients: of each Gaussian, at the end.
-        pixels: of the largest view.
-        image_bytes: of all training images.
+        gaussians: The maximum number of Gaussians.
+        sh_coefficients: The SH coefficients of each Gaussian at the end.
+        pixels: The pixels of the largest view.
+        image_bytes: The bytes of all training images.
     """
 
     gaussians: int
@@ -156,7 +140,7 @@ class ResidentTraining(ABC):
         """A line for the log with the memory that a training takes.
 
         Raises:
-            UserError: more than the device has, as far as it is known.
+            UserError: It is more than the device is known to have.
         """
 
     @abstractmethod

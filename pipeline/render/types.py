@@ -28,10 +28,10 @@ class RasterCamera:
     Pixel centres are at half integers: pixel (column i, row j) samples (i + 0.5, j + 0.5).
 
     Attributes:
-        width, height: image size in pixels.
-        fx, fy, cx, cy: focal lengths and principal point in pixels.
+        width, height: The image size in pixels.
+        fx, fy, cx, cy: The focal lengths and the principal point in pixels.
         world_to_camera: (4, 4) float32 or float64, rigid.
-        part_of: the camera of the whole image, if this one shows a part of it with the same focal
+        part_of: The camera of the whole image if this one shows a part of it, with the same focal
             lengths and pose: a part is rendered as the whole image is.
     """
 
@@ -64,15 +64,16 @@ class RasterOptions:
     """Options of rendering.
 
     Attributes:
-        sh_degree: active spherical harmonics degree, 0 to 3; coefficients above are ignored.
-        background: the color behind the Gaussians; None for none (the same image as black).
-        antialias: scale opacities by Mip-Splatting's compensation, so that the 0.3 px dilation
+        sh_degree: The active degree of the spherical harmonics, 0 to 3. Coefficients above it are
+            ignored.
+        background: The color behind the Gaussians; None gives the same image as black.
+        antialias: Scale opacities by Mip-Splatting's compensation, so that the 0.3 px dilation
             changes a Gaussian's size but not its energy.
-        near: distance of the near plane in world units: Gaussians whose mean has camera z <= near
-            are not rendered. Choose it well below the distance of the nearest surface.
-        clamp_color_gradient: a colour clamped at 0 has no gradient (3DGS); otherwise gradients that
+        near: The distance of the near plane in world units: Gaussians whose mean has camera z <=
+            near are not rendered. Choose it well below the distance of the nearest surface.
+        clamp_color_gradient: A colour clamped at 0 has no gradient (3DGS); otherwise gradients that
             would increase it pass.
-        threads: number of threads, 0 for all. The result does not depend on it.
+        threads: The number of threads, 0 for all. The result does not depend on it.
     """
 
     sh_degree: int = 3
@@ -90,12 +91,12 @@ class Surroundings:
 
     Attributes:
         behind: (H, W, 3) uint8, the scene behind the part over the background.
-        alpha: (H, W) uint8 of the part before training.
+        alpha: (H, W) uint8, the alpha of the part before training.
         front: (H, W, 3) uint8, the scene in front of the part, multiplied by its alpha; None if
-            nothing is.
-        transmittance: (H, W) uint8 of the front, 255 where there is none; None if nothing is.
-        correction: (H, W, 3) int8, in 1/255: what the composition before training lacks of the
-            image of the whole scene; None: nothing.
+            nothing is in front.
+        transmittance: (H, W) uint8, the transmittance of the front; None if nothing is in front.
+        correction: (H, W, 3) int8, in 1/255: the difference between the image of the whole scene
+            and the composition before training; None if there is none.
     """
 
     behind: torch.Tensor
@@ -120,8 +121,8 @@ class Subset:
     """Some of N Gaussians, to be rendered without the others.
 
     Attributes:
-        which: (N,) bool.
-        background: see ``RasterOptions``.
+        which: (N,) bool, true for these Gaussians.
+        background: See ``RasterOptions``.
     """
 
     which: torch.Tensor
@@ -135,14 +136,14 @@ class Forward:
     Attributes:
         color: (H, W, 3) float32, including the background.
         alpha: (H, W) float32, 1 - transmittance.
-        radii: (N,) float32, semi-major axis of the ellipse {alpha >= 1/255} in pixels; 0 for
+        radii: (N,) float32, the semi-major axis of the ellipse {alpha >= 1/255} in pixels; 0 for
             Gaussians that are not visible.
-        num_visible: number of Gaussians that overlap the image.
-        num_dropped: number of Gaussians left out because a value is not finite or degenerate.
-        num_intersections: number of (Gaussian, tile) pairs, to which memory and time are
+        num_visible: The number of Gaussians that overlap the image.
+        num_dropped: The number of Gaussians left out because a value is not finite or degenerate.
+        num_intersections: The number of (Gaussian, tile) pairs, to which memory and time are
             proportional.
-        render_depths: renders ``depth`` and ``median_depth``.
-        state: private data of the backend.
+        render_depths: A function that renders ``depth`` and ``median_depth``.
+        state: Private data of the backend.
     """
 
     color: torch.Tensor
@@ -193,10 +194,12 @@ class Gradients:
     visible.
 
     Attributes:
-        sh: without rows if ``backward`` applied it (``ShAdam``).
-        means2d: (N, 2) gradient of the projected mean, per pixel.
-        colors: (N, 3) gradient of the colours before they are clamped at 0; None if not requested.
-        camera: None if not requested.
+        sh: The gradient of the SH coefficients; it has no rows if ``backward`` applied it
+            (``ShAdam``).
+        means2d: (N, 2), the gradient of the projected mean, per pixel.
+        colors: (N, 3), the gradient of the colours before they are clamped at 0; None if not
+            requested.
+        camera: The gradients of the camera; None if not requested.
     """
 
     means: torch.Tensor
@@ -210,25 +213,51 @@ class Gradients:
 
 
 @dataclass(frozen=True)
-class DenseAdam:
-    """Adam over all elements of a tensor (``Backend.adam_step``).
+class AdamRates:
+    """The constants of one step of Adam (Kingma and Ba 2015).
 
     Attributes:
-        exp_avg, exp_avg_sq: float32, of the parameter's shape, updated in place. If the parameter
-            is (N, 3) or (N, 4), ``exp_avg_sq`` may be (N, 1): rows then share the second moment of
-            their mean square, which makes steps equivariant under rotation.
-        lr: learning rate. Several rates are repeated over the elements, for example one for each
-            column; a shared second moment requires a single rate.
-        step: number of the current step, starting at 1.
+        lr: The learning rate, or the rates: ``Backend.adam_step`` repeats them over the elements,
+            for example one for each column; ``Backend.frame_adam`` has two, of the means in units
+            of the scales and of the rotations for unit quaternions (half the angle); ``ShAdam`` has
+            two, of the constant coefficient and of the others.
+        step: The number of the current step, starting at 1.
     """
 
-    exp_avg: torch.Tensor
-    exp_avg_sq: torch.Tensor
     lr: float | Sequence[float]
     step: int
     beta1: float = 0.9
     beta2: float = 0.999
     eps: float = 1e-15
+
+    @property
+    def rates(self) -> Sequence[float]:
+        """The learning rates, of which there is at least one."""
+        return (self.lr,) if isinstance(self.lr, int | float) else self.lr
+
+
+@dataclass(frozen=True)
+class Moments:
+    """Adam's moments of a tensor: float32, updated in place.
+
+    Attributes:
+        exp_avg: The first moment, of the tensor's shape.
+        exp_avg_sq: The second moment, of the same shape. For a tensor (N, 3) or (N, 4) it may be
+            (N, 1): rows then share the second moment of their mean square, which makes steps
+            equivariant under rotation.
+    """
+
+    exp_avg: torch.Tensor
+    exp_avg_sq: torch.Tensor
+
+
+@dataclass(frozen=True)
+class FrameMoments:
+    """The moments of ``Backend.frame_adam``, each (N, 3): of the means along the local axes in
+    units of the scales, and of the rotations about the local axes."""
+
+    means: Moments
+    rotations: Moments
 
 
 @dataclass(frozen=True)
@@ -240,60 +269,14 @@ class ShAdam:
     result equals dense Adam, except for the colour that is rendered in that step.
 
     Attributes:
-        exp_avg, exp_avg_sq: (N, K, 3) float32, updated in place.
-        last: (N,) int32 last step with a gradient, 0 before the first; updated in place.
-        dc_rate, rate: learning rates of the constant coefficient and of the others.
-        step: number of the current step, starting at 1.
+        moments: (N, K, 3) each.
+        last: (N,) int32, the last step with a gradient, 0 before the first; updated in place.
+        rates: The rates of the constant coefficient and of the others.
     """
 
-    exp_avg: torch.Tensor
-    exp_avg_sq: torch.Tensor
+    moments: Moments
     last: torch.Tensor
-    dc_rate: float
-    rate: float
-    step: int
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
-
-
-@dataclass(frozen=True)
-class FrameAdam:
-    """Adam over means and rotations in the local frame of each Gaussian (``Backend.frame_adam``).
-
-    Attributes:
-        mean_avg, mean_avg_sq: (N, 3) float32 moments of the mean along the local axes, in units of
-            the scales; updated in place.
-        rotation_avg, rotation_avg_sq: (N, 3) float32 moments of the rotation about the local axes;
-            updated in place.
-        mean_rate: learning rate of the means, in units of the scales.
-        rotation_rate: learning rate of the rotations, for unit quaternions (half the angle).
-        step: number of the current step, starting at 1.
-    """
-
-    mean_avg: torch.Tensor
-    mean_avg_sq: torch.Tensor
-    rotation_avg: torch.Tensor
-    rotation_avg_sq: torch.Tensor
-    mean_rate: float
-    rotation_rate: float
-    step: int
-    beta1: float = 0.9
-    beta2: float = 0.999
-    eps: float = 1e-15
-
-
-@dataclass(frozen=True)
-class RenderOutput:
-    """A rendered view; color, alpha and depth are differentiable. Fields as in ``Forward``."""
-
-    color: torch.Tensor
-    alpha: torch.Tensor
-    depth: torch.Tensor
-    median_depth: torch.Tensor
-    radii: torch.Tensor
-    num_visible: int
-    num_dropped: int
+    rates: AdamRates
 
 
 @dataclass(frozen=True)

@@ -9,10 +9,11 @@ import pytest
 import torch
 
 from pipeline.render import (
+    AdamRates,
     AlphaChangeLoss,
     Backend,
-    DenseAdam,
-    FrameAdam,
+    FrameMoments,
+    Moments,
     RasterOptions,
     ShAdam,
     Subset,
@@ -183,14 +184,16 @@ def test_optimiser_steps_equal_the_reference(backend: Backend, scene: Scene) -> 
     for each in (backend, REFERENCE):
 
         def plain(m: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
-            each.adam_step(m, d_means, DenseAdam(a, b, 0.01, 3))
+            each.adam_step(m, d_means, Moments(a, b), AdamRates(0.01, 3))
 
         def frame(m: torch.Tensor, q: torch.Tensor, *state: torch.Tensor, each=each) -> None:
-            adam = FrameAdam(*state, mean_rate=0.02, rotation_rate=0.01, step=3)
-            each.frame_adam(m, q, log_scales, d_means, d_quats, adam)
+            moments = FrameMoments(Moments(*state[:2]), Moments(*state[2:]))
+            rates = AdamRates((0.02, 0.01), 3)
+            each.frame_adam(m, q, log_scales, d_means, d_quats, moments, rates)
 
         def harmonics(s: torch.Tensor, a: torch.Tensor, b: torch.Tensor, each=each) -> None:
-            adam = ShAdam(a, b, last.clone(), 0.01, 0.002, 6, eps=0.01)
+            rates = AdamRates((0.01, 0.002), 6, eps=0.01)
+            adam = ShAdam(Moments(a, b), last.clone(), rates)
             drawn = each.forward(*scene[:4], s, CAMERA, OPTIONS)
             gradients = each.backward(drawn, noise(22, 31, 3), sh_adam=adam)
             assert len(gradients.sh) == 0
@@ -215,7 +218,7 @@ def test_invalid_input_is_an_error(backend: Backend, scene: Scene) -> None:
         backend.backward(drawn, torch.zeros(3, 3, 3))
     with pytest.raises(ValueError, match="step 0"):
         p, grad, m, v = (torch.zeros(4, 3) for _ in range(4))
-        backend.adam_step(p, grad, DenseAdam(m, v, 0.1, 0))
+        backend.adam_step(p, grad, Moments(m, v), AdamRates(0.1, 0))
     assert set(backend.facts()) == {"instruction_set", "compiler"}
 
 

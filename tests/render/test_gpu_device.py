@@ -6,13 +6,13 @@ import numpy as np
 import pytest
 import torch
 
+from benchmarks.kernel_times import profiled
 from pipeline.render import RasterOptions, make_backend
 from pipeline.render.gpu import device, kernels, rasterise
 from pipeline.render.gpu.backend import GpuBackend
 from pipeline.render.gpu.device import Gpu
 from pipeline.render.gpu.memory import memory_line, training_bytes
-from pipeline.render.gpu.profile import profiled
-from pipeline.render.gpu.sort import scan, sort
+from pipeline.render.gpu.primitives import scan, sort
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import TrainingSize
 from pipeline.runtime.errors import UserError
@@ -99,7 +99,7 @@ def test_a_lost_device_is_an_error(gpu: Gpu, monkeypatch: pytest.MonkeyPatch) ->
 def test_prefix_sums(gpu: Gpu, count: int) -> None:
     values = np.random.default_rng(count).integers(0, 9, count).astype(np.uint32)
     buffer = gpu.upload(values)
-    scan(gpu, Workspace(gpu), buffer, count)
+    scan(Workspace(gpu), buffer, count)
     expected = np.cumsum(values) - values
     assert (gpu.read(buffer, np.uint32, count) == expected).all()
 
@@ -114,10 +114,8 @@ def test_sorting_is_stable(gpu: Gpu, length: int, capacity: int, bits: int) -> N
     keys[::3] = keys[0]  # equal keys
     values = np.arange(capacity, dtype=np.uint32)
     size = gpu.upload(np.array([length], np.uint32))
-    found = sort(
-        gpu, Workspace(gpu), gpu.upload(keys), gpu.upload(values), size,
-        capacity=capacity, bits=bits,
-    )  # fmt: skip
+    buffers = gpu.upload(keys), gpu.upload(values), size
+    found = sort(Workspace(gpu), *buffers, capacity=capacity, bits=bits)
     order = np.argsort(keys[:length], kind="stable")
     assert (gpu.read(found[0], np.uint32, length) == keys[order]).all()
     assert (gpu.read(found[1], np.uint32, length) == order).all()
@@ -146,7 +144,7 @@ def test_a_workspace_keeps_what_recorded_kernels_read(gpu: Gpu) -> None:
 def test_kernels_are_timed_one_by_one(gpu: Gpu) -> None:
     with profiled(gpu) as profile:
         for _ in range(3):
-            scan(gpu, Workspace(gpu), gpu.upload(np.ones(5000, np.uint32)), 5000)
+            scan(Workspace(gpu), gpu.upload(np.ones(5000, np.uint32)), 5000)
             profile.collect()
     assert set(profile.seconds) == {"scan.blocks", "scan.add"}
     assert 0 < profile.seconds["scan.blocks"] < 10

@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from dataclasses import replace
-from typing import NamedTuple
 
 import pytest
 import torch
 
 from pipeline.render import (
+    AdamRates,
     Backend,
-    DenseAdam,
-    FrameAdam,
+    FrameMoments,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
     reference,
+    reference_adam,
 )
 from tests.render.scenes import Scene, camera, random_scene, relative
 
 
+def normal(*shape: int, seed: int) -> torch.Tensor:
+    return torch.randn(*shape, generator=torch.Generator().manual_seed(seed))
+
+
 def images(height: int, width: int, seed: int = 0) -> tuple[torch.Tensor, torch.Tensor]:
-    gen = torch.Generator().manual_seed(seed)
-    target = torch.rand(height, width, 3, generator=gen)
-    rendered = (target + 0.2 * torch.randn(height, width, 3, generator=gen)).clamp(0, 1)
-    return rendered, target
+    target = torch.rand(height, width, 3, generator=torch.Generator().manual_seed(seed))
+    return (target + 0.2 * normal(height, width, 3, seed=seed)).clamp(0, 1), target
 
 
 @pytest.mark.parametrize("size", [(40, 53), (1, 1), (3, 200), (17, 5)])
@@ -68,21 +70,20 @@ def test_ssim_equals_scikit_image_away_from_the_border(backend: Backend) -> None
     from skimage.metrics import structural_similarity
 
     rendered, target = images(48, 60)
-    _, ssim_map = structural_similarity(
-        rendered.double().numpy(), target.double().numpy(), channel_axis=-1, data_range=1.0,
-        gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True, truncate=3.5,
-    )  # fmt: skip
     inside = torch.zeros(48, 60, dtype=torch.bool)
     inside[5:-5, 5:-5] = True
     # Border pixels are masked and equal in both images: the mean is over the inside.
     both = torch.where(inside[..., None], rendered, target)
-    _, map_of_both = structural_similarity(
-        both.double().numpy(), target.double().numpy(), channel_axis=-1, data_range=1.0,
-        gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True, truncate=3.5,
+    expected, without_mask = (
+        structural_similarity(
+            image.double().numpy(), target.double().numpy(), channel_axis=-1, data_range=1.0,
+            gaussian_weights=True, sigma=1.5, use_sample_covariance=False, full=True, truncate=3.5,
+        )[1][5:-5, 5:-5].mean()
+        for image in (both, rendered)
     )  # fmt: skip
     found = backend.l1_ssim(rendered, target, 1.0, ~inside)
-    assert found.ssim == pytest.approx(float(map_of_both[5:-5, 5:-5].mean()), abs=1e-6)
-    assert abs(found.ssim - float(ssim_map[5:-5, 5:-5].mean())) > 1e-6  # the mask matters
+    assert found.ssim == pytest.approx(float(expected), abs=1e-6)
+    assert abs(found.ssim - float(without_mask)) > 1e-6  # the mask matters
 
 
 def test_the_loss_of_a_fully_masked_image_is_zero(backend: Backend) -> None:
@@ -101,17 +102,25 @@ def test_masked_pixels_may_have_any_value(backend: Backend) -> None:
     assert after.loss == before.loss and torch.equal(after.grad, before.grad)
 
 
+def noisy_gradients(*shape: int, seed: int) -> list[tuple[int, torch.Tensor]]:
+    """19 steps with gradients of different sizes, zero for the first rows."""
+    generator = torch.Generator().manual_seed(seed)
+    steps = []
+    for step in range(1, 20):
+        grad = torch.randn(shape, generator=generator) * 10.0 ** (step % 5 - 3)
+        grad[:1] = 0
+        steps.append((step, grad))
+    return steps
+
+
 @pytest.mark.parametrize("shape", [(1,), (15,), (16,), (1001, 3), (7, 4, 3), (0, 3)])
 def test_adam_equals_torch(backend: Backend, shape: tuple[int, ...]) -> None:
-    gen = torch.Generator().manual_seed(2)
-    ours = torch.randn(shape, generator=gen)
+    ours = normal(*shape, seed=2)
     theirs = ours.double().requires_grad_()
     optimizer = torch.optim.Adam([theirs], lr=1e-2, betas=(0.9, 0.999), eps=1e-15)
-    m, v = torch.zeros(shape), torch.zeros(shape)
-    for step in range(1, 20):
-        grad = torch.randn(shape, generator=gen) * 10.0 ** (step % 5 - 3)
-        grad[..., :1] = 0
-        backend.adam_step(ours, grad, DenseAdam(m, v, 1e-2, step))
+    moments = Moments(torch.zeros(shape), torch.zeros(shape))
+    for step, grad in noisy_gradients(*shape, seed=3):
+        backend.adam_step(ours, grad, moments, AdamRates(1e-2, step))
         theirs.grad = grad.double()
         optimizer.step()
     assert torch.allclose(ours.double(), theirs.detach(), rtol=0, atol=2e-6)
@@ -119,72 +128,62 @@ def test_adam_equals_torch(backend: Backend, shape: tuple[int, ...]) -> None:
 
 @pytest.mark.parametrize(("rows", "columns"), [(11, 3), (37, 12), (5, 27), (129, 48)])
 def test_learning_rates_repeat_over_rows(backend: Backend, rows: int, columns: int) -> None:
-    gen = torch.Generator().manual_seed(3)
-    rates = torch.rand(columns, generator=gen, dtype=torch.float64).tolist()
-    ours, grad = (torch.randn(rows, columns, generator=gen) for _ in range(2))
-    expected = [ours[:, c].double().clone() for c in range(columns)]
-    m, v = torch.zeros_like(ours), torch.zeros_like(ours)
+    rates = normal(columns, seed=3).abs().tolist()
+    ours, grad = normal(rows, columns, seed=4), normal(rows, columns, seed=5)
+    expected = ours.double()
+    moments = Moments(torch.zeros_like(ours), torch.zeros_like(ours))
+    each = [Moments(*torch.zeros(2, rows, dtype=torch.float64).unbind()) for _ in range(columns)]
     for step in (1, 2, 3):
-        backend.adam_step(ours, grad, DenseAdam(m, v, rates, step))
-    for column, rate in enumerate(rates):
-        m64, v64 = (torch.zeros(rows, dtype=torch.float64) for _ in range(2))
-        for step in (1, 2, 3):
+        backend.adam_step(ours, grad, moments, AdamRates(rates, step))
+        for column, rate in enumerate(rates):
             g64 = grad[:, column].double()
-            reference.adam_step(expected[column], g64, DenseAdam(m64, v64, rate, step))
-    assert torch.allclose(ours.double(), torch.stack(expected, 1), rtol=0, atol=2e-6)
+            state = each[column], AdamRates(rate, step)
+            reference_adam.adam_step(expected[:, column], g64, *state)
+    assert torch.allclose(ours.double(), expected, rtol=0, atol=2e-6)
 
 
 @pytest.mark.parametrize(("rows", "columns"), [(1, 3), (16, 4), (37, 3), (1001, 4), (0, 3)])
 def test_adam_with_shared_second_moments_equals_the_reference(
     backend: Backend, rows: int, columns: int
 ) -> None:
-    gen = torch.Generator().manual_seed(5)
-    ours = torch.randn(rows, columns, generator=gen)
+    ours = normal(rows, columns, seed=5)
     theirs = ours.double()
-    m, v = torch.zeros_like(ours), torch.zeros(rows, 1)
-    m64, v64 = m.double(), v.double()
-    for step in range(1, 20):
-        grad = torch.randn(rows, columns, generator=gen) * 10.0 ** (step % 5 - 3)
-        grad[:1] = 0
-        backend.adam_step(ours, grad, DenseAdam(m, v, 1e-2, step))
-        reference.adam_step(theirs, grad.double(), DenseAdam(m64, v64, 1e-2, step))
+    moments = Moments(torch.zeros_like(ours), torch.zeros(rows, 1))
+    doubles = Moments(moments.exp_avg.double(), moments.exp_avg_sq.double())
+    for step, grad in noisy_gradients(rows, columns, seed=6):
+        rates = AdamRates(1e-2, step)
+        backend.adam_step(ours, grad, moments, rates)
+        reference_adam.adam_step(theirs, grad.double(), doubles, rates)
     assert torch.allclose(ours.double(), theirs, rtol=0, atol=4e-6)
-    assert torch.allclose(v.double(), v64, rtol=1e-5, atol=0)
+    assert torch.allclose(moments.exp_avg_sq.double(), doubles.exp_avg_sq, rtol=1e-5, atol=0)
 
 
-class Framed(NamedTuple):
+class Framed:
     """Parameters and state of ``frame_adam``."""
 
-    means: torch.Tensor
-    quats: torch.Tensor
-    log_scales: torch.Tensor
-    adam: FrameAdam
-    backend: Backend
-
-    @staticmethod
-    def of(
-        backend: Backend, means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor
-    ) -> Framed:
-        moments = torch.zeros(4, *means.shape, dtype=means.dtype)
-        adam = FrameAdam(*moments, 1e-2, 3e-3, 1)
-        return Framed(means.clone(), quats.clone(), log_scales.clone(), adam, backend)
+    def __init__(
+        self, backend: Backend, means: torch.Tensor, quats: torch.Tensor, log_scales: torch.Tensor
+    ):
+        self.backend = backend
+        self.means, self.quats, self.log_scales = means.clone(), quats.clone(), log_scales
+        zeros = torch.zeros(4, *means.shape, dtype=means.dtype)
+        self.moments = FrameMoments(Moments(*zeros[:2]), Moments(*zeros[2:]))
 
     @staticmethod
     def random(backend: Backend, rows: int, seed: int) -> Framed:
-        gen = torch.Generator().manual_seed(seed)
-        means, log_scales = (torch.randn(rows, 3, generator=gen) for _ in range(2))
-        return Framed.of(backend, means, 3 * torch.randn(rows, 4, generator=gen), log_scales)
+        means, log_scales = normal(2, rows, 3, seed=seed)
+        return Framed(backend, means, 3 * normal(rows, 4, seed=seed + 1), log_scales)
 
     def double(self) -> Framed:
         doubles = self.means.double(), self.quats.double(), self.log_scales.double()
-        return Framed.of(self.backend, *doubles)
+        return Framed(self.backend, *doubles)
 
     def step(self, number: int, d_means: torch.Tensor, d_quats: torch.Tensor) -> None:
-        update = (
-            self.backend.frame_adam if self.means.dtype == torch.float32 else reference.frame_adam
-        )
-        adam = replace(self.adam, step=number)
-        update(self.means, self.quats, self.log_scales, d_means, d_quats, adam)
+        is_double = self.means.dtype == torch.float64
+        update = reference_adam.frame_adam if is_double else self.backend.frame_adam
+        rates = AdamRates((1e-2, 3e-3), number)
+        parameters = self.means, self.quats, self.log_scales
+        update(*parameters, d_means, d_quats, self.moments, rates)
 
 
 @pytest.mark.parametrize("rows", [1, 16, 37, 1001, 0])
@@ -193,45 +192,41 @@ def test_frame_adam_equals_the_reference(backend: Backend, rows: int) -> None:
     ours.quats[:1] = 0  # not updated
     theirs = ours.double()
     before = ours.quats.clone()
-    gen = torch.Generator().manual_seed(6)
-    for step in range(1, 20):
-        scale = 10.0 ** (step % 5 - 3)
-        d_means = torch.randn(rows, 3, generator=gen) * scale
-        d_quats = torch.randn(rows, 4, generator=gen) * scale
-        d_means[1:2] = 0
+    for step, both in noisy_gradients(rows, 7, seed=6):
+        d_means, d_quats = both[:, :3].contiguous(), both[:, 3:].contiguous()
         ours.step(step, d_means, d_quats)
         theirs.step(step, d_means.double(), d_quats.double())
     assert torch.allclose(ours.means.double(), theirs.means, rtol=1e-5, atol=1e-5)
     assert torch.allclose(ours.quats.double(), theirs.quats, rtol=1e-5, atol=1e-5)
-    for a, b in ((ours.adam.mean_avg_sq, theirs.adam.mean_avg_sq),
-                 (ours.adam.rotation_avg_sq, theirs.adam.rotation_avg_sq)):  # fmt: skip
-        assert torch.allclose(a.double(), b, rtol=1e-3, atol=1e-6)
+    for name in ("means", "rotations"):
+        a, b = (getattr(each.moments, name).exp_avg_sq.double() for each in (ours, theirs))
+        assert torch.allclose(a, b, rtol=1e-3, atol=1e-6)
     assert torch.equal(ours.quats[:1], before[:1])
 
 
 def test_frame_adam_is_equivariant_under_similarities(backend: Backend) -> None:
     """x -> c T x: gradients of means are multiplied by T / c, quaternions from the left."""
-    gen = torch.Generator().manual_seed(7)
+    generator = torch.Generator().manual_seed(7)
     original = Framed.random(backend, 50, 8)
-    rotation = torch.randn(4, generator=gen, dtype=torch.float64)
+    rotation = torch.randn(4, generator=generator, dtype=torch.float64)
     rotation /= rotation.norm()
     matrix, size = reference.rotation_from_quat(rotation[None])[0], 7.0
     w, x, y, z = rotation.tolist()
     left = torch.tensor(
         [[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]], dtype=torch.float64
     )
-    world = Framed.of(
-        backend,
-        (size * original.means.double() @ matrix.T).float(),
-        (original.quats.double() @ left.T).float(),
-        original.log_scales + math.log(size),
-    )
+
+    def moved(framed: Framed) -> tuple[torch.Tensor, torch.Tensor]:
+        return size * framed.means.double() @ matrix.T, framed.quats.double() @ left.T
+
+    means, quats = moved(original)
+    world = Framed(backend, means.float(), quats.float(), original.log_scales + math.log(size))
     for step in range(1, 10):
-        d_means = torch.randn(50, 3, generator=gen, dtype=torch.float64)
-        d_quats = torch.randn(50, 4, generator=gen, dtype=torch.float64)
+        d_means = torch.randn(50, 3, generator=generator, dtype=torch.float64)
+        d_quats = torch.randn(50, 4, generator=generator, dtype=torch.float64)
         original.step(step, d_means.float(), d_quats.float())
         world.step(step, (d_means @ matrix.T / size).float(), (d_quats @ left.T).float())
-    means, quats = size * original.means.double() @ matrix.T, original.quats.double() @ left.T
+    means, quats = moved(original)
     assert torch.allclose(world.means.double(), means, rtol=0, atol=size * 1e-5)
     assert torch.allclose(world.quats.double(), quats, rtol=0, atol=1e-5)
 
@@ -240,58 +235,75 @@ def test_frame_adam_steps_are_relative_to_the_scales(backend: Backend) -> None:
     """Also for scales and gradients that overflow float32."""
     log_scales = torch.tensor([[0.0, -3.0, 2.0], [-200.0, 200.0, torch.nan], [0.0, 0.0, 0.0]])
     quats = torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [torch.inf, torch.nan, 1e30, 0]])
-    scene = Framed.of(backend, torch.zeros(3, 3), quats, log_scales)
+    scene = Framed(backend, torch.zeros(3, 3), quats, log_scales)
     d_means = torch.tensor([[1.0, -2.0, 0.5], [1e30, 1e30, 1e30], [1.0, 1.0, 1.0]])
     scene.step(1, d_means, torch.zeros(3, 4))
     assert torch.allclose(scene.means[0], -d_means[0].sign() * 1e-2 * log_scales[0].exp())
-    assert scene.means.isfinite().all()
-    assert all(moment.isfinite().all() for moment in (scene.adam.mean_avg, scene.adam.mean_avg_sq))
+    for tensor in (scene.means, *vars(scene.moments.means).values()):
+        assert tensor.isfinite().all()
 
 
 def test_adam_with_shared_second_moments_is_equivariant_under_rotation(backend: Backend) -> None:
-    gen = torch.Generator().manual_seed(6)
-    rotation = torch.linalg.qr(torch.randn(3, 3, generator=gen, dtype=torch.float64))[0]
-    rows = torch.randn(50, 3, generator=gen, dtype=torch.float64)
-    rotated = (rows @ rotation.T).float()
-    ours = rows.float()
-    moments = [(torch.zeros(50, 3), torch.zeros(50, 1)) for _ in range(2)]
+    rotation = torch.linalg.qr(normal(3, 3, seed=6).double())[0]
+    ours = normal(50, 3, seed=7)
+    rotated = (ours.double() @ rotation.T).float()
+    moments = [Moments(torch.zeros(50, 3), torch.zeros(50, 1)) for _ in range(2)]
     for step in range(1, 10):
-        grad = torch.randn(50, 3, generator=gen, dtype=torch.float64)
-        gradients = grad, grad @ rotation.T
+        grad = normal(50, 3, seed=7 + step)
+        gradients = grad, (grad.double() @ rotation.T).float()
         for param, gradient, state in zip((ours, rotated), gradients, moments, strict=True):
-            backend.adam_step(param, gradient.float(), DenseAdam(*state, 1e-2, step))
+            backend.adam_step(param, gradient, state, AdamRates(1e-2, step))
     assert torch.allclose(rotated.double(), ours.double() @ rotation.T, rtol=0, atol=1e-5)
 
 
-def test_invalid_arguments_of_adam_are_errors(backend: Backend) -> None:
-    a = torch.zeros(4, 4)
-    with pytest.raises(ValueError, match="contiguous"):
-        backend.adam_step(a.T[:, :2], a, DenseAdam(a, a, 0.1, 1))
-    with pytest.raises(ValueError, match="shapes differ"):
-        backend.adam_step(a, torch.zeros(4), DenseAdam(a, a, 0.1, 1))
-    with pytest.raises(ValueError, match="step"):
-        backend.adam_step(a, a, DenseAdam(a, a, 0.1, 0))
-    with pytest.raises(ValueError, match="one lr"):
-        backend.adam_step(a, a, DenseAdam(a, torch.zeros(4, 1), [0.1, 0.2], 1))
-    with pytest.raises(ValueError, match="shapes differ"):
-        b = torch.zeros(4, 5)
-        backend.adam_step(b, b, DenseAdam(b, torch.zeros(4, 1), 0.1, 1))
-    framed = Framed.random(backend, 4, 0)
-    with pytest.raises(ValueError, match="expected"):
-        framed.step(1, torch.zeros(4, 3), torch.zeros(4, 3))
-    with pytest.raises(ValueError, match="expected"):
-        framed.step(1, torch.zeros(5, 3), torch.zeros(4, 4))
-    with pytest.raises(ValueError, match="contiguous"):
-        framed.step(1, torch.zeros(3, 4).T, torch.zeros(4, 4))
-    with pytest.raises(ValueError, match="step"):
-        framed.step(0, torch.zeros(4, 3), torch.zeros(4, 4))
+A, B = torch.zeros(4, 4), torch.zeros(4, 5)
+COLUMN = torch.zeros(4, 1)
+
+
+@pytest.mark.parametrize(
+    ("message", "param", "grad", "moments", "rates"),
+    [
+        ("contiguous", A.T[:, :2], A, (A, A), (0.1, 1)),
+        ("shapes differ", A, torch.zeros(4), (A, A), (0.1, 1)),
+        ("step", A, A, (A, A), (0.1, 0)),
+        ("one lr", A, A, (A, COLUMN), ([0.1, 0.2], 1)),
+        ("shapes differ", B, B, (B, COLUMN), (0.1, 1)),
+        ("rates", A, A, (A, A), ([], 1)),
+    ],
+)
+def test_invalid_arguments_of_adam_are_errors(
+    backend: Backend,
+    message: str,
+    param: torch.Tensor,
+    grad: torch.Tensor,
+    moments: tuple[torch.Tensor, torch.Tensor],
+    rates: tuple[float, int],
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        backend.adam_step(param, grad, Moments(*moments), AdamRates(*rates))
+
+
+@pytest.mark.parametrize(
+    ("message", "step", "d_means", "d_quats"),
+    [
+        ("expected", 1, torch.zeros(4, 3), torch.zeros(4, 3)),
+        ("expected", 1, torch.zeros(5, 3), torch.zeros(4, 4)),
+        ("contiguous", 1, torch.zeros(3, 4).T, torch.zeros(4, 4)),
+        ("step", 0, torch.zeros(4, 3), torch.zeros(4, 4)),
+    ],
+)
+def test_invalid_arguments_of_frame_adam_are_errors(
+    backend: Backend, message: str, step: int, d_means: torch.Tensor, d_quats: torch.Tensor
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        Framed.random(backend, 4, 0).step(step, d_means, d_quats)
 
 
 def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:
     """A scene that is partly behind the camera, and a gradient on the image."""
     scene, cam = random_scene(5, 333, degree=degree), camera(70, 50)
     scene[0][::3, 2] *= -1  # behind the camera
-    d_color = torch.randn(50, 70, 3, generator=torch.Generator().manual_seed(9))
+    d_color = normal(50, 70, 3, seed=9)
     d_color[:, :20] = 0.0  # no gradient there
     return scene, cam, d_color
 
@@ -299,57 +311,45 @@ def sh_scene(degree: int) -> tuple[Scene, RasterCamera, torch.Tensor]:
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 def test_sh_adam_equals_the_reference(backend: Backend, degree: int) -> None:
     scene, cam, d_color = sh_scene(degree)
-    gen = torch.Generator().manual_seed(4)
     fwd = backend.forward(*scene, cam, RasterOptions(sh_degree=degree))
     plain = backend.backward(fwd, d_color)
     sh = scene[4]
     # Some were updated last many steps ago.
-    last = torch.randint(0, 1000, (len(sh),), generator=gen, dtype=torch.int32)
+    last = torch.randint(0, 1000, (len(sh),), generator=torch.manual_seed(4), dtype=torch.int32)
     last[::2] = 998
-    ours = ShAdam(
-        1e-3 * torch.randn(sh.shape, generator=gen), 1e-5 * torch.rand(sh.shape, generator=gen),
-        last, 0.01, 0.002, 1000,
-    )  # fmt: skip
-    theirs = dataclasses.replace(
-        ours,
-        exp_avg=ours.exp_avg.double(),
-        exp_avg_sq=ours.exp_avg_sq.double(),
-        last=ours.last.clone(),
-    )
-    expected, untouched = sh.double(), ours.exp_avg.clone()
+    moments = Moments(1e-3 * normal(*sh.shape, seed=4), 1e-5 * normal(*sh.shape, seed=5).abs())
+    doubles = Moments(moments.exp_avg.double(), moments.exp_avg_sq.double())
+    ours = ShAdam(moments, last, AdamRates((0.01, 0.002), 1000))
+    theirs = replace(ours, moments=doubles, last=last.clone())
+    expected, untouched = sh.double(), moments.exp_avg.clone()
     gradients = (plain.means, plain.log_scales, plain.quats, plain.opacity_logits, plain.sh)
     updated = torch.cat([g.reshape(len(sh), -1) for g in gradients], 1).any(1)
-    reference.sh_adam(expected, plain.sh.double(), updated, theirs)
+    reference_adam.sh_adam(expected, plain.sh.double(), updated, theirs)
     fused = backend.backward(fwd, d_color, sh_adam=ours)
     # Some visible Gaussians have no gradient.
     assert 0 < updated.sum() < (fwd.radii > 0).sum() < len(sh)
     assert torch.allclose(sh.double(), expected, rtol=0, atol=2e-6)
-    assert relative(ours.exp_avg, theirs.exp_avg) < 1e-5
-    assert relative(ours.exp_avg_sq, theirs.exp_avg_sq) < 1e-5
+    assert relative(moments.exp_avg, doubles.exp_avg) < 1e-5
+    assert relative(moments.exp_avg_sq, doubles.exp_avg_sq) < 1e-5
     assert torch.equal(ours.last, theirs.last)
-    assert torch.equal(ours.exp_avg[~updated], untouched[~updated])
+    assert torch.equal(moments.exp_avg[~updated], untouched[~updated])
     assert len(fused.sh) == 0 and torch.equal(fused.means, plain.means)
 
 
 def test_sh_adam_approximates_dense_adam_after_skipped_steps() -> None:
     """With a gradient in every tenth step, the parameter equals dense Adam's up to the bias
     corrections of the skipped steps."""
-    gen = torch.Generator().manual_seed(6)
-    dense = torch.randn(200, 1, 3, generator=gen, dtype=torch.float64)
-    sparse, (m, v) = dense.clone(), torch.zeros(2, 200, 1, 3, dtype=torch.float64)
-    state = ShAdam(
-        torch.zeros_like(dense), torch.zeros_like(dense),
-        torch.zeros(200, dtype=torch.int32), 1e-3, 1e-3, 1,
-    )  # fmt: skip
-    updated = torch.ones(200, dtype=torch.bool)
-    start = dense.clone()
+    start = normal(200, 1, 3, seed=6).double()
+    dense, sparse = start.clone(), start.clone()
+    of_dense, of_sparse = (Moments(start * 0, start * 0) for _ in range(2))
+    last, updated = torch.zeros(200, dtype=torch.int32), torch.ones(200, dtype=torch.bool)
     for step in range(1, 2001):
         seen = step % 10 == 0
-        grad = torch.randn(dense.shape, generator=gen, dtype=torch.float64) + 0.3
-        gradient = grad if seen else torch.zeros_like(grad)
-        reference.adam_step(dense, gradient, DenseAdam(m, v, 1e-3, step))
+        gradient = (normal(200, 1, 3, seed=step).double() + 0.3) * seen
+        reference_adam.adam_step(dense, gradient, of_dense, AdamRates(1e-3, step))
         if seen:
-            reference.sh_adam(sparse, grad, updated, dataclasses.replace(state, step=step))
+            adam = ShAdam(of_sparse, last, AdamRates((1e-3, 1e-3), step))
+            reference_adam.sh_adam(sparse, gradient, updated, adam)
     assert (sparse - dense).norm() < 0.01 * (dense - start).norm()
 
 
@@ -357,10 +357,12 @@ def test_sh_adam_with_invalid_moments_is_an_error(backend: Backend) -> None:
     scene, cam, d_color = sh_scene(1)
     fwd = backend.forward(*scene, cam, RasterOptions(sh_degree=1))
     like, last = torch.zeros_like(scene[4]), torch.zeros(333, dtype=torch.int32)
+    moments, rates = Moments(like, like), AdamRates((0.1, 0.1), 1)
     for wrong, message in (
-        (ShAdam(like[:5], like, last, 0.1, 0.1, 1), "moments"),
-        (ShAdam(like, like, last.long(), 0.1, 0.1, 1), "last"),
-        (ShAdam(like, like, last, 0.1, 0.1, 0), "step"),
+        (ShAdam(Moments(like[:5], like), last, rates), "moments"),
+        (ShAdam(moments, last.long(), rates), "last"),
+        (ShAdam(moments, last, replace(rates, step=0)), "step"),
+        (ShAdam(moments, last, AdamRates(0.1, 1)), "expected 2 rates"),
     ):
         with pytest.raises(ValueError, match=message):
             backend.backward(fwd, d_color, sh_adam=wrong)
@@ -369,10 +371,9 @@ def test_sh_adam_with_invalid_moments_is_an_error(backend: Backend) -> None:
 def test_sh_adam_stays_finite_for_gradients_whose_squares_overflow(backend: Backend) -> None:
     scene, cam, d_color = sh_scene(3)
     fwd = backend.forward(*scene, cam, RasterOptions())
-    adam = ShAdam(
-        torch.zeros_like(scene[4]), torch.zeros_like(scene[4]),
-        torch.zeros(333, dtype=torch.int32), 0.1, 0.1, 1,
-    )  # fmt: skip
+    moments = Moments(torch.zeros_like(scene[4]), torch.zeros_like(scene[4]))
+    last = torch.zeros(333, dtype=torch.int32)
     for step in (1, 2, 9):
-        backend.backward(fwd, 1e25 * d_color, sh_adam=dataclasses.replace(adam, step=step))
+        adam = ShAdam(moments, last, AdamRates((0.1, 0.1), step))
+        backend.backward(fwd, 1e25 * d_color, sh_adam=adam)
     assert scene[4].isfinite().all()

@@ -9,34 +9,36 @@ import pytest
 import torch
 
 from pipeline.render import (
+    AdamRates,
     AlphaChangeLoss,
     Backend,
     CameraGradients,
-    DenseAdam,
-    FrameAdam,
+    FrameMoments,
+    Moments,
     RasterOptions,
     ShAdam,
     Surroundings,
     make_backend,
 )
-from pipeline.render.resident import (
-    GaussianAdam,
-    Optimised,
-    Planes,
-    ResidentImage,
-    ResidentStep,
-)
+from pipeline.render.resident import Optimised, Planes, ResidentImage, ResidentStep
 from pipeline.training.appearance.embedding import appearance_gradients, colour_offsets
 from tests.render.scenes import NAMES, camera, random_scene, relative
 from tests.tools import need_gpu
 
 HEIGHT, WIDTH = 37, 50
 CAMERA = camera(WIDTH, HEIGHT, rotated=True)
-RATES = {
-    "means": 0.01, "log_scales": 0.02, "quats": 0.01, "opacity_logits": 0.03, "sh0": 0.01,
-    "shN": 0.002,
+
+
+def rates(*lr: float, eps: float = 1e-7) -> AdamRates:
+    return AdamRates(lr if len(lr) > 1 else lr[0], 1, eps=eps)
+
+
+ADAM = {
+    "log_scales": rates(0.02), "opacity_logits": rates(0.03), "sh": rates(0.01, 0.002),
+    "appearance": rates(0.01),
 }  # fmt: skip
-ADAM = GaussianAdam(RATES, 1, True, 0.9, 0.999, 1e-7, 1e-9)
+FRAMES = ADAM | {"frames": rates(0.01, 0.01)}
+WORLD = ADAM | {"means": rates(0.01, eps=1e-9), "quats": rates(0.01)}
 ALPHA_LOSS = AlphaChangeLoss(0.5, 0.1, 0.2)
 
 
@@ -64,7 +66,7 @@ STEP = ResidentStep(
     embedding=None,
     alpha_loss=ALPHA_LOSS,
     losses=None,
-    adam=ADAM,
+    adam=FRAMES,
 )
 MASKED = replace(IMAGE, key=None, mask=uniform(HEIGHT, WIDTH, seed=1) > 0.6)
 FLOATS = replace(IMAGE, target=uniform(HEIGHT, WIDTH, 3, seed=2), gain=(1.2, 0.9, 0.7))
@@ -77,7 +79,7 @@ AROUND = Surroundings(
 )
 STEPS = {
     "plain": STEP,
-    "world's axes": replace(STEP, adam=replace(ADAM, frames=False)),
+    "world's axes": replace(STEP, adam=WORLD),
     "masked": replace(STEP, image=MASKED),
     "gains": replace(STEP, image=FLOATS),
     "cameras": replace(STEP, camera_gradients=True),
@@ -86,6 +88,11 @@ STEPS = {
     "an appearance": replace(STEP, embedding=(0.7, -1.2)),
     "antialiased": replace(STEP, options=RasterOptions(antialias=True)),
 }
+
+
+def at_step(step: ResidentStep, number: int) -> ResidentStep:
+    adam = {name: replace(rates, step=number) for name, rates in step.adam.items()}
+    return replace(step, adam=adam)
 
 
 def start(frames: bool, embedding: tuple[float, ...] | None = None) -> Optimised:
@@ -112,9 +119,8 @@ def by_operators(
     backend: Backend, state: Optimised, step: ResidentStep
 ) -> tuple[float, CameraGradients | None, np.ndarray | None]:
     """The step, by the operators; returns its loss and other gradients."""
-    p, first, second, image, adam = (
-        state.parameters, state.first, state.second, step.image, step.adam,
-    )  # fmt: skip
+    p, image, adam = state.parameters, step.image, step.adam
+    moments = {name: Moments(state.first[name], state.second[name]) for name in p}
     constant, own = p["sh"][:, 0], p["sh"][:, 0].clone()
     if step.embedding is not None:
         constant += colour_offsets(p["appearance"], np.array(step.embedding))
@@ -131,11 +137,7 @@ def by_operators(
         by_alpha, d_depth = step.losses(DrawnPlanes(drawn.alpha, drawn.depth))
         assert by_alpha is not None
         d_alpha = d_alpha + by_alpha
-    decay = {"step": adam.step, "beta1": adam.beta1, "beta2": adam.beta2}
-    harmonics = ShAdam(
-        first["sh"], second["sh"], state.last, adam.rates["sh0"], adam.rates["shN"],
-        eps=adam.eps, **decay,
-    )  # fmt: skip
+    harmonics = ShAdam(moments["sh"], state.last, adam["sh"])
     g = backend.backward(
         drawn, d_color, d_alpha, d_depth, colors=True, camera=step.camera_gradients,
         sh_adam=harmonics,
@@ -147,25 +149,17 @@ def by_operators(
         d_embedding, d_appearance = appearance_gradients(
             p["appearance"], np.array(step.embedding), g.colors
         )
-        moments = first["appearance"], second["appearance"]
-        dense_adam = DenseAdam(*moments, adam.rates["sh0"], eps=adam.eps, **decay)
-        backend.adam_step(p["appearance"], d_appearance, dense_adam)
+        backend.adam_step(p["appearance"], d_appearance, moments["appearance"], adam["appearance"])
     change = g.means2d
     state.gradient_sum.add_(torch.hypot(change[:, 0] * WIDTH / 2, change[:, 1] * HEIGHT / 2))
     state.seen.add_(drawn.radii > 0)
-    dense = ["log_scales", "opacity_logits"]
-    if adam.frames:
-        frame = FrameAdam(
-            first["means"], second["means"], first["quats"], second["quats"],
-            adam.rates["means"], adam.rates["quats"], eps=adam.eps, **decay,
-        )  # fmt: skip
-        backend.frame_adam(p["means"], p["quats"], p["log_scales"], g.means, g.quats, frame)
-    else:
-        dense += ["means", "quats"]
-    for name in dense:
-        eps = adam.means_eps if name == "means" else adam.eps
-        each = DenseAdam(first[name], second[name], adam.rates[name], eps=eps, **decay)
-        backend.adam_step(p[name], getattr(g, name), each)
+    if "frames" in adam:
+        frames = FrameMoments(moments["means"], moments["quats"])
+        backend.frame_adam(
+            p["means"], p["quats"], p["log_scales"], g.means, g.quats, frames, adam["frames"]
+        )
+    for name in {"log_scales", "opacity_logits", "means", "quats"} & adam.keys():
+        backend.adam_step(p[name], getattr(g, name), moments[name], adam[name])
     return loss.loss, g.camera, d_embedding
 
 
@@ -186,10 +180,10 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
     backend, step = make_backend("gpu"), STEPS[name]
     training = backend.resident()
     assert training is not None
-    ours, theirs, untouched = (start(step.adam.frames, step.embedding) for _ in range(3))
+    ours, theirs, untouched = (start("frames" in step.adam, step.embedding) for _ in range(3))
     training.load(ours)
     for number in (1, 2, 5):
-        each = replace(step, adam=replace(step.adam, step=number))
+        each = at_step(step, number)
         found = training.step(each)
         loss, cameras, d_embedding = by_operators(backend, theirs, each)
         assert found.loss == pytest.approx(loss, rel=1e-5)
@@ -230,7 +224,7 @@ def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatc
                 key=(index, 1) if cached else None,
                 target=pixels(HEIGHT, WIDTH, 3, seed=index),
             )
-            training.step(replace(STEP, image=image, adam=replace(ADAM, step=number)))
+            training.step(at_step(replace(STEP, image=image), number))
         training.store(state)
         results.append(tensors(state))
     for key, tensor in results[0].items():

@@ -11,8 +11,7 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
 from benchmarks.raster_stress import FAMILIES, Tally, run
-from pipeline import render
-from pipeline.render import Backend, RasterOptions
+from pipeline.render import Backend, Forward, RasterCamera, RasterOptions
 from pipeline.render.gpu.backend import GpuBackend
 from tests.render.scenes import NAMES, Scene, camera, random_scene
 
@@ -24,10 +23,10 @@ SIZES = [(1, 1), (2, 3), (17, 31), (16, 16), (61, 7)]
 def check(
     backend: Backend,
     scene: Scene,
-    cam: render.RasterCamera,
+    cam: RasterCamera,
     options: RasterOptions,
     seed: int = 0,
-) -> render.Forward:
+) -> Forward:
     """Run forward and backward and check that all outputs are finite."""
     fwd = backend.forward(*scene, cam, options)
     for image in (fwd.color, fwd.alpha, fwd.depth, fwd.median_depth, fwd.radii):

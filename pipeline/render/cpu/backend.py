@@ -13,13 +13,14 @@ from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
 from pipeline.render.cpu import build
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
     CameraGradients,
-    DenseAdam,
     Forward,
-    FrameAdam,
+    FrameMoments,
     Gradients,
     LossResult,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
@@ -31,16 +32,21 @@ from pipeline.runtime.errors import UserError
 
 @dataclass(frozen=True)
 class Projected:
-    """Result of ``project``; layouts are in csrc/types.h."""
+    """The result of ``project``; csrc/types.h defines the layouts."""
 
     inputs: Parameters
-    view: torch.Tensor  # (21,) float64
-    size: tuple[int, int]  # width, height
+    camera: RasterCamera
     options: RasterOptions
+    view: torch.Tensor  # see _pack_view
     records: torch.Tensor  # (N, 16)
     radii: torch.Tensor  # (N,)
     num_visible: int
     num_dropped: int
+
+    @property
+    def size(self) -> tuple[int, int]:
+        """The width and the height of the image."""
+        return self.camera.width, self.camera.height
 
     @property
     def threads(self) -> int:
@@ -49,7 +55,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class Binned:
-    """Result of ``bin``."""
+    """The result of ``bin``."""
 
     projected: Projected
     entries: torch.Tensor  # (M, 3) int32
@@ -58,19 +64,10 @@ class Binned:
 
 
 @dataclass(frozen=True)
-class State:
-    """State of a rendered view for ``backward``."""
+class State(Binned):
+    """The state of a rendered view for ``backward``."""
 
-    inputs: Parameters
-    view: torch.Tensor
-    size: tuple[int, int]
-    background: torch.Tensor  # (3,)
-    options: RasterOptions
-    records: torch.Tensor
-    entries: torch.Tensor
-    tile_begin: torch.Tensor
     block_end: torch.Tensor  # (tiles, blocks of a tile) int32
-    slots: torch.Tensor
 
 
 def _ops() -> Any:
@@ -82,13 +79,24 @@ def _threads(threads: int) -> int:
     return threads if threads > 0 else torch.get_num_threads()
 
 
-def _pack_view(camera: RasterCamera, near: float) -> torch.Tensor:
-    """(21,) float64: fx fy cx cy, rotation by rows, translation, near, bounds of u and v in the
-    Jacobian."""
+def _pack_view(camera: RasterCamera, options: RasterOptions) -> torch.Tensor:
+    """(29,) float64: fx fy cx cy, the rotation by rows, the translation, the near plane, the bounds
+    of u and v in the Jacobian, width, height, the SH degree, two flags and the background."""
     pose = camera.world_to_camera.detach().double()
     head = torch.tensor([camera.fx, camera.fy, camera.cx, camera.cy], dtype=torch.float64)
-    tail = torch.tensor([near, *camera.slopes], dtype=torch.float64)
-    return torch.cat([head, pose[:3, :3].reshape(-1), pose[:3, 3], tail])
+    flags = options.antialias, options.clamp_color_gradient
+    size = camera.width, camera.height
+    background = options.background or (0.0, 0.0, 0.0)
+    tail = options.near, *camera.slopes, *size, options.sh_degree, *flags, *background
+    return torch.cat(
+        [head, pose[:3, :3].reshape(-1), pose[:3, 3], torch.tensor(tail, dtype=torch.float64)]
+    )
+
+
+def _pack_adam(rates: AdamRates) -> torch.Tensor:
+    """Float64: the step, beta1, beta2, epsilon and the learning rates."""
+    values = rates.step, rates.beta1, rates.beta2, rates.eps, *rates.rates
+    return torch.tensor(values, dtype=torch.float64)
 
 
 class CpuBackend(Backend[Projected, Binned]):
@@ -107,51 +115,44 @@ class CpuBackend(Backend[Projected, Binned]):
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
-        view, size = _pack_view(camera, options.near), (camera.width, camera.height)
-        found = _ops().project(
-            *parameters, view, *size, options.sh_degree, options.antialias,
-            _threads(options.threads),
-        )  # fmt: skip
-        return Projected(parameters, view, size, options, *found)
+        view = _pack_view(camera, options)
+        projected = _ops().project(*parameters, view, _threads(options.threads))
+        return Projected(parameters, camera, options, view, *projected)
 
     def subset_of(self, projected: Projected, subset: Subset) -> Projected:
         radii = torch.where(subset.which, projected.radii, 0.0)
         options = replace(projected.options, background=subset.background)
-        return replace(projected, radii=radii, options=options, num_visible=int((radii > 0).sum()))
+        return replace(
+            projected,
+            options=options,
+            view=_pack_view(projected.camera, options),
+            radii=radii,
+            num_visible=int((radii > 0).sum()),
+        )
 
     def bin(self, projected: Projected) -> Binned:
         p = projected
-        entries, tile_begin, slots, fits = _ops().bin(
-            p.records, p.radii, p.view, *p.size, p.threads
-        )
+        *lists, fits = _ops().bin(p.records, p.radii, p.view, p.threads)
         if not fits:
             raise UserError(
                 f"{p.num_visible} Gaussians overlap more than 2^27 tiles of 16 x 16 pixels in one "
                 "view",
                 fix="render smaller images, or remove Gaussians that are far too large",
             )
-        return Binned(projected, entries, tile_begin, slots)
+        return Binned(projected, *lists)
 
     def blend(self, binned: Binned) -> Forward:
-        p, ops, entries, tile_begin = binned.projected, _ops(), binned.entries, binned.tile_begin
-        background = torch.tensor(p.options.background or (0.0, 0.0, 0.0), dtype=torch.float32)
-        color, alpha, block_end = ops.blend(
-            p.records, entries, tile_begin, p.view, *p.size, background, p.threads
-        )
-        state = State(
-            p.inputs, p.view, p.size, background, p.options, p.records, entries, tile_begin,
-            block_end, binned.slots,
-        )  # fmt: skip
+        p, ops = binned.projected, _ops()
+        pairs = p.records, binned.entries, binned.tile_begin
+        color, alpha, block_end = ops.blend(*pairs, p.view, p.threads)
 
         def render_depths() -> tuple[torch.Tensor, torch.Tensor]:
-            depth, median = ops.blend_depth(
-                p.records, entries, tile_begin, p.view, *p.size, p.threads
-            )
+            depth, median = ops.blend_depth(*pairs, p.view, p.threads)
             return depth, median
 
         return Forward(
-            color, alpha, p.radii, p.num_visible, p.num_dropped, entries.shape[0], render_depths,
-            state,
+            color, alpha, p.radii, p.num_visible, p.num_dropped, len(binned.entries),
+            render_depths, State(**vars(binned), block_end=block_end),
         )  # fmt: skip
 
     def backward(
@@ -166,26 +167,25 @@ class CpuBackend(Backend[Projected, Binned]):
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
         s: State = fwd.state
-        width, height = s.size
-        d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, s.size)
-        ops, threads = _ops(), _threads(s.options.threads)
+        p, ops = s.projected, _ops()
+        d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, p.size)
         slot_gradients = ops.blend_backward(
-            s.records, s.entries, s.tile_begin, s.block_end, s.view, width, height, s.background,
-            fwd.color, fwd.alpha, None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth,
-            threads,
+            p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
+            None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
         )  # fmt: skip
-        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera = (
-            ops.project_backward(
-                *s.inputs, s.view, width, height, s.options.sh_degree, s.options.antialias,
-                s.records, fwd.radii, s.slots, slot_gradients, s.options.clamp_color_gradient,
-                colors, camera, *_moments(sh_adam, s.inputs[4]), threads,
-            )
+        adam: tuple[torch.Tensor | None, ...] = None, None, None, None
+        if sh_adam is not None:
+            checks.check_sh_adam(sh_adam, p.inputs[4])
+            moments = sh_adam.moments
+            adam = moments.exp_avg, moments.exp_avg_sq, sh_adam.last, _pack_adam(sh_adam.rates)
+        found = ops.project_backward(
+            *p.inputs, p.view, p.records, fwd.radii, s.slots, slot_gradients, colors, camera, *adam,
+            p.threads,
         )  # fmt: skip
-        parts = d_camera.split([3, 3, 2, 2]) if camera else None
+        d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera = found
         return Gradients(
-            d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d,
-            d_colors if colors else None,
-            None if parts is None else CameraGradients(*parts),
+            d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors if colors else None,
+            CameraGradients(*d_camera.split([3, 3, 2, 2])) if camera else None,
         )  # fmt: skip
 
     def l1_ssim(
@@ -224,14 +224,16 @@ class CpuBackend(Backend[Projected, Binned]):
         )  # fmt: skip
 
     def adam_step(
-        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
+        self,
+        param: torch.Tensor,
+        grad: torch.Tensor,
+        moments: Moments,
+        rates: AdamRates,
+        threads: int = 0,
     ) -> None:
-        checks.check_adam(param, grad, adam)
-        rates = torch.atleast_1d(torch.tensor(adam.lr, dtype=torch.float64))
-        _ops().adam_step(
-            param.detach(), grad.detach(), adam.exp_avg, adam.exp_avg_sq, rates, adam.step,
-            adam.beta1, adam.beta2, adam.eps, _threads(threads),
-        )  # fmt: skip
+        checks.check_adam(param, grad, moments, rates)
+        tensors = param.detach(), grad.detach(), moments.exp_avg, moments.exp_avg_sq
+        _ops().adam_step(*tensors, _pack_adam(rates), _threads(threads))
 
     def frame_adam(
         self,
@@ -240,22 +242,14 @@ class CpuBackend(Backend[Projected, Binned]):
         log_scales: torch.Tensor,
         d_means: torch.Tensor,
         d_quats: torch.Tensor,
-        adam: FrameAdam,
+        moments: FrameMoments,
+        rates: AdamRates,
         threads: int = 0,
     ) -> None:
-        checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
-        rates = torch.tensor([adam.mean_rate, adam.rotation_rate], dtype=torch.float64)
+        tensors = means, quats, log_scales, d_means, d_quats
+        checks.check_frame_adam(tensors[:3], tensors[3:], moments, rates)
+        of_means, of_rotations = moments.means, moments.rotations
         _ops().frame_adam(
-            means.detach(), quats.detach(), log_scales.detach(), d_means.detach(),
-            d_quats.detach(), adam.mean_avg, adam.mean_avg_sq, adam.rotation_avg,
-            adam.rotation_avg_sq, rates, adam.step, adam.beta1, adam.beta2, adam.eps,
-            _threads(threads),
+            *(tensor.detach() for tensor in tensors), of_means.exp_avg, of_means.exp_avg_sq,
+            of_rotations.exp_avg, of_rotations.exp_avg_sq, _pack_adam(rates), _threads(threads),
         )  # fmt: skip
-
-
-def _moments(adam: ShAdam | None, sh: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    if adam is None:
-        return None, None, None, None
-    checks.check_sh_adam(adam, sh)
-    values = [adam.dc_rate, adam.rate, adam.beta1, adam.beta2, adam.eps, adam.step]
-    return adam.exp_avg, adam.exp_avg_sq, adam.last, torch.tensor(values, dtype=torch.float64)

@@ -1,64 +1,84 @@
-"""The uniforms of the optimiser's kernels, with the bias corrections of a step."""
+"""The optimiser's kernels, and their uniforms with the bias corrections of a step."""
 
 from __future__ import annotations
 
 import math
 
 import numpy as np
-import torch
 
 from pipeline.render.gpu import layout
-from pipeline.render.gpu.device import Buffer
+from pipeline.render.gpu.device import Buffer, blocks
 from pipeline.render.gpu.workspace import Workspace
-from pipeline.render.types import DenseAdam, FrameAdam, ShAdam
+from pipeline.render.types import AdamRates
 
 
-def adam_uniform(
-    space: Workspace, name: str, adam: DenseAdam, count: int, width: int, at: int = 0
-) -> tuple[Buffer, Buffer]:
-    """``Adam`` of adam.wgsl for ``count`` elements or rows of ``width``, and the rates.
+def adam_step(
+    space: Workspace,
+    name: str,
+    rates: AdamRates,
+    shape: tuple[int, int],
+    *,
+    shared: bool,
+    at: int = 0,
+    **buffers: Buffer,
+) -> None:
+    """Update a parameter (N, width) by ``Backend.adam_step``.
 
     Args:
-        name: of the parameter.
-        at: the first element in the arrays of parameters and gradients.
+        name: The parameter's name, which the workspace's buffers get.
+        shared: Each row has one second moment.
+        at: The first element of the parameter and of its gradient in their buffers.
+        buffers: ``parameter``, ``gradient``, ``exp_avg`` and ``exp_avg_sq``.
     """
-    to_rate, to_root = corrections(adam)
-    rates = torch.atleast_1d(torch.tensor(adam.lr, dtype=torch.float64)) * to_rate
-    sizes = count, width, len(rates), at
-    uniform = space.uniform(
-        f"Adam of {name}", "4I6fIf", *sizes, *decay(adam), adam.eps, to_root, at, 0.0
-    )
-    packed = rates.numpy().astype(np.float32).tobytes()
-    return uniform, space.write_uniform(f"rates of {name}", packed)
-
-
-def frame_uniform(space: Workspace, adam: FrameAdam, count: int) -> Buffer:
-    """``Adam`` of frame_adam.wgsl."""
-    to_rate, to_root = corrections(adam)
-    rates = adam.mean_rate * to_rate, adam.rotation_rate * to_rate
-    return space.uniform(
-        "Adam of frames", "I9f8x", count, *rates, adam.eps, *decay(adam), to_root, 0.0
+    rows, width = shape
+    count = rows if shared else rows * width
+    to_rate, to_root = _corrections(rates)
+    lr = np.array([rate * to_rate for rate in rates.rates], np.float32)
+    sizes = count, width, len(lr), at
+    space.run(
+        "adam.rows" if shared else "adam.elements",
+        blocks(count),
+        adam=space.uniform(
+            f"Adam of {name}", "4I6fIf", *sizes, *_decay(rates), rates.eps, to_root, at, 0.0
+        ),
+        rates=space.write_uniform(f"rates of {name}", lr.tobytes()),
+        **buffers,
     )
 
 
-def sh_options(space: Workspace, adam: ShAdam | None, camera: bool) -> Buffer:
+def frame_adam(space: Workspace, rates: AdamRates, count: int, **buffers: Buffer) -> None:
+    """Update ``count`` means and rotations by ``Backend.frame_adam``.
+
+    Args:
+        buffers: ``geometry`` and ``gradients``, whose first sections are means, log scales and
+            quaternions, and the moments ``mean_avg``, ``mean_avg_sq``, ``rotation_avg`` and
+            ``rotation_avg_sq``.
+    """
+    to_rate, to_root = _corrections(rates)
+    lr = [rate * to_rate for rate in rates.rates]
+    values = count, *lr, rates.eps, *_decay(rates), to_root, 0.0
+    uniform = space.uniform("Adam of frames", "I9f8x", *values)
+    space.run("frame_adam", blocks(count), adam=uniform, **buffers)
+
+
+def sh_options(space: Workspace, rates: AdamRates | None, camera: bool) -> Buffer:
     """``Options`` of project_backward.wgsl."""
     flags = layout.CAMERA * camera
-    if adam is None:
+    if rates is None:
         return space.uniform("options of SH", "II10f", flags, *[0] * 11)
-    to_rate, to_root = corrections(adam)
-    rates = adam.dc_rate * to_rate, adam.rate * to_rate
-    ratio = adam.beta1 / math.sqrt(adam.beta2)
+    to_rate, to_root = _corrections(rates)
+    lr = [rate * to_rate for rate in rates.rates]
+    ratio = rates.beta1 / math.sqrt(rates.beta2)
     flags |= layout.SH_ADAM
-    values = flags, adam.step, *rates, *decay(adam), adam.eps, to_root, ratio, 0.0
+    values = flags, rates.step, *lr, *_decay(rates), rates.eps, to_root, ratio, 0.0
     return space.uniform("options of SH", "II10f", *values)
 
 
-def corrections(adam: DenseAdam | FrameAdam | ShAdam) -> tuple[float, float]:
-    """Bias corrections: factors of the learning rates and of the root of the second moment."""
-    return 1 / (1 - adam.beta1**adam.step), 1 / math.sqrt(1 - adam.beta2**adam.step)
+def _corrections(rates: AdamRates) -> tuple[float, float]:
+    """The bias corrections: factors of the learning rates and of the root of the second moment."""
+    return 1 / (1 - rates.beta1**rates.step), 1 / math.sqrt(1 - rates.beta2**rates.step)
 
 
-def decay(adam: DenseAdam | FrameAdam | ShAdam) -> tuple[float, float, float, float]:
+def _decay(rates: AdamRates) -> tuple[float, float, float, float]:
     """beta1, beta2, 1 - beta1, 1 - beta2."""
-    return adam.beta1, adam.beta2, 1 - adam.beta1, 1 - adam.beta2
+    return rates.beta1, rates.beta2, 1 - rates.beta1, 1 - rates.beta2

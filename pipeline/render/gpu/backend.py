@@ -8,25 +8,23 @@ from functools import cached_property
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from pipeline.render import checks
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
-from pipeline.render.gpu import layout, rasterise
-from pipeline.render.gpu.adam import adam_uniform, frame_uniform, sh_options
-from pipeline.render.gpu.device import Buffer, Gpu, blocks
-from pipeline.render.gpu.loss import LossImage, l1_ssim, layers_uniform, upload_layers
-from pipeline.render.gpu.reduce import camera_gradients
+from pipeline.render.gpu import adam, layout, rasterise
+from pipeline.render.gpu.device import Gpu
+from pipeline.render.gpu.loss import LossImage, compose, l1_ssim, upload_layers
 from pipeline.render.gpu.resident import GpuTraining
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import (
+    AdamRates,
     AlphaChangeLoss,
-    DenseAdam,
     Forward,
-    FrameAdam,
+    FrameMoments,
     Gradients,
     LossResult,
+    Moments,
     RasterCamera,
     RasterOptions,
     ShAdam,
@@ -34,12 +32,14 @@ from pipeline.render.types import (
     Surroundings,
 )
 
+NAMES = ("means", "log_scales", "quats", "opacity_logits")
+FRAMES = {name: layout.GEOMETRY[name] for name in ("means", "log_scales", "quats")}
+
 
 @dataclass(frozen=True)
 class Projected:
-    """Result of ``project``. ``sh``: the tensor of ``scene.sh``, which ``ShAdam`` updates."""
+    """The result of ``project``. ``sh`` is the tensor that ``ShAdam`` updates."""
 
-    scene: rasterise.Scene
     sh: torch.Tensor
     camera: RasterCamera
     options: RasterOptions
@@ -49,7 +49,7 @@ class Projected:
 
 @dataclass(frozen=True)
 class Binned:
-    """Result of ``bin``."""
+    """The result of ``bin``."""
 
     projected: Projected
     lists: rasterise.Lists
@@ -57,10 +57,9 @@ class Binned:
 
 @dataclass(frozen=True)
 class State:
-    """State of a rendered view for ``backward``."""
+    """The state of a rendered view for ``backward``."""
 
-    projected: Projected
-    lists: rasterise.Lists
+    sh: torch.Tensor
     image: rasterise.Image
 
 
@@ -69,7 +68,7 @@ class GpuBackend(Backend[Projected, Binned]):
     the same device and driver.
 
     Args:
-        number: of the device, in the order of ``device.adapters``.
+        number: The number of the device, in the order of ``device.adapters``.
     """
 
     def __init__(self, number: int = 0):
@@ -90,18 +89,18 @@ class GpuBackend(Backend[Projected, Binned]):
     def project(
         self, parameters: Parameters, camera: RasterCamera, options: RasterOptions
     ) -> Projected:
-        gpu, count, sh = self.gpu, len(parameters[0]), parameters[4]
-        scene = self._scene(parameters)
-        view = gpu.upload(layout.pack_view(camera, options, count, sh.shape[1]))
+        gpu, scene = self.gpu, self._scene(parameters)
+        view = gpu.upload(layout.pack_view(camera, options, scene.count, scene.coefficients))
         size = camera.width, camera.height
-        projection = rasterise.project(gpu, Workspace(gpu), scene, view, size)
-        radii = torch.from_numpy(gpu.read(projection.radii, np.float32, count))
-        return Projected(scene, sh, camera, options, projection, radii)
+        projection = rasterise.project(Workspace(gpu), scene, view, size)
+        radii = torch.from_numpy(gpu.read(projection.radii, np.float32, scene.count))
+        return Projected(parameters[4], camera, options, projection, radii)
 
     def subset_of(self, projected: Projected, subset: Subset) -> Projected:
-        gpu, count, whole = self.gpu, projected.scene.count, projected.projection
+        gpu, whole = self.gpu, projected.projection
+        count = whole.scene.count
         options = replace(projected.options, background=subset.background)
-        view = layout.pack_view(projected.camera, options, count, projected.scene.coefficients)
+        view = layout.pack_view(projected.camera, options, count, whole.scene.coefficients)
         radii = torch.where(subset.which, projected.radii, 0.0)
         tiles = gpu.read(whole.tile_counts, np.uint32, count) * subset.which.numpy()
         projection = replace(
@@ -114,24 +113,18 @@ class GpuBackend(Backend[Projected, Binned]):
         return replace(projected, options=options, projection=projection, radii=radii)
 
     def bin(self, projected: Projected) -> Binned:
-        space, count = Workspace(self.gpu), projected.scene.count
-        return Binned(projected, rasterise.list_pairs(self.gpu, space, projected.projection, count))
+        lists = rasterise.list_pairs(Workspace(self.gpu), projected.projection)
+        return Binned(projected, lists)
 
     def blend(self, binned: Binned) -> Forward:
         gpu, lists, projected = self.gpu, binned.lists, binned.projected
-        image = rasterise.blend(gpu, Workspace(gpu), projected.projection, lists)
-        width, height = projected.projection.size
-        pixels = width * height
-
-        def plane(number: int) -> torch.Tensor:
-            found = gpu.read(image.planes, np.float32, pixels, 4 * pixels * number)
-            return torch.from_numpy(found).view(height, width)
-
-        color = torch.from_numpy(gpu.read(image.color, np.float32, 3 * pixels))
+        image = rasterise.blend(Workspace(gpu), lists)
+        alpha = image.plane(gpu, 0)
+        color = torch.from_numpy(gpu.read(image.color, np.float32, 3 * alpha.numel()))
         return Forward(
-            color.view(height, width, 3), plane(0), projected.radii, lists.num_visible,
-            lists.num_dropped, lists.length, lambda: (plane(1), plane(2)),
-            State(projected, lists, image),
+            color.view(*alpha.shape, 3), alpha, projected.radii, lists.num_visible,
+            lists.num_dropped, lists.length, lambda: (image.plane(gpu, 1), image.plane(gpu, 2)),
+            State(projected.sh, image),
         )  # fmt: skip
 
     def backward(
@@ -146,51 +139,44 @@ class GpuBackend(Backend[Projected, Binned]):
         sh_adam: ShAdam | None = None,
     ) -> Gradients:
         state: State = fwd.state
-        gpu, projected = self.gpu, state.projected
-        scene, projection, sh = projected.scene, projected.projection, projected.sh
-        size, count = projection.size, scene.count
+        gpu, image, sh = self.gpu, state.image, state.sh
+        projection = image.lists.projection
+        size, scene = projection.size, projection.scene
+        count = scene.count
         d_color, d_alpha, d_depth = checks.image_gradients(d_color, d_alpha, d_depth, size)
         d_planes = np.zeros((2, size[1], size[0]), np.float32)
         for plane, gradient in zip(d_planes, (d_alpha, d_depth), strict=True):
             if gradient is not None:
                 plane[:] = gradient.numpy()
-        space = Workspace(gpu)
-        slots = rasterise.blend_backward(
-            gpu, space, projection, state.lists, state.image, gpu.upload(d_color.numpy()),
-            gpu.upload(d_planes),
-        )  # fmt: skip
-        if sh_adam is not None:
-            checks.check_sh_adam(sh_adam, sh)
-            moments = {
-                "exp_avg": gpu.upload(sh_adam.exp_avg.numpy()),
-                "exp_avg_sq": gpu.upload(sh_adam.exp_avg_sq.numpy()),
-                "last_step": gpu.upload(sh_adam.last.numpy()),
-            }
+        d_sh = sh.new_empty(len(sh) if sh_adam is None else 0, *sh.shape[1:])
+        if sh_adam is None:
+            tensors = {"d_sh": d_sh}
+            more = {"d_sh": gpu.empty(4 * sh.numel(), what="the gradients of SH")}
         else:
-            moments = {"d_sh": gpu.empty(4 * sh.numel(), what="the gradients of SH")}
+            checks.check_sh_adam(sh_adam, sh)
+            tensors = {**vars(sh_adam.moments), "last_step": sh_adam.last}
+            more = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
         if camera:
-            moments["d_camera"] = gpu.empty(4 * layout.CAMERA_PARAMETERS * count)
+            more["d_camera"] = gpu.empty(4 * layout.CAMERA_PARAMETERS * count)
         # A copy of the SH coefficients: further views may be rendered from the same projection.
         updated = gpu.empty(4 * sh.numel())
         gpu.copy(scene.sh, 0, updated, 0, 4 * sh.numel())
-        gradients = rasterise.project_backward(
-            space, replace(scene, sh=updated), projection, state.lists, slots,
-            sh_options(space, sh_adam, camera), **moments,
+        space = Workspace(gpu)
+        projection = replace(projection, scene=replace(scene, sh=updated))
+        gradients = rasterise.backward(
+            space, replace(image, lists=replace(image.lists, projection=projection)),
+            gpu.upload(d_color.numpy()), gpu.upload(d_planes),
+            None if sh_adam is None else sh_adam.rates, **more,
         )  # fmt: skip
         if sh_adam is not None:
-            self._fetch(updated, sh)
-            self._fetch(moments["exp_avg"], sh_adam.exp_avg)
-            self._fetch(moments["exp_avg_sq"], sh_adam.exp_avg_sq)
-            self._fetch(moments["last_step"], sh_adam.last)
-        found = self._read_sections(layout.GRADIENTS, gradients, count)
-        d_sh = sh.new_zeros(0, *sh.shape[1:])
-        if sh_adam is None:
-            d_sh = torch.from_numpy(gpu.read(moments["d_sh"], np.float32, sh.numel()))
-            d_sh = d_sh.view(sh.shape)
+            layout.fetch(gpu, updated, sh)
+        for name, tensor in tensors.items():
+            layout.fetch(gpu, more[name], tensor)
+        found = layout.split(layout.GRADIENTS, gradients, gpu, count)
         return Gradients(
             found["means"], found["log_scales"], found["quats"], found["opacity_logits"][:, 0],
             d_sh, found["means2d"], found["colors"] if colors else None,
-            camera_gradients(gpu, space, moments["d_camera"], count) if camera else None,
+            rasterise.camera_gradients(space, more["d_camera"], count) if camera else None,
         )  # fmt: skip
 
     def l1_ssim(
@@ -206,9 +192,9 @@ class GpuBackend(Backend[Projected, Binned]):
         gpu, (height, width, _) = self.gpu, rendered.shape
         space, image = Workspace(gpu), LossImage.upload(gpu, target, mask)
         found = l1_ssim(
-            gpu, space, gpu.upload(rendered.numpy()), image, (width, height), ssim_weight, l2_weight
+            space, gpu.upload(rendered.numpy()), image, (width, height), ssim_weight, l2_weight
         )
-        error, ssim, _ = found.values(gpu, space)
+        error, ssim, _ = found.values(space)
         loss = (1 - ssim_weight) * error + ssim_weight * (1 - ssim)
         grad = torch.from_numpy(gpu.read(found.gradient, np.float32, rendered.numel()))
         return LossResult(loss, error, ssim, grad.view(rendered.shape))
@@ -233,28 +219,23 @@ class GpuBackend(Backend[Projected, Binned]):
         return self._composition("compose.backward", around, alpha, d_image, loss)
 
     def adam_step(
-        self, param: torch.Tensor, grad: torch.Tensor, adam: DenseAdam, threads: int = 0
+        self,
+        param: torch.Tensor,
+        grad: torch.Tensor,
+        moments: Moments,
+        rates: AdamRates,
+        threads: int = 0,
     ) -> None:
-        checks.check_adam(param, grad, adam)
-        gpu, shared = self.gpu, adam.exp_avg_sq.shape != param.shape
-        count = len(param) if shared else param.numel()
-        uniform, rates = adam_uniform(Workspace(gpu), "a tensor", adam, count, param[:1].numel())
-        buffers = {
-            "parameter": gpu.upload(param.detach().numpy()),
-            "exp_avg": gpu.upload(adam.exp_avg.numpy()),
-            "exp_avg_sq": gpu.upload(adam.exp_avg_sq.numpy()),
-        }
-        gpu.run(
-            "adam.rows" if shared else "adam.elements",
-            blocks(count),
-            adam=uniform,
-            rates=rates,
-            gradient=gpu.upload(grad.detach().numpy()),
-            **buffers,
-        )
-        self._fetch(buffers["parameter"], param)
-        self._fetch(buffers["exp_avg"], adam.exp_avg)
-        self._fetch(buffers["exp_avg_sq"], adam.exp_avg_sq)
+        checks.check_adam(param, grad, moments, rates)
+        gpu, tensors = self.gpu, {"parameter": param.detach(), **vars(moments)}
+        buffers = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
+        adam.adam_step(
+            Workspace(gpu), "a tensor", rates, (len(param), param[:1].numel()),
+            shared=moments.exp_avg_sq.shape != param.shape,
+            gradient=gpu.upload(grad.detach().numpy()), **buffers,
+        )  # fmt: skip
+        for name, tensor in tensors.items():
+            layout.fetch(gpu, buffers[name], tensor)
 
     def frame_adam(
         self,
@@ -263,75 +244,49 @@ class GpuBackend(Backend[Projected, Binned]):
         log_scales: torch.Tensor,
         d_means: torch.Tensor,
         d_quats: torch.Tensor,
-        adam: FrameAdam,
+        moments: FrameMoments,
+        rates: AdamRates,
         threads: int = 0,
     ) -> None:
-        checks.check_frame_adam(means, quats, log_scales, d_means, d_quats, adam)
-        count = len(means)
-        tensors = {"means": means, "log_scales": log_scales, "quats": quats}
-        gradients = {"means": d_means, "log_scales": d_means, "quats": d_quats}
-        sections = {name: layout.GEOMETRY[name] for name in tensors}
-        geometry = self._sections(sections, _arrays(tensors), count)
-        moments = {
-            "mean_avg": adam.mean_avg,
-            "mean_avg_sq": adam.mean_avg_sq,
-            "rotation_avg": adam.rotation_avg,
-            "rotation_avg_sq": adam.rotation_avg_sq,
+        parameters = means, quats, log_scales
+        checks.check_frame_adam(parameters, (d_means, d_quats), moments, rates)
+        gpu, count = self.gpu, len(means)
+        of_means, of_rotations = moments.means, moments.rotations
+        tensors = {
+            "mean_avg": of_means.exp_avg,
+            "mean_avg_sq": of_means.exp_avg_sq,
+            "rotation_avg": of_rotations.exp_avg,
+            "rotation_avg_sq": of_rotations.exp_avg_sq,
         }
-        buffers = {name: self.gpu.upload(tensor.numpy()) for name, tensor in moments.items()}
-        self.gpu.run(
-            "frame_adam",
-            blocks(count),
-            adam=frame_uniform(Workspace(self.gpu), adam, count),
-            geometry=geometry,
-            gradients=self._sections(sections, _arrays(gradients), count),
-            **buffers,
-        )
-        found = self._read_sections(sections, geometry, count)
+        buffers = {name: gpu.upload(tensor.numpy()) for name, tensor in tensors.items()}
+        # The gradients of log scales are not read.
+        gradients = {"means": d_means, "log_scales": d_means, "quats": d_quats}
+        geometry = {"means": means, "log_scales": log_scales, "quats": quats}
+        buffers["geometry"] = gpu.upload(layout.join(FRAMES, geometry))
+        buffers["gradients"] = gpu.upload(layout.join(FRAMES, gradients))
+        adam.frame_adam(Workspace(gpu), rates, count, **buffers)
+        found = layout.split(FRAMES, buffers["geometry"], gpu, count)
         means.detach().copy_(found["means"])
         quats.detach().copy_(found["quats"])
-        for name, tensor in moments.items():
-            self._fetch(buffers[name], tensor)
+        for name, tensor in tensors.items():
+            layout.fetch(gpu, buffers[name], tensor)
 
     def _scene(self, parameters: Parameters) -> rasterise.Scene:
         """The parameters on the device. Those of the last call are copied once: usually, a scene is
         rendered from many views."""
         key = tuple((p.data_ptr(), p._version, p.shape) for p in parameters)
         if self._last is None or self._last[0] != key:
-            names = ("means", "log_scales", "quats", "opacity_logits")
-            arrays = dict(zip(names, (p.numpy() for p in parameters[:4]), strict=True))
             count, sh = len(parameters[0]), parameters[4]
+            geometry = layout.join(layout.GEOMETRY, dict(zip(NAMES, parameters[:4], strict=True)))
             scene = rasterise.Scene(
                 count,
                 sh.shape[1],
-                self._sections(layout.GEOMETRY, arrays, count),
+                self.gpu.upload(geometry, what=f"{count} Gaussians"),
                 self.gpu.upload(sh.numpy(), what="the SH coefficients"),
             )
             # The tensors are kept, so that others cannot get their addresses.
             self._last = key, scene, parameters
         return self._last[1]
-
-    def _sections(
-        self, sections: Mapping[str, int], arrays: Mapping[str, NDArray[np.float32]], count: int
-    ) -> Buffer:
-        """A buffer of the arrays, one after another."""
-        whole = np.concatenate([arrays[name].reshape(-1) for name in sections])
-        return self.gpu.upload(whole, what=f"{count} Gaussians")
-
-    def _read_sections(
-        self, sections: Mapping[str, int], buffer: Buffer, count: int
-    ) -> dict[str, torch.Tensor]:
-        """The tensors (N, width) of a buffer's sections."""
-        whole = torch.from_numpy(self.gpu.read(buffer, np.float32, layout.floats(sections) * count))
-        return {
-            name: whole[at : at + size].view(count, sections[name])
-            for name, (at, size) in layout.offsets(sections, count).items()
-        }
-
-    def _fetch(self, buffer: Buffer, tensor: torch.Tensor) -> None:
-        """Copy a buffer into a tensor."""
-        found = self.gpu.read(buffer, tensor.detach().numpy().dtype, tensor.numel())
-        tensor.detach().copy_(torch.from_numpy(found).view(tensor.shape))
 
     def _composition(
         self,
@@ -343,22 +298,11 @@ class GpuBackend(Backend[Projected, Binned]):
     ) -> tuple[torch.Tensor, torch.Tensor]:
         gpu, pixels = self.gpu, alpha.numel()
         result, d_alpha = gpu.empty(12 * pixels), gpu.empty(4 * pixels)
-        gpu.run(
-            kernel,
-            blocks(pixels),
-            layers=layers_uniform(gpu, around, pixels, loss),
-            alpha=gpu.upload(alpha.numpy()),
-            values=gpu.upload(values.numpy()),
-            result=result,
-            d_alpha=d_alpha,
-            **upload_layers(gpu, around),
-        )
-        images = (
-            torch.from_numpy(gpu.read(result, np.float32, 3 * pixels)).view(values.shape),
-            torch.from_numpy(gpu.read(d_alpha, np.float32, pixels)).view(alpha.shape),
-        )
+        compose(
+            Workspace(gpu), kernel, upload_layers(gpu, around), pixels, loss, result=result,
+            alpha=gpu.upload(alpha.numpy()), values=gpu.upload(values.numpy()), d_alpha=d_alpha,
+        )  # fmt: skip
+        images = torch.empty_like(values), torch.empty_like(alpha)
+        layout.fetch(gpu, result, images[0])
+        layout.fetch(gpu, d_alpha, images[1])
         return images
-
-
-def _arrays(tensors: Mapping[str, torch.Tensor]) -> dict[str, NDArray[np.float32]]:
-    return {name: tensor.detach().numpy() for name, tensor in tensors.items()}

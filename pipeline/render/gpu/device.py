@@ -83,7 +83,7 @@ def adapters() -> list[Adapter]:
 
 
 class KernelTimer(Protocol):
-    """Measures kernels (``profile.Profile``)."""
+    """Measures kernels (``benchmarks.kernel_times.Profile``)."""
 
     def timestamp_writes(self, kernel: str) -> dict[str, Any]:
         """For the pass of the next kernel."""

@@ -4,11 +4,16 @@ from __future__ import annotations
 
 import struct
 from collections.abc import Mapping
+from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
+from pipeline.render.gpu.device import Buffer, Gpu
 from pipeline.render.types import RasterCamera, RasterOptions
+
+Tensors = dict[str, torch.Tensor]
 
 TILE = 16  # kTile in constants.h
 RECORD_BYTES = 48  # Record in record.wgsl
@@ -38,6 +43,26 @@ def offsets(sections: Mapping[str, int], count: int) -> dict[str, tuple[int, int
         found[name] = at, width * count
         at += width * count
     return found
+
+
+def join(sections: Mapping[str, int], tensors: Mapping[str, torch.Tensor]) -> NDArray[Any]:
+    """The tensors of the sections, one after another."""
+    return np.concatenate([tensors[name].detach().numpy().reshape(-1) for name in sections])
+
+
+def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> Tensors:
+    """The tensors (N, width) of the sections of a buffer."""
+    numbers = torch.from_numpy(gpu.read(whole, np.float32, floats(sections) * count))
+    return {
+        name: numbers[at : at + size].view(count, sections[name])
+        for name, (at, size) in offsets(sections, count).items()
+    }
+
+
+def fetch(gpu: Gpu, buffer: Buffer, tensor: torch.Tensor) -> None:
+    """Copy a buffer into a tensor."""
+    found = gpu.read(buffer, tensor.detach().numpy().dtype, tensor.numel())
+    tensor.detach().copy_(torch.from_numpy(found).view(tensor.shape))
 
 
 def tiles_of(width: int, height: int) -> tuple[int, int]:

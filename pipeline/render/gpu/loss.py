@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import torch
 
 from pipeline.render.gpu import layout
-from pipeline.render.gpu.device import Buffer, Gpu
-from pipeline.render.gpu.reduce import sum_rows
+from pipeline.render.gpu.device import Buffer, Gpu, blocks
+from pipeline.render.gpu.primitives import sum_rows
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AlphaChangeLoss, Surroundings
 
@@ -21,9 +21,9 @@ class LossImage:
     """A photograph on the device.
 
     Attributes:
-        target, mask: as of ``Backend.l1_ssim``; bytes are padded to words.
-        count: number of unmasked values.
-        is_bytes: the target is uint8.
+        target, mask: As of ``Backend.l1_ssim``; bytes are padded to words.
+        count: The number of unmasked values.
+        is_bytes: Whether the target is uint8.
     """
 
     target: Buffer
@@ -58,16 +58,15 @@ class LossSums:
     rows: int
     count: int
 
-    def values(self, gpu: Gpu, space: Workspace) -> tuple[float, float, float]:
+    def values(self, space: Workspace) -> tuple[float, float, float]:
         """The means of the error, of SSIM and of the squared difference; (0, 1, 0) of no pixels."""
         if not self.count:
             return 0.0, 1.0, 0.0
-        error, ssim, squared, _ = sum_rows(gpu, space, self.sums, self.rows, 4) / self.count
+        error, ssim, squared, _ = sum_rows(space, self.sums, self.rows, 4) / self.count
         return float(error), float(ssim), float(squared)
 
 
 def l1_ssim(
-    gpu: Gpu,
     space: Workspace,
     rendered: Buffer,
     image: LossImage,
@@ -82,16 +81,16 @@ def l1_ssim(
     flags = layout.BYTES * image.is_bytes + layout.MASKED * (image.mask is not None)
     scales = (1 - ssim_weight) / count, -ssim_weight / count
     arguments = {
-        "loss": gpu.uniform("4I8f", *size, flags, 0, l2_weight, *scales, 0.0, *gain, 0.0),
+        "loss": space.gpu.uniform("4I8f", *size, flags, 0, l2_weight, *scales, 0.0, *gain, 0.0),
         "rendered": rendered,
         "derivatives": space.get("derivatives of SSIM", 36 * pixels),
         "gradient": space.get("gradient of the image", 12 * pixels),
         "sums": space.get("sums of the loss", 16 * rows),
         **image.buffers,
     }
-    # Not bound once for all steps: the bind groups would keep every image in memory.
-    gpu.run("loss.forward", (*tiles, 3), **arguments)
-    gpu.run("loss.backward", (*tiles, 3), **arguments)
+    # The workspace would keep the bind groups, and with them every image in memory.
+    space.gpu.run("loss.forward", (*tiles, 3), **arguments)
+    space.gpu.run("loss.backward", (*tiles, 3), **arguments)
     return LossSums(arguments["gradient"], arguments["sums"], rows, image.count)
 
 
@@ -107,9 +106,22 @@ def upload_layers(gpu: Gpu, around: Surroundings) -> dict[str, Buffer]:
     return {k: gpu.upload(v.numpy()) for k, v in layers.items() if v is not None}
 
 
-def layers_uniform(gpu: Gpu, around: Surroundings, pixels: int, loss: AlphaChangeLoss) -> Buffer:
-    """``Layers`` in compose.wgsl."""
-    flags = layout.FRONT * (around.front is not None)
-    flags |= layout.CORRECTION * (around.correction is not None)
+def compose(
+    space: Workspace,
+    kernel: str,
+    layers: dict[str, Buffer],
+    pixels: int,
+    loss: AlphaChangeLoss,
+    **images: Buffer,
+) -> None:
+    """Run ``compose.compose`` or ``compose.backward``, by the names of compose.wgsl.
+
+    Args:
+        layers: See ``upload_layers``.
+        images: ``alpha`` of the part, ``values`` and ``result``; ``d_alpha`` of the gradient.
+    """
+    flags = layout.FRONT * ("front" in layers) | layout.CORRECTION * ("correction" in layers)
     factor = 2 * loss.weight / pixels
-    return gpu.uniform("II4f8x", pixels, flags, loss.fade, loss.growth, factor, 0.0)
+    sizes = space.gpu.uniform("II4f8x", pixels, flags, loss.fade, loss.growth, factor, 0.0)
+    # As in ``l1_ssim``, the bind group is not kept.
+    space.gpu.run(kernel, blocks(pixels), layers=sizes, **layers, **images)

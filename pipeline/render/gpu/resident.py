@@ -3,26 +3,20 @@
 from __future__ import annotations
 
 from collections import OrderedDict
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
 import torch
 
 from pipeline.render.gpu import layout, rasterise
-from pipeline.render.gpu.adam import adam_uniform, frame_uniform, sh_options
+from pipeline.render.gpu.adam import adam_step, frame_adam
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
-from pipeline.render.gpu.loss import (
-    LossImage,
-    LossSums,
-    l1_ssim,
-    layers_uniform,
-    upload_layers,
-)
+from pipeline.render.gpu.loss import LossImage, LossSums, compose, l1_ssim, upload_layers
 from pipeline.render.gpu.memory import memory_line
-from pipeline.render.gpu.reduce import camera_gradients, sum_rows
+from pipeline.render.gpu.primitives import sum_rows
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.resident import (
-    GaussianAdam,
     Optimised,
     ResidentImage,
     ResidentStep,
@@ -30,9 +24,9 @@ from pipeline.render.resident import (
     StepResult,
     TrainingSize,
 )
-from pipeline.render.types import DenseAdam, FrameAdam, ShAdam
+from pipeline.render.types import AdamRates
 
-# Training images on the device, bytes; images beyond are copied at every use.
+# The bytes of the training images that are kept on the device. Others are copied at every use.
 IMAGE_CACHE = 2 << 30
 
 
@@ -45,7 +39,7 @@ class _Image:
 
     @property
     def size(self) -> int:
-        """Bytes."""
+        """The bytes of its buffers."""
         planes = [*self.photograph.buffers.values(), *self.layers.values()]
         return sum(int(buffer.size) for buffer in planes)
 
@@ -80,21 +74,15 @@ class _Planes:
     """See ``resident.Planes``: copied to the CPU when they are read."""
 
     gpu: Gpu
-    planes: Buffer
-    shape: tuple[int, int]
+    image: rasterise.Image
 
     @property
     def alpha(self) -> torch.Tensor:
-        return self._plane(0)
+        return self.image.plane(self.gpu, 0)
 
     @property
     def depth(self) -> torch.Tensor:
-        return self._plane(1)
-
-    def _plane(self, number: int) -> torch.Tensor:
-        pixels = self.shape[0] * self.shape[1]
-        found = self.gpu.read(self.planes, np.float32, pixels, 4 * pixels * number)
-        return torch.from_numpy(found).view(self.shape)
+        return self.image.plane(self.gpu, 1)
 
 
 class GpuTraining(ResidentTraining):
@@ -104,36 +92,31 @@ class GpuTraining(ResidentTraining):
         self.gpu, self.space, self.images = gpu, Workspace(gpu), _Images(gpu)
         self.scene = rasterise.Scene(0, 1, gpu.empty(0), gpu.empty(0))
         self.buffers: dict[str, Buffer] = {}
-        self.appearance_size = 0  # numbers of the parameter
+        self.embedding_size = 0
 
     def memory_line(self, size: TrainingSize) -> str:
         return memory_line(self.gpu, size, IMAGE_CACHE)
 
     def load(self, optimised: Optimised) -> None:
         parameters, count = optimised.parameters, len(optimised.last)
-        whole = np.concatenate([parameters[n].numpy().reshape(-1) for n in layout.GEOMETRY])
-        sh = parameters["sh"]
+        sh, geometry = parameters["sh"], layout.join(layout.GEOMETRY, parameters)
         self.scene = rasterise.Scene(
-            count, sh.shape[1], self._fill("geometry", whole), self._fill("sh", sh.numpy())
+            count, sh.shape[1], self._fill("geometry", geometry), self._fill("sh", sh.numpy())
         )
         appearance = parameters.get("appearance")
-        self.appearance_size = 0 if appearance is None else appearance.numel()
+        self.embedding_size = 0 if appearance is None else appearance.shape[1]
         self.buffers = {
             name: self._fill(name, tensor.numpy()) for name, tensor in _others(optimised).items()
         }
 
     def store(self, optimised: Optimised) -> None:
-        parameters, count = optimised.parameters, self.scene.count
-        whole = self.gpu.read(
-            self.scene.geometry, np.float32, layout.floats(layout.GEOMETRY) * count
-        )
-        for name, (at, size) in layout.offsets(layout.GEOMETRY, count).items():
-            parameters[name].view(-1).copy_(torch.from_numpy(whole[at : at + size]))
-        tensors = _others(optimised) | {"sh": parameters["sh"]}
-        for name, tensor in tensors.items():
-            buffer = self.scene.sh if name == "sh" else self.buffers[name]
-            found = self.gpu.read(buffer, tensor.numpy().dtype, tensor.numel())
-            tensor.copy_(torch.from_numpy(found).view(tensor.shape))
+        parameters, scene = optimised.parameters, self.scene
+        found = layout.split(layout.GEOMETRY, scene.geometry, self.gpu, scene.count)
+        for name, tensor in found.items():
+            parameters[name].copy_(tensor.view(parameters[name].shape))
+        layout.fetch(self.gpu, scene.sh, parameters["sh"])
+        for name, tensor in _others(optimised).items():
+            layout.fetch(self.gpu, self.buffers[name], tensor)
 
     def step(self, step: ResidentStep) -> StepResult:
         gpu, space, scene, camera = self.gpu, self.space, self.scene, step.camera
@@ -143,30 +126,35 @@ class GpuTraining(ResidentTraining):
         appearance = self._appearance(step)
         if appearance is not None:
             space.run("appearance.show", blocks(scene.count), **appearance)
-        projection = rasterise.project(gpu, space, scene, view, size)
-        lists = rasterise.list_pairs(gpu, space, projection, scene.count)
-        image = rasterise.blend(gpu, space, projection, lists)
+        projection = rasterise.project(space, scene, view, size)
+        lists = rasterise.list_pairs(space, projection)
+        image = rasterise.blend(space, lists)
         target = self.images.get(step.image)
         d_planes = space.get("gradients of alpha and depth", 8 * size[0] * size[1])
         gpu.clear(d_planes)
         d_color, loss = self._loss(step, target, image, d_planes)
         self._add_other_losses(step, image, d_planes)
-        slots = rasterise.blend_backward(gpu, space, projection, lists, image, d_color, d_planes)
-        gradients, d_camera = self._project_backward(step, projection, lists, slots)
+        more = self._moments("sh") | {"last_step": self.buffers["last"]}
+        if step.camera_gradients:
+            size_of_rows = 4 * layout.CAMERA_PARAMETERS * scene.count
+            more["d_camera"] = space.get("camera gradients", size_of_rows)
+        rates = step.adam["sh"]
+        gradients = rasterise.backward(space, image, d_color, d_planes, rates, **more)
         if appearance is not None:
             space.run("appearance.hide", blocks(scene.count), **appearance)
             space.run("appearance.gradient", blocks(scene.count), **appearance)
         self._observe(step, projection, gradients)
         self._optimise(step.adam, gradients)
-        error, ssim, squared = loss.values(gpu, space)
+        error, ssim, squared = loss.values(space)
+        cameras = None
+        if step.camera_gradients:
+            cameras = rasterise.camera_gradients(space, more["d_camera"], scene.count)
         return StepResult(
             loss=(1 - step.ssim_weight) * error + step.ssim_weight * (1 - ssim),
             squared_error=squared,
             num_visible=lists.num_visible,
             num_dropped=lists.num_dropped,
-            camera=(
-                None if d_camera is None else camera_gradients(gpu, space, d_camera, scene.count)
-            ),
+            camera=cameras,
             embedding=self._embedding_gradient(step),
         )
 
@@ -180,25 +168,23 @@ class GpuTraining(ResidentTraining):
     ) -> tuple[Buffer, LossSums]:
         """The gradient on the colours, and the loss; with surroundings, the gradient on alpha as
         well, in ``d_planes``."""
-        gpu, space = self.gpu, self.space
+        space, pixels = self.space, step.camera.width * step.camera.height
         size = step.camera.width, step.camera.height
-        pixels, around = size[0] * size[1], step.image.surroundings
         weights = step.ssim_weight, step.l2_weight, step.image.gain
-        if around is None:
-            loss = l1_ssim(gpu, space, image.color, target.photograph, size, *weights)
+        if step.image.surroundings is None:
+            loss = l1_ssim(space, image.color, target.photograph, size, *weights)
             return loss.gradient, loss
-        layers = {
-            **target.layers,
-            "alpha": image.planes,
-            "layers": layers_uniform(gpu, around, pixels, step.alpha_loss),
-        }
         composed = space.get("composed image", 12 * pixels)
-        gpu.run("compose.compose", blocks(pixels), values=image.color, result=composed, **layers)
-        loss = l1_ssim(gpu, space, composed, target.photograph, size, *weights)
+        around = target.layers, pixels, step.alpha_loss
+        compose(
+            space, "compose.compose", *around, alpha=image.planes, values=image.color,
+            result=composed,
+        )  # fmt: skip
+        loss = l1_ssim(space, composed, target.photograph, size, *weights)
         d_color = space.get("gradient of the part", 12 * pixels)
-        gpu.run(
-            "compose.backward", blocks(pixels), values=loss.gradient, result=d_color,
-            d_alpha=d_planes, **layers,
+        compose(
+            space, "compose.backward", *around, alpha=image.planes, values=loss.gradient,
+            result=d_color, d_alpha=d_planes,
         )  # fmt: skip
         return d_color, loss
 
@@ -210,39 +196,15 @@ class GpuTraining(ResidentTraining):
             return
         shape = step.camera.height, step.camera.width
         both = self.gpu.read(d_planes, np.float32, 2 * shape[0] * shape[1]).reshape(2, *shape)
-        found = step.losses(_Planes(self.gpu, image.planes, shape))
+        found = step.losses(_Planes(self.gpu, image))
         for part, gradient in zip(both, found, strict=True):
             if gradient is not None:
                 part += gradient.numpy()
         self.gpu.write(d_planes, both)
 
-    def _project_backward(
-        self,
-        step: ResidentStep,
-        projection: rasterise.Projection,
-        lists: rasterise.Lists,
-        slots: Buffer,
-    ) -> tuple[Buffer, Buffer | None]:
-        """The gradients of all but SH, which are updated, and those of the camera."""
-        space, adam = self.space, step.adam
-        nothing = torch.empty(0)
-        sh_adam = ShAdam(
-            nothing, nothing, nothing, adam.rates["sh0"], adam.rates["shN"], adam.step,
-            adam.beta1, adam.beta2, adam.eps,
-        )  # fmt: skip
-        more = {
-            "exp_avg": self.buffers["first sh"],
-            "exp_avg_sq": self.buffers["second sh"],
-            "last_step": self.buffers["last"],
-        }
-        if step.camera_gradients:
-            size = 4 * layout.CAMERA_PARAMETERS * self.scene.count
-            more["d_camera"] = space.get("camera gradients", size)
-        options = sh_options(space, sh_adam, step.camera_gradients)
-        gradients = rasterise.project_backward(
-            space, self.scene, projection, lists, slots, options, **more
-        )
-        return gradients, more.get("d_camera")
+    def _moments(self, name: str) -> dict[str, Buffer]:
+        first, second = self.buffers[f"first {name}"], self.buffers[f"second {name}"]
+        return {"exp_avg": first, "exp_avg_sq": second}
 
     def _appearance(self, step: ResidentStep) -> dict[str, Buffer] | None:
         """The buffers of appearance.wgsl, if colours depend on the photograph."""
@@ -271,7 +233,7 @@ class GpuTraining(ResidentTraining):
             return None
         size, count = len(step.embedding), self.scene.count
         rows = self.space.get("gradients of the embedding", 4 * size * count)
-        return tuple(sum_rows(self.gpu, self.space, rows, count, size).tolist())
+        return tuple(sum_rows(self.space, rows, count, size).tolist())
 
     def _observe(
         self, step: ResidentStep, projection: rasterise.Projection, gradients: Buffer
@@ -289,69 +251,47 @@ class GpuTraining(ResidentTraining):
             seen=self.buffers["seen"],
         )
 
-    def _optimise(self, adam: GaussianAdam, gradients: Buffer) -> None:
+    def _optimise(self, rates: Mapping[str, AdamRates], gradients: Buffer) -> None:
         """Update all parameters but SH."""
-        count, nothing = self.scene.count, torch.empty(0)
-        dense = ["log_scales", "opacity_logits"]
-        if adam.frames:
-            frame = FrameAdam(
-                nothing, nothing, nothing, nothing, adam.rates["means"], adam.rates["quats"],
-                adam.step, adam.beta1, adam.beta2, adam.eps,
-            )  # fmt: skip
-            self.space.run(
-                "frame_adam",
-                blocks(count),
-                adam=frame_uniform(self.space, frame, count),
+        space, scene, buffers = self.space, self.scene, self.buffers
+        if "frames" in rates:
+            frame_adam(
+                space,
+                rates["frames"],
+                scene.count,
                 gradients=gradients,
-                geometry=self.scene.geometry,
-                mean_avg=self.buffers["first means"],
-                mean_avg_sq=self.buffers["second means"],
-                rotation_avg=self.buffers["first quats"],
-                rotation_avg_sq=self.buffers["second quats"],
+                geometry=scene.geometry,
+                mean_avg=buffers["first means"],
+                mean_avg_sq=buffers["second means"],
+                rotation_avg=buffers["first quats"],
+                rotation_avg_sq=buffers["second quats"],
             )
-        else:
-            dense += ["means", "quats"]
-        if "appearance" in self.buffers:
-            self._step_appearance(adam)
-        for name in dense:
-            at, numbers = layout.offsets(layout.GEOMETRY, count)[name]
-            rows = name in ("means", "quats")
-            each = layout.GEOMETRY[name]
-            eps = adam.means_eps if name == "means" else adam.eps
-            dense_adam = DenseAdam(
-                nothing, nothing, adam.rates[name], adam.step, adam.beta1, adam.beta2, eps
+        if "appearance" in buffers:
+            width = 3 * self.embedding_size
+            adam_step(
+                space,
+                "appearance",
+                rates["appearance"],
+                (scene.count, width),
+                shared=False,
+                gradient=space.get("gradients of the appearance", 4 * width * scene.count),
+                parameter=buffers["appearance"],
+                **self._moments("appearance"),
             )
-            elements = count if rows else numbers
-            uniform, rates = adam_uniform(self.space, name, dense_adam, elements, each, at)
-            self.space.run(
-                "adam.rows" if rows else "adam.elements",
-                blocks(elements),
-                adam=uniform,
-                rates=rates,
+        for name, (at, _) in layout.offsets(layout.GEOMETRY, scene.count).items():
+            if name not in rates:
+                continue
+            adam_step(
+                space,
+                name,
+                rates[name],
+                (scene.count, layout.GEOMETRY[name]),
+                shared=name in ("means", "quats"),
+                at=at,
                 gradient=gradients,
-                parameter=self.scene.geometry,
-                exp_avg=self.buffers[f"first {name}"],
-                exp_avg_sq=self.buffers[f"second {name}"],
+                parameter=scene.geometry,
+                **self._moments(name),
             )
-
-    def _step_appearance(self, adam: GaussianAdam) -> None:
-        """At the rate of the constant SH coefficient."""
-        nothing, parameter = torch.empty(0), self.buffers["appearance"]
-        dense = DenseAdam(
-            nothing, nothing, adam.rates["sh0"], adam.step, adam.beta1, adam.beta2, adam.eps
-        )
-        count = self.appearance_size
-        uniform, rates = adam_uniform(self.space, "appearance", dense, count, 1)
-        self.space.run(
-            "adam.elements",
-            blocks(count),
-            adam=uniform,
-            rates=rates,
-            gradient=self.space.get("gradients of the appearance", 4 * count),
-            parameter=parameter,
-            exp_avg=self.buffers["first appearance"],
-            exp_avg_sq=self.buffers["second appearance"],
-        )
 
 
 def _others(optimised: Optimised) -> dict[str, torch.Tensor]:

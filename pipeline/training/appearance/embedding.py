@@ -25,7 +25,7 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from pipeline.render import Backend, DenseAdam
+from pipeline.render import AdamRates, Backend, Moments
 from pipeline.scene.appearance import Appearance
 from pipeline.splats.gaussians import Gaussians
 from pipeline.splats.init import SH_C0
@@ -84,7 +84,8 @@ class AppearanceEmbeddings:
         index: int,
         gaussians: Gaussians,
         d_colors: Tensor,
-        dense: DenseAdam,
+        moments: Moments,
+        rates: AdamRates,
         rate: float,
         backend: Backend,
         threads: int,
@@ -93,14 +94,14 @@ class AppearanceEmbeddings:
 
         Args:
             d_colors: (N, 3) gradient of the colours (``Gradients.colors``).
-            dense: Adam of ``gaussians.appearance``.
+            moments, rates: The state and the rates of Adam for ``gaussians.appearance``.
             rate: learning rate of the embedding, as a share of ``MAX_CHANGE``.
         """
         assert gaussians.appearance is not None
         d_embedding, d_appearance = appearance_gradients(
             gaussians.appearance, self.embeddings[index], d_colors
         )
-        backend.adam_step(gaussians.appearance, d_appearance, dense, threads)
+        backend.adam_step(gaussians.appearance, d_appearance, moments, rates, threads)
         self.update(index, d_embedding, rate)
 
     def update(self, index: int, d_embedding: Array, rate: float) -> None:

@@ -67,7 +67,7 @@ class DeviceStep(StepEngine):
                 embedding=embedding,
                 alpha_loss=BLOCK_ALPHA_LOSS,
                 losses=losses if has_losses else None,
-                adam=state.adam.resident(step.adam),
+                adam=state.adam.rates(step.adam),
             )
         )
         self.require_finite(result.loss, view)

@@ -7,14 +7,21 @@ in 3DGS.
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from pipeline.config.settled import TrainOptions
-from pipeline.render import Backend, DenseAdam, FrameAdam, Gradients, ShAdam, make_backend
-from pipeline.render.resident import GaussianAdam
+from pipeline.render import (
+    AdamRates,
+    Backend,
+    FrameMoments,
+    Gradients,
+    Moments,
+    ShAdam,
+    make_backend,
+)
 from pipeline.splats.gaussians import Gaussians, resize_bands
 
 BETA2 = 0.999
@@ -40,8 +47,8 @@ class AdamStep:
     """One optimiser step.
 
     Attributes:
-        number: counts from 1.
-        pixels: number of pixels of the image. The loss is a mean over them and three channels.
+        number: The number of the step, from 1.
+        pixels: The number of pixels of the image. The loss is a mean over them and three channels.
     """
 
     number: int
@@ -51,12 +58,12 @@ class AdamStep:
 
 @dataclass(frozen=True)
 class AdamOptions:
-    """What does not change during a run.
+    """The options that stay the same during a run.
 
     Attributes:
-        beta1: decay rate of the first moment.
-        own_frames: update means along, and rotations about, each Gaussian's own axes.
-        epsilon: pixels. Gaussians that change the loss by less than so many pixels do, because
+        beta1: The decay rate of the first moment.
+        own_frames: Update means along, and rotations about, each Gaussian's own axes.
+        epsilon: In pixels. Gaussians that change the loss by less than so many pixels do, because
             others hide them or they are small, take smaller steps: their gradients are noise, and
             Adam's steps do not depend on a gradient's size.
     """
@@ -73,15 +80,14 @@ class AdamOptions:
 
 
 class Adam:
-    """First and second moments of each row of ``Gaussians``.
+    """The moments of each row of ``Gaussians``, and its updates.
 
     Attributes:
-        options: of the run.
-        backend: performs the updates.
-        first, second: moments by the name of the array, of its shape, float32. With ``own_frames``,
-            those of quaternions are (N, 3), about the axes. Without, the second moments of means
-            and quaternions are (N, 1), shared by their components. Either way, results do not
-            depend on the orientation of the world.
+        backend: The backend that performs the updates.
+        first, second: The moments by the name of the array, of its shape, float32. With
+            ``own_frames``, those of quaternions are (N, 3), about the axes. Without, the second
+            moments of means and quaternions are (N, 1), shared by their components. Either way,
+            results do not depend on the orientation of the world.
         last: (N,) int32, the last step in which each row had a gradient.
     """
 
@@ -100,59 +106,48 @@ class Adam:
             self.second["quats"] = torch.zeros(count, 1)
         self.last = torch.zeros(count, dtype=torch.int32)
 
-    def harmonics(self, step: AdamStep) -> ShAdam:
-        """Arguments of ``backward``, which updates ``sh``."""
-        return ShAdam(
-            self.first["sh"], self.second["sh"], self.last, step.rates.sh0, step.rates.shN,
-            step.number, self.options.beta1, BETA2, self.epsilon(step),
-        )  # fmt: skip
+    def rates(self, step: AdamStep) -> dict[str, AdamRates]:
+        """The rates of each array by its name. With ``own_frames``, ``frames`` has those of means
+        and rotations."""
+        epsilon = max(self.options.epsilon / (3 * step.pixels), EPSILON)
 
-    def appearance(self, step: AdamStep) -> DenseAdam:
-        """Adam of ``Gaussians.appearance``, at the learning rate of SH coefficient 0."""
-        return DenseAdam(
-            self.first["appearance"], self.second["appearance"], step.rates.sh0, step.number,
-            self.options.beta1, BETA2, self.epsilon(step),
-        )  # fmt: skip
+        def rates(*lr: float, eps: float = epsilon) -> AdamRates:
+            one_or_more = lr if len(lr) > 1 else lr[0]
+            return AdamRates(one_or_more, step.number, self.options.beta1, BETA2, eps)
+
+        lr = step.rates
+        found = {name: rates(getattr(lr, name)) for name in ("log_scales", "opacity_logits")}
+        found |= {"sh": rates(lr.sh0, lr.shN), "appearance": rates(lr.sh0)}
+        if self.options.own_frames:
+            return found | {"frames": rates(lr.means, lr.quats)}
+        # The gradient of means that move along the world's axes has another unit.
+        return found | {"means": rates(lr.means, eps=EPSILON), "quats": rates(lr.quats)}
+
+    def moments(self, name: str) -> Moments:
+        """The moments of an array."""
+        return Moments(self.first[name], self.second[name])
+
+    def harmonics(self, step: AdamStep) -> ShAdam:
+        """The argument of ``Backend.backward`` with which it updates ``sh``."""
+        return ShAdam(self.moments("sh"), self.last, self.rates(step)["sh"])
 
     def step(
         self, gaussians: Gaussians, gradients: Gradients, step: AdamStep, threads: int
     ) -> None:
         """Update all arrays but ``sh`` and ``appearance``, in place."""
-        updated = {"sh", "appearance"}
-        if self.options.own_frames:
-            updated |= {"means", "quats"}
+        rates = self.rates(step)
+        if "frames" in rates:
+            moments = FrameMoments(self.moments("means"), self.moments("quats"))
             self.backend.frame_adam(
                 gaussians.means, gaussians.quats, gaussians.log_scales, gradients.means,
-                gradients.quats, self.frames(step), threads,
+                gradients.quats, moments, rates["frames"], threads,
             )  # fmt: skip
         for name, parameter in gaussians.tensors().items():
-            if name in updated:
-                continue
-            # The gradient of means that move along the world's axes has another unit.
-            epsilon = EPSILON if name == "means" else self.epsilon(step)
-            adam = DenseAdam(
-                self.first[name], self.second[name], getattr(step.rates, name), step.number,
-                self.options.beta1, BETA2, epsilon,
-            )  # fmt: skip
-            self.backend.adam_step(parameter, getattr(gradients, name), adam, threads)
-
-    def frames(self, step: AdamStep) -> FrameAdam:
-        return FrameAdam(
-            self.first["means"], self.second["means"], self.first["quats"], self.second["quats"],
-            step.rates.means, step.rates.quats, step.number, self.options.beta1, BETA2,
-            self.epsilon(step),
-        )  # fmt: skip
-
-    def resident(self, step: AdamStep) -> GaussianAdam:
-        """The same updates, of all arrays, by a device."""
-        epsilon = self.epsilon(step)
-        return GaussianAdam(
-            asdict(step.rates), step.number, self.options.own_frames, self.options.beta1, BETA2,
-            epsilon, EPSILON,
-        )  # fmt: skip
-
-    def epsilon(self, step: AdamStep) -> float:
-        return max(self.options.epsilon / (3 * step.pixels), EPSILON)
+            if name in rates and name not in ("sh", "appearance"):
+                gradient = getattr(gradients, name)
+                self.backend.adam_step(
+                    parameter, gradient, self.moments(name), rates[name], threads
+                )
 
     def select(self, rows: Tensor, fresh: Tensor) -> None:
         """Select rows as ``Gaussians.select(rows)`` does; ``fresh`` (M,) bool rows are set to 0."""

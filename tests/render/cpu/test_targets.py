@@ -17,7 +17,14 @@ import numpy as np
 import pytest
 import torch
 
-from pipeline.render import DenseAdam, RasterCamera, RasterOptions, reference
+from pipeline.render import (
+    AdamRates,
+    Moments,
+    RasterCamera,
+    RasterOptions,
+    reference,
+    reference_adam,
+)
 from pipeline.render.cpu import build
 from pipeline.runtime import processor, targets
 from tests.render.cpu.compiled import compiled, linked_driver
@@ -102,9 +109,7 @@ def make_case(seed: int, count: int, size: tuple[int, int], options: RasterOptio
     inputs = [t.double().requires_grad_() for t in scene]
     change = torch.zeros(10, dtype=torch.float64, requires_grad=True)
     moved = reference.perturbed(cam, change)
-    projection = reference.project(*inputs, moved, options)
-    colors = reference.sh_colors(inputs[0][projection.index], inputs[4][projection.index], moved, 3)
-    image = reference.blend(projection, colors, moved, options)
+    projection, image = reference.render(*inputs, moved, options)
     sure = image.margin > 1e-5
     assert sure.double().mean() > 0.99
     gen = torch.Generator().manual_seed(seed + 100)
@@ -144,8 +149,8 @@ def check(case: Case, found: dict[str, torch.Tensor], found_camera: torch.Tensor
     loss, _, _ = reference.l1_ssim(rendered, case.incoming[3], 0.2, None, 2.5)
     assert relative(found["loss"], torch.autograd.grad(loss, rendered)[0]) <= GRADIENT
     sh, d_sh = case.scene[4].double(), found["sh"].double()
-    adam = DenseAdam(torch.zeros_like(sh), torch.zeros_like(sh), 1e-2, 1)
-    reference.adam_step(sh, d_sh, adam)
+    moments = Moments(torch.zeros_like(sh), torch.zeros_like(sh))
+    reference_adam.adam_step(sh, d_sh, moments, AdamRates(1e-2, 1))
     assert (found["moved"] - sh).abs().max() <= 2e-6
 
 

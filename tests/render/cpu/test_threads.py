@@ -8,15 +8,15 @@ from concurrent.futures import ThreadPoolExecutor
 import pytest
 import torch
 
-from pipeline import render
-from pipeline.render import RasterOptions
+from pipeline.render import RasterOptions, make_backend
 from tests.render.scenes import camera, random_scene
 
 
 def draw(threads: int) -> bytes:
     """The bytes of a rendered view and its gradients."""
-    fwd = render.forward(*random_scene(3, 4000), camera(203, 151), RasterOptions(threads=threads))
-    gradients = render.backward(fwd, torch.ones_like(fwd.color))
+    backend, options = make_backend("cpu"), RasterOptions(threads=threads)
+    fwd = backend.forward(*random_scene(3, 4000), camera(203, 151), options)
+    gradients = backend.backward(fwd, torch.ones_like(fwd.color))
     tensors = (fwd.color, gradients.means, gradients.sh, gradients.log_scales)
     return b"".join(tensor.numpy().tobytes() for tensor in tensors)
 

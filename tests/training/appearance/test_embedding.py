@@ -66,7 +66,7 @@ def test_gradients_equal_the_reference_and_finite_differences(gaussians: Gaussia
 
     def value(embedding: torch.Tensor) -> torch.Tensor:
         sh = shown(fixed[4], appearance, embedding)
-        return (reference.render(*fixed[:4], sh, CAMERA, OPTIONS).color * weights).sum()
+        return (reference.render(*fixed[:4], sh, CAMERA, OPTIONS)[1].color * weights).sum()
 
     expected = torch.autograd.grad(value(embedding), [embedding, appearance])
     assert relative(torch.from_numpy(d_embedding), expected[0]) < 1e-4
@@ -105,7 +105,7 @@ def test_the_scene_has_the_colours_of_the_mean_photograph(gaussians: Gaussians) 
 
 def test_the_first_step_is_the_learning_rate(gaussians: Gaussians) -> None:
     """Up or down, of the view's embedding only, and of the Gaussians that it shows."""
-    from pipeline.render import DenseAdam
+    from pipeline.render import AdamRates, Moments
     from pipeline.training.appearance.embedding import MAX_CHANGE
 
     assert gaussians.appearance is not None
@@ -113,9 +113,9 @@ def test_the_first_step_is_the_learning_rate(gaussians: Gaussians) -> None:
     before = gaussians.appearance.clone()
     d_colors = torch.zeros(80, 3)
     d_colors[:40] = torch.randn(40, 3, generator=torch.manual_seed(3))
-    moments = torch.zeros_like(before), torch.zeros_like(before)
-    adam = DenseAdam(*moments, 0.01, 1)
-    embeddings.step(0, gaussians, d_colors, adam, 0.05, make_backend(), 1)
+    moments = Moments(torch.zeros_like(before), torch.zeros_like(before))
+    adam = moments, AdamRates(0.01, 1)
+    embeddings.step(0, gaussians, d_colors, *adam, 0.05, make_backend(), 1)
     assert np.allclose(np.abs(embeddings.embeddings[0] - EMBEDDING), 0.05 * MAX_CHANGE)
     assert np.array_equal(embeddings.embeddings[1], EMBEDDING)
     change = (gaussians.appearance - before).abs()

@@ -11,7 +11,7 @@ import torch
 from PIL import Image
 
 from pipeline.photos.load import resize_area
-from pipeline.render import RasterOptions, Surroundings, forward
+from pipeline.render import RasterOptions, Surroundings, make_backend
 from pipeline.render.views import raster_camera
 from pipeline.scene.views import View, reduced_size
 from pipeline.training.data.image_store import DiskStore, MemoryStore
@@ -73,6 +73,7 @@ def test_the_reduced_camera_renders_the_reduced_image(scene: TinyScene) -> None:
     options = RasterOptions(sh_degree=1, threads=1)
     soft = scene.truth.clone()
     soft.log_scales += 1.0  # large, so that the dilation by 0.3 pixels hardly shows
+    forward = make_backend().forward
     full = forward(*soft.parameters(), raster_camera(view), options).color.numpy()
     small = forward(*soft.parameters(), raster_camera(view, 2), options).color.numpy()
     width, height = reduced_size(view, 2)

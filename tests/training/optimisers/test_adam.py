@@ -2,17 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import pytest
 import torch
 
-from pipeline.render import DenseAdam, FrameAdam, RasterOptions, backward, forward
-from pipeline.render import reference as float64
+from pipeline.render import AdamRates, FrameMoments, Moments, RasterOptions, make_backend
+from pipeline.render import reference_adam as float64
 from pipeline.render.views import raster_camera
 from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep, Rates
 from tests.training.conftest import ball, camera_at
 
+forward, backward = make_backend().forward, make_backend().backward
 RATES = Rates(means=1e-3, log_scales=5e-3, quats=2e-3, opacity_logits=5e-2, sh0=2e-2, shN=1e-3)
 
 
@@ -23,7 +22,8 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
     adam = Adam(gaussians, AdamOptions(0.8, own_frames))
     leaves = {name: tensor.clone() for name, tensor in gaussians.tensors().items()}
     shared = {"means": torch.zeros(37, 1), "quats": torch.zeros(37, 1)}
-    frames = FrameAdam(*torch.zeros(4, 37, 3), RATES.means, RATES.quats, 0, 0.8)
+    zeros = torch.zeros(4, 37, 3)
+    frames = FrameMoments(Moments(*zeros[:2]), Moments(*zeros[2:]))
     first = {name: torch.zeros_like(leaves[name]) for name in shared}
     groups = [(leaves[n], getattr(RATES, n)) for n in leaves if n != "sh" and n not in shared]
     dc, rest = leaves["sh"][:, :1].clone(), leaves["sh"][:, 1:].clone()
@@ -47,13 +47,13 @@ def test_matches_torch_adam_with_parameter_groups(degree: int, own_frames: bool)
         if own_frames:
             float64.frame_adam(
                 leaves["means"], leaves["quats"], scales, gradients.means, gradients.quats,
-                replace(frames, step=step),
+                frames, AdamRates((RATES.means, RATES.quats), step, 0.8),
             )  # fmt: skip
         else:
             for name, second in shared.items():
                 rate, gradient = getattr(RATES, name), getattr(gradients, name)
-                moments = DenseAdam(first[name], second, rate, step, 0.8)
-                float64.adam_step(leaves[name], gradient, moments)
+                moments = Moments(first[name], second)
+                float64.adam_step(leaves[name], gradient, moments, AdamRates(rate, step, 0.8))
         backward(drawn, d_color, sh_adam=adam.harmonics(AdamStep(step, RATES, 1)))
         adam.step(gaussians, gradients, AdamStep(step, RATES, 1), 1)
     leaves["sh"] = torch.cat([dc, rest], 1)

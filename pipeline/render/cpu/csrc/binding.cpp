@@ -47,20 +47,33 @@ Tensor new_longs(const std::vector<int64_t>& shape) {
     return new_tensor<int64_t>(shape, ScalarType::Long);
 }
 
-// view: 21 float64, fx fy cx cy, rotation, translation, near, bounds of u and v in the Jacobian.
-splat::View view_from(const Tensor& packed, int64_t width, int64_t height, int64_t sh_degree,
-                      bool antialias) {
+// view: float64, in the order of `_pack_view` in backend.py.
+splat::View view_from(const Tensor& packed) {
     const double* v = packed.const_data_ptr<double>();
     splat::View view = {};
-    view.width = width, view.height = height;
     view.fx = v[0], view.fy = v[1], view.cx = v[2], view.cy = v[3];
-    view.near = v[16];
-    view.min_u = v[17], view.max_u = v[18], view.min_v = v[19], view.max_v = v[20];
-    view.antialias = antialias;
-    view.sh_degree = int(sh_degree);
     for (int i = 0; i < 9; i++) view.rotation[i] = v[4 + i];
     for (int i = 0; i < 3; i++) view.translation[i] = v[13 + i];
+    view.near = v[16];
+    view.min_u = v[17], view.max_u = v[18], view.min_v = v[19], view.max_v = v[20];
+    view.width = int64_t(v[21]), view.height = int64_t(v[22]);
+    view.sh_degree = int(v[23]);
+    view.antialias = v[24] != 0, view.clamp_color_gradient = v[25] != 0;
     return view;
+}
+struct Background {
+    float rgb[3];
+
+    explicit Background(const Tensor& view) {
+        const double* v = view.const_data_ptr<double>();
+        for (int c = 0; c < 3; c++) rgb[c] = float(v[26 + c]);
+    }
+};
+
+// adam: float64, the step, beta1, beta2, epsilon and the learning rates.
+splat::AdamSettings settings_from(const Tensor& adam) {
+    const double* a = adam.const_data_ptr<double>();
+    return {a + 4, adam.numel() - 4, a[1], a[2], a[3], int64_t(a[0])};
 }
 
 splat::Gaussians gaussians_from(const Tensor& means, const Tensor& log_scales, const Tensor& quats,
@@ -82,24 +95,20 @@ splat::Pairs pairs_from(const Tensor& entries, const Tensor& tile_begin) {
 std::tuple<Tensor, Tensor, int64_t, int64_t> project(const Tensor& means, const Tensor& log_scales,
                                                      const Tensor& quats,
                                                      const Tensor& opacity_logits, const Tensor& sh,
-                                                     const Tensor& view, int64_t width,
-                                                     int64_t height, int64_t sh_degree,
-                                                     bool antialias, int64_t threads) {
+                                                     const Tensor& view, int64_t threads) {
     const int64_t n = means.size(0);
     Tensor records = new_floats({n, int64_t(sizeof(splat::Record) / sizeof(float))});
     Tensor radii = new_floats({n});
     const splat::ProjectCounts counts = splat::project_view(
-        gaussians_from(means, log_scales, quats, opacity_logits, sh),
-        view_from(view, width, height, sh_degree, antialias), int(threads),
+        gaussians_from(means, log_scales, quats, opacity_logits, sh), view_from(view), int(threads),
         reinterpret_cast<splat::Record*>(mutable_floats(records)), mutable_floats(radii));
     return {records, radii, counts.visible, counts.dropped};
 }
 
 // (M, 3) entries, (tiles + 1) tile_begin, (N, 2) slots, and whether the pairs fit
 std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor& radii,
-                                             const Tensor& view, int64_t width, int64_t height,
-                                             int64_t threads) {
-    const splat::View v = view_from(view, width, height, 0, false);
+                                             const Tensor& view, int64_t threads) {
+    const splat::View v = view_from(view);
     Tensor slots = new_ints({records.size(0), 2});
     splat::Binner binner;
     const bool fits =
@@ -116,13 +125,11 @@ std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor
 // (H, W, 3) color, (H, W) alpha, (tiles, kBlocks) block_end
 std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& entries,
                                          const Tensor& tile_begin, const Tensor& view,
-                                         int64_t width, int64_t height, const Tensor& background,
                                          int64_t threads) {
-    const splat::View v = view_from(view, width, height, 0, false);
-    Tensor color = new_floats({height, width, 3});
-    Tensor alpha = new_floats({height, width});
+    const splat::View v = view_from(view);
+    Tensor color = new_floats({v.height, v.width, 3}), alpha = new_floats({v.height, v.width});
     Tensor block_end = new_ints({v.tiles(), splat::kBlocks});
-    splat::blend(records_from(records), pairs_from(entries, tile_begin), v, floats(background),
+    splat::blend(records_from(records), pairs_from(entries, tile_begin), v, Background(view).rgb,
                  int(threads), mutable_floats(color), mutable_floats(alpha),
                  block_end.mutable_data_ptr<int32_t>());
     return {color, alpha, block_end};
@@ -130,49 +137,46 @@ std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& en
 
 // (H, W) depth, (H, W) median depth
 std::tuple<Tensor, Tensor> blend_depth(const Tensor& records, const Tensor& entries,
-                                       const Tensor& tile_begin, const Tensor& view, int64_t width,
-                                       int64_t height, int64_t threads) {
-    Tensor depth = new_floats({height, width});
-    Tensor median = new_floats({height, width});
-    splat::blend_depth(records_from(records), pairs_from(entries, tile_begin),
-                       view_from(view, width, height, 0, false), int(threads),
+                                       const Tensor& tile_begin, const Tensor& view,
+                                       int64_t threads) {
+    const splat::View v = view_from(view);
+    Tensor depth = new_floats({v.height, v.width}), median = new_floats({v.height, v.width});
+    splat::blend_depth(records_from(records), pairs_from(entries, tile_begin), v, int(threads),
                        mutable_floats(depth), mutable_floats(median));
     return {depth, median};
 }
 
 // (M, 16) gradient slots
 Tensor blend_backward(const Tensor& records, const Tensor& entries, const Tensor& tile_begin,
-                      const Tensor& block_end, const Tensor& view, int64_t width, int64_t height,
-                      const Tensor& background, const Tensor& color, const Tensor& alpha,
-                      OptionalTensor depth, const Tensor& d_color, OptionalTensor d_alpha,
-                      OptionalTensor d_depth, int64_t threads) {
+                      const Tensor& block_end, const Tensor& view, const Tensor& color,
+                      const Tensor& alpha, OptionalTensor depth, const Tensor& d_color,
+                      OptionalTensor d_alpha, OptionalTensor d_depth, int64_t threads) {
     Tensor slots = new_floats({entries.size(0), splat::kSlotFloats});
-    splat::blend_backward(records_from(records), pairs_from(entries, tile_begin),
-                          view_from(view, width, height, 0, false),
+    const Background background(view);
+    splat::blend_backward(records_from(records), pairs_from(entries, tile_begin), view_from(view),
                           {floats(color), floats(alpha), floats(depth), floats(d_color),
-                           floats(d_alpha), floats(d_depth), floats(background)},
+                           floats(d_alpha), floats(d_depth), background.rgb},
                           block_end.const_data_ptr<int32_t>(), int(threads), mutable_floats(slots));
     return slots;
 }
 
 // Gradients of means, log_scales, quats, opacity_logits, sh, means2d, colours and the camera's
 // parameters (float64); the last two have no rows if not requested. With exp_avg, exp_avg_sq, last
-// and sh_adam (6 float64: ShAdamSettings), sh is updated in place and its gradient has no rows.
+// and adam, sh is updated in place and its gradient has no rows.
 std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> project_backward(
     const Tensor& means, const Tensor& log_scales, const Tensor& quats,
-    const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, int64_t width,
-    int64_t height, int64_t sh_degree, bool antialias, const Tensor& records, const Tensor& radii,
-    const Tensor& slots, const Tensor& slot_gradients, bool clamp_color_gradient, bool colors,
+    const Tensor& opacity_logits, const Tensor& sh, const Tensor& view, const Tensor& records,
+    const Tensor& radii, const Tensor& slots, const Tensor& slot_gradients, bool colors,
     bool camera, OptionalTensor exp_avg, OptionalTensor exp_avg_sq, OptionalTensor last,
-    OptionalTensor sh_adam, int64_t threads) {
+    OptionalTensor adam, int64_t threads) {
     const int64_t n = means.size(0);
-    std::optional<splat::ShAdam> adam;
-    if (sh_adam) {
-        const double* s = sh_adam->const_data_ptr<double>();
-        adam.emplace(
+    std::optional<splat::ShAdam> sh_adam;
+    if (adam) {
+        const splat::AdamSettings s = settings_from(*adam);
+        sh_adam.emplace(
             splat::ShAdamState{mutable_floats(sh), mutable_floats(*exp_avg),
                                mutable_floats(*exp_avg_sq), last->mutable_data_ptr<int32_t>()},
-            splat::ShAdamSettings{s[0], s[1], s[2], s[3], s[4], int64_t(s[5])});
+            splat::ShAdamSettings{s.rates[0], s.rates[1], s.beta1, s.beta2, s.eps, s.step});
     }
     Tensor d_means = new_floats({n, 3}), d_scales = new_floats({n, 3}),
            d_quats = new_floats({n, 4});
@@ -180,10 +184,8 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
     Tensor d_means2d = new_floats({n, 2}), d_colors = new_floats({colors ? n : 0, 3});
     Tensor d_camera =
         new_tensor<double>({camera ? splat::kCameraParameters : 0}, ScalarType::Double);
-    splat::View seen = view_from(view, width, height, sh_degree, antialias);
-    seen.clamp_color_gradient = clamp_color_gradient;
     splat::project_view_backward(
-        gaussians_from(means, log_scales, quats, opacity_logits, sh), seen, int(threads),
+        gaussians_from(means, log_scales, quats, opacity_logits, sh), view_from(view), int(threads),
         records_from(records), floats(radii),
         reinterpret_cast<const splat::Slots*>(slots.const_data_ptr<int32_t>()),
         floats(slot_gradients),
@@ -191,7 +193,7 @@ std::tuple<Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor> proje
          mutable_floats(d_opacity), adam ? nullptr : mutable_floats(d_sh),
          mutable_floats(d_means2d), colors ? mutable_floats(d_colors) : nullptr,
          camera ? d_camera.mutable_data_ptr<double>() : nullptr},
-        adam ? &*adam : nullptr);
+        adam ? &*sh_adam : nullptr);
     return {d_means, d_scales, d_quats, d_opacity, d_sh, d_means2d, d_colors, d_camera};
 }
 
@@ -247,10 +249,8 @@ std::tuple<Tensor, Tensor> compose_backward(const Tensor& behind, const Tensor& 
 }
 
 void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
-               const Tensor& exp_avg_sq, const Tensor& rates, int64_t step, double beta1,
-               double beta2, double eps, int64_t threads) {
-    const splat::AdamSettings settings = {
-        rates.const_data_ptr<double>(), rates.numel(), beta1, beta2, eps, step};
+               const Tensor& exp_avg_sq, const Tensor& adam, int64_t threads) {
+    const splat::AdamSettings settings = settings_from(adam);
     if (exp_avg_sq.numel() == param.numel())
         splat::adam_step(mutable_floats(param), floats(grad), mutable_floats(exp_avg),
                          mutable_floats(exp_avg_sq), param.numel(), settings, int(threads));
@@ -263,14 +263,12 @@ void adam_step(const Tensor& param, const Tensor& grad, const Tensor& exp_avg,
 void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scales,
                 const Tensor& d_means, const Tensor& d_quats, const Tensor& mean_avg,
                 const Tensor& mean_avg_sq, const Tensor& rotation_avg,
-                const Tensor& rotation_avg_sq, const Tensor& rates, int64_t step, double beta1,
-                double beta2, double eps, int64_t threads) {
+                const Tensor& rotation_avg_sq, const Tensor& adam, int64_t threads) {
     splat::frame_adam(mutable_floats(means), mutable_floats(quats), floats(log_scales),
                       floats(d_means), floats(d_quats),
                       {mutable_floats(mean_avg), mutable_floats(mean_avg_sq),
                        mutable_floats(rotation_avg), mutable_floats(rotation_avg_sq)},
-                      means.size(0), {rates.const_data_ptr<double>(), 2, beta1, beta2, eps, step},
-                      int(threads));
+                      means.size(0), settings_from(adam), int(threads));
 }
 
 }  // namespace
@@ -278,34 +276,29 @@ void frame_adam(const Tensor& means, const Tensor& quats, const Tensor& log_scal
 STABLE_TORCH_LIBRARY(splatmake, m) {
     m.def(
         "project(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, Tensor sh, "
-        "Tensor view, int width, int height, int sh_degree, bool antialias, int threads) -> "
-        "(Tensor, Tensor, int, int)");
+        "Tensor view, int threads) -> (Tensor, Tensor, int, int)");
     m.def(
-        "bin(Tensor records, Tensor radii, Tensor view, int width, int height, int threads) -> "
+        "bin(Tensor records, Tensor radii, Tensor view, int threads) -> "
         "(Tensor, Tensor, Tensor, bool)");
     m.def(
-        "blend(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int width, "
-        "int height, Tensor background, int threads) -> (Tensor, Tensor, Tensor)");
+        "blend(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int threads) -> "
+        "(Tensor, Tensor, Tensor)");
     m.def(
-        "blend_depth(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int width, "
-        "int height, int threads) -> (Tensor, Tensor)");
+        "blend_depth(Tensor records, Tensor entries, Tensor tile_begin, Tensor view, int threads) "
+        "-> (Tensor, Tensor)");
     m.def(
         "blend_backward(Tensor records, Tensor entries, Tensor tile_begin, Tensor block_end, "
-        "Tensor view, int width, int height, Tensor background, Tensor color, Tensor alpha, "
-        "Tensor? depth, Tensor d_color, Tensor? d_alpha, Tensor? d_depth, "
-        "int threads) -> Tensor");
+        "Tensor view, Tensor color, Tensor alpha, Tensor? depth, Tensor d_color, Tensor? d_alpha, "
+        "Tensor? d_depth, int threads) -> Tensor");
     m.def(
         "project_backward(Tensor means, Tensor log_scales, Tensor quats, Tensor opacity_logits, "
-        "Tensor(a!) sh, Tensor view, int width, int height, int sh_degree, bool antialias, "
-        "Tensor records, Tensor radii, Tensor slots, Tensor slot_gradients, bool "
-        "clamp_color_gradient, "
-        "bool colors, "
-        "bool camera, Tensor(b!)? exp_avg, Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? "
-        "sh_adam, "
-        "int threads) -> (Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
+        "Tensor(a!) sh, Tensor view, Tensor records, Tensor radii, Tensor slots, "
+        "Tensor slot_gradients, bool colors, bool camera, Tensor(b!)? exp_avg, "
+        "Tensor(c!)? exp_avg_sq, Tensor(d!)? last, Tensor? adam, int threads) -> "
+        "(Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor, Tensor)");
     m.def(
-        "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, float "
-        "l2_weight, int threads) -> (float, float, float, Tensor)");
+        "l1_ssim(Tensor rendered, Tensor target, Tensor? mask, float ssim_weight, "
+        "float l2_weight, int threads) -> (float, float, float, Tensor)");
     m.def(
         "compose(Tensor behind, Tensor old_alpha, Tensor? front, Tensor? transmittance, "
         "Tensor? correction, Tensor color, Tensor alpha, int threads) -> Tensor");
@@ -315,12 +308,11 @@ STABLE_TORCH_LIBRARY(splatmake, m) {
         "(Tensor, Tensor)");
     m.def(
         "adam_step(Tensor(a!) param, Tensor grad, Tensor(b!) exp_avg, Tensor(c!) exp_avg_sq, "
-        "Tensor rates, int step, float beta1, float beta2, float eps, int threads) -> ()");
+        "Tensor adam, int threads) -> ()");
     m.def(
         "frame_adam(Tensor(a!) means, Tensor(b!) quats, Tensor log_scales, Tensor d_means, "
         "Tensor d_quats, Tensor(c!) mean_avg, Tensor(d!) mean_avg_sq, Tensor(e!) rotation_avg, "
-        "Tensor(f!) rotation_avg_sq, Tensor rates, int step, float beta1, float beta2, float eps, "
-        "int threads) -> ()");
+        "Tensor(f!) rotation_avg_sq, Tensor adam, int threads) -> ()");
     m.def("release_memory() -> ()");
     m.def("save_memory(bool little) -> ()");
 }

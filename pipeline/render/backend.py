@@ -12,7 +12,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Generic, Protocol, TypeVar
 
-import torch
+from torch import Tensor
 
 from pipeline.render import checks
 from pipeline.render.checks import Parameters
@@ -37,7 +37,7 @@ class Projection(Protocol):
     """What a backend's result of ``project`` has."""
 
     @property
-    def radii(self) -> torch.Tensor:
+    def radii(self) -> Tensor:
         """See ``Forward.radii``."""
 
 
@@ -93,9 +93,9 @@ class Backend(ABC, Generic[Projected, Binned]):
     def backward(
         self,
         fwd: Forward,
-        d_color: torch.Tensor,
-        d_alpha: torch.Tensor | None = None,
-        d_depth: torch.Tensor | None = None,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
         *,
         colors: bool = False,
         camera: bool = False,
@@ -117,10 +117,10 @@ class Backend(ABC, Generic[Projected, Binned]):
     @abstractmethod
     def l1_ssim(
         self,
-        rendered: torch.Tensor,
-        target: torch.Tensor,
+        rendered: Tensor,
+        target: Tensor,
         ssim_weight: float,
-        mask: torch.Tensor | None = None,
+        mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
@@ -140,8 +140,8 @@ class Backend(ABC, Generic[Projected, Binned]):
 
     @abstractmethod
     def compose(
-        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
-    ) -> torch.Tensor:
+        self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
+    ) -> Tensor:
         """(H, W, 3) float32 image of a scene, of which one part is rendered:
 
             C = F + T (C_p + (1 - alpha_p) B) + correction
@@ -157,22 +157,17 @@ class Backend(ABC, Generic[Projected, Binned]):
     def compose_backward(
         self,
         around: Surroundings,
-        alpha: torch.Tensor,
-        d_image: torch.Tensor,
+        alpha: Tensor,
+        d_image: Tensor,
         loss: AlphaChangeLoss,
         threads: int = 0,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         """Gradients with respect to ``color`` (H, W, 3) and ``alpha`` (H, W) of ``compose``, from
         the gradient on its image (H, W, 3) float32, and of the loss on alpha."""
 
     @abstractmethod
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        moments: Moments,
-        rates: AdamRates,
-        threads: int = 0,
+        self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:
         """One step of Adam, in place, as ``torch.optim.Adam``.
 
@@ -183,11 +178,11 @@ class Backend(ABC, Generic[Projected, Binned]):
     @abstractmethod
     def frame_adam(
         self,
-        means: torch.Tensor,
-        quats: torch.Tensor,
-        log_scales: torch.Tensor,
-        d_means: torch.Tensor,
-        d_quats: torch.Tensor,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        d_means: Tensor,
+        d_quats: Tensor,
         moments: FrameMoments,
         rates: AdamRates,
         threads: int = 0,
@@ -202,11 +197,11 @@ class Backend(ABC, Generic[Projected, Binned]):
 
     def forward(
         self,
-        means: torch.Tensor,
-        log_scales: torch.Tensor,
-        quats: torch.Tensor,
-        opacity_logits: torch.Tensor,
-        sh: torch.Tensor,
+        means: Tensor,
+        log_scales: Tensor,
+        quats: Tensor,
+        opacity_logits: Tensor,
+        sh: Tensor,
         camera: RasterCamera,
         options: RasterOptions,
     ) -> Forward:
@@ -234,7 +229,7 @@ class Backend(ABC, Generic[Projected, Binned]):
         parameters: Parameters,
         camera: RasterCamera,
         options: RasterOptions,
-        subsets: Callable[[torch.Tensor], Iterable[Subset]],
+        subsets: Callable[[Tensor], Iterable[Subset]],
     ) -> Iterator[Forward]:
         """Render subsets of the Gaussians, each without the others; all are projected once. Images
         have the same bits as of these Gaussians alone. Errors: see ``forward``.

@@ -8,6 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from pipeline.render.backend import Backend
 from pipeline.render.checks import Parameters
@@ -38,7 +39,7 @@ class StepScene:
 
     gaussians: Parameters
     camera: RasterCamera
-    target: torch.Tensor
+    target: Tensor
 
 
 def step_seconds(backend: Backend, gaussians: int = GAUSSIANS, steps: int = STEPS) -> float:
@@ -57,7 +58,7 @@ def made_scene(count: int) -> StepScene:
     """Gaussians of a few pixels in a camera's view, and noise as the photograph."""
     generator = torch.Generator().manual_seed(0)
 
-    def uniform(*shape: int) -> torch.Tensor:
+    def uniform(*shape: int) -> Tensor:
         return torch.rand(*shape, generator=generator)
 
     depth = 2 + 4 * uniform(count)

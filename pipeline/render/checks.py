@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import torch
+from torch import Tensor
 
 from pipeline.render.types import (
     AdamRates,
@@ -15,11 +16,11 @@ from pipeline.render.types import (
 
 MAX_IMAGE_SIDE = 1 << 16
 
-Parameters = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
+Parameters = tuple[Tensor, Tensor, Tensor, Tensor, Tensor]
 """means (N, 3), log_scales (N, 3), quats (N, 4), opacity_logits (N,), sh (N, K, 3)."""
 
 
-def checked(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> torch.Tensor:
+def checked(name: str, value: Tensor, shape: tuple[int | None, ...]) -> Tensor:
     """The tensor, detached and contiguous.
 
     Raises:
@@ -38,11 +39,11 @@ def checked(name: str, value: torch.Tensor, shape: tuple[int | None, ...]) -> to
 
 
 def parameters(
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quats: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh: Tensor,
     degree: int,
 ) -> Parameters:
     """The parameters of Gaussians, checked, with SH coefficients up to ``degree``."""
@@ -77,11 +78,8 @@ def check_camera(camera: RasterCamera, near: float) -> None:
 
 
 def image_gradients(
-    d_color: torch.Tensor,
-    d_alpha: torch.Tensor | None,
-    d_depth: torch.Tensor | None,
-    size: tuple[int, int],
-) -> tuple[torch.Tensor, torch.Tensor | None, torch.Tensor | None]:
+    d_color: Tensor, d_alpha: Tensor | None, d_depth: Tensor | None, size: tuple[int, int]
+) -> tuple[Tensor, Tensor | None, Tensor | None]:
     """Gradients on the images of a view of ``size`` (width, height), checked by ``checked``."""
     width, height = size
     return (
@@ -92,8 +90,8 @@ def image_gradients(
 
 
 def images(
-    rendered: torch.Tensor, target: torch.Tensor, mask: torch.Tensor | None
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor | None]:
+    rendered: Tensor, target: Tensor, mask: Tensor | None
+) -> tuple[Tensor, Tensor, Tensor | None]:
     """The images of a loss, checked: rendered (H, W, 3), target float32 or uint8, mask uint8."""
     rendered = checked("rendered", rendered, (None, None, 3))
     size = tuple(rendered.shape)
@@ -110,9 +108,7 @@ def images(
     return rendered, target, mask
 
 
-def layers(
-    around: Surroundings, color: torch.Tensor, alpha: torch.Tensor
-) -> tuple[torch.Tensor, torch.Tensor]:
+def layers(around: Surroundings, color: Tensor, alpha: Tensor) -> tuple[Tensor, Tensor]:
     """(H, W, 3) and (H, W) images of a part of a scene that fit its surroundings, checked."""
     color = checked("color", color, (None, None, 3))
     height, width = color.shape[:2]
@@ -137,7 +133,7 @@ def layers(
     return color, checked("alpha", alpha, (height, width))
 
 
-def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
+def check_sh_adam(adam: ShAdam, sh: Tensor) -> None:
     """Raise ValueError if the moments do not fit ``sh`` or the rates are invalid."""
     for tensor in (adam.moments.exp_avg, adam.moments.exp_avg_sq):
         if tensor.dtype != torch.float32 or tensor.shape != sh.shape or not tensor.is_contiguous():
@@ -147,7 +143,7 @@ def check_sh_adam(adam: ShAdam, sh: torch.Tensor) -> None:
     _check_rates("sh_adam", adam.rates, count=2)
 
 
-def check_adam(param: torch.Tensor, grad: torch.Tensor, moments: Moments, rates: AdamRates) -> None:
+def check_adam(param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates) -> None:
     """Raise ValueError if the arguments of ``adam_step`` are invalid."""
     second = moments.exp_avg_sq
     shared = tuple(second.shape) == (len(param), 1) and tuple(param.shape[1:]) in ((3,), (4,))
@@ -162,8 +158,8 @@ def check_adam(param: torch.Tensor, grad: torch.Tensor, moments: Moments, rates:
 
 
 def check_frame_adam(
-    parameters: tuple[torch.Tensor, torch.Tensor, torch.Tensor],
-    gradients: tuple[torch.Tensor, torch.Tensor],
+    parameters: tuple[Tensor, Tensor, Tensor],
+    gradients: tuple[Tensor, Tensor],
     moments: FrameMoments,
     rates: AdamRates,
 ) -> None:

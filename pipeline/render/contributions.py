@@ -19,11 +19,7 @@ def in_grey(gaussians: Gaussians) -> Gaussians:
 
 
 def contributions(
-    grey: Gaussians,
-    camera: RasterCamera,
-    options: RasterOptions,
-    pixel: float,
-    backend: Backend,
+    grey: Gaussians, camera: RasterCamera, options: RasterOptions, pixel: float, backend: Backend
 ) -> Tensor:
     """(N,) float32 sum over pixels of alpha times transmittance: the gradient of the sum of the
     image with respect to the Gaussian's colour.

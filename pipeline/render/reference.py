@@ -16,13 +16,9 @@ from typing import Any
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
 
-from pipeline.render.types import (
-    AlphaChangeLoss,
-    RasterCamera,
-    RasterOptions,
-    Surroundings,
-)
+from pipeline.render.types import AlphaChangeLoss, RasterCamera, RasterOptions, Surroundings
 
 # The same constants as in cpu/csrc/constants.h, which has their reasons.
 DILATION = 0.3
@@ -49,16 +45,16 @@ class Projection:
         num_dropped: Gaussians left out because a value is not finite or degenerate.
     """
 
-    index: torch.Tensor
-    means2d: torch.Tensor
-    conics: torch.Tensor
-    depths: torch.Tensor
-    opacities: torch.Tensor
-    radii: torch.Tensor
+    index: Tensor
+    means2d: Tensor
+    conics: Tensor
+    depths: Tensor
+    opacities: Tensor
+    radii: Tensor
     num_dropped: int
 
 
-def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
+def rotation_from_quat(quats: Tensor) -> Tensor:
     """(N, 4) quaternions (wxyz) of any norm -> (N, 3, 3) rotations (Kerbl et al. 2023, eq. 10)."""
     w, x, y, z = (quats / quats.norm(dim=-1, keepdim=True)).unbind(-1)
     rows = [
@@ -69,7 +65,7 @@ def rotation_from_quat(quats: torch.Tensor) -> torch.Tensor:
     return torch.stack(rows, -1).reshape(*quats.shape[:-1], 3, 3)
 
 
-def perturbed(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
+def perturbed(camera: RasterCamera, change: Tensor) -> RasterCamera:
     """The camera after a ``change`` (10,); the gradient at zero is ``CameraGradients``.
 
     The first six values are a rotation vector r (radians) and a translation t (world units): a
@@ -91,11 +87,11 @@ def perturbed(camera: RasterCamera, change: torch.Tensor) -> RasterCamera:
 
 
 def project(
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quats: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh: Tensor,
     camera: RasterCamera,
     options: RasterOptions,
 ) -> Projection:
@@ -169,7 +165,7 @@ def project(
     )  # fmt: skip
 
 
-def sh_basis(directions: torch.Tensor, degree: int) -> torch.Tensor:
+def sh_basis(directions: Tensor, degree: int) -> Tensor:
     """Real spherical harmonics of unit (V, 3) directions, degree 0 to 3 -> (V, (degree + 1)^2).
 
     Ordered and signed as in 3DGS (the Condon-Shortley phase included); the polynomials are those
@@ -204,23 +200,19 @@ class _ClampAtZero(torch.autograd.Function):
     views stays black."""
 
     @staticmethod
-    def forward(ctx: Any, x: torch.Tensor) -> torch.Tensor:
+    def forward(ctx: Any, x: Tensor) -> Tensor:
         ctx.save_for_backward(x)
         return x.clamp(min=0)
 
     @staticmethod
-    def backward(ctx: Any, grad: torch.Tensor) -> torch.Tensor:  # type: ignore[override]
+    def backward(ctx: Any, grad: Tensor) -> Tensor:  # type: ignore[override]
         (x,) = ctx.saved_tensors
         return torch.where(x > 0, grad, grad.clamp(max=0))
 
 
 def sh_colors(
-    means: torch.Tensor,
-    sh: torch.Tensor,
-    camera: RasterCamera,
-    degree: int,
-    clamp_gradient: bool = False,
-) -> torch.Tensor:
+    means: Tensor, sh: Tensor, camera: RasterCamera, degree: int, clamp_gradient: bool = False
+) -> Tensor:
     """(V, 3) RGB as seen from the camera: max(0, 0.5 + sum_k basis_k(direction) sh_k).
 
     The direction is from the camera's centre to the mean; the gradient includes its dependence on
@@ -233,7 +225,7 @@ def sh_colors(
     colors = (basis.unsqueeze(-1) * sh[:, : basis.shape[1]]).sum(1) + 0.5
     if clamp_gradient:
         return torch.relu(colors)
-    clamped: torch.Tensor = _ClampAtZero.apply(colors)
+    clamped: Tensor = _ClampAtZero.apply(colors)
     return clamped
 
 
@@ -250,16 +242,16 @@ class Blend:
         pairs: number of contributing (pixel, Gaussian) pairs.
     """
 
-    color: torch.Tensor
-    alpha: torch.Tensor
-    depth: torch.Tensor
-    median_depth: torch.Tensor
-    margin: torch.Tensor
+    color: Tensor
+    alpha: Tensor
+    depth: Tensor
+    median_depth: Tensor
+    margin: Tensor
     pairs: int
 
 
 def blend(
-    projection: Projection, colors: torch.Tensor, camera: RasterCamera, options: RasterOptions
+    projection: Projection, colors: Tensor, camera: RasterCamera, options: RasterOptions
 ) -> Blend:
     """Front to back alpha compositing (Kerbl et al. 2023, eq. 3).
 
@@ -314,11 +306,7 @@ def blend(
 
 
 def draw(
-    means: torch.Tensor,
-    sh: torch.Tensor,
-    projection: Projection,
-    camera: RasterCamera,
-    options: RasterOptions,
+    means: Tensor, sh: Tensor, projection: Projection, camera: RasterCamera, options: RasterOptions
 ) -> Blend:
     """Composite projected Gaussians with the means (N, 3) and SH coefficients (N, K, 3)."""
     visible, clamp = projection.index, options.clamp_color_gradient
@@ -327,11 +315,11 @@ def draw(
 
 
 def render(
-    means: torch.Tensor,
-    log_scales: torch.Tensor,
-    quats: torch.Tensor,
-    opacity_logits: torch.Tensor,
-    sh: torch.Tensor,
+    means: Tensor,
+    log_scales: Tensor,
+    quats: Tensor,
+    opacity_logits: Tensor,
+    sh: Tensor,
     camera: RasterCamera,
     options: RasterOptions,
 ) -> tuple[Projection, Blend]:
@@ -345,12 +333,12 @@ SSIM_C1, SSIM_C2 = 0.01**2, 0.03**2
 
 
 def l1_ssim(
-    rendered: torch.Tensor,
-    target: torch.Tensor,
+    rendered: Tensor,
+    target: Tensor,
     ssim_weight: float,
-    mask: torch.Tensor | None = None,
+    mask: Tensor | None = None,
     l2_weight: float = 0.0,
-) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+) -> tuple[Tensor, Tensor, Tensor]:
     """(1 - w) E + w (1 - SSIM) -> (loss, E, ssim), scalars.
 
     E is the mean of |d| + k d^2 (k = ``l2_weight``); with k = 0 it is the L1 loss of 3DGS. The
@@ -375,7 +363,7 @@ def l1_ssim(
     window = window / window.sum()
     kernel = torch.outer(window, window)[None, None]
 
-    def blur(image: torch.Tensor) -> torch.Tensor:
+    def blur(image: Tensor) -> Tensor:
         planes = image.permute(2, 0, 1).unsqueeze(1)
         return F.conv2d(planes, kernel, padding=SSIM_WINDOW // 2).squeeze(1).permute(1, 2, 0)
 
@@ -392,7 +380,7 @@ def l1_ssim(
     return (1 - ssim_weight) * error + ssim_weight * (1 - ssim), error, ssim
 
 
-def compose(around: Surroundings, color: torch.Tensor, alpha: torch.Tensor) -> torch.Tensor:
+def compose(around: Surroundings, color: Tensor, alpha: Tensor) -> Tensor:
     """(H, W, 3) image of a scene, of which one part is rendered; see ``Backend.compose``."""
     image = color + (1 - alpha)[..., None] * around.behind / 255
     if around.front is not None and around.transmittance is not None:
@@ -400,9 +388,7 @@ def compose(around: Surroundings, color: torch.Tensor, alpha: torch.Tensor) -> t
     return image if around.correction is None else image + around.correction / 255
 
 
-def alpha_change_loss(
-    around: Surroundings, alpha: torch.Tensor, loss: AlphaChangeLoss
-) -> torch.Tensor:
+def alpha_change_loss(around: Surroundings, alpha: Tensor, loss: AlphaChangeLoss) -> Tensor:
     """See ``AlphaChangeLoss``."""
     change = alpha - around.alpha.to(alpha.dtype) / 255
     beyond = (change - loss.growth).clamp(min=0) + (-loss.fade - change).clamp(min=0)

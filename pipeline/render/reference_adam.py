@@ -6,12 +6,13 @@ import math
 from dataclasses import replace
 
 import torch
+from torch import Tensor
 
 from pipeline.render.reference import QUAT_NORM2_MIN, rotation_from_quat
 from pipeline.render.types import AdamRates, FrameMoments, Moments, ShAdam
 
 
-def adam_step(param: torch.Tensor, grad: torch.Tensor, moments: Moments, rates: AdamRates) -> None:
+def adam_step(param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates) -> None:
     """Adam (Kingma & Ba 2015, algorithm 1), in place."""
     pattern = torch.tensor(rates.rates, dtype=param.dtype)
     repeats = -(-param.numel() // len(pattern))
@@ -26,11 +27,11 @@ def adam_step(param: torch.Tensor, grad: torch.Tensor, moments: Moments, rates: 
 
 
 def frame_adam(
-    means: torch.Tensor,
-    quats: torch.Tensor,
-    log_scales: torch.Tensor,
-    d_means: torch.Tensor,
-    d_quats: torch.Tensor,
+    means: Tensor,
+    quats: Tensor,
+    log_scales: Tensor,
+    d_means: Tensor,
+    d_quats: Tensor,
     moments: FrameMoments,
     rates: AdamRates,
 ) -> None:
@@ -66,7 +67,7 @@ def frame_adam(
         param.add_(torch.einsum("nij,nj->ni", axes, local))
 
 
-def sh_adam(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
+def sh_adam(sh: Tensor, grad: Tensor, updated: Tensor, adam: ShAdam) -> None:
     """Adam over the SH coefficients (N, K, 3) of the Gaussians with a gradient, ``updated`` (N,)
     bool; in place. All tensors but ``adam.last`` have the type of ``sh``.
 

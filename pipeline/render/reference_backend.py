@@ -9,6 +9,7 @@ from dataclasses import dataclass, replace
 from typing import cast
 
 import torch
+from torch import Tensor
 
 from pipeline.render import checks, reference, reference_adam
 from pipeline.render.backend import Backend
@@ -44,13 +45,13 @@ class Projected:
 
     parameters: Parameters
     leaves: Parameters
-    change: torch.Tensor
+    change: Tensor
     camera: RasterCamera
     options: RasterOptions
     projection: reference.Projection
 
     @property
-    def radii(self) -> torch.Tensor:
+    def radii(self) -> Tensor:
         return self.projection.radii.float()
 
 
@@ -107,9 +108,9 @@ class ReferenceBackend(Backend[Projected, Projected]):
     def backward(
         self,
         fwd: Forward,
-        d_color: torch.Tensor,
-        d_alpha: torch.Tensor | None = None,
-        d_depth: torch.Tensor | None = None,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
         *,
         colors: bool = False,
         camera: bool = False,
@@ -149,10 +150,10 @@ class ReferenceBackend(Backend[Projected, Projected]):
 
     def l1_ssim(
         self,
-        rendered: torch.Tensor,
-        target: torch.Tensor,
+        rendered: Tensor,
+        target: Tensor,
         ssim_weight: float,
-        mask: torch.Tensor | None = None,
+        mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
@@ -166,19 +167,19 @@ class ReferenceBackend(Backend[Projected, Projected]):
         )
 
     def compose(
-        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
-    ) -> torch.Tensor:
+        self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
+    ) -> Tensor:
         color, alpha = checks.layers(around, color, alpha)
         return reference.compose(around, color.double(), alpha.double()).float()
 
     def compose_backward(
         self,
         around: Surroundings,
-        alpha: torch.Tensor,
-        d_image: torch.Tensor,
+        alpha: Tensor,
+        d_image: Tensor,
         loss: AlphaChangeLoss,
         threads: int = 0,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         d_image, alpha = checks.layers(around, d_image, alpha)
         # The composition is linear in the colour.
         color = torch.zeros(d_image.shape, dtype=torch.float64, requires_grad=True)
@@ -189,12 +190,7 @@ class ReferenceBackend(Backend[Projected, Projected]):
         return color.grad.float(), change.grad.float()
 
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        moments: Moments,
-        rates: AdamRates,
-        threads: int = 0,
+        self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:
         checks.check_adam(param, grad, moments, rates)
         with _in_double(param, *vars(moments).values()) as (p, *doubles):
@@ -202,11 +198,11 @@ class ReferenceBackend(Backend[Projected, Projected]):
 
     def frame_adam(
         self,
-        means: torch.Tensor,
-        quats: torch.Tensor,
-        log_scales: torch.Tensor,
-        d_means: torch.Tensor,
-        d_quats: torch.Tensor,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        d_means: Tensor,
+        d_quats: Tensor,
         moments: FrameMoments,
         rates: AdamRates,
         threads: int = 0,
@@ -220,14 +216,14 @@ class ReferenceBackend(Backend[Projected, Projected]):
             reference_adam.frame_adam(m, q, log_scales.double(), d_m, d_q, precise, rates)
 
 
-def _step_sh(sh: torch.Tensor, grad: torch.Tensor, updated: torch.Tensor, adam: ShAdam) -> None:
+def _step_sh(sh: Tensor, grad: Tensor, updated: Tensor, adam: ShAdam) -> None:
     checks.check_sh_adam(adam, sh)
     with _in_double(sh, *vars(adam.moments).values()) as (p, *doubles):
         reference_adam.sh_adam(p, grad, updated, replace(adam, moments=Moments(*doubles)))
 
 
 @contextmanager
-def _in_double(*tensors: torch.Tensor) -> Iterator[list[torch.Tensor]]:
+def _in_double(*tensors: Tensor) -> Iterator[list[Tensor]]:
     """Float64 copies of tensors, whose values are copied back at the end."""
     with torch.no_grad():
         doubles = [tensor.double() for tensor in tensors]

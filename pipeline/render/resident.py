@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Protocol
 
-import torch
+from torch import Tensor
 
 from pipeline.render.types import (
     AdamRates,
@@ -23,13 +23,13 @@ class Planes(Protocol):
     """Images (H, W) float32 of a rendered view, see ``Forward``."""
 
     @property
-    def alpha(self) -> torch.Tensor: ...
+    def alpha(self) -> Tensor: ...
 
     @property
-    def depth(self) -> torch.Tensor: ...
+    def depth(self) -> Tensor: ...
 
 
-HostLosses = Callable[[Planes], tuple[torch.Tensor | None, torch.Tensor | None]]
+HostLosses = Callable[[Planes], tuple[Tensor | None, Tensor | None]]
 """Gradients of losses on alpha and depth (H, W), which are computed on the CPU; None: zero."""
 
 
@@ -48,12 +48,12 @@ class Optimised:
             gradient in normalised device coordinates, and of visibility.
     """
 
-    parameters: Mapping[str, torch.Tensor]
-    first: Mapping[str, torch.Tensor]
-    second: Mapping[str, torch.Tensor]
-    last: torch.Tensor
-    gradient_sum: torch.Tensor
-    seen: torch.Tensor
+    parameters: Mapping[str, Tensor]
+    first: Mapping[str, Tensor]
+    second: Mapping[str, Tensor]
+    last: Tensor
+    gradient_sum: Tensor
+    seen: Tensor
 
 
 @dataclass(frozen=True)
@@ -68,8 +68,8 @@ class ResidentImage:
     """
 
     key: tuple[int, int] | None
-    target: torch.Tensor
-    mask: torch.Tensor | None
+    target: Tensor
+    mask: Tensor | None
     gain: tuple[float, float, float]
     surroundings: Surroundings | None
 

@@ -8,7 +8,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    import torch
+    from torch import Tensor
 
 
 Color = tuple[float, float, float]
@@ -41,7 +41,7 @@ class RasterCamera:
     fy: float
     cx: float
     cy: float
-    world_to_camera: torch.Tensor
+    world_to_camera: Tensor
     part_of: RasterCamera | None = None
 
     @property
@@ -99,11 +99,11 @@ class Surroundings:
             and the composition before training; None if there is none.
     """
 
-    behind: torch.Tensor
-    alpha: torch.Tensor
-    front: torch.Tensor | None = None
-    transmittance: torch.Tensor | None = None
-    correction: torch.Tensor | None = None
+    behind: Tensor
+    alpha: Tensor
+    front: Tensor | None = None
+    transmittance: Tensor | None = None
+    correction: Tensor | None = None
 
 
 @dataclass(frozen=True)
@@ -125,7 +125,7 @@ class Subset:
         background: See ``RasterOptions``.
     """
 
-    which: torch.Tensor
+    which: Tensor
     background: Color | None = None
 
 
@@ -146,27 +146,27 @@ class Forward:
         state: Private data of the backend.
     """
 
-    color: torch.Tensor
-    alpha: torch.Tensor
-    radii: torch.Tensor
+    color: Tensor
+    alpha: Tensor
+    radii: Tensor
     num_visible: int
     num_dropped: int
     num_intersections: int
-    render_depths: Callable[[], tuple[torch.Tensor, torch.Tensor]]
+    render_depths: Callable[[], tuple[Tensor, Tensor]]
     state: Any
 
     @cached_property
-    def _depths(self) -> tuple[torch.Tensor, torch.Tensor]:
+    def _depths(self) -> tuple[Tensor, Tensor]:
         # Computed at first use: most training steps need no depths.
         return self.render_depths()
 
     @property
-    def depth(self) -> torch.Tensor:
+    def depth(self) -> Tensor:
         """(H, W) float32 sum of weight * camera z, not divided by alpha."""
         return self._depths[0]
 
     @property
-    def median_depth(self) -> torch.Tensor:
+    def median_depth(self) -> Tensor:
         """(H, W) float32 camera z of the Gaussian at which the transmittance falls below 0.5; 0 if
         it does not."""
         return self._depths[1]
@@ -182,10 +182,10 @@ class CameraGradients:
         focal, principal: (2,) per pixel of focal length and principal point.
     """
 
-    rotation: torch.Tensor
-    translation: torch.Tensor
-    focal: torch.Tensor
-    principal: torch.Tensor
+    rotation: Tensor
+    translation: Tensor
+    focal: Tensor
+    principal: Tensor
 
 
 @dataclass(frozen=True)
@@ -202,13 +202,13 @@ class Gradients:
         camera: The gradients of the camera; None if not requested.
     """
 
-    means: torch.Tensor
-    log_scales: torch.Tensor
-    quats: torch.Tensor
-    opacity_logits: torch.Tensor
-    sh: torch.Tensor
-    means2d: torch.Tensor
-    colors: torch.Tensor | None
+    means: Tensor
+    log_scales: Tensor
+    quats: Tensor
+    opacity_logits: Tensor
+    sh: Tensor
+    means2d: Tensor
+    colors: Tensor | None
     camera: CameraGradients | None
 
 
@@ -247,8 +247,8 @@ class Moments:
             equivariant under rotation.
     """
 
-    exp_avg: torch.Tensor
-    exp_avg_sq: torch.Tensor
+    exp_avg: Tensor
+    exp_avg_sq: Tensor
 
 
 @dataclass(frozen=True)
@@ -275,7 +275,7 @@ class ShAdam:
     """
 
     moments: Moments
-    last: torch.Tensor
+    last: Tensor
     rates: AdamRates
 
 
@@ -286,4 +286,4 @@ class LossResult:
     loss: float
     error: float
     ssim: float
-    grad: torch.Tensor
+    grad: Tensor

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
+from torch import Tensor
 
 from pipeline.render import checks
 from pipeline.render.backend import Backend
@@ -37,9 +38,9 @@ class Projected:
     inputs: Parameters
     camera: RasterCamera
     options: RasterOptions
-    view: torch.Tensor  # see _pack_view
-    records: torch.Tensor  # (N, 16)
-    radii: torch.Tensor  # (N,)
+    view: Tensor  # see _pack_view
+    records: Tensor  # (N, 16)
+    radii: Tensor  # (N,)
     num_visible: int
     num_dropped: int
 
@@ -58,16 +59,16 @@ class Binned:
     """The result of ``bin``."""
 
     projected: Projected
-    entries: torch.Tensor  # (M, 3) int32
-    tile_begin: torch.Tensor  # (tiles + 1,) int64
-    slots: torch.Tensor  # (N, 2) int32
+    entries: Tensor  # (M, 3) int32
+    tile_begin: Tensor  # (tiles + 1,) int64
+    slots: Tensor  # (N, 2) int32
 
 
 @dataclass(frozen=True)
 class State(Binned):
     """The state of a rendered view for ``backward``."""
 
-    block_end: torch.Tensor  # (tiles, blocks of a tile) int32
+    block_end: Tensor  # (tiles, blocks of a tile) int32
 
 
 def _ops() -> Any:
@@ -79,7 +80,7 @@ def _threads(threads: int) -> int:
     return threads if threads > 0 else torch.get_num_threads()
 
 
-def _pack_view(camera: RasterCamera, options: RasterOptions) -> torch.Tensor:
+def _pack_view(camera: RasterCamera, options: RasterOptions) -> Tensor:
     """(29,) float64: fx fy cx cy, the rotation by rows, the translation, the near plane, the bounds
     of u and v in the Jacobian, width, height, the SH degree, two flags and the background."""
     pose = camera.world_to_camera.detach().double()
@@ -93,7 +94,7 @@ def _pack_view(camera: RasterCamera, options: RasterOptions) -> torch.Tensor:
     )
 
 
-def _pack_adam(rates: AdamRates) -> torch.Tensor:
+def _pack_adam(rates: AdamRates) -> Tensor:
     """Float64: the step, beta1, beta2, epsilon and the learning rates."""
     values = rates.step, rates.beta1, rates.beta2, rates.eps, *rates.rates
     return torch.tensor(values, dtype=torch.float64)
@@ -146,7 +147,7 @@ class CpuBackend(Backend[Projected, Binned]):
         pairs = p.records, binned.entries, binned.tile_begin
         color, alpha, block_end = ops.blend(*pairs, p.view, p.threads)
 
-        def render_depths() -> tuple[torch.Tensor, torch.Tensor]:
+        def render_depths() -> tuple[Tensor, Tensor]:
             depth, median = ops.blend_depth(*pairs, p.view, p.threads)
             return depth, median
 
@@ -158,9 +159,9 @@ class CpuBackend(Backend[Projected, Binned]):
     def backward(
         self,
         fwd: Forward,
-        d_color: torch.Tensor,
-        d_alpha: torch.Tensor | None = None,
-        d_depth: torch.Tensor | None = None,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
         *,
         colors: bool = False,
         camera: bool = False,
@@ -173,7 +174,7 @@ class CpuBackend(Backend[Projected, Binned]):
             p.records, s.entries, s.tile_begin, s.block_end, p.view, fwd.color, fwd.alpha,
             None if d_depth is None else fwd.depth, d_color, d_alpha, d_depth, p.threads,
         )  # fmt: skip
-        adam: tuple[torch.Tensor | None, ...] = None, None, None, None
+        adam: tuple[Tensor | None, ...] = None, None, None, None
         if sh_adam is not None:
             checks.check_sh_adam(sh_adam, p.inputs[4])
             moments = sh_adam.moments
@@ -190,10 +191,10 @@ class CpuBackend(Backend[Projected, Binned]):
 
     def l1_ssim(
         self,
-        rendered: torch.Tensor,
-        target: torch.Tensor,
+        rendered: Tensor,
+        target: Tensor,
         ssim_weight: float,
-        mask: torch.Tensor | None = None,
+        mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
@@ -201,8 +202,8 @@ class CpuBackend(Backend[Projected, Binned]):
         return LossResult(*_ops().l1_ssim(*images, ssim_weight, l2_weight, _threads(threads)))
 
     def compose(
-        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
-    ) -> torch.Tensor:
+        self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
+    ) -> Tensor:
         color, alpha = checks.layers(around, color, alpha)
         return _ops().compose(
             around.behind, around.alpha, around.front, around.transmittance, around.correction,
@@ -212,11 +213,11 @@ class CpuBackend(Backend[Projected, Binned]):
     def compose_backward(
         self,
         around: Surroundings,
-        alpha: torch.Tensor,
-        d_image: torch.Tensor,
+        alpha: Tensor,
+        d_image: Tensor,
         loss: AlphaChangeLoss,
         threads: int = 0,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         d_image, alpha = checks.layers(around, d_image, alpha)
         return _ops().compose_backward(
             around.behind, around.alpha, around.front, around.transmittance, alpha, d_image,
@@ -224,12 +225,7 @@ class CpuBackend(Backend[Projected, Binned]):
         )  # fmt: skip
 
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        moments: Moments,
-        rates: AdamRates,
-        threads: int = 0,
+        self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:
         checks.check_adam(param, grad, moments, rates)
         tensors = param.detach(), grad.detach(), moments.exp_avg, moments.exp_avg_sq
@@ -237,11 +233,11 @@ class CpuBackend(Backend[Projected, Binned]):
 
     def frame_adam(
         self,
-        means: torch.Tensor,
-        quats: torch.Tensor,
-        log_scales: torch.Tensor,
-        d_means: torch.Tensor,
-        d_quats: torch.Tensor,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        d_means: Tensor,
+        d_quats: Tensor,
         moments: FrameMoments,
         rates: AdamRates,
         threads: int = 0,

@@ -8,6 +8,7 @@ from functools import cached_property
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pipeline.render import checks
 from pipeline.render.backend import Backend
@@ -40,11 +41,11 @@ FRAMES = {name: layout.GEOMETRY[name] for name in ("means", "log_scales", "quats
 class Projected:
     """The result of ``project``. ``sh`` is the tensor that ``ShAdam`` updates."""
 
-    sh: torch.Tensor
+    sh: Tensor
     camera: RasterCamera
     options: RasterOptions
     projection: rasterise.Projection
-    radii: torch.Tensor
+    radii: Tensor
 
 
 @dataclass(frozen=True)
@@ -59,7 +60,7 @@ class Binned:
 class State:
     """The state of a rendered view for ``backward``."""
 
-    sh: torch.Tensor
+    sh: Tensor
     image: rasterise.Image
 
 
@@ -130,9 +131,9 @@ class GpuBackend(Backend[Projected, Binned]):
     def backward(
         self,
         fwd: Forward,
-        d_color: torch.Tensor,
-        d_alpha: torch.Tensor | None = None,
-        d_depth: torch.Tensor | None = None,
+        d_color: Tensor,
+        d_alpha: Tensor | None = None,
+        d_depth: Tensor | None = None,
         *,
         colors: bool = False,
         camera: bool = False,
@@ -181,10 +182,10 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def l1_ssim(
         self,
-        rendered: torch.Tensor,
-        target: torch.Tensor,
+        rendered: Tensor,
+        target: Tensor,
         ssim_weight: float,
-        mask: torch.Tensor | None = None,
+        mask: Tensor | None = None,
         l2_weight: float = 0.0,
         threads: int = 0,
     ) -> LossResult:
@@ -200,8 +201,8 @@ class GpuBackend(Backend[Projected, Binned]):
         return LossResult(loss, error, ssim, grad.view(rendered.shape))
 
     def compose(
-        self, around: Surroundings, color: torch.Tensor, alpha: torch.Tensor, threads: int = 0
-    ) -> torch.Tensor:
+        self, around: Surroundings, color: Tensor, alpha: Tensor, threads: int = 0
+    ) -> Tensor:
         color, alpha = checks.layers(around, color, alpha)
         nothing = AlphaChangeLoss(0.0, 0.0, 0.0)
         result, _ = self._composition("compose.compose", around, alpha, color, nothing)
@@ -210,21 +211,16 @@ class GpuBackend(Backend[Projected, Binned]):
     def compose_backward(
         self,
         around: Surroundings,
-        alpha: torch.Tensor,
-        d_image: torch.Tensor,
+        alpha: Tensor,
+        d_image: Tensor,
         loss: AlphaChangeLoss,
         threads: int = 0,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         d_image, alpha = checks.layers(around, d_image, alpha)
         return self._composition("compose.backward", around, alpha, d_image, loss)
 
     def adam_step(
-        self,
-        param: torch.Tensor,
-        grad: torch.Tensor,
-        moments: Moments,
-        rates: AdamRates,
-        threads: int = 0,
+        self, param: Tensor, grad: Tensor, moments: Moments, rates: AdamRates, threads: int = 0
     ) -> None:
         checks.check_adam(param, grad, moments, rates)
         gpu, tensors = self.gpu, {"parameter": param.detach(), **vars(moments)}
@@ -239,11 +235,11 @@ class GpuBackend(Backend[Projected, Binned]):
 
     def frame_adam(
         self,
-        means: torch.Tensor,
-        quats: torch.Tensor,
-        log_scales: torch.Tensor,
-        d_means: torch.Tensor,
-        d_quats: torch.Tensor,
+        means: Tensor,
+        quats: Tensor,
+        log_scales: Tensor,
+        d_means: Tensor,
+        d_quats: Tensor,
         moments: FrameMoments,
         rates: AdamRates,
         threads: int = 0,
@@ -292,10 +288,10 @@ class GpuBackend(Backend[Projected, Binned]):
         self,
         kernel: str,
         around: Surroundings,
-        alpha: torch.Tensor,
-        values: torch.Tensor,
+        alpha: Tensor,
+        values: Tensor,
         loss: AlphaChangeLoss,
-    ) -> tuple[torch.Tensor, torch.Tensor]:
+    ) -> tuple[Tensor, Tensor]:
         gpu, pixels = self.gpu, alpha.numel()
         result, d_alpha = gpu.empty(12 * pixels), gpu.empty(4 * pixels)
         compose(

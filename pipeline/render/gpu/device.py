@@ -146,8 +146,7 @@ class Gpu:
             )
         except (wgpu.GPUOutOfMemoryError, wgpu.GPUValidationError) as error:
             raise UserError(
-                f"{self.adapter}: no memory for {what} of {size / 1e6:.0f} MB: {error}",
-                fix=SMALLER,
+                f"{self.adapter}: no memory for {what} of {size / 1e6:.0f} MB: {error}", fix=SMALLER
             ) from error
 
     def upload(self, array: NDArray[Any], *, what: str = "an array") -> Buffer:

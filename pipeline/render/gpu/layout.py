@@ -9,11 +9,12 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch import Tensor
 
 from pipeline.render.gpu.device import Buffer, Gpu
 from pipeline.render.types import RasterCamera, RasterOptions
 
-Tensors = dict[str, torch.Tensor]
+Tensors = dict[str, Tensor]
 
 TILE = 16  # kTile in constants.h
 RECORD_BYTES = 48  # Record in record.wgsl
@@ -45,7 +46,7 @@ def offsets(sections: Mapping[str, int], count: int) -> dict[str, tuple[int, int
     return found
 
 
-def join(sections: Mapping[str, int], tensors: Mapping[str, torch.Tensor]) -> NDArray[Any]:
+def join(sections: Mapping[str, int], tensors: Mapping[str, Tensor]) -> NDArray[Any]:
     """The tensors of the sections, one after another."""
     return np.concatenate([tensors[name].detach().numpy().reshape(-1) for name in sections])
 
@@ -59,7 +60,7 @@ def split(sections: Mapping[str, int], whole: Buffer, gpu: Gpu, count: int) -> T
     }
 
 
-def fetch(gpu: Gpu, buffer: Buffer, tensor: torch.Tensor) -> None:
+def fetch(gpu: Gpu, buffer: Buffer, tensor: Tensor) -> None:
     """Copy a buffer into a tensor."""
     found = gpu.read(buffer, tensor.detach().numpy().dtype, tensor.numel())
     tensor.detach().copy_(torch.from_numpy(found).view(tensor.shape))

@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import torch
+from torch import Tensor
 
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
@@ -32,7 +33,7 @@ class LossImage:
     is_bytes: bool
 
     @staticmethod
-    def upload(gpu: Gpu, target: torch.Tensor, mask: torch.Tensor | None) -> LossImage:
+    def upload(gpu: Gpu, target: Tensor, mask: Tensor | None) -> LossImage:
         ignored = 0 if mask is None else int((mask != 0).sum())
         return LossImage(
             gpu.upload(target.contiguous().numpy(), what="a training image"),

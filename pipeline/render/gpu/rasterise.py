@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from pipeline.render.gpu import layout
 from pipeline.render.gpu.adam import sh_options
@@ -113,7 +114,7 @@ class Image:
     planes: Buffer
     ends: Buffer
 
-    def plane(self, gpu: Gpu, number: int) -> torch.Tensor:
+    def plane(self, gpu: Gpu, number: int) -> Tensor:
         """(H, W), a copy of one of the planes."""
         width, height = self.lists.projection.size
         pixels = width * height

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import torch
+from torch import Tensor
 
 from pipeline.render.gpu import layout, rasterise
 from pipeline.render.gpu.adam import adam_step, frame_adam
@@ -77,11 +77,11 @@ class _Planes:
     image: rasterise.Image
 
     @property
-    def alpha(self) -> torch.Tensor:
+    def alpha(self) -> Tensor:
         return self.image.plane(self.gpu, 0)
 
     @property
-    def depth(self) -> torch.Tensor:
+    def depth(self) -> Tensor:
         return self.image.plane(self.gpu, 1)
 
 
@@ -294,7 +294,7 @@ class GpuTraining(ResidentTraining):
             )
 
 
-def _others(optimised: Optimised) -> dict[str, torch.Tensor]:
+def _others(optimised: Optimised) -> dict[str, Tensor]:
     """All tensors but the parameters of the rasterizer, by the names of their buffers."""
     tensors = {f"first {name}": tensor for name, tensor in optimised.first.items()}
     tensors |= {f"second {name}": tensor for name, tensor in optimised.second.items()}

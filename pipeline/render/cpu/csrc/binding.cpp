@@ -40,12 +40,6 @@ Tensor new_tensor(const std::vector<int64_t>& shape, ScalarType type) {
 Tensor new_floats(const std::vector<int64_t>& shape) {
     return new_tensor<float>(shape, ScalarType::Float);
 }
-Tensor new_ints(const std::vector<int64_t>& shape) {
-    return new_tensor<int32_t>(shape, ScalarType::Int);
-}
-Tensor new_longs(const std::vector<int64_t>& shape) {
-    return new_tensor<int64_t>(shape, ScalarType::Long);
-}
 
 // view: float64, in the order of `_pack_view` in backend.py.
 splat::View view_from(const Tensor& packed) {
@@ -109,13 +103,13 @@ std::tuple<Tensor, Tensor, int64_t, int64_t> project(const Tensor& means, const 
 std::tuple<Tensor, Tensor, Tensor, bool> bin(const Tensor& records, const Tensor& radii,
                                              const Tensor& view, int64_t threads) {
     const splat::View v = view_from(view);
-    Tensor slots = new_ints({records.size(0), 2});
+    Tensor slots = new_tensor<int32_t>({records.size(0), 2}, ScalarType::Int);
     splat::Binner binner;
     const bool fits =
         binner.find(records_from(records), floats(radii), records.size(0), v, int(threads),
                     reinterpret_cast<splat::Slots*>(slots.mutable_data_ptr<int32_t>()));
-    Tensor entries = new_ints({fits ? binner.intersections() : 0, 3});
-    Tensor tile_begin = new_longs({v.tiles() + 1});
+    Tensor entries = new_tensor<int32_t>({fits ? binner.intersections() : 0, 3}, ScalarType::Int);
+    Tensor tile_begin = new_tensor<int64_t>({v.tiles() + 1}, ScalarType::Long);
     if (fits)
         binner.write(reinterpret_cast<splat::Entry*>(entries.mutable_data_ptr<int32_t>()),
                      tile_begin.mutable_data_ptr<int64_t>());
@@ -128,7 +122,7 @@ std::tuple<Tensor, Tensor, Tensor> blend(const Tensor& records, const Tensor& en
                                          int64_t threads) {
     const splat::View v = view_from(view);
     Tensor color = new_floats({v.height, v.width, 3}), alpha = new_floats({v.height, v.width});
-    Tensor block_end = new_ints({v.tiles(), splat::kBlocks});
+    Tensor block_end = new_tensor<int32_t>({v.tiles(), splat::kBlocks}, ScalarType::Int);
     splat::blend(records_from(records), pairs_from(entries, tile_begin), v, Background(view).rgb,
                  int(threads), mutable_floats(color), mutable_floats(alpha),
                  block_end.mutable_data_ptr<int32_t>());

@@ -414,40 +414,4 @@ SPLAT_INLINE Vector<float, kCount * N> join(const Vector<float, N>* parts) {
         return combine(join<kCount / 2>(parts), join<kCount / 2>(parts + kCount / 2));
 }
 
-// ---- Bits as numbers ----
-
-#if !SPLAT_AVX512
-// The positions of the bits of a byte, lowest first.
-struct BitPlaces {
-    uint8_t of[256][8];
-    constexpr BitPlaces() : of() {
-        for (int byte = 0; byte < 256; byte++)
-            for (int bit = 0, n = 0; bit < 8; bit++)
-                if (byte >> bit & 1) of[byte][n++] = uint8_t(bit);
-    }
-};
-alignas(64) constexpr BitPlaces kBitPlaces;
-#endif
-
-// Writes base + kStep i for every set bit i of kBits, lowest first; returns their number. May write
-// undefined values up to to[kBits - 1].
-template <int kBits, uint32_t kStep>
-SPLAT_INLINE int list_bits(uint32_t bits, uint32_t base, uint32_t* to) {
-#if SPLAT_AVX512
-    static_assert(kBits == 16);
-    const u32x16 all = bit_cast<u32x16>(to_int(lane_numbers())) * kStep + base;
-    _mm512_storeu_si512(to, _mm512_maskz_compress_epi32(__mmask16(bits), (__m512i)all.lanes));
-    return __builtin_popcount(bits);
-#else
-    int count = 0;
-    for (int byte = 0; byte < kBits / 8; byte++, bits >>= 8) {
-        Unsigned<8> places;
-        native::widen_bytes(kBitPlaces.of[bits & 255], &places);
-        store(to + count, places * kStep + (base + 8 * byte * kStep));
-        count += __builtin_popcount(bits & 255);
-    }
-    return count;
-#endif
-}
-
 }  // namespace splat

@@ -25,9 +25,8 @@ struct Adam {
 @group(0) @binding(5) var<storage, read_write> exp_avg_sq: array<f32>;
 
 @compute @workgroup_size(kThreads)
-fn elements(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-            @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn elements(thread: Thread) {
+    let i = number_of(thread);
     if (i >= adam.count) { return; }
     let g = gradient[adam.gradient_at + i];
     let m = exp_avg[i] * adam.beta1 + g * adam.rest1;
@@ -38,9 +37,8 @@ fn elements(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gr
 }
 
 @compute @workgroup_size(kThreads)
-fn rows(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let row = thread_number(group, groups, local);
+fn rows(thread: Thread) {
+    let row = number_of(thread);
     if (row >= adam.count) { return; }
     var squares = 0.0;
     for (var k = 0u; k < adam.width; k++) {

@@ -23,9 +23,8 @@ struct Appearance {
 const kConstantBasis = 0.28209479177387814;
 
 @compute @workgroup_size(kThreads)
-fn show(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn show(thread: Thread) {
+    let i = number_of(thread);
     if (i >= appearance.gaussians) { return; }
     for (var channel = 0u; channel < 3u; channel++) {
         var offset = 0.0;
@@ -40,9 +39,8 @@ fn show(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 }
 
 @compute @workgroup_size(kThreads)
-fn hide(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn hide(thread: Thread) {
+    let i = number_of(thread);
     if (i >= appearance.gaussians) { return; }
     for (var channel = 0u; channel < 3u; channel++) {
         let at = 3u * appearance.sh_coefficients * i + channel;
@@ -51,9 +49,8 @@ fn hide(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups
 }
 
 @compute @workgroup_size(kThreads)
-fn gradient(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-            @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn gradient(thread: Thread) {
+    let i = number_of(thread);
     if (i >= appearance.gaussians) { return; }
     let at = appearance.colors_at + 3u * i;
     let d = kConstantBasis * vec3(gradients[at], gradients[at + 1u], gradients[at + 2u]);

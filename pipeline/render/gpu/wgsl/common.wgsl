@@ -1,13 +1,18 @@
-// What all kernels share. The constants (k...) are those of cpu/csrc/constants.h.
+// The common part of all kernels. The constants (k...) are those of cpu/csrc/constants.h.
 
 const kThreads = 256u;  // of a workgroup
 
-// Number of a thread, or of a workgroup, in a dispatch: one dimension has at most 65535 workgroups.
-fn group_number(group: vec3<u32>, groups: vec3<u32>) -> u32 {
-    return group.y * groups.x + group.x;
+// The place of a thread in a dispatch, of which one dimension has at most 65535 workgroups.
+struct Thread {
+    @builtin(workgroup_id) group: vec3<u32>,
+    @builtin(num_workgroups) groups: vec3<u32>,
+    @builtin(local_invocation_index) local: u32,
 }
-fn thread_number(group: vec3<u32>, groups: vec3<u32>, local: u32) -> u32 {
-    return group_number(group, groups) * kThreads + local;
+fn group_of(thread: Thread) -> u32 {
+    return thread.group.y * thread.groups.x + thread.group.x;
+}
+fn number_of(thread: Thread) -> u32 {
+    return group_of(thread) * kThreads + thread.local;
 }
 
 // By its bits: compilers may assume that floats are finite.

@@ -15,9 +15,8 @@ struct Size {
 @group(0) @binding(6) var<storage, read_write> length: u32;
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let i = number_of(thread);
     if (i >= size.count) { return; }
     let visible = radii[i] > 0.0;
     if (visible) {

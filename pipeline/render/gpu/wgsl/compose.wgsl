@@ -40,9 +40,8 @@ fn passing(i: u32) -> f32 {
 }
 
 @compute @workgroup_size(kThreads)
-fn compose(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-           @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn compose(thread: Thread) {
+    let i = number_of(thread);
     if (i >= layers.pixels) { return; }
     for (var k = 3u * i; k < 3u * i + 3u; k++) {
         var value = values[k] + (1.0 - alpha[i]) * kUnit * byte(behind[k / 4u], k);
@@ -57,9 +56,8 @@ fn compose(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
 }
 
 @compute @workgroup_size(kThreads)
-fn backward(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-            @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn backward(thread: Thread) {
+    let i = number_of(thread);
     if (i >= layers.pixels) { return; }
     var hidden = 0.0;
     for (var k = 3u * i; k < 3u * i + 3u; k++) {

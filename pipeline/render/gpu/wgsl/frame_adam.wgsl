@@ -1,5 +1,5 @@
-// Adam over means and rotations in the local frame of each Gaussian; `frame_adam` in reference.py
-// documents the method.
+// Adam over means and rotations in the local frame of each Gaussian; `frame_adam` in
+// reference_adam.py documents the method.
 #import common
 
 struct Adam {
@@ -47,9 +47,8 @@ fn step(m: Moments) -> vec3<f32> {
 }
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let i = number_of(thread);
     let n = adam.gaussians;
     if (i >= n) { return; }
     let mean = 3u * i;

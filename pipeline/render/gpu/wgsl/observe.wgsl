@@ -15,9 +15,8 @@ struct Options {
 @group(0) @binding(4) var<storage, read_write> seen: array<f32>;
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let i = number_of(thread);
     if (i >= options.gaussians || radii[i] <= 0.0) { return; }
     let at = options.gradient_at + 2u * i;
     gradient_sum[i] += length(vec2(gradients[at], gradients[at + 1u]) * options.half_size);

@@ -12,9 +12,8 @@ struct Size {
 @group(0) @binding(4) var<storage, read_write> ordered: array<u32>;
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let rank = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let rank = number_of(thread);
     if (rank >= size.count) { return; }
     var count = 0u;
     if (rank < length) { count = tile_counts[gaussians[rank]]; }

@@ -24,9 +24,8 @@ struct Size {
 @group(0) @binding(10) var<storage, read_write> slots: array<u32>;
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let rank = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let rank = number_of(thread);
     if (rank >= length) { return; }
     let i = gaussians[rank];
     let r = records[i];

@@ -43,9 +43,8 @@ fn color_of(i: u32, mean: vec3<f32>) -> vec4<f32> {
 }
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let i = number_of(thread);
     if (i >= view.gaussians) { return; }
     radii[i] = 0.0;
     tile_counts[i] = 0u;

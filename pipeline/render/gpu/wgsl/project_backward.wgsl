@@ -121,9 +121,8 @@ fn step_sh(at: u32, gradient: f32, rate: f32, missed: Missed) {
 }
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let i = thread_number(group, groups, local);
+fn main(thread: Thread) {
+    let i = number_of(thread);
     if (i >= view.gaussians) { return; }
     var m: array<f32, kMoments>;
     var most = 0.0;

@@ -14,38 +14,36 @@ const kEach = 4u;  // numbers per thread
 var<workgroup> running: array<u32, kThreads>;
 
 @compute @workgroup_size(kThreads)
-fn blocks(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-          @builtin(local_invocation_index) local: u32) {
-    let block = group_number(group, groups);
-    let first = (block * kThreads + local) * kEach;
+fn blocks(thread: Thread) {
+    let block = group_of(thread);
+    let first = (block * kThreads + thread.local) * kEach;
     var before: array<u32, kEach>;
     var sum = 0u;
     for (var j = 0u; j < kEach; j++) {
         before[j] = sum;
         if (first + j < size.count) { sum += values[first + j]; }
     }
-    running[local] = sum;
+    running[thread.local] = sum;
     for (var step = 1u; step < kThreads; step *= 2u) {
         workgroupBarrier();
         var left = 0u;
-        if (local >= step) { left = running[local - step]; }
+        if (thread.local >= step) { left = running[thread.local - step]; }
         workgroupBarrier();
-        running[local] += left;
+        running[thread.local] += left;
     }
-    let base = running[local] - sum;
+    let base = running[thread.local] - sum;
     for (var j = 0u; j < kEach; j++) {
         if (first + j < size.count) { values[first + j] = base + before[j]; }
     }
-    if (local == kThreads - 1u && block * kThreads * kEach < size.count) {
-        sums[block] = running[local];
+    if (thread.local == kThreads - 1u && block * kThreads * kEach < size.count) {
+        sums[block] = running[thread.local];
     }
 }
 
 @compute @workgroup_size(kThreads)
-fn add(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-       @builtin(local_invocation_index) local: u32) {
-    let block = group_number(group, groups);
-    let first = (block * kThreads + local) * kEach;
+fn add(thread: Thread) {
+    let block = group_of(thread);
+    let first = (block * kThreads + thread.local) * kEach;
     for (var j = 0u; j < kEach; j++) {
         if (first + j < size.count) { values[first + j] += sums[block]; }
     }

@@ -26,19 +26,18 @@ fn digit_of(key: u32) -> u32 {
 var<workgroup> counts: array<atomic<u32>, kDigits>;
 
 @compute @workgroup_size(kThreads)
-fn histogram(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-             @builtin(local_invocation_index) local: u32) {
-    let block = group_number(group, groups);
-    let first = (block * kThreads + local) * kEach;
+fn histogram(thread: Thread) {
+    let block = group_of(thread);
+    let first = (block * kThreads + thread.local) * kEach;
     // Some drivers do not zero the memory of workgroups.
-    if (local < kDigits) { atomicStore(&counts[local], 0u); }
+    if (thread.local < kDigits) { atomicStore(&counts[thread.local], 0u); }
     workgroupBarrier();
     for (var j = 0u; j < kEach; j++) {
         if (first + j < length) { atomicAdd(&counts[digit_of(keys[first + j])], 1u); }
     }
     workgroupBarrier();
-    if (local < kDigits && block < pass_.blocks) {
-        places[local * pass_.blocks + block] = atomicLoad(&counts[local]);
+    if (thread.local < kDigits && block < pass_.blocks) {
+        places[thread.local * pass_.blocks + block] = atomicLoad(&counts[thread.local]);
     }
 }
 
@@ -56,10 +55,9 @@ fn counter(c: Counters, digit: u32) -> u32 {
 }
 
 @compute @workgroup_size(kThreads)
-fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-           @builtin(local_invocation_index) local: u32) {
-    let block = group_number(group, groups);
-    let first = (block * kThreads + local) * kEach;
+fn scatter(thread: Thread) {
+    let block = group_of(thread);
+    let first = (block * kThreads + thread.local) * kEach;
     var own = Counters(vec4(0u), vec4(0u));
     for (var j = 0u; j < kEach; j++) {
         if (first + j < length) {
@@ -69,16 +67,16 @@ fn scatter(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) gro
             if (word < 4u) { own.low[word] += one; } else { own.high[word - 4u] += one; }
         }
     }
-    running[local] = own;
+    running[thread.local] = own;
     for (var step = 1u; step < kThreads; step *= 2u) {
         workgroupBarrier();
         var left = Counters(vec4(0u), vec4(0u));
-        if (local >= step) { left = running[local - step]; }
+        if (thread.local >= step) { left = running[thread.local - step]; }
         workgroupBarrier();
-        running[local].low += left.low;
-        running[local].high += left.high;
+        running[thread.local].low += left.low;
+        running[thread.local].high += left.high;
     }
-    let before = Counters(running[local].low - own.low, running[local].high - own.high);
+    let before = Counters(running[thread.local].low - own.low, running[thread.local].high - own.high);
     for (var j = 0u; j < kEach; j++) {
         if (first + j < length) {
             let key = keys[first + j];

@@ -13,14 +13,13 @@ struct Size {
 const kRows = 1024u;
 
 @compute @workgroup_size(kThreads)
-fn main(@builtin(workgroup_id) group: vec3<u32>, @builtin(num_workgroups) groups: vec3<u32>,
-        @builtin(local_invocation_index) local: u32) {
-    let block = group_number(group, groups);
+fn main(thread: Thread) {
+    let block = group_of(thread);
     let begin = block * kRows;
-    if (begin >= size.rows || local >= size.columns) { return; }
+    if (begin >= size.rows || thread.local >= size.columns) { return; }
     var sum = 0.0;
     for (var row = begin; row < min(begin + kRows, size.rows); row++) {
-        sum += values[row * size.columns + local];
+        sum += values[row * size.columns + thread.local];
     }
-    sums[block * size.columns + local] = sum;
+    sums[block * size.columns + thread.local] = sum;
 }

@@ -11,8 +11,7 @@
 #include <limits>
 #include <memory>
 #include <random>
-#include <string>
-#include <vector>
+#include <utility>
 
 #include "adam.h"
 #include "bin.h"
@@ -83,6 +82,67 @@ void set_slopes(View& view) {
     view.max_v = (view.height - view.cy) / view.fy + margin_y;
 }
 
+// The kernels over one view, with arrays of exactly the sizes that they need.
+struct Pass {
+    const View& view;
+    const int threads;
+    const float* background;
+    const Gaussians in;
+    const size_t n = size_t(in.count), pixels = size_t(view.width * view.height);
+    const size_t sh = size_t(3 * in.count * in.sh_coefficients);
+    Array<Record> records{n};
+    Array<Slots> slots{n};
+    Array<Entry> entries{0};
+    Array<int64_t> begin{size_t(view.tiles() + 1)};
+    Array<int32_t> block_end{size_t(kBlocks * view.tiles())};
+    Array<float> radii{n}, color{3 * pixels}, alpha{pixels}, depth{pixels}, median{pixels};
+    Array<float> d_means{3 * n}, d_scales{3 * n}, d_quats{4 * n}, d_opacity{n}, d_sh{sh};
+    Array<float> d_means2d{2 * n}, d_colors{3 * n}, d_loss{3 * pixels};
+    Array<double> d_camera{kCameraParameters};
+
+    Pass(Scene& s, const View& view, int threads, const float* background)
+        : view(view), threads(threads), background(background), in(gaussians(s)) {}
+
+    static Gaussians gaussians(Scene& s) {
+        return {s.count,       (s.degree + 1) * (s.degree + 1), s.means.get(), s.log_scales.get(),
+                s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
+    }
+
+    // Returns false if there are too many pairs.
+    bool forward() {
+        project_view(in, view, threads, records.get(), radii.get());
+        Binner binner;
+        if (!binner.find(records.get(), radii.get(), in.count, view, threads, slots.get()))
+            return false;
+        entries = Array<Entry>(size_t(binner.intersections()));
+        binner.write(entries.get(), begin.get());
+        blend(records.get(), {entries.get(), begin.get()}, view, background, threads, color.get(),
+              alpha.get(), block_end.get());
+        blend_depth(records.get(), {entries.get(), begin.get()}, view, threads, depth.get(),
+                    median.get());
+        return true;
+    }
+    void backward(const float* d_color, const float* d_alpha, const float* d_depth,
+                  bool optional_outputs, const ShAdam* sh_adam) {
+        Array<float> slot_gradients(entries.size * kSlotFloats);
+        blend_backward(
+            records.get(), {entries.get(), begin.get()}, view,
+            {color.get(), alpha.get(), depth.get(), d_color, d_alpha, d_depth, background},
+            block_end.get(), threads, slot_gradients.get());
+        project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
+                              slot_gradients.get(),
+                              {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
+                               sh_adam ? nullptr : d_sh.get(), d_means2d.get(),
+                               optional_outputs ? d_colors.get() : nullptr,
+                               optional_outputs ? d_camera.get() : nullptr},
+                              sh_adam);
+    }
+    void loss(const Array<float>& target, const uint8_t* mask) {
+        l1_ssim({view.width, view.height, color.get(), target.data.get(), nullptr, mask},
+                {0.2, 2.5}, threads, d_loss.get());
+    }
+};
+
 // Runs all kernels over one view; writes the image and the gradients to `out`, if any.
 void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, std::FILE* out) {
     View view = {width,
@@ -96,86 +156,47 @@ void run(Scene& s, int64_t width, int64_t height, bool antialias, int threads, s
                  0.01};
     view.antialias = antialias, view.sh_degree = s.degree;
     set_slopes(view);
-    const Gaussians in = {
-        s.count,       (s.degree + 1) * (s.degree + 1), s.means.get(), s.log_scales.get(),
-        s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
-    const size_t n = size_t(s.count), pixels = size_t(width * height);
-    Array<Record> records(n);
-    Array<float> radii(n);
-    project_view(in, view, threads, records.get(), radii.get());
-    Array<Slots> slots(n);
-    Binner binner;
-    if (!binner.find(records.get(), radii.get(), s.count, view, threads, slots.get())) return;
-    Array<Entry> entries(size_t(binner.intersections()));
-    Array<int64_t> begin(size_t(view.tiles() + 1));
-    Array<int32_t> block_end(size_t(kBlocks * view.tiles()));
-    binner.write(entries.get(), begin.get());
-    const Pairs pairs = {entries.get(), begin.get()};
     const float background[3] = {0.1f, 0.5f, 0.9f};
-    Array<float> color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);
-    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(),
-          block_end.get());
-    blend_depth(records.get(), pairs, view, threads, depth.get(), median.get());
-    Array<float> target(3 * pixels), d_color(3 * pixels);
-    Array<uint8_t> mask(pixels);
-    for (size_t i = 0; i < 3 * pixels; i++) target[i] = float(i % 97) / 97;
-    for (size_t i = 0; i < pixels; i++) mask[i] = i % 5 == 0;
-    l1_ssim({width, height, color.get(), target.get(), nullptr, mask.get()}, {0.2, 2.5}, threads,
-            d_color.get());
-    l1_ssim({width, height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
-            d_color.get());
-    Array<float> slot_gradients(entries.size * kSlotFloats);
-    Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
-    Array<float> d_means2d(2 * n), d_colors(3 * n);
-    Array<double> d_camera(kCameraParameters);
-    for (const bool everything : {true, false}) {
-        blend_backward(records.get(), pairs, view,
-                       {color.get(), alpha.get(), depth.get(), d_color.get(),
-                        everything ? median.get() : nullptr, everything ? alpha.get() : nullptr,
-                        background},
-                       block_end.get(), threads, slot_gradients.get());
-        project_view_backward(
-            in, view, threads, records.get(), radii.get(), slots.get(), slot_gradients.get(),
-            {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), d_sh.get(),
-             d_means2d.get(), everything ? d_colors.get() : nullptr,
-             everything ? d_camera.get() : nullptr},
-            nullptr);
-    }
+    Pass p(s, view, threads, background);
+    if (!p.forward()) return;
+    const size_t n = p.n;
+    Array<float> target(3 * p.pixels);
+    Array<uint8_t> mask(p.pixels);
+    for (size_t i = 0; i < target.size; i++) target[i] = float(i % 97) / 97;
+    for (size_t i = 0; i < mask.size; i++) mask[i] = i % 5 == 0;
+    p.loss(target, mask.get());
+    p.loss(target, nullptr);
+    p.backward(p.d_loss.get(), p.median.get(), p.alpha.get(), true, nullptr);
+    p.backward(p.d_loss.get(), nullptr, nullptr, false, nullptr);
     Array<float> m(s.sh.size), v(s.sh.size), param(s.sh.size);
     Array<int32_t> last(n);
     const ShAdam sh_adam({s.sh.get(), m.get(), v.get(), last.get()},
                          {1e-2, 1e-3, 0.9, 0.999, 1e-15, 9});
-    project_view_backward(in, view, threads, records.get(), radii.get(), slots.get(),
-                          slot_gradients.get(),
-                          {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(), nullptr,
-                           d_means2d.get(), nullptr, nullptr},
-                          &sh_adam);
-    expect_finite(d_camera, "d_camera");
+    p.backward(p.d_loss.get(), nullptr, nullptr, false, &sh_adam);
+    expect_finite(p.d_camera, "d_camera");
     for (Array<float>* moments : {&m, &v}) expect_finite(*moments, "moments");
     const double rate = 1e-2;
-    adam_step(param.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
+    adam_step(param.get(), p.d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
     // Steps from zero; invalid quaternions and Gaussians that are not drawn are not updated, so NaN
     // inputs stay NaN.
-    Array<float> moved(3 * n), turned(4 * n),
-        frame[4] = {Array<float>(3 * n), Array<float>(3 * n), Array<float>(3 * n),
-                    Array<float>(3 * n)};
+    Array<float> moved(3 * n), turned(4 * n), f0(3 * n), f1(3 * n), f2(3 * n), f3(3 * n);
     for (size_t i = 0; i < turned.size; i++)
         turned[i] = std::isfinite(s.quats[i]) ? s.quats[i] : 0.0f;
     const double rates[] = {1e-2, 1e-3};
-    frame_adam(moved.get(), turned.get(), s.log_scales.get(), d_means.get(), d_quats.get(),
-               {frame[0].get(), frame[1].get(), frame[2].get(), frame[3].get()}, n,
-               {rates, 2, 0.9, 0.999, 1e-15, 1}, threads);
-    for (Array<float>& moments : frame) expect_finite(moments, "frame moments");
-    Array<float>* results[] = {&color,     &alpha,    &depth,   &median,    &d_color,
-                               &d_means,   &d_scales, &d_quats, &d_opacity, &d_sh,
-                               &d_means2d, &param,    &moved,   &turned};
-    const char* names[] = {"color",     "alpha",    "depth",   "median",    "d_color",
-                           "d_means",   "d_scales", "d_quats", "d_opacity", "d_sh",
-                           "d_means2d", "param",    "moved",   "turned"};
-    for (int i = 0; i < 14; i++) {
-        expect_finite(*results[i], names[i]);
-        if (out) std::fwrite(results[i]->get(), sizeof(float), results[i]->size, out);
+    frame_adam(moved.get(), turned.get(), s.log_scales.get(), p.d_means.get(), p.d_quats.get(),
+               {f0.get(), f1.get(), f2.get(), f3.get()}, n, {rates, 2, 0.9, 0.999, 1e-15, 1},
+               threads);
+    for (Array<float>* moments : {&f0, &f1, &f2, &f3}) expect_finite(*moments, "frame moments");
+    const std::pair<const char*, Array<float>*> results[] = {
+        {"color", &p.color},       {"alpha", &p.alpha},         {"depth", &p.depth},
+        {"median", &p.median},     {"d_color", &p.d_loss},      {"d_means", &p.d_means},
+        {"d_scales", &p.d_scales}, {"d_quats", &p.d_quats},     {"d_opacity", &p.d_opacity},
+        {"d_sh", &p.d_sh},         {"d_means2d", &p.d_means2d}, {"param", &param},
+        {"moved", &moved},         {"turned", &turned}};
+    for (const auto& [name, values] : results) {
+        expect_finite(*values, name);
+        if (out) std::fwrite(values->get(), sizeof(float), values->size, out);
     }
 }
 
@@ -201,7 +222,7 @@ int run_file(const char* input, const char* output) {
     read(in, &h, 1);
     Scene s(h.count, int(h.degree));
     for (Array<float>* field : s.fields) read(in, field->get(), field->size);
-    const size_t n = size_t(h.count), pixels = size_t(h.width * h.height);
+    const size_t pixels = size_t(h.width * h.height);
     Array<float> d_color(3 * pixels), d_alpha(pixels), d_depth(pixels), target(3 * pixels);
     for (Array<float>* image : {&d_color, &d_alpha, &d_depth, &target})
         read(in, image->get(), image->size);
@@ -215,47 +236,19 @@ int run_file(const char* input, const char* output) {
     const int threads = int(h.threads);
     const float background[3] = {float(h.background[0]), float(h.background[1]),
                                  float(h.background[2])};
-    const Gaussians gaussians = {
-        s.count,       (h.degree + 1) * (h.degree + 1), s.means.get(), s.log_scales.get(),
-        s.quats.get(), s.opacity_logits.get(),          s.sh.get()};
-    Array<Record> records(n);
-    Array<float> radii(n), color(3 * pixels), alpha(pixels), depth(pixels), median(pixels);
-    Array<Slots> slots(n);
-    Array<int32_t> block_end(size_t(kBlocks * view.tiles()));
-    project_view(gaussians, view, threads, records.get(), radii.get());
-    Binner binner;
-    if (!binner.find(records.get(), radii.get(), s.count, view, threads, slots.get())) return 2;
-    Array<Entry> entries(size_t(binner.intersections()));
-    Array<int64_t> begin(size_t(view.tiles() + 1));
-    binner.write(entries.get(), begin.get());
-    const Pairs pairs = {entries.get(), begin.get()};
-    blend(records.get(), pairs, view, background, threads, color.get(), alpha.get(),
-          block_end.get());
-    blend_depth(records.get(), pairs, view, threads, depth.get(), median.get());
-
-    Array<float> slot_gradients(entries.size * kSlotFloats);
-    Array<float> d_means(3 * n), d_scales(3 * n), d_quats(4 * n), d_opacity(n), d_sh(s.sh.size);
-    Array<float> d_means2d(2 * n), d_loss(3 * pixels);
-    Array<double> d_camera(kCameraParameters);
-    blend_backward(records.get(), pairs, view,
-                   {color.get(), alpha.get(), depth.get(), d_color.get(), d_alpha.get(),
-                    d_depth.get(), background},
-                   block_end.get(), threads, slot_gradients.get());
-    project_view_backward(gaussians, view, threads, records.get(), radii.get(), slots.get(),
-                          slot_gradients.get(),
-                          {d_means.get(), d_scales.get(), d_quats.get(), d_opacity.get(),
-                           d_sh.get(), d_means2d.get(), nullptr, d_camera.get()},
-                          nullptr);
-    l1_ssim({h.width, h.height, color.get(), target.get(), nullptr, nullptr}, {0.2, 2.5}, threads,
-            d_loss.get());
+    Pass p(s, view, threads, background);
+    if (!p.forward()) return 2;
+    p.backward(d_color.get(), d_alpha.get(), d_depth.get(), true, nullptr);
+    p.loss(target, nullptr);
     Array<float> m(s.sh.size), v(s.sh.size);
     const double rate = 1e-2;
-    adam_step(s.sh.get(), d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
+    adam_step(s.sh.get(), p.d_sh.get(), m.get(), v.get(), int64_t(s.sh.size),
               {&rate, 1, 0.9, 0.999, 1e-15, 1}, threads);
-    for (Array<float>* result : {&color, &alpha, &depth, &median, &radii, &d_means, &d_scales,
-                                 &d_quats, &d_opacity, &d_sh, &d_means2d, &d_loss, &s.sh})
+    for (Array<float>* result :
+         {&p.color, &p.alpha, &p.depth, &p.median, &p.radii, &p.d_means, &p.d_scales, &p.d_quats,
+          &p.d_opacity, &p.d_sh, &p.d_means2d, &p.d_loss, &s.sh})
         std::fwrite(result->get(), sizeof(float), result->size, out);
-    std::fwrite(d_camera.get(), sizeof(double), d_camera.size, out);
+    std::fwrite(p.d_camera.get(), sizeof(double), p.d_camera.size, out);
     return std::fclose(out) ? 2 : 0;
 }
 

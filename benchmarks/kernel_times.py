@@ -12,14 +12,14 @@ import numpy as np
 from pipeline.render.gpu.device import Gpu
 from pipeline.runtime.errors import UserError
 
-MAX_KERNELS = 2048  # between two collections: half of the limit of a query set
+MAX_KERNELS = 2048  # Kernels between two collections: half of the limit of a query set.
 
 
 class Profile:
     """Measures each kernel in a pass of its own.
 
     Attributes:
-        seconds: sum of each kernel's times since the start, by name.
+        seconds: The sum of each kernel's times since the start, by name.
     """
 
     def __init__(self, gpu: Gpu):
@@ -31,7 +31,7 @@ class Profile:
         self._kernels: list[str] = []
 
     def timestamp_writes(self, kernel: str) -> dict[str, Any]:
-        """For the pass of the next kernel."""
+        """Return the queries of the pass of the next kernel."""
         if len(self._kernels) == MAX_KERNELS:
             raise UserError("too many kernels between two collections", fix="collect more often")
         first = 2 * len(self._kernels)
@@ -64,7 +64,7 @@ class Profile:
 
 @contextmanager
 def profiled(gpu: Gpu) -> Iterator[Profile]:
-    """Kernels inside are measured."""
+    """Measure the kernels that run inside."""
     gpu.submit()
     gpu.timer = profile = Profile(gpu)
     try:
@@ -75,7 +75,7 @@ def profiled(gpu: Gpu) -> Iterator[Profile]:
 
 
 def seconds_per_tick(gpu: Gpu) -> float:
-    """Of timestamps. WebGPU's are in nanoseconds, those of wgpu-native in the device's unit."""
+    """Return the unit of timestamps: WebGPU's are in nanoseconds, wgpu-native's in the device's."""
     from wgpu.backends.wgpu_native import lib
 
     return 1e-9 * float(lib.wgpuQueueGetTimestampPeriod(gpu.device.queue._internal))

@@ -20,8 +20,8 @@ class Accuracy:
     """Errors against the reference.
 
     Attributes:
-        colour: largest error of pixels that are not near a cut-off.
-        gradient: largest relative L2 error of the gradients of the five parameters.
+        colour: The largest error of pixels that are not near a cut-off.
+        gradient: The largest relative L2 error of the gradients of the five parameters.
     """
 
     colour: float

@@ -17,8 +17,8 @@ class Drawing:
     """Milliseconds per frame, over rounds of all views: wall time, and CPU time over threads.
 
     Attributes:
-        visible: Gaussians that touch the image, mean over the views.
-        tile_pairs: (Gaussian, tile) pairs, mean over the views.
+        visible: The mean number of Gaussians that touch the image over the views.
+        tile_pairs: The mean number of (Gaussian, tile) pairs over the views.
     """
 
     threads: int

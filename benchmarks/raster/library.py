@@ -22,11 +22,13 @@ INSTRUCTION_SETS = (
 
 @dataclass(frozen=True)
 class Library:
-    """Attributes:
-    target: one of ``pipeline.runtime.targets``.
-    instruction_set: the widest that the kernels may use.
-    lanes: float32 lanes of its registers.
-    compiler: name and version.
+    """The library of kernels that is measured.
+
+    Attributes:
+        target: One of ``pipeline.runtime.targets``.
+        instruction_set: The widest instruction set that the kernels may use.
+        lanes: The float32 lanes of its registers.
+        compiler: The name and version of the compiler.
     """
 
     target: str

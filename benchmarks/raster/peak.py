@@ -21,10 +21,10 @@ class Peak:
     """Peak of ``threads`` threads: float32 operations and bytes moved per second.
 
     Attributes:
-        instruction_set: the widest that the processor has.
-        lanes: of its registers, float32.
-        fused: whether a multiplication and an addition are one instruction.
-        clock: cycles a second of one core.
+        instruction_set: The widest instruction set of the processor.
+        lanes: The float32 lanes of its registers.
+        fused: Whether a multiplication and an addition are one instruction.
+        clock: The cycles a second of one core.
     """
 
     threads: int

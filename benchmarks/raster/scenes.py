@@ -15,7 +15,7 @@ from pipeline.io.ply import read_splat_ply
 from pipeline.render import RasterCamera
 from pipeline.splats.morton import morton_order
 
-MAX_VIEWS = 16  # of a trained model, evenly spread over its images
+MAX_VIEWS = 16  # The views of a trained model, evenly spread over its images.
 
 Arrays = tuple[torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor, torch.Tensor]
 
@@ -25,9 +25,9 @@ class Scene:
     """Gaussians with views.
 
     Attributes:
-        name: for people.
-        gaussians: means, log_scales, quats, opacity_logits, sh, float32.
-        views: all of one size; a training step is measured with the first.
+        name: A description of the scene.
+        gaussians: The float32 tensors means, log_scales, quats, opacity_logits and sh.
+        views: Cameras of one size; a training step is measured with the first.
     """
 
     name: str
@@ -86,7 +86,7 @@ def trained(folder: Path, size: tuple[int, int] | None = None) -> Scene:
     """An export folder: its ``point_cloud.ply`` seen by the images of its ``sparse/0``.
 
     Args:
-        size: width and height to draw instead of the first image's, which is stretched to it.
+        size: The width and height to draw instead of the first image's, which is stretched to it.
     """
     arrays = read_splat_ply(folder / "point_cloud.ply")
     model = read_model(folder / "sparse" / "0")

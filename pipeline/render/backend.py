@@ -34,7 +34,7 @@ from pipeline.render.types import (
 
 
 class Projection(Protocol):
-    """What a backend's result of ``project`` has."""
+    """The part of a result of ``project`` that all backends share."""
 
     @property
     def radii(self) -> Tensor:
@@ -54,8 +54,8 @@ class Backend(ABC, Generic[Projected, Binned]):
 
     @abstractmethod
     def facts(self) -> Mapping[str, str]:
-        """What determines the rounding of results besides the inputs, by name: instruction set,
-        compiler, device. Compiles or loads the backend if necessary."""
+        """Return the facts besides the inputs that determine the rounding of results, by name:
+        instruction set, compiler, device. Compiles or loads the backend if necessary."""
 
     def release_memory(self) -> None:
         """Return to the system the memory that is kept for later calls."""
@@ -64,7 +64,7 @@ class Backend(ABC, Generic[Projected, Binned]):
         """Choose whether to keep little memory for later calls, which costs some time."""
 
     def resident(self) -> ResidentTraining | None:
-        """Training in the memory of the backend's device; None if that is the CPU's."""
+        """Return training in the memory of the backend's device, or None if that is the CPU's."""
         return None
 
     @abstractmethod
@@ -104,12 +104,12 @@ class Backend(ABC, Generic[Projected, Binned]):
         """Gradients of a scalar with respect to the parameters, from its gradients on the images.
 
         Args:
-            fwd: the result of ``forward``.
+            fwd: The result of ``forward``.
             d_color: (H, W, 3) float32.
             d_alpha, d_depth: (H, W) float32 or None.
-            colors: compute ``Gradients.colors``.
-            camera: compute ``Gradients.camera``.
-            sh_adam: update the SH coefficients of the Gaussians with a gradient in place by Adam
+            colors: Compute ``Gradients.colors``.
+            camera: Compute ``Gradients.camera``.
+            sh_adam: Update the SH coefficients of the Gaussians with a gradient in place by Adam
                 instead of returning their gradients. SH coefficients are four fifths of all
                 parameters: this saves the memory traffic of their gradients.
         """
@@ -135,7 +135,7 @@ class Backend(ABC, Generic[Projected, Binned]):
             mask: (H, W) bool or uint8, non-zero for ignored pixels: the rendered image is replaced
                 by the target there, and both means are over the other pixels.
             l2_weight: k >= 0.
-            threads: number of threads, 0 for all.
+            threads: The number of threads, 0 for all.
         """
 
     @abstractmethod
@@ -235,7 +235,8 @@ class Backend(ABC, Generic[Projected, Binned]):
         have the same bits as of these Gaussians alone. Errors: see ``forward``.
 
         Args:
-            subsets: given (N,) bool, the Gaussians that overlap the image, those to render.
+            subsets: A function from the Gaussians that overlap the image, (N,) bool, to the subsets
+                to render.
         """
         parameters = checks.parameters(*parameters, options.sh_degree)
         checks.check_camera(camera, options.near)

@@ -13,7 +13,7 @@ from pipeline.splats.init import SH_C0
 
 
 def in_grey(gaussians: Gaussians) -> Gaussians:
-    """The same Gaussians, all of one colour, which no clamping changes."""
+    """Return the same Gaussians, all of one colour, which no clamping changes."""
     grey = gaussians.with_sh_degree(0)
     return replace(grey, sh=torch.zeros_like(grey.sh))
 
@@ -25,9 +25,9 @@ def contributions(
     image with respect to the Gaussian's colour.
 
     Args:
-        grey: see ``in_grey``.
-        options: of SH degree 0 and without a background.
-        pixel: area of one pixel of the camera, in pixels of the view.
+        grey: The result of ``in_grey``.
+        options: Options of SH degree 0 and without a background.
+        pixel: The area of one pixel of the camera, in pixels of the view.
     """
     rendered = backend.forward(*grey.parameters(), camera, options)
     d_color = torch.full((camera.height, camera.width, 3), pixel / SH_C0)

@@ -1,4 +1,4 @@
-"""The devices of this machine, and which of them to train on: decided by a measurement, which is
+"""The devices of this machine, and the choice of the one to train on by a measurement, which is
 stored for the next time. Importing this module does not import torch."""
 
 from __future__ import annotations
@@ -27,8 +27,8 @@ class DeviceChoice:
 
     Attributes:
         device: ``cpu`` or ``gpu:N``.
-        reason: a sentence for plans, the same at every measurement; empty if there is no GPU.
-        detail: a sentence for ``doctor``.
+        reason: A sentence for plans, the same at every measurement; empty if there is no GPU.
+        detail: A sentence for ``doctor``.
     """
 
     device: str
@@ -37,8 +37,8 @@ class DeviceChoice:
 
 
 def choose_device() -> DeviceChoice:
-    """A GPU if a step of a made scene takes less time on it than on the processor; never one in
-    software."""
+    """Return a GPU if a step of a synthetic scene takes less time on it than on the processor. A
+    GPU in software is never chosen."""
     if find_spec("wgpu") is None:
         return DeviceChoice("cpu", "", "on the processor; wgpu is not installed")
     found = adapters()
@@ -65,7 +65,7 @@ def check_device(device: str) -> None:
     """Check that this machine has the device that ``train.device`` names: ``gpu`` or ``gpu:N``.
 
     Raises:
-        UserError: the package wgpu is not installed, or there is no such GPU.
+        UserError: The package wgpu is not installed, or there is no such GPU.
     """
     kind, _, number = device.partition(":")
     if kind != "gpu":
@@ -95,7 +95,7 @@ def _times_of(adapter: Adapter) -> tuple[float, float] | str:
         pass
     times: tuple[float, float] | str
     try:
-        # A process of its own: drivers crash.
+        # In a process of its own, since drivers crash.
         times = run_isolated(time_steps, f"gpu:{adapter.number}")
     except UserError as error:
         times = error.what

@@ -36,9 +36,9 @@ class Projection:
     """The visible Gaussians on the image plane, in the order of their index.
 
     Attributes:
-        index: (V,) int64 index among the N.
+        index: (V,) int64, the index among the N.
         means2d: (V, 2) pixels.
-        conics: (V, 3) the inverse 2D covariance's xx, xy, yy, in 1/px^2.
+        conics: (V, 3), the inverse 2D covariance's xx, xy, yy, in 1/px^2.
         depths: (V,) camera z.
         opacities: (V,) in (0, 1), including the compensation.
         radii: (N,) pixels; 0 for Gaussians that are not visible.
@@ -236,10 +236,10 @@ class Blend:
     Attributes:
         color: (H, W, 3), including the background.
         alpha, depth, median_depth: (H, W), see ``Forward``.
-        margin: (H, W) smallest relative distance of a pixel to a threshold of the method (alpha at
-            1/255 and at its maximum, transmittance at its minimum). If it is small, different
-            rounding may change the pixel.
-        pairs: number of contributing (pixel, Gaussian) pairs.
+        margin: (H, W), the smallest relative distance of a pixel to a threshold of the method
+            (alpha at 1/255 and at its maximum, transmittance at its minimum). If it is small,
+            different rounding may change the pixel.
+        pairs: The number of contributing (pixel, Gaussian) pairs.
     """
 
     color: Tensor

@@ -86,8 +86,8 @@ class RasterOptions:
 
 @dataclass(frozen=True)
 class Surroundings:
-    """What a view shows around a part of a scene, as images. The image of the whole scene is a
-    composition of three layers (Porter and Duff 1984): the front, the part, and what is behind it.
+    """The images of a view around a part of a scene. The image of the whole scene is a composition
+    of three layers (Porter and Duff 1984): the front, the part, and the scene behind the part.
 
     Attributes:
         behind: (H, W, 3) uint8, the scene behind the part over the background.
@@ -177,9 +177,9 @@ class CameraGradients:
     """dL/d(change of the camera), float64; ``reference.perturbed`` defines a change.
 
     Attributes:
-        rotation: (3,) per radian of rotation of the scene about the camera's axes.
-        translation: (3,) per world unit of translation of the scene along the camera's axes.
-        focal, principal: (2,) per pixel of focal length and principal point.
+        rotation: (3,), per radian of a rotation of the scene about the camera's axes.
+        translation: (3,), per world unit of a translation of the scene along the camera's axes.
+        focal, principal: (2,), per pixel of focal length and principal point.
     """
 
     rotation: Tensor
@@ -269,7 +269,7 @@ class ShAdam:
     result equals dense Adam, except for the colour that is rendered in that step.
 
     Attributes:
-        moments: (N, K, 3) each.
+        moments: The moments of the coefficients, (N, K, 3) each.
         last: (N,) int32, the last step with a gradient, 0 before the first; updated in place.
         rates: The rates of the constant coefficient and of the others.
     """

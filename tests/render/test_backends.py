@@ -83,7 +83,7 @@ def random_surroundings(height: int, width: int, front: bool, correction: bool) 
 def test_the_composition_equals_the_reference(
     any_backend: Backend, front: bool, correction: bool
 ) -> None:
-    """And its gradients, with that of the loss on alpha."""
+    """The gradients, with that of the loss on alpha, equal the reference's as well."""
     around = random_surroundings(22, 31, front, correction)
     color, alpha, d = torch.rand(22, 31, 3), torch.rand(22, 31), noise(22, 31, 3)
     # Less than the gradients through the image, but not negligible.

@@ -199,7 +199,7 @@ def test_a_step_against_the_gradient_lowers_the_loss(backend: Backend) -> None:
 
 @pytest.mark.parametrize("antialias", [False, True])
 def test_a_part_of_an_image_is_rendered_as_the_whole_is(backend: Backend, antialias: bool) -> None:
-    """Also Gaussians whose Jacobian is clamped to the part's frustum, if it were an image."""
+    """This holds also for Gaussians whose Jacobian would be clamped to the frustum of the part."""
     scene, whole = random_scene(8, 400, size=0.4), camera(96, 80)
     left, top, width, height = 37, 21, 23, 30
     part = replace(

@@ -223,7 +223,7 @@ def test_frame_adam_is_equivariant_under_similarities(backend: Backend) -> None:
 
 
 def test_frame_adam_steps_are_relative_to_the_scales(backend: Backend) -> None:
-    """Also for scales and gradients that overflow float32."""
+    """This holds also for scales and gradients that overflow float32."""
     log_scales = torch.tensor([[0.0, -3.0, 2.0], [-200.0, 200.0, torch.nan], [0.0, 0.0, 0.0]])
     quats = torch.tensor([[1.0, 0, 0, 0], [1.0, 0, 0, 0], [torch.inf, torch.nan, 1e30, 0]])
     scene = Framed(backend, torch.zeros(3, 3), quats, log_scales)

@@ -42,7 +42,7 @@ def test_gradient_of_the_sh_colors(degree: int) -> None:
 
 
 def test_gradient_of_the_camera() -> None:
-    """Of the projection and of the colours, which depend on the camera's centre."""
+    """The projection and the colours depend on the camera, the latter on its centre."""
     scene = [t.detach() for t in doubles()]
 
     def outputs(change: torch.Tensor) -> tuple[torch.Tensor, ...]:

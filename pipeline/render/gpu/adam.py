@@ -6,7 +6,6 @@ import math
 
 import numpy as np
 
-from pipeline.render.gpu import layout
 from pipeline.render.gpu.device import Buffer, blocks
 from pipeline.render.gpu.workspace import Workspace
 from pipeline.render.types import AdamRates
@@ -32,15 +31,11 @@ def adam_step(
     """
     rows, width = shape
     count = rows if shared else rows * width
-    to_rate, to_root = _corrections(rates)
-    lr = np.array([rate * to_rate for rate in rates.rates], np.float32)
-    sizes = count, width, len(lr), at
+    lr = np.array(_corrected(rates), np.float32)
     space.run(
         "adam.rows" if shared else "adam.elements",
         blocks(count),
-        adam=space.uniform(
-            f"Adam of {name}", "4I6fIf", *sizes, *_decay(rates), rates.eps, to_root, at, 0.0
-        ),
+        adam=uniform(space, f"Adam of {name}", rates, count, width=width, at=at),
         rates=space.write_uniform(f"rates of {name}", lr.tobytes()),
         **buffers,
     )
@@ -54,31 +49,31 @@ def frame_adam(space: Workspace, rates: AdamRates, count: int, **buffers: Buffer
             quaternions, and the moments ``mean_avg``, ``mean_avg_sq``, ``rotation_avg`` and
             ``rotation_avg_sq``.
     """
-    to_rate, to_root = _corrections(rates)
-    lr = [rate * to_rate for rate in rates.rates]
-    values = count, *lr, rates.eps, *_decay(rates), to_root, 0.0
-    uniform = space.uniform("Adam of frames", "I9f8x", *values)
-    space.run("frame_adam", blocks(count), adam=uniform, **buffers)
+    adam = uniform(space, "Adam of frames", rates, count)
+    space.run("frame_adam", blocks(count), adam=adam, **buffers)
 
 
-def sh_options(space: Workspace, rates: AdamRates | None, camera: bool) -> Buffer:
-    """``Options`` of project_backward.wgsl."""
-    flags = layout.CAMERA * camera
-    if rates is None:
-        return space.uniform("options of SH", "II10f", flags, *[0] * 11)
-    to_rate, to_root = _corrections(rates)
-    lr = [rate * to_rate for rate in rates.rates]
-    ratio = rates.beta1 / math.sqrt(rates.beta2)
-    flags |= layout.SH_ADAM
-    values = flags, rates.step, *lr, *_decay(rates), rates.eps, to_root, ratio, 0.0
-    return space.uniform("options of SH", "II10f", *values)
+def uniform(
+    space: Workspace,
+    name: str,
+    rates: AdamRates,
+    count: int,
+    *,
+    width: int = 0,
+    at: int = 0,
+    flags: int = 0,
+) -> Buffer:
+    """The buffer of this name with ``Adam`` of adam_rates.wgsl."""
+    beta1, beta2, step = rates.beta1, rates.beta2, rates.step
+    lr = _corrected(rates)
+    to_root = 1 / math.sqrt(1 - beta2**step)
+    return space.uniform(
+        name, "6I10f", count, width, len(lr), at, flags, step, *[*lr, 0.0][:2],
+        beta1, beta2, 1 - beta1, 1 - beta2, rates.eps, to_root, beta1 / math.sqrt(beta2), 0.0,
+    )  # fmt: skip
 
 
-def _corrections(rates: AdamRates) -> tuple[float, float]:
-    """The bias corrections: factors of the learning rates and of the root of the second moment."""
-    return 1 / (1 - rates.beta1**rates.step), 1 / math.sqrt(1 - rates.beta2**rates.step)
-
-
-def _decay(rates: AdamRates) -> tuple[float, float, float, float]:
-    """beta1, beta2, 1 - beta1, 1 - beta2."""
-    return rates.beta1, rates.beta2, 1 - rates.beta1, 1 - rates.beta2
+def _corrected(rates: AdamRates) -> list[float]:
+    """The learning rates with the bias correction of the first moment."""
+    to_rate = 1 / (1 - rates.beta1**rates.step)
+    return [rate * to_rate for rate in rates.rates]

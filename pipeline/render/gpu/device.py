@@ -18,16 +18,16 @@ from pipeline.render.gpu.kernels import source
 from pipeline.runtime.errors import UserError
 
 THREADS = 256  # kThreads in common.wgsl
-SMALLEST = 256  # bytes of a buffer: bindings must not be smaller than their struct
-MAX_UNIFORMS = 1024  # kept
-MAX_GROUPS = 65535  # of a dispatch, in one dimension: the limit of WebGPU
-# What the kernels need beyond WebGPU's defaults.
+SMALLEST = 256  # The bytes of a buffer: bindings must not be smaller than their struct.
+MAX_UNIFORMS = 1024  # The number of uniforms that are kept.
+MAX_GROUPS = 65535  # WebGPU's limit of workgroups in one dimension of a dispatch.
+# The limits that the kernels need beyond WebGPU's defaults.
 NEEDED = {
     "max-compute-workgroup-storage-size": 24 * 1024,
     "max-storage-buffers-per-shader-stage": 12,
 }
 OPTIONAL_FEATURES = ("timestamp-query",)
-# What is requested as far as the device has it: the size of a scene depends on it.
+# Limits that are requested as far as the device has them: the size of a scene depends on them.
 WANTED = ("max-buffer-size", "max-storage-buffer-binding-size")
 
 SMALLER = (
@@ -48,8 +48,8 @@ class Adapter:
     """A GPU of this machine.
 
     Attributes:
-        number: ``gpu:N`` chooses it.
-        name, driver: as the driver reports them.
+        number: The N of ``gpu:N``, which chooses the adapter.
+        name, driver: The names that the driver reports.
         kind: ``discrete``, ``integrated``, ``software`` (the CPU) or ``unknown``.
         api: ``Vulkan``, ``Metal`` or ``D3D12``.
     """
@@ -83,10 +83,10 @@ def adapters() -> list[Adapter]:
 
 
 class KernelTimer(Protocol):
-    """Measures kernels (``benchmarks.kernel_times.Profile``)."""
+    """An object that measures kernels (``benchmarks.kernel_times.Profile``)."""
 
     def timestamp_writes(self, kernel: str) -> dict[str, Any]:
-        """For the pass of the next kernel."""
+        """Return the queries of the pass of the next kernel."""
 
 
 class Gpu:
@@ -123,7 +123,7 @@ class Gpu:
         self._uniforms: dict[bytes, Buffer] = {}
         self._encoder: Any = None
         self._pass: Any = None
-        self.submissions = 0  # number of submitted command buffers
+        self.submissions = 0  # The number of submitted command buffers.
         self.timer: KernelTimer | None = None
 
     # ---- Buffers ----
@@ -132,7 +132,7 @@ class Gpu:
         """A buffer of zeros of at least ``size`` bytes.
 
         Raises:
-            UserError: more than the device's limit, or than its memory.
+            UserError: The size exceeds the device's limit or its memory.
         """
         import wgpu
 
@@ -172,7 +172,7 @@ class Gpu:
         self.write_now(buffer, array, offset)
 
     def write_now(self, buffer: Buffer, array: NDArray[Any], offset: int = 0) -> None:
-        """As ``write``, but before the kernels that are not submitted yet."""
+        """Copy an array as ``write`` does, but before the kernels that are not submitted yet."""
         data = np.ascontiguousarray(array).reshape(-1).view(np.uint8)
         if data.nbytes % 4:
             data = np.concatenate([data, np.zeros(-data.nbytes % 4, np.uint8)])
@@ -188,7 +188,7 @@ class Gpu:
         """A copy of ``count`` numbers of a buffer; waits for the kernels before.
 
         Raises:
-            UserError: the device is lost.
+            UserError: The device is lost.
         """
         self.submit()
         size = count * np.dtype(dtype).itemsize
@@ -209,9 +209,10 @@ class Gpu:
         """Record a kernel; it runs after those recorded before.
 
         Args:
-            groups: number of workgroups, of ``THREADS`` threads; a single number may exceed the
+            groups: The number of workgroups of ``THREADS`` threads. A single number may exceed the
                 limit of one dimension.
-            buffers: by the names of the kernel's bindings. Missing ones are not used by it.
+            buffers: The buffers by the names of the kernel's bindings. The kernel does not use
+                bindings that are missing here.
         """
         self.dispatch(kernel, groups, self.bind(kernel, buffers))
 
@@ -269,7 +270,7 @@ class Gpu:
             self._pass = None
 
     def _placeholder(self, number: int) -> Buffer:
-        # One for each binding: a buffer cannot be bound twice if a kernel may write to it.
+        # There is one for each binding: a buffer cannot be bound twice if a kernel may write to it.
         while len(self._placeholders) <= number:
             self._placeholders.append(self.empty(256))
         return self._placeholders[number]

@@ -24,7 +24,7 @@ CAMERA_PARAMETERS = 10  # kCameraParameters in project_backward.wgsl
 ANTIALIAS, CLAMP_COLOR_GRADIENT = 1, 2  # flags of View
 BYTES, MASKED = 1, 2  # flags of Loss in loss.wgsl
 FRONT, CORRECTION = 1, 2  # flags of Layers in compose.wgsl
-SH_ADAM, CAMERA = 1, 2  # flags of Options in project_backward.wgsl
+SH_ADAM, CAMERA = 1, 2  # flags of Adam in project_backward.wgsl
 
 # The sections of arrays: names and the number of floats of a Gaussian. geometry.wgsl has the
 # offsets of the parameters, project_backward.wgsl those of the gradients.

@@ -44,7 +44,7 @@ class LossImage:
 
     @property
     def buffers(self) -> dict[str, Buffer]:
-        """By the names of loss.wgsl."""
+        """The buffers by the names of loss.wgsl."""
         masked = {} if self.mask is None else {"mask": self.mask}
         return {"target_words": self.target, **masked}
 

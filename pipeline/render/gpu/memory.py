@@ -6,10 +6,10 @@ from pipeline.render.gpu import layout
 from pipeline.render.gpu.device import Gpu, too_large
 from pipeline.render.resident import TrainingSize
 
-# Tiles that a Gaussian overlaps, on average over all Gaussians: typical of trained scenes.
+# The mean number of tiles that a Gaussian of a typical trained scene overlaps.
 PAIRS_PER_GAUSSIAN = 8
-# Bytes of a Gaussian, of a pair and of a pixel in the arrays that are not the largest: counts,
-# radii and ranks; keys and values of sorting; images and their gradients.
+# The bytes of a Gaussian (counts, radii and ranks), of a pair (keys and values of sorting) and of a
+# pixel (images and their gradients) in the arrays that are not the largest.
 GAUSSIAN_BYTES, PAIR_BYTES, PIXEL_BYTES = 48, 20, 48
 
 
@@ -25,10 +25,10 @@ def large_arrays(size: TrainingSize) -> dict[str, int]:
 
 
 def training_bytes(size: TrainingSize, cached: int) -> int:
-    """All arrays.
+    """The bytes of all arrays.
 
     Args:
-        cached: training images on the device at most, bytes.
+        cached: The maximum bytes of the training images on the device.
     """
     parameters = 12 * size.sh_coefficients + 4 * layout.floats(layout.GEOMETRY)
     per_gaussian = layout.RECORD_BYTES + layout.BOX_BYTES + GAUSSIAN_BYTES
@@ -44,10 +44,10 @@ def training_bytes(size: TrainingSize, cached: int) -> int:
 
 
 def memory_line(gpu: Gpu, size: TrainingSize, cached: int) -> str:
-    """A line for the log.
+    """Return a line for the log.
 
     Raises:
-        UserError: an array is larger than the device's buffers can be.
+        UserError: An array is larger than the device's buffers can be.
     """
     arrays = large_arrays(size)
     name = max(arrays, key=lambda each: arrays[each])

@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from pipeline.render.gpu import layout
-from pipeline.render.gpu.adam import sh_options
+from pipeline.render.gpu.adam import uniform
 from pipeline.render.gpu.device import Buffer, Gpu, blocks
 from pipeline.render.gpu.primitives import scan, sort, sum_rows
 from pipeline.render.gpu.workspace import Workspace
@@ -19,6 +19,7 @@ from pipeline.runtime.errors import UserError
 # Slots of gradients are the largest array: more pairs do not fit into 4 GB, WebGPU's offsets.
 MAX_INTERSECTIONS = (1 << 32) // layout.SLOT_BYTES - 1
 DEPTH_BITS = 32
+NO_RATES = AdamRates((0.0, 0.0), 1)
 # The tiles of one dispatch: an image of 1024 x 1024 pixels.
 TILES_OF_BAND = 4096
 
@@ -260,12 +261,13 @@ def backward(
         space, "blend_backward", lists, color=image.color, planes=image.planes, ends=image.ends,
         d_color=d_color, d_planes=d_planes, slots=slots,
     )  # fmt: skip
+    flags = layout.SH_ADAM * (rates is not None) | layout.CAMERA * ("d_camera" in more)
     gradients = space.get("gradients", 4 * layout.floats(layout.GRADIENTS) * scene.count)
     space.run(
         "project_backward",
         blocks(scene.count),
         view=projection.view,
-        options=sh_options(space, rates, "d_camera" in more),
+        adam=uniform(space, "Adam of SH", rates or NO_RATES, scene.count, flags=flags),
         geometry=scene.geometry,
         sh=scene.sh,
         records=projection.records,

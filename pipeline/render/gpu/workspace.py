@@ -9,8 +9,8 @@ import numpy as np
 
 from pipeline.render.gpu.device import Buffer, Gpu
 
-GROWTH = 1.25  # over what is needed, if a buffer is replaced by a larger one
-MAX_GROUPS = 1024  # bind groups that are kept
+GROWTH = 1.25  # The factor over the needed size if a buffer is replaced by a larger one.
+MAX_GROUPS = 1024  # The number of bind groups that are kept.
 
 
 class Workspace:
@@ -20,7 +20,7 @@ class Workspace:
         self.gpu = gpu
         self._buffers: dict[str, Buffer] = {}
         self._uniforms: dict[str, tuple[bytes, int]] = {}
-        # With the buffers, whose ids are the key.
+        # The buffers are kept with the groups: their ids are the keys.
         self._groups: dict[tuple[Any, ...], tuple[Any, dict[str, Buffer]]] = {}
 
     def get(self, name: str, size: int) -> Buffer:

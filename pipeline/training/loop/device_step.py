@@ -39,8 +39,8 @@ class DeviceStep(StepEngine):
     ) -> None:
         super().__init__(scene, state, run, backend)
         self.training = training
-        self._loaded = False  # Whether the device has what the state has, or newer.
-        self._ahead = False
+        self._loaded = False  # The device has the tensors of the state, or newer ones.
+        self._ahead = False  # The device has newer ones.
 
     def step(self, step: Step) -> StepResult:
         state, view, options = self.state, step.view, self.run.options

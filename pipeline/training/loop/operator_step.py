@@ -54,7 +54,7 @@ class OperatorStep(StepEngine):
         """The tensors of the state are always current."""
 
     def invalidate(self) -> None:
-        """There are no others."""
+        """There are no copies of the tensors of the state."""
 
     def _update_cameras(self, step: Step, gradients: Gradients) -> None:
         """Update what belongs to the photograph: its camera and its appearance."""

@@ -18,9 +18,9 @@ class PerCameraAdam:
     """The moments of each camera.
 
     Attributes:
-        shape: (cameras, parameters).
-        first, second: moments, of that shape.
-        steps: (cameras,) int64, number of steps of each camera.
+        shape: The numbers of cameras and of parameters of each.
+        first, second: The moments, of that shape.
+        steps: (cameras,) int64, the number of steps of each camera.
     """
 
     shape: tuple[int, int]

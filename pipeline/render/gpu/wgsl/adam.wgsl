@@ -1,21 +1,7 @@
 // Adam (Kingma & Ba 2015) over the elements of an array (`elements`), or over rows that share the
 // second moment of their mean square (`rows`).
 #import common
-
-struct Adam {
-    count: u32,    // elements, or rows
-    width: u32,    // elements of a row
-    num_rates: u32,
-    parameter_at: u32,  // first element in its array
-    beta1: f32,
-    beta2: f32,
-    rest1: f32,    // 1 - beta1
-    rest2: f32,
-    epsilon: f32,
-    to_root: f32,  // bias correction of the root of the second moment
-    gradient_at: u32,   // first element in its array
-    unused: f32,
-}
+#import adam_rates
 
 @group(0) @binding(0) var<uniform> adam: Adam;
 @group(0) @binding(1) var<storage, read> rates: array<f32>;  // repeated, with the bias correction
@@ -28,12 +14,12 @@ struct Adam {
 fn elements(thread: Thread) {
     let i = number_of(thread);
     if (i >= adam.count) { return; }
-    let g = gradient[adam.gradient_at + i];
+    let g = gradient[adam.at + i];
     let m = exp_avg[i] * adam.beta1 + g * adam.rest1;
     let v = exp_avg_sq[i] * adam.beta2 + g * g * adam.rest2;
     exp_avg[i] = m;
     exp_avg_sq[i] = v;
-    parameter[adam.parameter_at + i] -= rates[i % adam.num_rates] * m / (sqrt(v) * adam.to_root + adam.epsilon);
+    parameter[adam.at + i] -= rates[i % adam.num_rates] * m / (sqrt(v) * adam.to_root + adam.epsilon);
 }
 
 @compute @workgroup_size(kThreads)
@@ -42,7 +28,7 @@ fn rows(thread: Thread) {
     if (row >= adam.count) { return; }
     var squares = 0.0;
     for (var k = 0u; k < adam.width; k++) {
-        let g = gradient[adam.gradient_at + row * adam.width + k];
+        let g = gradient[adam.at + row * adam.width + k];
         squares += g * g;
     }
     let v = exp_avg_sq[row] * adam.beta2 + squares * adam.rest2 / f32(adam.width);
@@ -50,8 +36,8 @@ fn rows(thread: Thread) {
     let far = rates[0] / (sqrt(v) * adam.to_root + adam.epsilon);
     for (var k = 0u; k < adam.width; k++) {
         let at = row * adam.width + k;
-        let m = exp_avg[at] * adam.beta1 + gradient[adam.gradient_at + at] * adam.rest1;
+        let m = exp_avg[at] * adam.beta1 + gradient[adam.at + at] * adam.rest1;
         exp_avg[at] = m;
-        parameter[adam.parameter_at + at] -= far * m;
+        parameter[adam.at + at] -= far * m;
     }
 }

@@ -1,20 +1,7 @@
 // Adam over means and rotations in the local frame of each Gaussian; `frame_adam` in
 // reference_adam.py documents the method.
 #import common
-
-struct Adam {
-    gaussians: u32,
-    mean_rate: f32,      // with the bias correction
-    rotation_rate: f32,
-    epsilon: f32,
-    beta1: f32,
-    beta2: f32,
-    rest1: f32,          // 1 - beta1
-    rest2: f32,
-    to_root: f32,        // bias correction of the root of the second moment
-    unused: f32,
-    unused2: vec2<f32>,
-}
+#import adam_rates
 
 // Parameters and gradients: sections of N rows, means (3), log scales (3), quaternions (4).
 @group(0) @binding(0) var<uniform> adam: Adam;
@@ -49,7 +36,7 @@ fn step(m: Moments) -> vec3<f32> {
 @compute @workgroup_size(kThreads)
 fn main(thread: Thread) {
     let i = number_of(thread);
-    let n = adam.gaussians;
+    let n = adam.count;
     if (i >= n) { return; }
     let mean = 3u * i;
     let log_scale = 3u * (n + i);
@@ -85,7 +72,7 @@ fn main(thread: Thread) {
         mean_avg[mean + k] = m.first[k];
         mean_avg_sq[mean + k] = m.second[k];
     }
-    let along = adam.mean_rate * scale * step(m);
+    let along = adam.rate0 * scale * step(m);
     let moved = axes * along;
     geometry[mean] -= moved.x;
     geometry[mean + 1u] -= moved.y;
@@ -101,7 +88,7 @@ fn main(thread: Thread) {
         rotation_avg_sq[mean + k] = m.second[k];
     }
     if (!valid) { return; }
-    let turned = tangents * (adam.rotation_rate * norm * step(m));
+    let turned = tangents * (adam.rate1 * norm * step(m));
     geometry[quat] = q.x - turned.x;
     geometry[quat + 1u] = q.y - turned.y;
     geometry[quat + 2u] = q.z - turned.z;

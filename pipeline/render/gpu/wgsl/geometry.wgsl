@@ -1,4 +1,4 @@
-// The array of all parameters but the SH coefficients: sections of N rows, as `geometry_sections`
+// The array of all parameters but the SH coefficients: sections of N rows, as `GEOMETRY`
 // in layout.py.
 fn inputs_of(i: u32, n: u32) -> Inputs {
     var in: Inputs;

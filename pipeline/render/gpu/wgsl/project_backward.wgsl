@@ -2,37 +2,24 @@
 // projection and the colour. With kShAdam the SH coefficients are updated in place (ShAdam in
 // types.py) while their gradients are in registers.
 #import common
+#import adam_rates
 #import projection
 #import record
 #import moments
 #import sh
 
-struct Options {
-    flags: u32,
-    step: u32,
-    rate0: f32,  // of the constant coefficient, with the bias correction
-    rate: f32,   // of the others
-    beta1: f32,
-    beta2: f32,
-    rest1: f32,  // 1 - beta1
-    rest2: f32,
-    epsilon: f32,
-    to_root: f32,  // bias correction of the root of the second moment
-    ratio: f32,    // beta1 / sqrt(beta2)
-    unused: f32,
-}
 const kShAdam = 1u;
 const kCamera = 2u;
 
 @group(0) @binding(0) var<uniform> view: View;
-@group(0) @binding(1) var<uniform> options: Options;
+@group(0) @binding(1) var<uniform> adam: Adam;
 @group(0) @binding(2) var<storage, read> geometry: array<f32>;
 @group(0) @binding(3) var<storage, read_write> sh: array<f32>;
 @group(0) @binding(4) var<storage, read> records: array<Record>;
 @group(0) @binding(5) var<storage, read> tile_counts: array<u32>;
 @group(0) @binding(6) var<storage, read> slot_of: array<u32>;  // the first of each Gaussian
 @group(0) @binding(7) var<storage, read> slots: array<f32>;
-// Sections of N rows: as geometry; then 2D means, their absolute values, colours.
+// Sections of N rows: those of geometry, then 2D means and colours.
 @group(0) @binding(8) var<storage, read_write> gradients: array<f32>;
 @group(0) @binding(9) var<storage, read_write> d_sh: array<f32>;
 @group(0) @binding(10) var<storage, read_write> exp_avg: array<f32>;  // of sh
@@ -84,11 +71,11 @@ fn write(i: u32, g: Gradient) {
 // Without a gradient. SH gradients are zero, and moments stay as they are.
 fn write_nothing(i: u32) {
     write(i, Gradient());
-    if ((options.flags & kShAdam) == 0u) {
+    if ((adam.flags & kShAdam) == 0u) {
         let row = 3u * view.sh_coefficients * i;
         for (var k = 0u; k < 3u * view.sh_coefficients; k++) { d_sh[row + k] = 0.0; }
     }
-    if ((options.flags & kCamera) != 0u) {
+    if ((adam.flags & kCamera) != 0u) {
         for (var k = 0u; k < kCameraParameters; k++) { d_camera[kCameraParameters * i + k] = 0.0; }
     }
 }
@@ -100,10 +87,10 @@ struct Missed {
     drift: f32,  // change of the parameter, in units of the last step's
 }
 fn missed_steps(last: i32) -> Missed {
-    let missed = f32(max(i32(options.step) - 1 - last, 0));
+    let missed = f32(max(i32(adam.step) - 1 - last, 0));
     if (missed == 0.0) { return Missed(1.0, 1.0, 0.0); }
-    return Missed(pow(options.beta1, missed), pow(options.beta2, missed),
-                  options.ratio * (1.0 - pow(options.ratio, missed)) / (1.0 - options.ratio));
+    return Missed(pow(adam.beta1, missed), pow(adam.beta2, missed),
+                  adam.ratio * (1.0 - pow(adam.ratio, missed)) / (1.0 - adam.ratio));
 }
 
 fn step_sh(at: u32, gradient: f32, rate: f32, missed: Missed) {
@@ -111,11 +98,11 @@ fn step_sh(at: u32, gradient: f32, rate: f32, missed: Missed) {
     var v = exp_avg_sq[at];
     var p = sh[at];
     if (missed.drift != 0.0) {
-        p -= rate * missed.drift * m / (sqrt(v) * options.to_root + options.epsilon);
+        p -= rate * missed.drift * m / (sqrt(v) * adam.to_root + adam.epsilon);
     }
-    m = m * missed.keep1 * options.beta1 + gradient * options.rest1;
-    v = v * missed.keep2 * options.beta2 + gradient * gradient * options.rest2;
-    sh[at] = p - rate * m / (sqrt(v) * options.to_root + options.epsilon);
+    m = m * missed.keep1 * adam.beta1 + gradient * adam.rest1;
+    v = v * missed.keep2 * adam.beta2 + gradient * gradient * adam.rest2;
+    sh[at] = p - rate * m / (sqrt(v) * adam.to_root + adam.epsilon);
     exp_avg[at] = m;
     exp_avg_sq[at] = v;
 }
@@ -225,16 +212,16 @@ fn main(thread: Thread) {
         && bounded3(vec3(g.means2d, 0.0));
     if (!sound) { g = Gradient(); }
     write(i, g);
-    if ((options.flags & kShAdam) != 0u) {
+    if ((adam.flags & kShAdam) != 0u) {
         let missed = missed_steps(last_step[i]);
         for (var k = 0u; k < kBands; k++) {
             if (k >= used) { continue; }
-            let rate = select(options.rate, options.rate0, k == 0u);
+            let rate = select(adam.rate1, adam.rate0, k == 0u);
             for (var channel = 0u; channel < 3u; channel++) {
                 step_sh(row + 3u * k + channel, basis[k] * g.rgb[channel], rate, missed);
             }
         }
-        last_step[i] = i32(options.step);
+        last_step[i] = i32(adam.step);
     } else {
         for (var k = 0u; k < kBands; k++) {
             if (k >= view.sh_coefficients) { continue; }
@@ -244,7 +231,7 @@ fn main(thread: Thread) {
             d_sh[row + 3u * k + 2u] = value.z;
         }
     }
-    if ((options.flags & kCamera) == 0u) { return; }
+    if ((adam.flags & kCamera) == 0u) { return; }
 
     // `perturbed` in reference.py defines the parameters. T = (f / z) (W_i - u W_2); a rotation
     // changes the columns of W like the centre; a translation changes the viewing direction as well.

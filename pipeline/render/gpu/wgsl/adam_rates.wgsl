@@ -1,0 +1,20 @@
+// The constants of a step of Adam (AdamRates in types.py). Learning rates include the bias
+// correction.
+struct Adam {
+    count: u32,      // of the elements, rows or Gaussians
+    width: u32,      // elements of a row
+    num_rates: u32,
+    at: u32,         // first element of the parameter and of its gradient in their arrays
+    flags: u32,
+    step: u32,
+    rate0: f32,      // the first two rates
+    rate1: f32,
+    beta1: f32,
+    beta2: f32,
+    rest1: f32,      // 1 - beta1
+    rest2: f32,
+    epsilon: f32,
+    to_root: f32,    // bias correction of the root of the second moment
+    ratio: f32,      // beta1 / sqrt(beta2)
+    unused: f32,
+}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -109,7 +109,7 @@ class Case:
         assert (found["median_depth"] - image.median_depth).abs()[self.sure].max() <= 1e-5
 
     def check_gradients(
-        self, found: Mapping[str, torch.Tensor], incoming: list[torch.Tensor | None]
+        self, found: Mapping[str, torch.Tensor], incoming: Sequence[torch.Tensor | None]
     ) -> None:
         """Compare the gradients of the parameters, of means2d and, if they are among them, of the
         colors and the camera (10,), to a relative error of 1e-5; ``incoming`` as the attribute."""

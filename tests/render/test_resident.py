@@ -9,36 +9,24 @@ import pytest
 import torch
 
 from pipeline.render import (
-    AdamRates,
     AlphaChangeLoss,
     Backend,
     CameraGradients,
-    FrameMoments,
-    Moments,
     RasterOptions,
-    ShAdam,
     Surroundings,
     make_backend,
 )
 from pipeline.render.resident import Optimised, Planes, ResidentImage, ResidentStep
+from pipeline.splats.gaussians import Gaussians
 from pipeline.training.appearance.embedding import appearance_gradients, colour_offsets
-from tests.render.scenes import NAMES, camera, random_scene, relative
+from pipeline.training.optimisers.adam import Adam, AdamOptions, AdamStep, Rates
+from tests.render.scenes import camera, random_scene, relative
 from tests.tools import need_gpu
 
 HEIGHT, WIDTH = 37, 50
 CAMERA = camera(WIDTH, HEIGHT, rotated=True)
-
-
-def rates(*lr: float, eps: float = 1e-7) -> AdamRates:
-    return AdamRates(lr if len(lr) > 1 else lr[0], 1, eps=eps)
-
-
-ADAM = {
-    "log_scales": rates(0.02), "opacity_logits": rates(0.03), "sh": rates(0.01, 0.002),
-    "appearance": rates(0.01),
-}  # fmt: skip
-FRAMES = ADAM | {"frames": rates(0.01, 0.01)}
-WORLD = ADAM | {"means": rates(0.01, eps=1e-9), "quats": rates(0.01)}
+RATES = Rates(means=0.01, log_scales=0.02, quats=0.01, opacity_logits=0.03, sh0=0.01, shN=0.002)
+EPSILON = 1e-7 * 3 * HEIGHT * WIDTH
 ALPHA_LOSS = AlphaChangeLoss(0.5, 0.1, 0.2)
 
 
@@ -66,7 +54,7 @@ STEP = ResidentStep(
     embedding=None,
     alpha_loss=ALPHA_LOSS,
     losses=None,
-    adam=FRAMES,
+    adam={},
 )
 MASKED = replace(IMAGE, key=None, mask=uniform(HEIGHT, WIDTH, seed=1) > 0.6)
 FLOATS = replace(IMAGE, target=uniform(HEIGHT, WIDTH, 3, seed=2), gain=(1.2, 0.9, 0.7))
@@ -79,7 +67,7 @@ AROUND = Surroundings(
 )
 STEPS = {
     "plain": STEP,
-    "world's axes": replace(STEP, adam=WORLD),
+    "world's axes": STEP,
     "masked": replace(STEP, image=MASKED),
     "gains": replace(STEP, image=FLOATS),
     "cameras": replace(STEP, camera_gradients=True),
@@ -90,23 +78,30 @@ STEPS = {
 }
 
 
-def at_step(step: ResidentStep, number: int) -> ResidentStep:
-    adam = {name: replace(rates, step=number) for name, rates in step.adam.items()}
-    return replace(step, adam=adam)
+class State:
+    """Gaussians with Adam's moments and the statistics of density control."""
+
+    def __init__(self, embedding: tuple[float, ...] | None = None, own_frames: bool = True):
+        appearance = None if embedding is None else uniform(400, len(embedding), 3, seed=8) - 0.5
+        self.gaussians = Gaussians(*random_scene(3, 400, size=0.12), appearance=appearance)
+        self.adam = Adam(self.gaussians, AdamOptions(0.9, own_frames, EPSILON), make_backend("gpu"))
+        self.gradient_sum, self.seen = torch.zeros(400), torch.zeros(400)
+
+    @property
+    def optimised(self) -> Optimised:
+        adam, statistics = self.adam, (self.gradient_sum, self.seen)
+        return Optimised(self.gaussians.tensors(), adam.first, adam.second, adam.last, *statistics)
+
+    def tensors(self) -> dict[str, torch.Tensor]:
+        found = {}
+        for name, value in vars(self.optimised).items():
+            each = value if isinstance(value, dict) else {"": value}
+            found |= {f"{name} {key}": tensor for key, tensor in each.items()}
+        return found
 
 
-def start(frames: bool, embedding: tuple[float, ...] | None = None) -> Optimised:
-    parameters = dict(zip(NAMES, random_scene(3, 400, size=0.12), strict=True))
-    if embedding is not None:
-        parameters["appearance"] = uniform(400, len(embedding), 3, seed=8) - 0.5
-    first = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
-    second = {name: torch.zeros_like(tensor) for name, tensor in parameters.items()}
-    if frames:
-        first["quats"], second["quats"] = torch.zeros(400, 3), torch.zeros(400, 3)
-    else:
-        second["means"], second["quats"] = torch.zeros(400, 1), torch.zeros(400, 1)
-    last = torch.zeros(400, dtype=torch.int32)
-    return Optimised(parameters, first, second, last, torch.zeros(400), torch.zeros(400))
+def adam_step(number: int) -> AdamStep:
+    return AdamStep(number, RATES, HEIGHT * WIDTH)
 
 
 @dataclass(frozen=True)
@@ -116,16 +111,15 @@ class DrawnPlanes:
 
 
 def by_operators(
-    backend: Backend, state: Optimised, step: ResidentStep
+    backend: Backend, state: State, step: ResidentStep, number: int
 ) -> tuple[float, CameraGradients | None, np.ndarray | None]:
-    """The step, by the operators; returns its loss and other gradients."""
-    p, image, adam = state.parameters, step.image, step.adam
-    moments = {name: Moments(state.first[name], state.second[name]) for name in p}
-    constant, own = p["sh"][:, 0], p["sh"][:, 0].clone()
-    if step.embedding is not None:
-        constant += colour_offsets(p["appearance"], np.array(step.embedding))
+    """Make the step by the operators; return its loss and other gradients."""
+    gaussians, adam, image = state.gaussians, state.adam, step.image
+    constant, own = gaussians.sh[:, 0], gaussians.sh[:, 0].clone()
+    if gaussians.appearance is not None:
+        constant += colour_offsets(gaussians.appearance, np.array(step.embedding))
     shown = constant.clone()
-    drawn = backend.forward(*(p[name] for name in NAMES), step.camera, step.options)
+    drawn = backend.forward(*gaussians.parameters(), step.camera, step.options)
     color, around, gain = drawn.color, image.surroundings, torch.tensor(image.gain)
     if around is not None:
         color = backend.compose(around, color, drawn.alpha)
@@ -137,39 +131,25 @@ def by_operators(
         by_alpha, d_depth = step.losses(DrawnPlanes(drawn.alpha, drawn.depth))
         assert by_alpha is not None
         d_alpha = d_alpha + by_alpha
-    harmonics = ShAdam(moments["sh"], state.last, adam["sh"])
     g = backend.backward(
         drawn, d_color, d_alpha, d_depth, colors=True, camera=step.camera_gradients,
-        sh_adam=harmonics,
+        sh_adam=adam.harmonics(adam_step(number)),
     )  # fmt: skip
     d_embedding = None
-    if step.embedding is not None:
+    if gaussians.appearance is not None:
         constant[:] = own + (constant - shown)
         assert g.colors is not None
         d_embedding, d_appearance = appearance_gradients(
-            p["appearance"], np.array(step.embedding), g.colors
+            gaussians.appearance, np.array(step.embedding), g.colors
         )
-        backend.adam_step(p["appearance"], d_appearance, moments["appearance"], adam["appearance"])
+        rates = adam.rates(adam_step(number))["appearance"]
+        moments = adam.moments("appearance")
+        backend.adam_step(gaussians.appearance, d_appearance, moments, rates)
     change = g.means2d
     state.gradient_sum.add_(torch.hypot(change[:, 0] * WIDTH / 2, change[:, 1] * HEIGHT / 2))
     state.seen.add_(drawn.radii > 0)
-    if "frames" in adam:
-        frames = FrameMoments(moments["means"], moments["quats"])
-        backend.frame_adam(
-            p["means"], p["quats"], p["log_scales"], g.means, g.quats, frames, adam["frames"]
-        )
-    for name in {"log_scales", "opacity_logits", "means", "quats"} & adam.keys():
-        backend.adam_step(p[name], getattr(g, name), moments[name], adam[name])
+    adam.step(gaussians, g, adam_step(number), 1)
     return loss.loss, g.camera, d_embedding
-
-
-def tensors(state: Optimised) -> dict[str, torch.Tensor]:
-    found = {f"parameter {name}": tensor for name, tensor in state.parameters.items()}
-    found |= {f"first {name}": tensor for name, tensor in state.first.items()}
-    found |= {f"second {name}": tensor for name, tensor in state.second.items()}
-    return found | {
-        "last": state.last, "gradient_sum": state.gradient_sum, "seen": state.seen,
-    }  # fmt: skip
 
 
 @pytest.mark.parametrize("name", STEPS)
@@ -180,12 +160,11 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
     backend, step = make_backend("gpu"), STEPS[name]
     training = backend.resident()
     assert training is not None
-    ours, theirs, untouched = (start("frames" in step.adam, step.embedding) for _ in range(3))
-    training.load(ours)
+    ours, theirs, untouched = (State(step.embedding, name != "world's axes") for _ in range(3))
+    training.load(ours.optimised)
     for number in (1, 2, 5):
-        each = at_step(step, number)
-        found = training.step(each)
-        loss, cameras, d_embedding = by_operators(backend, theirs, each)
+        found = training.step(replace(step, adam=ours.adam.rates(adam_step(number))))
+        loss, cameras, d_embedding = by_operators(backend, theirs, step, number)
         assert found.loss == pytest.approx(loss, rel=1e-5)
         assert (found.camera is None) == (cameras is None)
         if found.camera is not None and cameras is not None:
@@ -194,16 +173,16 @@ def test_resident_steps_equal_the_operators(name: str) -> None:
         assert (found.embedding is None) == (d_embedding is None)
         if d_embedding is not None:
             np.testing.assert_allclose(found.embedding, d_embedding, rtol=1e-4)
-    for key, tensor in tensors(ours).items():
-        assert torch.equal(tensor, tensors(untouched)[key]), f"{key} changed before store"
-    training.store(ours)
-    for key, tensor in tensors(ours).items():
-        if key == "gradient_sum" or step.embedding is not None:
-            assert relative(tensor, tensors(theirs)[key]) < 1e-5, key
+    for key, tensor in ours.tensors().items():
+        assert torch.equal(tensor, untouched.tensors()[key]), f"{key} changed before store"
+    training.store(ours.optimised)
+    for key, tensor in ours.tensors().items():
+        if key == "gradient_sum " or step.embedding is not None:
+            assert relative(tensor, theirs.tensors()[key]) < 1e-5, key
         else:
-            assert torch.equal(tensor, tensors(theirs)[key]), key
-    assert (ours.seen == 3).any() and (ours.last == 5).any()
-    assert not torch.equal(ours.parameters["means"], untouched.parameters["means"])
+            assert torch.equal(tensor, theirs.tensors()[key]), key
+    assert (ours.seen == 3).any() and (ours.adam.last == 5).any()
+    assert not torch.equal(ours.gaussians.means, untouched.gaussians.means)
 
 
 def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -215,18 +194,16 @@ def test_images_beyond_the_cache_are_copied_again(monkeypatch: pytest.MonkeyPatc
     for cached in (True, False):
         training = make_backend("gpu").resident()
         assert training is not None
-        state = start(True)
-        training.load(state)
+        state = State()
+        training.load(state.optimised)
         for number in range(1, 6):
             index = number % 2
-            image = replace(
-                IMAGE,
-                key=(index, 1) if cached else None,
-                target=pixels(HEIGHT, WIDTH, 3, seed=index),
-            )
-            training.step(at_step(replace(STEP, image=image), number))
-        training.store(state)
-        results.append(tensors(state))
+            target = pixels(HEIGHT, WIDTH, 3, seed=index)
+            image = replace(IMAGE, key=(index, 1) if cached else None, target=target)
+            adam = state.adam.rates(adam_step(number))
+            training.step(replace(STEP, image=image, adam=adam))
+        training.store(state.optimised)
+        results.append(state.tensors())
     for key, tensor in results[0].items():
         assert torch.equal(tensor, results[1][key]), key
 

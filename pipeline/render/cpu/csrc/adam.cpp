@@ -46,7 +46,7 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         read_rows(grad + K * first, count, g);
         read_rows(exp_avg + K * first, count, m);
         for (int k = 0; k < K; k++) squares += g[k] * g[k];
-        const f32x16 v = read_column(exp_avg_sq + first, count) * beta2 + squares * rest2;
+        const f32x16 v = load_first(exp_avg_sq + first, count) * beta2 + squares * rest2;
         const f32x16 far = rate / (sqrt(v) * correct.to_root + eps);
         for (int k = 0; k < K; k++) {
             m[k] = m[k] * beta1 + g[k] * rest1;
@@ -54,7 +54,7 @@ void adam_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         }
         write_rows(p, count, param + K * first);
         write_rows(m, count, exp_avg + K * first);
-        write_column(v, count, exp_avg_sq + first);
+        store_first(exp_avg_sq + first, v, count);
     });
 }
 
@@ -85,17 +85,14 @@ void adam_step(float* param, const float* grad, float* exp_avg, float* exp_avg_s
         store(exp_avg + i, m);
         store(exp_avg_sq + i, v);
     });
-    const int64_t done = 16 * vectors, bytes = (count - done) * int64_t(sizeof(float));
-    if (bytes == 0) return;
-    f32x16 p = {}, g = {}, m = {}, v = {};
-    std::memcpy(&p, param + done, bytes);
-    std::memcpy(&g, grad + done, bytes);
-    std::memcpy(&m, exp_avg + done, bytes);
-    std::memcpy(&v, exp_avg_sq + done, bytes);
-    update(vectors, p, g, m, v);
-    std::memcpy(param + done, &p, bytes);
-    std::memcpy(exp_avg + done, &m, bytes);
-    std::memcpy(exp_avg_sq + done, &v, bytes);
+    const int64_t done = 16 * vectors, left = count - done;
+    if (left == 0) return;
+    f32x16 p = load_first(param + done, left), m = load_first(exp_avg + done, left);
+    f32x16 v = load_first(exp_avg_sq + done, left);
+    update(vectors, p, load_first(grad + done, left), m, v);
+    store_first(param + done, p, left);
+    store_first(exp_avg + done, m, left);
+    store_first(exp_avg_sq + done, v, left);
 }
 
 void adam_step_rows(float* param, const float* grad, float* exp_avg, float* exp_avg_sq,

@@ -25,18 +25,6 @@ SPLAT_INLINE void write_rows(const f32x16 (&columns)[K], int count, float* to) {
     interleave(columns, count < kGroup ? padded : to);
     if (count < kGroup) std::memcpy(to, padded, count * K * sizeof(float));
 }
-SPLAT_INLINE f32x16 read_column(const float* from, int count) {
-    if (count >= kGroup) return load<f32x16>(from);
-    f32x16 column = {};
-    std::memcpy(&column, from, count * sizeof(float));
-    return column;
-}
-SPLAT_INLINE void write_column(f32x16 column, int count, float* to) {
-    if (count >= kGroup)
-        store(to, column);
-    else
-        std::memcpy(to, &column, count * sizeof(float));
-}
 
 // A group is projected in float64 in parts of one register each. `widened` converts part `number`
 // to float64; `narrowed` joins the parts' values into one float32 vector.
@@ -65,7 +53,7 @@ struct Group {
         read_rows(g.means + 3 * first, count, mean);
         read_rows(g.log_scales + 3 * first, count, log_scale);
         read_rows(g.quats + 4 * first, count, quat);
-        opacity_logit = read_column(g.opacity_logits + first, count);
+        opacity_logit = load_first(g.opacity_logits + first, count);
     }
     SPLAT_INLINE Inputs part(int number) const {
         const auto wide = [number](const f32x16& v) { return widened(v, number); };

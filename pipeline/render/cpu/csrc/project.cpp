@@ -206,7 +206,7 @@ ProjectCounts project_view(const Gaussians& in, const View& view, int threads, R
                     if (drawn >> lane & 1) store(records + group.first + lane, rows[lane]);
             }
             const f32x16 radius = narrowed(seen, [](const Seen& s) { return s.radius; });
-            write_column(keep(mask(drawn), radius), group.count, radii + group.first);
+            store_first(radii + group.first, keep(mask(drawn), radius), group.count);
         }
         all_visible += visible;
         all_dropped += dropped;

@@ -204,7 +204,7 @@ void project_view_backward(const Gaussians& in, const View& view, int threads,
         write_rows(g.mean, group.count, out.means + 3 * first);
         write_rows(g.log_scale, group.count, out.log_scales + 3 * first);
         write_rows(g.quat, group.count, out.quats + 4 * first);
-        write_column(g.opacity_logit, group.count, out.opacity_logits + first);
+        store_first(out.opacity_logits + first, g.opacity_logit, group.count);
         write_rows(g.means2d, group.count, out.means2d + 2 * first);
         if (out.colors) write_rows(d_rgb, group.count, out.colors + 3 * first);
         sh.to_rows(view.sh_degree);

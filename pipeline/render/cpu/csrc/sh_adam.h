@@ -51,17 +51,18 @@ class ShAdam {
             for (int j = 0; 16 * j < active; j++) {
                 const int here = active - 16 * j < 16 ? active - 16 * j : 16;
                 const int64_t at = row + 16 * j;
-                f32x16 p = read(state_.sh + at, here), m = read(state_.exp_avg + at, here);
-                f32x16 v = read(state_.exp_avg_sq + at, here);
+                f32x16 p = load_first(state_.sh + at, here);
+                f32x16 m = load_first(state_.exp_avg + at, here);
+                f32x16 v = load_first(state_.exp_avg_sq + at, here);
                 const f32x16 g = gradient.value[16 * j + lane],
                              rate = load<f32x16>(rates_ + 16 * j);
                 if (missed) p -= rate * past.drift * m * inverse_root(v);
                 m = m * past.keep1 + g * rest1_;
                 v = v * past.keep2 + g * g * rest2_;
                 p -= rate * m * inverse_root(v);
-                write(p, state_.sh + at, here);
-                write(m, state_.exp_avg + at, here);
-                write(v, state_.exp_avg_sq + at, here);
+                store_first(state_.sh + at, p, here);
+                store_first(state_.exp_avg + at, m, here);
+                store_first(state_.exp_avg_sq + at, v, here);
             }
         }
     }
@@ -83,20 +84,6 @@ class ShAdam {
     // An infinite moment (of a gradient above 1e19) gives no change, as a division would.
     SPLAT_INLINE f32x16 inverse_root(f32x16 v) const {
         return reciprocal(min(sqrt(v) * scale_ + eps_, splat16(1e37f)));
-    }
-
-    // The common case, without a copy through memory.
-    static SPLAT_INLINE f32x16 read(const float* from, int count) {
-        if (count == 16) return load<f32x16>(from);
-        f32x16 value = {};
-        std::memcpy(&value, from, count * sizeof(float));
-        return value;
-    }
-    static SPLAT_INLINE void write(f32x16 value, float* to, int count) {
-        if (count == 16)
-            store(to, value);
-        else
-            std::memcpy(to, &value, count * sizeof(float));
     }
 
     ShAdamState state_;

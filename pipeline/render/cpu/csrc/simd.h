@@ -85,6 +85,20 @@ SPLAT_INLINE void store(void* to, V v) {
     }
 }
 
+// The first `count` lanes of 16; the others are zeros. Whole vectors are not copied through memory.
+SPLAT_INLINE f32x16 load_first(const float* from, int64_t count) {
+    if (count >= 16) return load<f32x16>(from);
+    f32x16 v = {};
+    std::memcpy(&v, from, count * sizeof(float));
+    return v;
+}
+SPLAT_INLINE void store_first(float* to, f32x16 v, int64_t count) {
+    if (count >= 16)
+        store(to, v);
+    else
+        std::memcpy(to, &v, count * sizeof(float));
+}
+
 // The bits of a vector as one of another type.
 template <class To, class T, int N>
 SPLAT_INLINE To bit_cast(Vector<T, N> v) {

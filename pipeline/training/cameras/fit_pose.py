@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from pipeline.render import Backend, RasterOptions, make_backend
+from pipeline.render import RasterOptions, make_backend
 from pipeline.render.views import limit_sh_degree, raster_camera
 from pipeline.scene.views import View
 from pipeline.splats.gaussians import Gaussians
@@ -29,19 +29,17 @@ def fit_pose(
     options: RasterOptions,
     extent: float,
     ssim_weight: float,
-    backend: Backend | None = None,
 ) -> View:
     """The view with the pose at which the render of the fixed scene is closest to its photograph.
 
     Args:
         photo: (H, W, 3), over the background of ``options``.
         mask: (H, W), False for ignored pixels.
-        gain: factor of each channel of the render.
-        extent: unit of translations (``scene.views.scene_extent``), world units.
-        ssim_weight: as in training.
-        backend: None: the default.
+        gain: The factor of each channel of the render.
+        extent: The unit of translations (``scene.views.scene_extent``), world units.
+        ssim_weight: The weight of SSIM in the loss, as in training.
     """
-    backend = backend or make_backend()
+    backend = make_backend()
     options = limit_sh_degree(options, gaussians)
     poses = PoseRefinement.of([view], gaussians, extent, limit=math.inf)
     camera = raster_camera(view)

@@ -27,7 +27,7 @@ def work(job: Job) -> None:
 
     partition = partition_scene(
         read_npz(job.inputs["coarse"] / "gaussians.npz"),
-        inputs.coarse_views(job),
+        inputs.trained_views(job, "coarse"),
         inputs.read_manifest(job, "views"),
         int(job.section(Partition).blocks),
         job.section(Train),

@@ -64,20 +64,21 @@ class Job:
     """The interface of a running stage.
 
     Attributes:
-        stage: name of the stage's folder.
-        scene: name of the scene or run.
-        key: the stage's key as a parsed JSON object (see ``pipeline.plan.keys``).
-        inputs: role ("photos", "model", ...) -> folder.
-        out: folder for the outputs, which becomes the stage's folder when the stage has finished.
-        scratch: folder that a later run with the same key and inputs finds if this one is killed.
-        shared_cache: folder for per-image results that are addressed by content and independent
-            of the key.
-        threads: number of native threads; does not affect results.
-        memory_mb: memory limit, or None; does not affect results.
-        counters, decisions, warnings: written to ``stage.json``; counters are of the model that
-            the stage declares.
-        timings: written to ``run.json``.
-        logs: folder for logs, which are not part of the result.
+        stage: The name of the stage's folder.
+        scene: The name of the scene or run.
+        key: The stage's key as a parsed JSON object (see ``pipeline.plan.keys``).
+        inputs: The folder of each input by its role ("photos", "model", ...).
+        out: The folder for the outputs, which becomes the stage's folder at the end.
+        scratch: The folder that a later run with the same key and inputs finds if this one is
+            killed.
+        shared_cache: The folder for per-image results that are addressed by content and
+            independent of the key.
+        threads: The number of native threads, which does not affect results.
+        memory_mb: The memory limit, or None, which does not affect results.
+        counters, decisions, warnings: The content of ``stage.json``. The counters are of the
+            model that the stage declares.
+        timings: Further facts for ``run.json``.
+        logs: The folder for logs, which are not part of the result.
     """
 
     stage: str
@@ -97,17 +98,17 @@ class Job:
 
     @property
     def seed(self) -> int:
-        """The run's seed; only for stages whose key contains it."""
+        """The run's seed. Only stages whose key contains it have one."""
         return int(self.key["seed"])
 
     @property
     def number(self) -> int:
-        """Number of the job, from 1; only for stages with several jobs."""
+        """The number of the job, from 1. Only stages with several jobs have it."""
         return int(self.key["job"])
 
     @property
     def of_jobs(self) -> int:
-        """Number of the stage's jobs; only for stages with several."""
+        """The number of the stage's jobs. Only stages with several have it."""
         return int(self.key["jobs"])
 
     def cache_of(self, stage: str) -> Path:
@@ -153,8 +154,8 @@ class Request:
     """The arguments of a stage's command line.
 
     Attributes:
-        stage: name of the stage. The name of its folder ``out`` ends with the number of the job if
-            the stage has several.
+        stage: The name of the stage. The name of its folder ``out`` ends with the number of the
+            job if the stage has several.
     """
 
     stage: str
@@ -166,9 +167,13 @@ class Request:
     publish: dict[str, Path]
     memory_mb: int | None = None
 
+    def __str__(self) -> str:
+        """The job and its scene, as in messages."""
+        return f"{self.name} of {self.out.parent.name}"
+
     @property
     def name(self) -> str:
-        """Name of the folder, under which the job is recorded."""
+        """The name of the folder, under which the job is recorded."""
         return self.out.name
 
 
@@ -180,7 +185,7 @@ def run_stage(
     """Run ``work`` as a stage and return the exit code.
 
     Args:
-        counters: model of the counters that ``work`` must record.
+        counters: The model of the counters that ``work`` must record.
 
     0: finished, or up to date. 2: a ``UserError``, with its message. 130: interrupted by Ctrl-C.
     1: another exception, which is a bug of the program, with a traceback.
@@ -189,41 +194,34 @@ def run_stage(
         try:
             targets.usable()  # Reports a wrong $SPLATMAKE_TARGET before any work.
             return _run_locked(request, work, counters)
-        except UserError as error:
-            if isinstance(error, ChangedFileError):
-                # The facts that the scan has cached about the scene's files may be wrong.
-                (request.out.parent / SCAN_CACHE).unlink(missing_ok=True)
-            _say_error(request, error)
-            return EXIT_USER_ERROR
         except KeyboardInterrupt:
             print(f"{request.name}: interrupted", file=sys.stderr, flush=True)
             return EXIT_INTERRUPTED
         except Terminated:
-            name = f"{request.name} of {request.out.parent.name}"
-            print(f"{name} was terminated (SIGTERM or SIGHUP)", file=sys.stderr, flush=True)
+            print(f"{request} was terminated (SIGTERM or SIGHUP)", file=sys.stderr, flush=True)
             return EXIT_TERMINATED
-        except MemoryError:
-            _say_error(request, UserError("out of memory", fix="lower views.max_long_side_px"))
-            return EXIT_USER_ERROR
-        except sqlite3.OperationalError as error:
-            fix = "free some space and make results/ writable, then run again"
-            _say_error(request, UserError(f"the database cannot be written: {error}", fix=fix))
-            return EXIT_USER_ERROR
-        except OSError as error:
-            known = as_user_error(error)
+        except Exception as error:
+            known = _known(error)
             if known is None:
                 traceback.print_exc(file=sys.stderr)
                 return 1
-            _say_error(request, known)
+            if isinstance(known, ChangedFileError):
+                # The facts that the scan has cached about the scene's files may be wrong.
+                (request.out.parent / SCAN_CACHE).unlink(missing_ok=True)
+            print(f"error in {request}: {known}", file=sys.stderr, flush=True)
             return EXIT_USER_ERROR
-        except Exception:
-            traceback.print_exc(file=sys.stderr)
-            return 1
 
 
-def _say_error(request: Request, error: UserError) -> None:
-    scene = request.out.parent.name
-    print(f"error in {request.name} of {scene}: {error}", file=sys.stderr, flush=True)
+def _known(error: Exception) -> UserError | None:
+    """The message for an error that the user can correct; None for a bug of the program."""
+    if isinstance(error, UserError):
+        return error
+    if isinstance(error, MemoryError):
+        return UserError("out of memory", fix="lower views.max_long_side_px")
+    if isinstance(error, sqlite3.OperationalError):
+        fix = "free some space and make results/ writable, then run again"
+        return UserError(f"the database cannot be written: {error}", fix=fix)
+    return as_user_error(error) if isinstance(error, OSError) else None
 
 
 def _run_locked(

@@ -65,9 +65,9 @@ def _scene(job: Job, open_scene: Callable[[], GaussianSource]) -> SceneInBlocks:
     from pipeline.training.blocks.train import SceneInBlocks
     from pipeline.training.scene import SceneData
 
-    views = inputs.coarse_views(job)
+    views = inputs.trained_views(job, "coarse")
     return SceneInBlocks(
-        SceneData(views, inputs.read_manifest(job, "views"), inputs.coarse_model(job)),
+        SceneData(views, inputs.read_manifest(job, "views"), inputs.trained_model(job, "coarse")),
         gains=ExposureGains.read_for(job.inputs["coarse"], [view.name for view in views]),
         partition=read_partition(job),
         read_gaussians=lambda: Gaussians.sharing(collect(open_scene())),

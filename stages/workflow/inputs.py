@@ -66,26 +66,13 @@ def copy_georeference(job: Job, role: str) -> None:
         shutil.copy(file, job.out)
 
 
-def trained_model(job: Job, *, points: bool = True) -> Reconstruction:
+def trained_model(job: Job, role: str = "train", *, points: bool = True) -> Reconstruction:
     """The model with cameras as refined by training (``train.refine_poses``,
-    ``train.refine_intrinsics``)."""
-    refined = job.inputs["train"] / "sparse" / "0"
+    ``train.refine_intrinsics``), or by another stage that trains."""
+    refined = job.inputs[role] / "sparse" / "0"
     if not has_model(refined):
         return input_model(job, points=points)
     return read_model(refined, points=points)
-
-
-def coarse_model(job: Job, *, points: bool = True) -> Reconstruction:
-    """The model with cameras as refined by the coarse run, for scenes in blocks."""
-    refined = job.inputs["coarse"] / "sparse" / "0"
-    if not has_model(refined):
-        return input_model(job, points=points)
-    return read_model(refined, points=points)
-
-
-def coarse_views(job: Job) -> list[View]:
-    """All views, with the cameras of ``coarse_model``."""
-    return _views(job, coarse_model(job, points=False))
 
 
 def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None = None) -> None:
@@ -143,9 +130,9 @@ def trained_gaussians(job: Job) -> Gaussians:
     return read_npz(job.inputs["train"] / "gaussians.npz")
 
 
-def trained_views(job: Job) -> list[View]:
+def trained_views(job: Job, role: str = "train") -> list[View]:
     """All views, with the cameras of ``trained_model``."""
-    return _views(job, trained_model(job, points=False))
+    return _views(job, trained_model(job, role, points=False))
 
 
 def _views(job: Job, model: Reconstruction) -> list[View]:

@@ -6,8 +6,8 @@ import sys
 
 sys.path.insert(0, workflow.basedir)
 
+from stages.workflow.internals import shorten_failures
 from stages.workflow.project import SnakemakeProject, check_config
-from stages.workflow.terminal import shorten_failures
 
 shorten_failures()
 
@@ -27,9 +27,6 @@ RUN = (
 
 onstart:
     project.before_jobs()
-    # No limit on the rate of jobs: Snakemake's limiter uses a considerable share of a core after
-    # some dozens of jobs.
-    workflow.scheduler.job_rate_limiter = None
 
 
 onerror:

@@ -3,15 +3,13 @@
 from __future__ import annotations
 
 import os
-import re
 import subprocess
 import sys
 import time
-from collections.abc import AsyncIterator, Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
-from typing import Any
 
 from pipeline.plan.values import Plan
 from pipeline.runtime.native import MODULES
@@ -32,12 +30,6 @@ DEFAULT_CPUS = 8
 OVERHEAD_MB = 400
 # Seconds between two looks at the queue.
 QUEUE_SECONDS = 10.0
-# Seconds between two checks of jobs: at least so many, and this share of the time since a job has
-# started or ended, so that the wait for the check is short beside the job.
-SHORTEST_INTERVAL, INTERVAL_SHARE = 5.0, 0.1
-# Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
-_JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
-
 # Variables in jobs of Slurm, Grid Engine, PBS and LSF: the job's number and its number of cores.
 _GRANTED = (
     ("SLURM_JOB_ID", "SLURM_CPUS_PER_TASK"),
@@ -135,6 +127,9 @@ def wait_for_earlier_jobs(folder: Path) -> None:
 def earlier_jobs(folder: Path) -> Sequence[str]:
     """Ids of the jobs in the queue that a Snakemake in this folder has submitted; none if Slurm
     does not answer."""
+    # Jobs import this module; Snakemake's modules are slow to import.
+    from stages.workflow.internals import JOB_NAME
+
     command = ["squeue", "-h", "-o", "%i|%j|%Z"]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
@@ -145,50 +140,8 @@ def earlier_jobs(folder: Path) -> Sequence[str]:
     return [
         number
         for number, name, started_in in rows
-        if _JOB_NAME.fullmatch(name) and os.path.realpath(started_in) == here
+        if JOB_NAME.fullmatch(name) and os.path.realpath(started_in) == here
     ]
-
-
-def watch_jobs(executor: Any, seconds: float) -> None:
-    """Let an executor of Snakemake check its jobs at this interval at most, more often while they
-    are young, and each until it has reported the job's end.
-
-    The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
-    does not answer, as while the controller is started again: Snakemake would never end.
-    """
-    check, finished = executor.check_active_jobs, set()
-    known: set[int] = set()
-    changed = time.monotonic()
-
-    def recording(report: Callable[..., None]) -> Callable[..., None]:
-        def reported(job: Any, *args: Any, **options: Any) -> None:
-            finished.add(id(job))
-            report(job, *args, **options)
-
-        return reported
-
-    async def checked(active: Sequence[Any]) -> AsyncIterator[Any]:
-        nonlocal changed
-        finished.clear()
-        yielded = set()
-        async for job in check(active):
-            yielded.add(id(job))
-            yield job
-        for job in active:
-            if id(job) not in yielded | finished:
-                yield job
-        jobs, now = {id(job) for job in active}, time.monotonic()
-        if finished or not jobs <= known:
-            changed = now
-        known.clear()
-        known.update(jobs)
-        young = max(SHORTEST_INTERVAL, INTERVAL_SHARE * (now - changed))
-        due = min(seconds, young, executor.next_seconds_between_status_checks)
-        executor.next_seconds_between_status_checks = due
-
-    executor.report_job_success = recording(executor.report_job_success)
-    executor.report_job_error = recording(executor.report_job_error)
-    executor.check_active_jobs = checked
 
 
 def compile_for_all_nodes() -> None:

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 
 from pipeline.runtime.errors import UserError
-from stages.workflow.locks import prepare_folder
+from stages.workflow.internals import prepare_folder
 
 _FIX = "make it writable, or run in another folder (snakemake --directory)"
 

@@ -46,11 +46,10 @@ from stages.workflow.cluster import (
     group_of,
     largest_node,
     wait_for_earlier_jobs,
-    watch_jobs,
 )
 from stages.workflow.failures import reporting_errors
 from stages.workflow.folders import check_working_directory, check_writable
-from stages.workflow.locks import use_locks_of_runs
+from stages.workflow.internals import Flow, use_locks_of_runs
 from stages.workflow.outcomes import error_in, failed_job, outcome
 from stages.workflow.registry import STAGES
 
@@ -88,7 +87,7 @@ class SnakemakeProject:
 
     def __init__(self, raw: Mapping[str, Any], workflow: Any):
         self._raw = dict(raw)
-        self._workflow = workflow
+        self._flow = Flow(workflow)
         self._started = time.time()
         # Snakemake and packages end with a traceback if the user has no name.
         os.environ.setdefault("LOGNAME", user_name())
@@ -108,7 +107,7 @@ class SnakemakeProject:
         # Not set in the rules' commands, which Snakemake compares: moving the project or its
         # virtual environment must not rerun anything.
         os.environ["PYTHONPATH"] = os.pathsep.join(
-            filter(None, [workflow.basedir, os.environ.get("PYTHONPATH", "")])
+            filter(None, [self._flow.folder, os.environ.get("PYTHONPATH", "")])
         )
         os.environ["PATH"] = os.pathsep.join(
             [str(Path(sys.executable).parent), os.environ.get("PATH", "")]
@@ -153,26 +152,24 @@ class SnakemakeProject:
         exist. It compares keys with records of its own, in .snakemake, which a copied folder of
         results does not have.
         """
-        dag = self._workflow.dag
-        if dag is None or self._workflow.remote_exec:
+        if not self._flow.decides_jobs:
             return
         folder = RESULTS / wildcards.scene / self.folder(spec).format_map(wildcards)
         if lost := missing_output(folder):
-            dag.forcefiles.add(str(folder / STAGE))
+            self._flow.force(folder / STAGE)
             # The outputs of an unfinished run are not lost: they have not been made yet.
             if folder not in self._lost and (folder.parent / "metrics.json").is_file():
                 self._lost.add(folder)
                 print(f"{lost} is missing: {folder.name} runs again", file=sys.stderr)
             return
-        compared = {trigger.name for trigger in self._workflow.rerun_triggers}
-        if "PARAMS" not in compared:
+        if not self._flow.compares_keys:
             return
         try:
             current = canonical(read_stage(folder).key) == self.key(spec)(wildcards)
         except UserError:  # The stage that reads the record has a message.
             return
         if not current:
-            dag.forcefiles.add(str(folder / STAGE))
+            self._flow.force(folder / STAGE)
 
     def folders(self, spec: StageSpec) -> Callable[[Any], list[str]]:
         """Params function: "role=folder" for the stage's command line."""
@@ -200,20 +197,20 @@ class SnakemakeProject:
         )
 
     def _cores(self) -> int:
-        limit = self._workflow.resource_settings.cores
-        if self._workflow.remote_exec:
+        limit = self._flow.cores_option or DEFAULT_CPUS
+        if self._flow.in_job:
             # Snakemake gives the job all cores of the node.
-            return granted_cpus() or min(int(limit), DEFAULT_CPUS)
-        if not self._workflow.non_local_exec:
-            return int(self._workflow.cores)
-        wanted, node = int(limit or DEFAULT_CPUS), largest_node()
-        return wanted if node is None else min(wanted, node.cpus)
+            return granted_cpus() or min(limit, DEFAULT_CPUS)
+        if not self._flow.submits_jobs:
+            return self._flow.cores
+        node = largest_node()
+        return limit if node is None else min(limit, node.cpus)
 
     def group(self, spec: StageSpec) -> Callable[[Any], str | None]:
         """Group function: the group of jobs that a cluster runs as one, if there is a cluster."""
 
         def name(wildcards: Any) -> str | None:
-            if not (self._workflow.remote_exec or self._workflow.non_local_exec):
+            if not (self._flow.in_job or self._flow.submits_jobs):
                 return None
             return group_of(spec.name, self._plan(wildcards.scene))
 
@@ -227,9 +224,9 @@ class SnakemakeProject:
         def megabytes(wildcards: Any, threads: int, attempt: int) -> int:
             estimate = stage_memory.memory_mb(spec.name, self._plan(wildcards.scene), threads)
             needed = round(estimate * MORE_MEMORY ** (attempt - 1))
-            if self._workflow.remote_exec:
+            if self._flow.in_job:
                 most = granted_memory_mb()
-            elif self._workflow.non_local_exec:
+            elif self._flow.submits_jobs:
                 node = largest_node()
                 most = None if node is None else node.memory_mb
             else:
@@ -260,16 +257,11 @@ class SnakemakeProject:
         """The run's plan; a UserError ends Snakemake."""
         try:
             # A run of another user is named before the missing permission to write.
-            if self._writes_results():
+            if self._flow.runs_jobs:
                 check_not_locked(RESULTS / name)
             return self._make_plan(name)
         except UserError as error:
             _exit(error)
-
-    def _writes_results(self) -> bool:
-        """Whether this Snakemake runs jobs and is not itself in one."""
-        flow = self._workflow
-        return bool(flow.is_main_process and flow.executor_plugin and not flow.dryrun)
 
     def _scan_and_plan(self, name: str) -> Plan:
         self._check_results(name)
@@ -295,8 +287,7 @@ class SnakemakeProject:
         return chosen.device, chosen.reason
 
     def _is_on_cluster(self) -> bool:
-        flow = self._workflow
-        return bool(flow.remote_exec or flow.non_local_exec or "SLURM_JOB_ID" in os.environ)
+        return self._flow.in_job or self._flow.submits_jobs or "SLURM_JOB_ID" in os.environ
 
     def _will_use_gpu(self, plan: Plan, name: str) -> bool:
         """Whether a stage that computes on a GPU has no current result."""
@@ -384,8 +375,7 @@ class SnakemakeProject:
         """Check that the jobs can write and that no other run does, and compile the native
         libraries before jobs are submitted: a compiler takes more memory than a job may use, and
         nodes may have none."""
-        workflow = self._workflow
-        needed = list(workflow.dag.needrun_jobs())
+        needed = self._flow.needed_jobs()
         # The tables of a batch are in the folder of all results.
         written = {RESULTS / getattr(job.wildcards, "scene", "") for job in needed if job.output}
         for folder in sorted(written):
@@ -397,10 +387,9 @@ class SnakemakeProject:
             except OSError as error:
                 error.filename = error.filename or str(folder)
                 _exit(as_user_error(error) or UserError(f"{error}", file=folder))
-        if workflow.non_local_exec:
-            interval = workflow.remote_execution_settings.seconds_between_status_checks
-            for executor in {workflow.scheduler.get_executor(j) for j in needed if not j.is_local}:
-                watch_jobs(executor, interval)
+        self._flow.unlimit_rate()
+        if self._flow.submits_jobs:
+            self._flow.watch(needed)
             wait_for_earlier_jobs(Path.cwd())
             compile_for_all_nodes()
 

@@ -12,15 +12,8 @@ import pytest
 from pipeline.command.main import main
 from stages.workflow.project import SnakemakeProject
 from tests.pictures import photos
+from tests.stages.flow import dry_run
 
-# Snakemake's, in a dry run.
-WORKFLOW = SimpleNamespace(
-    basedir=str(Path(__file__).parents[2]),
-    is_main_process=True,
-    executor_plugin=None,
-    non_local_exec=False,
-    remote_exec=False,
-)
 NAMES = ("<x>", "{x}", "ab" * 20, "n" * 250, "a\nb", "\udcff")
 
 
@@ -34,7 +27,7 @@ def data(tmp_path, monkeypatch) -> Path:
 
 def runs(**config: object) -> tuple[list[str], dict[str, str]]:
     """The scenes that can be planned, and why the others cannot."""
-    project = SnakemakeProject(config, WORKFLOW)
+    project = SnakemakeProject(config, dry_run())
     found, left_out = project._batch
     planned = [run.scene for run in found if run not in left_out]
     assert {Path(file).parts[1] for file in project.every_run(None)} == set(planned)
@@ -114,8 +107,7 @@ def test_finished_results_that_are_to_be_made_again_but_cannot_be_written(data, 
     job = SimpleNamespace(wildcards=SimpleNamespace(scene="good"), output=["x"])
     batch = SimpleNamespace(wildcards=SimpleNamespace(), output=[])
     dag = SimpleNamespace(needrun_jobs=lambda: [batch, job])
-    flow = SimpleNamespace(**vars(WORKFLOW), dag=dag)
-    project = SnakemakeProject({}, flow)
+    project = SnakemakeProject({}, dry_run(dag=dag, scheduler=SimpleNamespace()))
     project.before_jobs()
     monkeypatch.setattr(os, "access", lambda path, mode: Path(path).name != "good")
     with pytest.raises(SystemExit):

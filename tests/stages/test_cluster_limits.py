@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import asyncio
 import os
 import signal
 import sys
@@ -23,6 +22,7 @@ from stages.workflow import project as project_module
 from stages.workflow.project import SnakemakeProject
 from stages.workflow.registry import STAGES
 from tests.pictures import photos
+from tests.stages.flow import dry_run
 
 
 def program(folder: Path, name: str, text: str, code: int = 0) -> Path:
@@ -85,68 +85,6 @@ def test_a_run_waits_for_earlier_jobs_with_one_message(tmp_path, monkeypatch, ca
     assert "scancel 7 8" in said
 
 
-class Executor:
-    """Reports the end of one job, returns another as active, and forgets the others."""
-
-    def __init__(self):
-        self.ended: list[str] = []
-        self.next_seconds_between_status_checks = 5
-
-    def report_job_success(self, job):
-        self.ended.append(job)
-
-    report_job_error = report_job_success
-
-    async def check_active_jobs(self, active):
-        for job in active:
-            if job == "finished":
-                self.report_job_success(job)
-            elif job == "failed":
-                self.report_job_error(job)
-            elif job == "running":
-                yield job
-        self.next_seconds_between_status_checks += 10
-
-
-def test_jobs_without_a_status_stay_active():
-    """An executor that forgets them would never report their end."""
-    executor = Executor()
-    cluster.watch_jobs(executor, 20)
-
-    async def check(*jobs: str) -> list[str]:
-        return [job async for job in executor.check_active_jobs(jobs)]
-
-    active = asyncio.run(check("finished", "running", "unknown", "failed"))
-    assert active == ["running", "unknown"]
-    assert executor.ended == ["finished", "failed"]
-
-
-def test_intervals_grow_with_the_age_of_the_jobs_and_are_bounded(monkeypatch):
-    """The executor's own interval grows by 10 s with each check."""
-    now = 1000.0
-    monkeypatch.setattr(cluster.time, "monotonic", lambda: now)
-    executor = Executor()
-    cluster.watch_jobs(executor, 15)
-
-    def interval_after(seconds: float, *jobs: str) -> float:
-        nonlocal now
-        now += seconds
-
-        async def check() -> None:
-            [job async for job in executor.check_active_jobs(jobs)]
-
-        asyncio.run(check())
-        return executor.next_seconds_between_status_checks
-
-    assert interval_after(5, "running") == 5
-    assert interval_after(5, "running") == 5
-    assert interval_after(75, "running") == 8
-    assert interval_after(1000, "running") == 15
-    assert interval_after(15, "running", "finished") == 5, "a job has ended"
-    assert interval_after(1000, "running") == 15
-    assert interval_after(15, "running", "unknown") == 5, "a job was submitted"
-
-
 def test_the_cores_of_a_job_are_those_it_was_given(monkeypatch):
     for name in ("SLURM_JOB_ID", "SLURM_CPUS_PER_TASK", "SLURM_CPUS_ON_NODE"):
         monkeypatch.delenv(name, raising=False)
@@ -165,15 +103,7 @@ def test_jobs_ask_for_no_more_than_a_node_has(tmp_path, monkeypatch):
     for name in ("SLURM_JOB_ID", "SLURM_MEM_PER_NODE"):
         monkeypatch.delenv(name, raising=False)
     photos(tmp_path / "data" / "scene", 3)
-    flow = SimpleNamespace(
-        basedir=str(tmp_path),
-        is_main_process=True,
-        executor_plugin=None,
-        remote_exec=False,
-        non_local_exec=False,
-        cores=2,
-        resource_settings=SimpleNamespace(cores=16),
-    )
+    flow = dry_run(cores=2, resource_settings=SimpleNamespace(cores=16))
     project = SnakemakeProject({}, flow)
     scene = SimpleNamespace(scene="scene")
     needed = project.memory_mb(STAGES["train"])

@@ -1,0 +1,314 @@
+"""Contracts with Snakemake: each part of it that ``stages.workflow.internals`` uses is as expected.
+
+A run of Snakemake itself, in a folder with lock files of a dead one, reports what ``Flow`` finds.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import inspect
+import io
+import json
+import logging
+import re
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+from snakemake.logging import ColorizingTextHandler, DefaultFilter, DefaultFormatter, logger
+from snakemake_interface_logger_plugins.common import LogEvent
+
+from stages.workflow import internals
+from stages.workflow.internals import JOB_NAME, prepare_folder, shorten_failures, watch_jobs
+from tests.e2e.harness import ROOT, environment
+from tests.tools import need_package
+
+# --- a run ----------------------------------------------------------------------------------------
+
+SNAKEFILE = """
+import json
+from pathlib import Path
+from stages.workflow import internals
+
+flow = internals.Flow(workflow)
+internals.shorten_failures()
+internals.use_locks_of_runs()
+internals.prepare_folder(Path(".snakemake"))
+
+
+def nothing(wildcards):
+    if flow.decides_jobs and config.get("force"):
+        flow.force(Path("made.txt"))
+    return []
+
+
+onstart:
+    flow.unlimit_rate()
+    flow.watch(flow.needed_jobs())
+    names = "folder in_job submits_jobs runs_jobs cores cores_option decides_jobs compares_keys"
+    facts = {name: getattr(flow, name) for name in names.split()}
+    facts["needed"] = sorted(job.rule.name for job in flow.needed_jobs())
+    facts["limiter"] = repr(workflow.scheduler.job_rate_limiter)
+    handlers = internals.logger.handlers
+    facts["terminal"] = [type(handler.formatter).__name__ for handler in handlers]
+    Path("facts.json").write_text(json.dumps(facts))
+
+
+rule all:
+    input: "made.txt"
+
+
+rule made:
+    input: nothing
+    output: "made.txt"
+    params: text=lambda wildcards: config["text"]
+    shell: "echo {params.text} > {output}"
+"""
+
+
+def run_snakemake(folder: Path, *words: str) -> str:
+    done = subprocess.run(
+        [sys.executable, "-m", "snakemake", *words],
+        cwd=folder,
+        env=environment(ROOT),
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+    )
+    assert done.returncode == 0 and "Traceback" not in done.stdout, done.stdout
+    return done.stdout
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A folder in which Snakemake has run beside the lock files of a dead one."""
+    folder = tmp_path_factory.mktemp("snakemake")
+    (folder / "Snakefile").write_text(SNAKEFILE)
+    (folder / "own").mkdir()
+    (folder / "own/config.yaml").write_text("keep-going: true\n")
+    locks = folder / ".snakemake" / "locks"
+    locks.mkdir(parents=True)
+    for kind in ("input", "output"):
+        (locks / f"0.{kind}.lock").write_text("made.txt\n")
+    profile = ("--workflow-profile", "own")
+    run_snakemake(folder, "--cores", "2", *profile, "--config", "text=a")
+    return folder
+
+
+def test_a_workflow_has_the_facts_of_the_run(folder: Path) -> None:
+    found = json.loads((folder / "facts.json").read_text())
+    assert Path(found.pop("folder")).samefile(folder)
+    assert "_ShortFormatter" in found.pop("terminal")
+    assert found == {
+        "in_job": False,
+        "submits_jobs": False,
+        "runs_jobs": True,
+        "cores": 2,
+        "cores_option": 2,
+        "decides_jobs": True,
+        "compares_keys": True,
+        "needed": ["all", "made"],
+        "limiter": "None",
+    }
+
+
+def test_lock_files_of_a_dead_snakemake_block_nothing_and_can_be_removed(folder: Path) -> None:
+    dry = run_snakemake(folder, "-n", "--cores", "1", "--config", "text=a")
+    assert "Nothing to be done" in dry and "locked" not in dry
+    assert len(list(folder.glob(".snakemake/locks/*"))) == 2
+    run_snakemake(folder, "--unlock", "--cores", "1", "--config", "text=a")
+    assert not list(folder.glob(".snakemake/locks/*"))
+
+
+def test_a_forced_file_is_made_again(folder: Path) -> None:
+    forced = run_snakemake(folder, "-n", "--cores", "1", "--config", "text=a", "force=1")
+    assert re.search(r"^rule made:", forced, re.M)
+
+
+def test_changed_params_run_a_job_again_unless_only_times_are_compared(folder: Path) -> None:
+    words = ("-n", "--cores", "1", "--config", "text=b")
+    assert re.search(r"^rule made:", run_snakemake(folder, *words), re.M)
+    assert "Nothing to be done" in run_snakemake(folder, *words, "--rerun-triggers", "mtime")
+
+
+def test_snakemake_migrates_a_folder_without_incomplete(tmp_path: Path) -> None:
+    from snakemake.persistence import file
+
+    source = inspect.getsource(file)
+    assert "migrate_v1_to_v2()" in source and '"incomplete"' in source
+    prepare_folder(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["incomplete"]
+    (tmp_path / "incomplete").rmdir()
+    (tmp_path / "metadata").mkdir()
+    prepare_folder(tmp_path)
+    assert [path.name for path in tmp_path.iterdir()] == ["metadata"]
+
+
+# --- executors ------------------------------------------------------------------------------------
+
+
+def test_the_executor_for_slurm_has_what_is_replaced() -> None:
+    need_package("snakemake_executor_plugin_slurm")
+    import snakemake_executor_plugin_slurm as slurm
+
+    executor = slurm.Executor
+    assert inspect.isasyncgenfunction(executor.check_active_jobs)
+    assert [*inspect.signature(executor.check_active_jobs).parameters] == ["self", "active_jobs"]
+    assert isinstance(executor.next_seconds_between_status_checks, property)
+    for report in (executor.report_job_success, executor.report_job_error):
+        assert [*inspect.signature(report).parameters][:2] == ["self", "job_info"]
+    assert "self.run_uuid = str(uuid.uuid4())" in inspect.getsource(executor)
+    run = "12345678-1234-1234-1234-1234567890ab"
+    assert JOB_NAME.fullmatch(run) and JOB_NAME.fullmatch(f"splatmake_{run}")
+
+
+class Executor:
+    """Reports the end of one job, returns another as active, and forgets the others."""
+
+    def __init__(self):
+        self.ended: list[str] = []
+        self.next_seconds_between_status_checks = 5
+
+    def report_job_success(self, job):
+        self.ended.append(job)
+
+    report_job_error = report_job_success
+
+    async def check_active_jobs(self, active):
+        for job in active:
+            if job == "finished":
+                self.report_job_success(job)
+            elif job == "failed":
+                self.report_job_error(job)
+            elif job == "running":
+                yield job
+        self.next_seconds_between_status_checks += 10
+
+
+def test_jobs_without_a_status_stay_active():
+    """An executor that forgets them would never report their end."""
+    executor = Executor()
+    watch_jobs(executor, 20)
+
+    async def check(*jobs: str) -> list[str]:
+        return [job async for job in executor.check_active_jobs(jobs)]
+
+    active = asyncio.run(check("finished", "running", "unknown", "failed"))
+    assert active == ["running", "unknown"]
+    assert executor.ended == ["finished", "failed"]
+
+
+def test_intervals_grow_with_the_age_of_the_jobs_and_are_bounded(monkeypatch):
+    """The executor's own interval grows by 10 s with each check."""
+    now = 1000.0
+    monkeypatch.setattr(internals.time, "monotonic", lambda: now)
+    executor = Executor()
+    watch_jobs(executor, 15)
+
+    def interval_after(seconds: float, *jobs: str) -> float:
+        nonlocal now
+        now += seconds
+
+        async def check() -> None:
+            [job async for job in executor.check_active_jobs(jobs)]
+
+        asyncio.run(check())
+        return executor.next_seconds_between_status_checks
+
+    assert interval_after(5, "running") == 5
+    assert interval_after(5, "running") == 5
+    assert interval_after(75, "running") == 8
+    assert interval_after(1000, "running") == 15
+    assert interval_after(15, "running", "finished") == 5, "a job has ended"
+    assert interval_after(1000, "running") == 15
+    assert interval_after(15, "running", "unknown") == 5, "a job was submitted"
+
+
+# --- the terminal ---------------------------------------------------------------------------------
+
+PLAN = "x" * 100_000
+COMMAND = f"set -euo pipefail;  python -m stages.workflow.plan --plan '{PLAN}'"
+
+
+@pytest.fixture
+def terminal(monkeypatch: pytest.MonkeyPatch) -> Iterator[io.StringIO]:
+    """What Snakemake's logger prints, with the handler that Snakemake makes."""
+    output = io.StringIO()
+    handler = ColorizingTextHandler(nocolor=True, stream=output)
+    handler.name = "DefaultStreamHandler"
+    handler.addFilter(DefaultFilter((), False, False, False, False))
+    handler.setFormatter(DefaultFormatter(None, False))
+    monkeypatch.setattr(logger, "handlers", [handler])
+    monkeypatch.setattr(logging, "raiseExceptions", True)
+    shorten_failures()
+    yield output
+
+
+def rule_exception(end: str) -> None:
+    text = 'RuleException:\nCalledProcessError in file "/p/Snakefile", line 94:\n'
+    text += f"Command '{COMMAND}' {end}\n"
+    logger.error(text, extra={"event": LogEvent.ERROR, "exception": "RuleException"})
+
+
+@pytest.mark.parametrize(
+    ("end", "said"),
+    [
+        ("returned non-zero exit status 2.", ""),
+        ("returned non-zero exit status 1.", "returned non-zero exit status 1"),
+        ("returned non-zero exit status 137.", "it was killed"),
+        ("died with <Signals.SIGKILL: 9>.", "it was killed"),
+        ("died with <Signals.SIGTERM: 15>.", "died with <Signals.SIGTERM: 15>"),
+    ],
+)
+def test_the_end_of_a_command_is_said_unless_the_job_has_a_message(
+    terminal: io.StringIO, end: str, said: str
+) -> None:
+    rule_exception(end)
+    assert said in terminal.getvalue() and len(terminal.getvalue()) < 200
+    assert bool(terminal.getvalue().strip()) == bool(said)
+
+
+def test_an_error_in_a_rule_names_its_log_and_no_command(terminal: io.StringIO) -> None:
+    names = ("jobid", "input", "output", "conda_env")
+    logger.error(
+        "Error in rule plan, jobid: 1",
+        extra={
+            "event": LogEvent.JOB_ERROR,
+            "rule_name": "plan",
+            "rule_msg": None,
+            "log": ["results/garden/logs/plan.log"],
+            "shellcmd": COMMAND,
+            "aux": {},
+            **dict.fromkeys(names),
+        },
+    )
+    said = terminal.getvalue()
+    assert "Error in rule plan" in said and "logs/plan.log" in said
+    assert "python -m" not in said and "None:" not in said
+
+
+def test_a_full_disk_under_snakemakes_own_files_is_named(terminal: io.StringIO) -> None:
+    logger.error(
+        "WorkflowError:\nError recording metadata for finished job ([Errno 28] No space left on "
+        "device). Please ensure write permissions",
+        extra={"event": LogEvent.ERROR, "exception": "WorkflowError"},
+    )
+    assert "the disk is full" in terminal.getvalue()
+    assert "permissions" not in terminal.getvalue()
+
+
+def test_other_messages_stay_as_they_are(terminal: io.StringIO) -> None:
+    logger.error("WorkflowError:\nMissing input", extra={"event": LogEvent.ERROR})
+    logger.warning("Building DAG of jobs...")
+    assert terminal.getvalue() == "WorkflowError:\nMissing input\nBuilding DAG of jobs...\n"
+
+
+def test_a_log_on_a_full_disk_prints_no_traceback(
+    terminal: io.StringIO, capsys: pytest.CaptureFixture[str]
+) -> None:
+    log = logging.FileHandler("/dev/full")
+    logger.addHandler(log)
+    logger.error("Error in rule plan")
+    assert terminal.getvalue() and capsys.readouterr().err == ""

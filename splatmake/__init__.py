@@ -54,9 +54,9 @@ class Quality:
     """Image quality of renders, as in metrics.json.
 
     Attributes:
-        psnr: in dB.
-        lpips: None if its weights are not installed.
-        views: name -> quality of a single view; empty for a single view.
+        psnr: The PSNR in dB.
+        lpips: The LPIPS, or None if its weights are not installed.
+        views: The quality of each view by its name; empty for a single view.
     """
 
     psnr: float
@@ -69,14 +69,14 @@ class Scene:
     """Gaussians with views and photographs of the same scene.
 
     Args:
-        gaussians: the model.
-        posed: the views, and the settings that the scene was trained with.
-        threads: threads for rendering; the number does not affect results.
-        appearance: of these Gaussians in photographs; None if it is not modelled.
+        gaussians: The model.
+        posed: The views, and the settings that the scene was trained with.
+        threads: The number of threads for rendering, which does not affect results.
+        appearance: How these Gaussians look in each photograph, or None if it is not modelled.
 
     Attributes:
-        gaussians: the model; can be replaced.
-        views: all views, sorted by name.
+        gaussians: The model, which can be replaced.
+        views: All views, sorted by name.
     """
 
     def __init__(
@@ -144,7 +144,7 @@ class Scene:
                 self._train,
                 Path(renders),
                 gains=self._gains,
-                # Of other Gaussians it is not known.
+                # The appearance of other Gaussians is not known.
                 appearance=self._appearance if self.gaussians is self._loaded else None,
                 threads=self._threads,
             )

@@ -53,7 +53,7 @@ def read_counters(folder: Path, model: type[C]) -> C:
     """The counters of the finished stage with this folder.
 
     Args:
-        model: of the stage's counters (``StageSpec.counters``).
+        model: The model of the stage's counters (``StageSpec.counters``).
 
     Raises:
         UserError: the stage's record is missing or damaged, belongs to another stage, or has

@@ -8,7 +8,7 @@ from pathlib import Path
 from pipeline.runtime.text import without_middle
 
 EXIT_USER_ERROR = 2
-# Characters of a line, and of the parts of a message.
+# The largest numbers of characters of a line, and of the parts of a message.
 _MAX_LINE = 600
 _MAX_WHAT, _MAX_FILE, _MAX_FIX = 1150, 280, 450
 EXIT_INTERRUPTED = 130
@@ -21,9 +21,9 @@ class UserError(Exception):
     A stage that raises it ends with its message and exit code 2, without a traceback.
 
     Args:
-        what: what is wrong, in one sentence: what was expected and what was found.
-        file: the file or folder concerned, if any.
-        fix: what to do, in one sentence.
+        what: A sentence that says what was expected and what was found.
+        file: The file or folder concerned, if any.
+        fix: A sentence that says what to do.
 
     Attributes:
         warnings: Sentences about other files of the same input, to be shown before the error.

@@ -36,7 +36,7 @@ class JsonFile(BaseModel):
     """The content of a file in a stage's folder.
 
     Attributes:
-        file_name: of the file.
+        file_name: The name of the file.
     """
 
     model_config = ConfigDict(frozen=True, allow_inf_nan=False)

@@ -51,8 +51,8 @@ def threads_within(threads: int, bytes_each: float, kept: float = 0.0) -> int:
     """The number of threads, at most ``threads``, that a part of the memory is enough for.
 
     Args:
-        bytes_each: memory that each thread needs.
-        kept: memory that all need together.
+        bytes_each: The bytes that each thread needs.
+        kept: The bytes that all threads need together.
     """
     available = _THREADS_SHARE * usable_memory() - kept
     return max(1, min(threads, int(available / max(bytes_each, 1.0))))
@@ -63,7 +63,7 @@ def usable_memory(root: Path = Path("/")) -> int:
     group (version 1 or 2, or a parent) set by a container, batch system or service manager.
 
     Args:
-        root: the folder of /proc and /sys.
+        root: The folder of /proc and /sys.
     """
     limits = [physical_memory()]
     try:

@@ -45,8 +45,8 @@ class Built:
     """A compiled library.
 
     Attributes:
-        target: the variant that it was compiled for.
-        compiler: the first line of the compiler's ``--version``.
+        target: The variant that it was compiled for.
+        compiler: The first line of the compiler's ``--version``.
     """
 
     path: Path
@@ -71,13 +71,13 @@ class NativeLibrary:
     """A shared library of all ``.cpp`` files of a folder.
 
     Attributes:
-        name: for messages.
-        file: the library's file name.
-        sources: folder of the sources and headers.
-        flags: compiler flags besides the variant's.
-        compile_only, link_only: further flags of one of the two steps; not recorded.
-        facts: name -> value of anything else that the library depends on.
-        extensions: see ``targets.usable_variants``.
+        name: The name that messages use.
+        file: The library's file name.
+        sources: The folder of the sources and headers.
+        flags: The compiler flags besides the variant's.
+        compile_only, link_only: Further flags of one of the two steps, which are not recorded.
+        facts: The values of anything else that the library depends on, by name.
+        extensions: The extensions of each target (see ``targets.usable_variants``).
     """
 
     name: str

@@ -50,7 +50,7 @@ _file: Path | None = None
 
 
 def write_progress_to(path: Path | None) -> None:
-    """Set the file that all ``Progress`` objects write their state to (atomically); None: none."""
+    """Set the file that all ``Progress`` objects write their state to, or None."""
     global _file
     _file = path
 
@@ -63,9 +63,9 @@ class Console:
     cannot be written, as on a full disk, are given up: the stage goes on without them.
 
     Args:
-        terminal: the original stderr.
-        log: an open file, or None.
-        name: prefix of progress lines on the terminal.
+        terminal: The original stderr.
+        log: An open file, or None.
+        name: The prefix of progress lines on the terminal.
     """
 
     def __init__(self, terminal: TextIO, log: TextIO | None, name: str = ""):
@@ -136,9 +136,9 @@ class Progress:
     """Counts units of work and shows the rate and the remaining time.
 
     Args:
-        label: the work ("extracting features").
-        total: number of units.
-        unit: name of a unit ("images").
+        label: The work, such as "extracting features".
+        total: The number of units.
+        unit: The name of the units, such as "images".
     """
 
     def __init__(self, label: str, total: int, unit: str = "it"):

@@ -158,7 +158,7 @@ def read_record(path: Path, model: type[M], fix: str | None = None) -> M:
     """A JSON file that a stage wrote, as ``model``.
 
     Args:
-        fix: what to do about a damaged file; None: rerun the stage whose folder it is in.
+        fix: The remedy for a damaged file. None means to rerun the stage whose folder it is in.
 
     Raises:
         UserError: it is missing, truncated, or not valid for ``model``.
@@ -178,7 +178,7 @@ def unreadable(
     """The error for a record that does not fit its model.
 
     Args:
-        inside: the field of the record that was validated; empty: all of it.
+        inside: The field of the record that was validated, or empty for the whole record.
     """
     first = error.errors()[0]
     where = ".".join(map(str, (*inside, *first["loc"])))

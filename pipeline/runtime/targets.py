@@ -20,8 +20,8 @@ class Target:
     """A named instruction set.
 
     Attributes:
-        flags: compiler flags (g++ 11, clang++ 12 or newer).
-        features: features that a processor must have, with Linux's names.
+        flags: The compiler flags (g++ 11, clang++ 12 or newer).
+        features: The features that a processor must have, with Linux's names.
     """
 
     name: str
@@ -138,7 +138,7 @@ def usable_variants(extensions: Extensions) -> list[Variant]:
     all extensions that the processor has, then the one without.
 
     Args:
-        extensions: target's name -> extensions that the library uses.
+        extensions: The extensions that the library uses, by the target's name.
     """
     available = processor.features()
     found: list[Variant] = []

@@ -8,7 +8,7 @@ from typing import Any
 
 # Control characters, surrogates (bytes that are not UTF-8), separators of lines and paragraphs.
 _REFUSED = frozenset({"Cc", "Cs", "Zl", "Zp"})
-# Of lists, as many values as lenses have numbers.
+# The largest number of numbers that a lens has.
 _REPR = reprlib.Repr()
 _REPR.maxlist = _REPR.maxtuple = 14
 

@@ -29,7 +29,7 @@ class ViewerFrame:
     float32 is precise enough for scenes of any unit and origin.
 
     Args:
-        views: the scene's cameras, at least one.
+        views: The scene's cameras, at least one.
     """
 
     def __init__(self, views: list[View]):
@@ -49,8 +49,8 @@ class ViewerFrame:
         Args:
             wxyz: (4,) rotation, camera to viewer's frame; x right, y down, z forward.
             position: (3,), viewer's frame.
-            fov: vertical, radians.
-            size: width and height in pixels.
+            fov: The vertical field of view in radians.
+            size: The width and height in pixels.
         """
         width, height = size
         focal = height / 2 / np.tan(fov / 2)
@@ -104,11 +104,11 @@ class Page:
     """The web server. ``stop`` ends it.
 
     Args:
-        source: the scene; polled for newer states.
-        host, port: address of the page; another port is taken if this one is in use.
-        side: longer side of the renders, pixels.
-        threads: number of threads of the rasterizer.
-        allowed_hosts: see ``access.refusal``.
+        source: The scene, which is polled for newer states.
+        host, port: The address of the page. Another port is taken if this one is in use.
+        side: The longer side of the renders in pixels.
+        threads: The number of threads of the rasterizer.
+        allowed_hosts: Further host names of the page (see ``access.refusal``).
 
     Raises:
         UserError: viser is not installed.

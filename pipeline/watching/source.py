@@ -22,9 +22,9 @@ class Snapshot:
     """A state of a scene.
 
     Attributes:
-        file: file of the Gaussians.
-        stamp: modification time of the file, ns.
-        summary: one line for display.
+        file: The file of the Gaussians.
+        stamp: The file's modification time in ns.
+        summary: One line for display.
     """
 
     gaussians: Gaussians

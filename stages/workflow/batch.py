@@ -27,9 +27,10 @@ def write_batch(outcomes: list[dict[str, Any]], results: Path) -> None:
     """Write the three files into the folder ``results``.
 
     Args:
-        outcomes: for each run ``run`` (scene, config, seed) and ``status``; unless that is "ok",
-            also ``stage`` and ``message`` (see ``pipeline.reporting.batch.Result``).
-        results: the folder of the runs.
+        outcomes: A record of each run with ``run`` (scene, config, seed) and ``status``. Unless
+            that is "ok", it also has ``stage`` and ``message`` (see
+            ``pipeline.reporting.batch.Result``).
+        results: The folder of the runs.
     """
     found = [result_of(outcome, results) for outcome in outcomes]
     write_text(results / "benchmark.csv", as_csv(found, list(STAGES)))

@@ -42,14 +42,14 @@ def train(job: Job, open_scene: Callable[[], GaussianSource], part: Part) -> Non
     """Train the job's block and write the result.
 
     Args:
-        open_scene: returns the Gaussians of the whole scene.
+        open_scene: A function that returns the Gaussians of the whole scene.
     """
     from pipeline.training.blocks.train import block_training, with_far_field
     from pipeline.training.scene import run_training
     from stages.workflow.training import training_run
 
     trained = run_training(
-        # Not a local variable here: what it is made from is not held during training.
+        # Without a local variable, what it is made from is freed before training.
         *block_training(_scene(job, open_scene), job.number, training_run(job, part))
     )
     gaussians = with_far_field(

@@ -79,7 +79,7 @@ def write_trained(job: Job, trained: TrainedScene, gaussians: Gaussians | None =
     """Write the outputs of a training, and record what it counted and decided.
 
     Args:
-        gaussians: the result; None: those that were trained.
+        gaussians: The Gaussians to write, or None for those that were trained.
     """
     from pipeline.io.appearance_files import write_appearance
     from pipeline.io.colmap import write_model

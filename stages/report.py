@@ -27,10 +27,12 @@ def work(job: Job) -> None:
     from pipeline.metrics.evaluation import Evaluation
     from pipeline.metrics.protocol import choose_protocol
     from pipeline.reporting.collect import collect_metrics
+    from pipeline.reporting.data import TrainedScene
     from pipeline.reporting.headline import headline
     from pipeline.reporting.metrics import read_runs, with_times
     from pipeline.reporting.page import write_report
-    from pipeline.reporting.scene import SceneResults, report_data
+    from pipeline.reporting.scene import read_results
+    from pipeline.scene.georeference import Georeference
 
     start = time.perf_counter()
     views, train = inputs.trained_views(job), job.section(Train)
@@ -43,19 +45,24 @@ def work(job: Job) -> None:
     )
     metrics.write(job.out)
     runs = read_runs(metrics, results, without=job.stage) | {job.stage: own}
-    scene = SceneResults(
-        scene=job.scene,
-        metrics=with_times(metrics, runs),
-        plan=plan,
-        folders=job.inputs,
-        manifest=inputs.read_manifest(job, "views"),
-        model=inputs.trained_model(job),
-        views=views,
+    protocol = choose_protocol(views, job.section(Split), train)
+    trained = TrainedScene(
         gaussians=inputs.trained_arrays(job),
-        protocol=choose_protocol(views, job.section(Split), train),
+        views=views,
+        orientations={p.name: p.orientation for p in inputs.read_manifest(job, "views").photos},
+        background=protocol.background,
         antialias=train.antialias,
+        near=protocol.near,
+        normalization=Georeference.normalization_of(job.inputs["poses"]),
     )
-    data = report_data(scene, evaluation, shown=job.section(Experiments).report.views)
+    data = read_results(
+        job.inputs,
+        with_times(metrics, runs),
+        plan,
+        trained,
+        inputs.trained_model(job).points,
+        shown=job.section(Experiments).report.views,
+    )
     write_report(data, job.out / "report.html")
     job.decide(headline(metrics))
 

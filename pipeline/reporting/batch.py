@@ -13,6 +13,7 @@ from typing import Any, Literal
 
 from pipeline.config.runs import Run
 from pipeline.plan.protocols import benchmark_scene
+from pipeline.reporting.metrics import TimedMetrics
 
 PUBLISHED = Path(__file__).with_name("published.json")
 
@@ -44,7 +45,7 @@ class Result:
         status: "left out": the folder is no scene; "not run": the run was not started.
         stage: name of the failed stage; empty otherwise.
         message: reason, if status is not "ok".
-        metrics: content of ``metrics.json`` if status is "ok", else empty.
+        metrics: The content of ``metrics.json`` with times; None unless status is "ok".
         size_mb: size of the exported Gaussians (PLY) in MB (10^6 bytes); None if there are none.
         machine: fields ``MACHINE`` of its training.
     """
@@ -53,7 +54,7 @@ class Result:
     status: Literal["ok", "failed", "not run", "left out"]
     stage: str = ""
     message: str = ""
-    metrics: Mapping[str, Any] = field(default_factory=dict)
+    metrics: TimedMetrics | None = None
     size_mb: float | None = None
     machine: Mapping[str, Any] = field(default_factory=dict)
 
@@ -75,7 +76,7 @@ class Spread:
 def row(result: Result, stages: Sequence[str] = ()) -> dict[str, Any]:
     """One line of ``benchmark.csv``: the run, its status, quality, and the time and memory of
     each of ``stages`` (empty if skipped). Names contain the units."""
-    m = result.metrics
+    m = {} if result.metrics is None else result.metrics.model_dump(mode="json")
     protocol = m.get("protocol") or {}
     pose = m.get("pose_error") or {}
     ran = {name: s for name, s in (m.get("stages") or {}).items() if not s["skipped"]}
@@ -191,7 +192,8 @@ def _spreads(rows: Sequence[Mapping[str, Any]]) -> dict[str, Spread]:
 
 def photographs(results: Sequence[Result], scene: str) -> int | None:
     """The number of photographs of a scene; None without a finished run."""
-    return next((r.metrics["total_images"] for r in results if r.ok and r.run.scene == scene), None)
+    found = (r.metrics.total_images for r in results if r.metrics and r.run.scene == scene)
+    return next(found, None)
 
 
 def published_for(scene: str, count: int | None) -> list[dict[str, Any]]:

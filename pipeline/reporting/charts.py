@@ -11,9 +11,10 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.reporting.text import escape
+from pipeline.reporting.html import render
 
 _WIDTH, _HEIGHT = 440, 250
 _LEFT, _RIGHT, _TOP, _BOTTOM = 58, 14, 14, 40
@@ -78,7 +79,7 @@ def line_chart(
     y_label: Label,
     timed: bool = False,
     log: bool = False,
-) -> str:
+) -> Markup:
     """A line chart, with the values of each point as a tooltip.
 
     Args:
@@ -99,19 +100,18 @@ def line_chart(
     y_ticks = log_ticks(y_low, y_high) if log else linear_ticks(y_low, y_high, 5)
     if len(y_ticks) < 2:
         y_ticks = linear_ticks(y_low, y_high, 5)
-    spots = [(across(x), up(y)) for x, y in zip(xs, ys, strict=True)]
-    path = " ".join(f"{x:.1f},{y:.1f}" for x, y in spots)
-    base = _HEIGHT - _BOTTOM
-    area = f"{spots[0][0]:.1f},{base} {path} {spots[-1][0]:.1f},{base}"
-    points = "".join(
-        f'<circle class="dot" cx="{sx:.1f}" cy="{sy:.1f}" r="5"><title>'
-        f"{escape(x_title)} {escape(clock(x) if timed else f'{x:,.0f}')}: {escape(y_label(y))}"
-        "</title></circle>"
-        for (sx, sy), x, y in zip(spots, xs, ys, strict=True)
+    spots = [
+        (across(x), up(y), f"{x_title} {clock(x) if timed else f'{x:,.0f}'}: {y_label(y)}")
+        for x, y in zip(xs, ys, strict=True)
+    ]
+    return _chart(
+        "line",
+        title,
+        x_title,
+        xs=[(across(t), x_label(t)) for t in x_ticks],
+        ys=[(up(t), short(t)) for t in y_ticks],
+        spots=spots,
     )
-    marks = f'<polygon class="area" points="{area}"/><polyline class="line" points="{path}"/>'
-    axes = _axes([(across(t), x_label(t)) for t in x_ticks], [(up(t), short(t)) for t in y_ticks])
-    return _svg(title, x_title, axes + marks + points)
 
 
 @dataclass(frozen=True)
@@ -137,7 +137,7 @@ _COLOURS = ("--accent", "--test", "--train", "--bad", "--good")
 
 def trade_off_chart(
     points: Sequence[ChartPoint], *, title: str, x_title: str, y_label: Label
-) -> str:
+) -> Markup:
     """Error against time, both logarithmic, with a line through the Pareto front of the named
     points.
 
@@ -157,31 +157,29 @@ def trade_off_chart(
     if len(y_ticks) < 3:
         y_ticks = [t for t in linear_ticks(y_low, y_high, 5) if t > 0]
     step = max(1, math.ceil(len(x_ticks) / 7))
-    axes = _axes(
-        [(across(t), clock(t)) for t in x_ticks[::step]], [(up(t), y_label(t)) for t in y_ticks]
-    )
-    front = pareto_front([d for d in points if d.name])
-    line = " ".join(f"{across(d.seconds):.1f},{up(d.error):.1f}" for d in front)
-    marks = f'<polyline class="front" points="{line}"/>'
+    dots = []
     taken: list[tuple[float, float]] = []
-    for dot in sorted(points, key=lambda d: (bool(d.name), d.error)):
-        x, y = across(dot.seconds), up(dot.error)
-        paint = f'style="fill: var({_COLOURS[dot.colour % len(_COLOURS)]})"'
-        size, faint = (5.5, "") if dot.name else (3, ' opacity=".45"')
-        name = ""
-        if dot.name:
-            left = x + 16 + 7.5 * len(dot.name) > _WIDTH
+    for point in sorted(points, key=lambda d: (bool(d.name), d.error)):
+        x, y = across(point.seconds), up(point.error)
+        dot = {"x": x, "y": y, "name": point.name, "tip": point.tip}
+        dot["colour"] = _COLOURS[point.colour % len(_COLOURS)]
+        if point.name:
+            left = x + 16 + 7.5 * len(point.name) > _WIDTH
             heights = [y + d for d in (-6, 14, -20, 28)]
             taken.append((x, next((h for h in heights if _free(x, h, taken)), y)))
-            name = (
-                f'<text class="name" x="{x + (-9 if left else 9):.1f}" y="{taken[-1][1]:.1f}" '
-                f'text-anchor="{"end" if left else "start"}">{escape(dot.name)}</text>'
-            )
-        marks += (
-            f'<g><title>{escape(dot.tip)}</title><circle cx="{x:.1f}" cy="{y:.1f}" r="{size}" '
-            f"{paint}{faint}/>{name}</g>"
-        )
-    return _svg(title, x_title, axes + marks)
+            dot["name_x"], dot["name_y"] = x + (-9 if left else 9), taken[-1][1]
+            dot["anchor"] = "end" if left else "start"
+        dots.append(dot)
+    front = pareto_front([d for d in points if d.name])
+    return _chart(
+        "trade_off",
+        title,
+        x_title,
+        xs=[(across(t), clock(t)) for t in x_ticks[::step]],
+        ys=[(up(t), y_label(t)) for t in y_ticks],
+        front=[(across(d.seconds), up(d.error)) for d in front],
+        dots=dots,
+    )
 
 
 def _free(x: float, y: float, taken: Sequence[tuple[float, float]]) -> bool:
@@ -200,7 +198,7 @@ def pareto_front(points: Sequence[ChartPoint]) -> list[ChartPoint]:
 
 def histogram(
     values: NDArray[Any], *, title: str, x_title: str, whole: bool = False, bins: int = 40
-) -> str:
+) -> Markup:
     """Counts of the values; those above the 99th percentile stand in the last bar.
 
     Args:
@@ -229,25 +227,22 @@ def histogram(
         else:
             name = f"{short(edges[i])} to {short(edges[i + 1])}"
         name = f"{short(edges[i])} or more" if last else name
-        bars.append(
-            f'<rect class="bar" x="{x:.1f}" y="{up(n):.1f}" width="{max(right - x, 0.5):.1f}" '
-            f'height="{_HEIGHT - _BOTTOM - up(n):.1f}"><title>{name}: {n:,}</title></rect>'
-        )
+        bars.append((x, up(n), max(right - x, 0.5), f"{name}: {n:,}"))
     ticks = linear_ticks(float(edges[0]), float(edges[-1]))
-    half = (
-        0.5 if whole and edges[1] - edges[0] == 1 else 0.0
-    )  # the label of an integer is at the middle of its bar
+    # The label of an integer is at the middle of its bar.
+    half = 0.5 if whole and edges[1] - edges[0] == 1 else 0.0
     ticks = [t for t in ticks if t == round(t) and t < edges[-1]] if whole else ticks
     median = float(np.median(values))
-    at = across(min(median + half, float(edges[-1])))
-    line = (
-        f'<line class="median" x1="{at:.1f}" x2="{at:.1f}" y1="{_TOP}" y2="{_HEIGHT - _BOTTOM}"/>'
-    )
     y_ticks = [t for t in linear_ticks(0.0, float(counts.max()) * 1.04, 5) if t == round(t)]
-    axes = _axes(
-        [(across(t + half), short(t)) for t in ticks], [(up(t), short(t)) for t in y_ticks]
+    return _chart(
+        "histogram",
+        title,
+        x_title,
+        xs=[(across(t + half), short(t)) for t in ticks],
+        ys=[(up(t), short(t)) for t in y_ticks],
+        bars=bars,
+        median=across(min(median + half, float(edges[-1]))),
     )
-    return _svg(title, x_title, axes + "".join(bars) + line)
 
 
 def _range(low: float, high: float, pad: float) -> tuple[float, float]:
@@ -268,23 +263,17 @@ def _scale(
     return lambda value: start + (value - low) / (high - low) * (stop - start)
 
 
-def _axes(xs: list[tuple[float, str]], ys: list[tuple[float, str]]) -> str:
-    base, right = _HEIGHT - _BOTTOM, _WIDTH - _RIGHT
-    parts = []
-    for y, label in ys:
-        parts.append(f'<line class="grid" x1="{_LEFT}" x2="{right}" y1="{y:.1f}" y2="{y:.1f}"/>')
-        parts.append(f'<text x="{_LEFT - 8}" y="{y + 4:.1f}" text-anchor="end">{label}</text>')
-    parts.append(f'<line class="axis" x1="{_LEFT}" x2="{right}" y1="{base}" y2="{base}"/>')
-    for x, label in xs:
-        parts.append(f'<text x="{x:.1f}" y="{base + 17}" text-anchor="middle">{label}</text>')
-    return "".join(parts)
-
-
-def _svg(title: str, x_title: str, inside: str) -> str:
-    middle = (_LEFT + _WIDTH - _RIGHT) / 2
-    return (
-        f'<figure class="chart"><figcaption>{escape(title)}</figcaption>'
-        f'<svg viewBox="0 0 {_WIDTH} {_HEIGHT}" role="img" aria-label="{escape(title)}">{inside}'
-        f'<text class="name" x="{middle}" y="{_HEIGHT - 5}" text-anchor="middle">'
-        f"{escape(x_title)}</text></svg></figure>"
+def _chart(kind: str, title: str, x_title: str, **values: Any) -> Markup:
+    """Draw a chart with the template of its kind."""
+    return render(
+        f"charts/{kind}.html.jinja",
+        title=title,
+        x_title=x_title,
+        width=_WIDTH,
+        height=_HEIGHT,
+        left=_LEFT,
+        right=_WIDTH - _RIGHT,
+        top=_TOP,
+        base=_HEIGHT - _BOTTOM,
+        **values,
     )

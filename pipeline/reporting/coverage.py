@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,51 +14,73 @@ from pipeline.coverage.record import (
     ProposedViewpoint,
     ViewCoverage,
 )
-from pipeline.reporting.data import CoverageSection, ReportData, TrainedScene
-from pipeline.reporting.pictures import data_uri, trust_colours, trust_gradient, upright
+from pipeline.reporting.data import SceneResults, TrainedScene
+from pipeline.reporting.pictures import Embedded, embedded, trust_colours, trust_gradient, upright
 from pipeline.reporting.space import upright_frame
-from pipeline.reporting.text import count, escape, fixed
+from pipeline.reporting.text import count, fixed
+from pipeline.scene.views import View
 
-_ABOVE = 440  # side of the map, pixels
-_MARGIN = 28
-_TICK = 17  # length of the line that shows a viewing direction, pixels
+# Pixels: the side of the map, and the length of the line that shows a viewing direction.
+_ABOVE, _MARGIN, _TICK = 440, 28, 17
 
 
-def coverage_section(data: ReportData) -> str:
-    """HTML of the section."""
-    shown = data.coverage
-    if shown is None:
-        return '<p class="hint">No coverage was recorded.</p>'
-    record = shown.record
-    if record.reason:
-        return f'<p class="hint">No coverage was measured: {escape(record.reason)}.</p>'
-    orientations = data.trained.orientations if data.trained else {}
-    worst = [view for view in record.views if view.trust_map is not None]
-    return (
-        '<p class="hint">Trust is a number from 0 to 1 for each pixel: how well the photographs '
-        "determine the surface point that it shows, from their number, the angles between them, "
-        "their resolution and the angle to this view. The photograph that the view is compared "
-        "with is not used.</p>"
-        f'<div class="scale">trust 0<i style="background: {trust_gradient()}"></i>1</div>'
-        f'<div class="unseen"><div>{_views(shown, worst, orientations)}{_facts(record)}'
-        f"{_above(record.viewpoints, data.trained)}</div><div>{_viewpoints(shown)}</div></div>"
+@dataclass(frozen=True)
+class Above:
+    """Map of the cameras and proposed viewpoints from above, in pixels.
+
+    Attributes:
+        cameras: The view, x and y of each camera.
+        viewpoints: For each viewpoint x and y, and those of the end of its viewing direction.
+    """
+
+    width: int
+    height: float
+    cameras: Sequence[tuple[View, float, float]]
+    viewpoints: Sequence[tuple[float, ...]]
+
+
+@dataclass(frozen=True)
+class CoverageContent:
+    """What the section shows beside the record.
+
+    Attributes:
+        worst: The test views of least trust.
+        facts: Names and values.
+        above: The map; None without viewpoints.
+        gradient: The colours of trust as CSS.
+        pictures: The images of the record by name.
+    """
+
+    worst: Sequence[ViewCoverage]
+    facts: Sequence[tuple[str, str]]
+    above: Above | None
+    gradient: str
+    pictures: Mapping[str, NDArray[np.uint8]]
+
+    def pair(
+        self, entry: ViewCoverage | ProposedViewpoint, orientation: int
+    ) -> list[tuple[str, Embedded]]:
+        """The render and the trust map of a view, rotated by an EXIF orientation."""
+        assert entry.render is not None and entry.trust_map is not None
+        trust = trust_colours(self.pictures[entry.trust_map])
+        pictures = {"render": self.pictures[entry.render], "trust": trust}
+        return [(kind, embedded(upright(p, orientation))) for kind, p in pictures.items()]
+
+
+def coverage_content(results: SceneResults) -> CoverageContent:
+    """The content of the section."""
+    shown = results.coverage
+    views = [view for view in shown.record.views if view.trust_map is not None]
+    return CoverageContent(
+        worst=sorted(views, key=lambda view: view.mean_trust or 0.0),
+        facts=_facts(shown.record),
+        above=_above(shown.record.viewpoints, results.trained),
+        gradient=trust_gradient(),
+        pictures=shown.pictures,
     )
 
 
-def _views(
-    shown: CoverageSection, views: Sequence[ViewCoverage], orientations: Mapping[str, int]
-) -> str:
-    if not views:
-        return ""
-    items = "".join(
-        f"<li><p>{escape(view.name)}: mean trust {fixed(view.mean_trust, 2)}, PSNR "
-        f"{fixed(view.psnr, 2)} dB</p>{_pair(shown, view, orientations.get(view.name, 1))}</li>"
-        for view in sorted(views, key=lambda view: view.mean_trust or 0.0)
-    )
-    return f"<h3>Test views of least trust</h3><ol>{items}</ol>"
-
-
-def _facts(record: CoverageRecord) -> str:
+def _facts(record: CoverageRecord) -> list[tuple[str, str]]:
     rows: list[tuple[str, str]] = []
     if record.surface is not None:
         seen = record.surface.seen_by
@@ -80,8 +103,7 @@ def _facts(record: CoverageRecord) -> str:
         rows.append(("floaters near cameras", number + (f", near {near}" if near else "")))
     if record.error is not None:
         rows += _error_rows(record.error)
-    inside = "".join(f"<dt>{escape(name)}</dt><dd>{escape(text)}</dd>" for name, text in rows)
-    return f"<dl>{inside}</dl>"
+    return rows
 
 
 def _error_rows(error: ErrorByTrust) -> list[tuple[str, str]]:
@@ -99,43 +121,9 @@ def _error_rows(error: ErrorByTrust) -> list[tuple[str, str]]:
     return rows
 
 
-def _viewpoints(shown: CoverageSection) -> str:
-    viewpoints = shown.record.viewpoints
-    if not viewpoints:
-        return "<h3>To photograph next</h3><p>No nearby viewpoint would add much trust.</p>"
-    items = "".join(
-        f"<li><p><b>{i + 1}.</b> {escape(_sentence(view.description))} {view.unknown_percent:.0f} "
-        f"% of this view is unknown; a photograph would add {view.gain_percent:.0f} % of the "
-        f"trust that is missing around the photographs.</p>{_pair(shown, view, 1)}</li>"
-        for i, view in enumerate(viewpoints)
-    )
-    return (
-        '<h3>To photograph next</h3><p class="hint">Each gain is in addition to the proposals '
-        "before it. The images are the current render from there, and its trust.</p>"
-        f"<ol>{items}</ol>"
-    )
-
-
-def _sentence(text: str) -> str:
-    return text[:1].upper() + text[1:] + "."
-
-
-def _pair(shown: CoverageSection, entry: ViewCoverage | ProposedViewpoint, orientation: int) -> str:
-    assert entry.render is not None and entry.trust_map is not None
-    render, trust = shown.pictures[entry.render], shown.pictures[entry.trust_map]
-    pictures = (("render", render), ("trust", trust_colours(trust)))
-    images = "".join(
-        f'<img src="{data_uri(picture)}" width="{picture.shape[1]}" height="{picture.shape[0]}" '
-        f'alt="{kind}">'
-        for kind, picture in ((kind, upright(p, orientation)) for kind, p in pictures)
-    )
-    return f'<div class="pair">{images}</div>'
-
-
-def _above(viewpoints: Sequence[ProposedViewpoint], scene: TrainedScene | None) -> str:
-    """Map of the cameras and proposed viewpoints, as SVG."""
-    if scene is None or not scene.views or not viewpoints:
-        return ""
+def _above(viewpoints: Sequence[ProposedViewpoint], scene: TrainedScene) -> Above | None:
+    if not scene.views or not viewpoints:
+        return None
     frame = upright_frame(np.stack([view.world_to_camera[:3, :3] for view in scene.views]))
     plan = frame[[0, 2]]
     cameras = np.stack([view.centre for view in scene.views]) @ plan.T
@@ -149,23 +137,13 @@ def _above(viewpoints: Sequence[ProposedViewpoint], scene: TrainedScene | None) 
     def at(place: NDArray[np.float64]) -> NDArray[np.float64]:
         return np.asarray(_MARGIN + (place - low) * scale)
 
-    marks = []
-    for view, place in zip(scene.views, at(cameras), strict=True):
-        kind = "test" if view.is_test else "train"
-        marks.append(
-            f'<circle class="{kind}" cx="{place[0]:.1f}" cy="{place[1]:.1f}" r="4"><title>'
-            f"{escape(view.name)}</title></circle>"
-        )
-    for i, (viewpoint, place) in enumerate(zip(viewpoints, at(places), strict=True)):
-        end = place + _TICK * (plan @ np.array(viewpoint.direction))
-        marks.append(
-            f'<path class="next" d="M{place[0]:.1f} {place[1]:.1f}L{end[0]:.1f} {end[1]:.1f}"/>'
-            f'<circle class="next" cx="{place[0]:.1f}" cy="{place[1]:.1f}" r="6"/>'
-            f'<text x="{place[0]:.1f}" y="{place[1] - 9:.1f}">{i + 1}</text>'
-        )
-    return (
-        f'<h3>From above</h3><svg class="above" viewBox="0 0 {_ABOVE} {height:.0f}" role="img" '
-        f'aria-label="cameras and viewpoints from above">{"".join(marks)}</svg>'
+    starts = at(places)
+    ends = starts + _TICK * (np.array([v.direction for v in viewpoints]) @ plan.T)
+    return Above(
+        width=_ABOVE,
+        height=height,
+        cameras=[(view, *at) for view, at in zip(scene.views, at(cameras).tolist(), strict=True)],
+        viewpoints=np.hstack([starts, ends]).tolist(),
     )
 
 

@@ -5,27 +5,19 @@ from __future__ import annotations
 import textwrap
 from collections.abc import Mapping
 
+from markupsafe import Markup
+
 from pipeline.plan.record import PlanRecord
 from pipeline.plan.values import StagePlan
-from pipeline.reporting.text import escape
+from pipeline.reporting.html import render
 
 _BOX_W, _BOX_H = 92, 34
 _GAP_X, _GAP_Y = 26, 16
 _MARGIN = 8
 _REASON_CHARS, _REASON_LINES, _LINE_H = 20, 5, 12
-# Colours are CSS variables of the page, if there are any, so that the theme applies.
-_STYLE = (
-    ".plan text{font:600 13px system-ui,sans-serif;fill:var(--ink,#16191d);text-anchor:middle}"
-    ".plan .why{font-size:10px;font-weight:400;fill:var(--soft,#5d6673)}"
-    ".plan rect{fill:var(--card,#fff);stroke:var(--accent,#0d7d74);stroke-width:1.5}"
-    ".plan .skipped rect{stroke:var(--soft,#5d6673);stroke-width:1;stroke-dasharray:4 3;"
-    "fill:none}.plan .skipped .name{fill:var(--soft,#5d6673);font-weight:400}"
-    ".plan path{fill:none;stroke:var(--accent,#0d7d74);stroke-width:1.5}"
-    ".plan .head{fill:var(--accent,#0d7d74);stroke:none}"
-)
 
 
-def plan_svg(plan: PlanRecord) -> str:
+def plan_svg(plan: PlanRecord) -> Markup:
     """The plan as an ``<svg>`` element, for a page or as a separate file.
 
     Returns:
@@ -49,12 +41,21 @@ def plan_svg(plan: PlanRecord) -> str:
         )
         for name, (column, lane) in places.items()
     }
-    parts = [_arrow(corner[source], corner[target]) for source, target in edges]
-    parts += [_box(name, stage, *corner[name]) for name, stage in stages.items()]
-    label = escape(f"plan of {plan.scene}")
-    return (
-        f'<svg class="plan" xmlns="http://www.w3.org/2000/svg" viewBox="0 0 {width} {height}" '
-        f'role="img" aria-label="{label}"><style>{_STYLE}</style>{"".join(parts)}</svg>'
+    boxes = [
+        {"name": name, "stage": stage, "x": corner[name][0], "y": corner[name][1]}
+        | {"reason": [] if stage.run else _reason(stage.reason)}
+        for name, stage in stages.items()
+    ]
+    return render(
+        "plan.svg.jinja",
+        scene=plan.scene,
+        width=width,
+        height=height,
+        arrows=[_arrow(corner[source], corner[target]) for source, target in edges],
+        boxes=boxes,
+        box_width=_BOX_W,
+        box_height=_BOX_H,
+        line_height=_LINE_H,
     )
 
 
@@ -102,26 +103,13 @@ def _places(
     return places, column + 1, lanes
 
 
-def _box(name: str, stage: StagePlan, x: float, y: float) -> str:
-    tip = "\n".join([stage.reason, *stage.decisions])
-    why = "" if stage.run else _reason(stage.reason, x + _BOX_W / 2, y + _BOX_H + _LINE_H)
-    return (
-        f'<g class="{"run" if stage.run else "skipped"}"><title>{escape(name)}: {escape(tip)}'
-        f'</title><rect x="{x}" y="{y}" width="{_BOX_W}" height="{_BOX_H}" rx="8"/>'
-        f'<text class="name" x="{x + _BOX_W / 2}" y="{y + _BOX_H / 2 + 4.5}">{escape(name)}</text>'
-        f"{why}</g>"
-    )
+def _reason(text: str) -> list[str]:
+    """The lines below the box of a skipped stage."""
+    return textwrap.wrap(text, _REASON_CHARS, max_lines=_REASON_LINES, placeholder=" \u2026")
 
 
-def _reason(text: str, x: float, y: float) -> str:
-    lines = textwrap.wrap(text, _REASON_CHARS, max_lines=_REASON_LINES, placeholder=" \u2026")
-    return "".join(
-        f'<text class="why" x="{x}" y="{y + i * _LINE_H}">{escape(line)}</text>'
-        for i, line in enumerate(lines)
-    )
-
-
-def _arrow(source: tuple[float, float], target: tuple[float, float]) -> str:
+def _arrow(source: tuple[float, float], target: tuple[float, float]) -> tuple[str, float, float]:
+    """The path of an arrow, and where its head ends."""
     x0, y0 = source[0] + _BOX_W, source[1] + _BOX_H / 2
     x1, y1 = target[0], target[1] + _BOX_H / 2
     # Bends lie next to the boxes: other boxes may be in between.
@@ -132,7 +120,4 @@ def _arrow(source: tuple[float, float], target: tuple[float, float]) -> str:
     if y1 < y0:
         start = x1 - 2 * bend
         middle = f"L{start} {y0} C{start + bend} {y0} {start + bend} {y1} {x1 - 6} {y1}"
-    return (
-        f'<path d="M{x0} {y0} {middle} L{x1 - 5} {y1}"/>'
-        f'<path class="head" d="M{x1} {y1} l-8 -4.5 v9 z"/>'
-    )
+    return f"M{x0} {y0} {middle} L{x1 - 5} {y1}", x1, y1

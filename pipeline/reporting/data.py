@@ -1,9 +1,9 @@
-"""The content of the report page."""
+"""The results of a scene that its page shows."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from pipeline.coverage.record import CoverageRecord
 from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.plan.record import PlanRecord
+from pipeline.reporting.metrics import TimedMetrics
 from pipeline.scene.blocks import Partition
 from pipeline.scene.normalization import IDENTITY, Normalization
+from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
 from pipeline.training.loop.curve import CurveRecord
@@ -110,42 +112,31 @@ class TrainingRecord(NamedTuple):
     seconds: float
 
 
-def _empty(*shape: int) -> NDArray[np.float64]:
-    return np.zeros(shape)
-
-
 @dataclass(frozen=True)
-class ReportData:
-    """Content of the page of one scene. For empty values the page states that they are missing.
+class SceneResults:
+    """The results of one scene, read once from the outputs of its stages.
 
     Attributes:
-        scene: its name.
-        metrics: the content of ``metrics.json``.
-        plan: of the scene, or None.
-        decisions: stage -> its decisions, as recorded in ``stage.json``.
-        curve: the training curve.
-        comparisons: views to show, worst first.
-        trained: the Gaussians and their views.
-        coverage: None without a record.
-        blocks: None for a scene that was trained as one block.
-        points_xyz, points_rgb: (P, 3) world, uint8; thinned for the page.
-        reprojection_errors: pixels, one per sparse point.
-        track_lengths: number of images, one per sparse point.
+        metrics: The content of ``metrics.json`` with the times of the stages.
+        plan: The plan of the scene.
+        trained: The Gaussians and their views.
+        points: The sparse points, world.
+        coverage: The coverage by the photographs.
+        decisions: The decisions of each stage, the plan's and those of ``stage.json``.
+        curve: The training curve.
+        comparisons: The views to show, worst first.
+        blocks: The trained blocks; None for a scene that was trained as one block.
     """
 
-    scene: str
-    metrics: Mapping[str, Any]
-    plan: PlanRecord | None = None
-    decisions: Mapping[str, Sequence[str]] = field(default_factory=dict)
-    curve: Sequence[TrainingRecord] = ()
-    comparisons: Sequence[Comparison] = ()
-    trained: TrainedScene | None = None
-    coverage: CoverageSection | None = None
+    metrics: TimedMetrics
+    plan: PlanRecord
+    trained: TrainedScene
+    points: Points
+    coverage: CoverageSection
+    decisions: Mapping[str, Sequence[str]]
+    curve: Sequence[TrainingRecord]
+    comparisons: Sequence[Comparison]
     blocks: BlocksSection | None = None
-    points_xyz: NDArray[np.float64] = field(default_factory=lambda: _empty(0, 3))
-    points_rgb: NDArray[np.uint8] = field(default_factory=lambda: _empty(0, 3).astype(np.uint8))
-    reprojection_errors: NDArray[Any] = field(default_factory=lambda: _empty(0))
-    track_lengths: NDArray[Any] = field(default_factory=lambda: _empty(0))
 
 
 def ranked(per_view: Sequence[ViewMetrics], count: int) -> list[tuple[Rank, ViewMetrics]]:
@@ -158,16 +149,8 @@ def ranked(per_view: Sequence[ViewMetrics], count: int) -> list[tuple[Rank, View
     chosen: list[tuple[Rank, ViewMetrics]] = []
     for i in range(count):
         share = i / (count - 1)
-        label: Rank = (
-            "worst"
-            if i == 0
-            else "best"
-            if i == count - 1
-            else "median"
-            if share == 0.5
-            else "low"
-            if share < 0.5
-            else "high"
-        )
+        label: Rank = "median" if share == 0.5 else "low" if share < 0.5 else "high"
+        if share in (0, 1):
+            label = "best" if share else "worst"
         chosen.append((label, ordered[round(share * (len(ordered) - 1))]))
     return chosen

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar, Literal
+from typing import ClassVar, Literal
 
 from pydantic import Field
 
@@ -53,6 +53,20 @@ class Metrics(JsonFile, SceneQuality):
     warnings: list[str] = Field(description="Of the plan and of all stages.")
 
 
+class TimedStage(StageStatus):
+    """Whether a stage has run, and its cost."""
+
+    wall_s: float = 0.0
+    cpu_s: float = 0.0
+    peak_rss_mb: float = 0.0
+
+
+class TimedMetrics(Metrics):
+    """A scene's result in numbers, with the cost of each stage."""
+
+    stages: dict[str, TimedStage]  # type: ignore[assignment]
+
+
 def read_metrics(folder: Path) -> Metrics:
     """The metrics of a finished scene's folder (``results/<scene>``).
 
@@ -86,13 +100,14 @@ def together(runs: Sequence[RunRecord]) -> RunRecord:
     return runs[-1].model_copy(update={**summed, "peak_rss_mb": peak, "curve_seconds": None})
 
 
-def with_times(metrics: Metrics, runs: Mapping[str, RunRecord]) -> dict[str, Any]:
-    """The metrics for people: with ``wall_s``, ``cpu_s`` and ``peak_rss_mb`` of each stage, zero
-    for skipped ones. Work that was killed and resumed counts its earlier processes, too."""
-    shown = metrics.model_dump(mode="json")
-    for name, stage in shown["stages"].items():
-        run = runs.get(name)
-        stage["wall_s"] = 0.0 if run is None else round(run.wall_s + run.earlier_s, 3)
-        stage["cpu_s"] = 0.0 if run is None else run.cpu_s
-        stage["peak_rss_mb"] = 0.0 if run is None else run.peak_rss_mb
-    return shown
+def with_times(metrics: Metrics, runs: Mapping[str, RunRecord]) -> TimedMetrics:
+    """The metrics with the times of each stage, which are zero for skipped ones. Work that was
+    killed and resumed counts its earlier processes, too."""
+    shown = metrics.model_dump()
+    for name, run in runs.items():
+        shown["stages"][name] |= {
+            "wall_s": round(run.wall_s + run.earlier_s, 3),
+            "cpu_s": run.cpu_s,
+            "peak_rss_mb": run.peak_rss_mb,
+        }
+    return TimedMetrics.model_validate(shown)

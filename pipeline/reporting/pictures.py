@@ -6,7 +6,7 @@ import base64
 import io
 from collections.abc import Sequence
 from functools import cache
-from typing import Any
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -114,39 +114,31 @@ def shrunk(picture: Picture, max_side: int) -> Picture:
     return np.asarray(Image.fromarray(picture).resize(size, Image.Resampling.BOX))
 
 
-def page_pictures(views: Sequence[Comparison]) -> list[list[tuple[str, int, int]]]:
-    """The triples of all views for one page, reduced to fit a total size in bytes.
+class Embedded(NamedTuple):
+    """An image in a page: its data URI, and its size in pixels."""
 
-    Returns:
-        For each view its photograph, render and error map as (data URI, width, height).
-    """
+    uri: str
+    width: int
+    height: int
+
+
+def page_pictures(views: Sequence[Comparison]) -> list[dict[str, Embedded]]:
+    """The photograph, render and error map of each view, reduced to fit a total size in bytes."""
     triples = [triple(view) for view in views]
     side = _PAGE_SIDE
     while True:
-        small = [[shrunk(picture, side) for picture in pictures] for pictures in triples]
-        encoded = [[_jpeg(picture) for picture in pictures] for pictures in small]
-        if sum(len(data) for row in encoded for data in row) <= _PAGE_BUDGET or side <= 100:
-            break
+        rows = [[embedded(shrunk(picture, side)) for picture in row] for row in triples]
+        # base64 makes 4 characters of 3 bytes.
+        size = sum(len(picture.uri) for row in rows for picture in row) * 3 // 4
+        if size <= _PAGE_BUDGET or side <= 100:
+            kinds = "photograph", "render", "error"
+            return [dict(zip(kinds, row, strict=True)) for row in rows]
         side = side * 4 // 5
-    return [
-        [
-            (_data_uri(data), picture.shape[1], picture.shape[0])
-            for data, picture in zip(row, pictures, strict=True)
-        ]
-        for row, pictures in zip(encoded, small, strict=True)
-    ]
 
 
-def data_uri(picture: Picture) -> str:
+def embedded(picture: Picture, quality: int = _JPEG_QUALITY) -> Embedded:
     """The image as a JPEG data URI."""
-    return _data_uri(_jpeg(picture))
-
-
-def _jpeg(picture: Picture) -> bytes:
     buffer = io.BytesIO()
-    Image.fromarray(picture).save(buffer, "JPEG", quality=_JPEG_QUALITY, optimize=True)
-    return buffer.getvalue()
-
-
-def _data_uri(jpeg: bytes) -> str:
-    return "data:image/jpeg;base64," + base64.b64encode(jpeg).decode()
+    Image.fromarray(picture).save(buffer, "JPEG", quality=quality, optimize=True)
+    uri = "data:image/jpeg;base64," + base64.b64encode(buffer.getvalue()).decode()
+    return Embedded(uri, picture.shape[1], picture.shape[0])

@@ -1,18 +1,15 @@
-"""Reads the content of a scene's page from the outputs of its stages."""
+"""Reads the results of a scene from the outputs of its stages."""
 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from PIL import Image
 
 from pipeline.coverage.record import CoverageRecord, ProposedViewpoint, ViewCoverage
-from pipeline.metrics.evaluation import Evaluation
-from pipeline.metrics.protocol import Protocol
+from pipeline.metrics.evaluation import ViewMetrics
 from pipeline.photos.load import load_view
 from pipeline.plan.record import PlanRecord
 from pipeline.reporting.data import (
@@ -20,107 +17,77 @@ from pipeline.reporting.data import (
     BlocksSection,
     Comparison,
     CoverageSection,
-    ReportData,
+    Rank,
+    SceneResults,
     TrainedScene,
     TrainingRecord,
     ranked,
 )
-from pipeline.reporting.metrics import together
+from pipeline.reporting.metrics import TimedMetrics, together
 from pipeline.runtime.counters import read_counters
 from pipeline.runtime.json_file import mismatch
 from pipeline.runtime.record import read_run, read_stage
 from pipeline.scene.blocks import Partition
-from pipeline.scene.georeference import Georeference
-from pipeline.scene.manifest import Manifest
-from pipeline.scene.reconstruction import Reconstruction
-from pipeline.scene.views import View
-from pipeline.splats.arrays import GaussianArrays
+from pipeline.scene.reconstruction import Points
 from pipeline.training.loop.counters import TrainCounters
 from pipeline.training.loop.curve import TrainingCurve
 
 
-@dataclass(frozen=True)
-class SceneResults:
-    """Outputs of the stages of a scene.
-
-    Attributes:
-        metrics: the content of ``metrics.json`` with the times of the stages.
-        folders: role -> the stage's folder: inspect, poses, train, evaluate and coverage.
-        manifest: photographs of the views.
-        model: cameras (refined, if training refines them) and sparse points.
-        protocol: of the evaluation. antialias: as in training.
-    """
-
-    scene: str
-    metrics: Mapping[str, Any]
-    plan: PlanRecord
-    folders: Mapping[str, Path]
-    manifest: Manifest
-    model: Reconstruction
-    views: list[View]
-    gaussians: GaussianArrays
-    protocol: Protocol
-    antialias: bool
-
-
-def report_data(results: SceneResults, evaluation: Evaluation, shown: int) -> ReportData:
-    """The content of the page.
+def read_results(
+    folders: Mapping[str, Path],
+    metrics: TimedMetrics,
+    plan: PlanRecord,
+    trained: TrainedScene,
+    points: Points,
+    shown: int,
+) -> SceneResults:
+    """Read the results of a scene.
 
     Args:
-        evaluation: of views of the scene.
-        shown: number of views shown with their photographs.
+        folders: The folders of inspect, train, evaluate and coverage, by stage.
+        metrics: The content of ``metrics.json`` with the times of the stages.
+        plan: The plan of the scene.
+        trained: The Gaussians and their views.
+        points: The sparse points, world.
+        shown: The number of views shown with their photographs.
 
     Raises:
         UserError: an output of a stage is missing, damaged, or does not match the others.
     """
-    points = results.model.points
-    return ReportData(
-        scene=results.scene,
-        metrics=results.metrics,
-        plan=results.plan,
-        decisions=_decisions(results.plan, results.folders["inspect"].parent),
-        curve=_curve(results.folders["train"]),
-        comparisons=_comparisons(results, evaluation, shown),
-        trained=TrainedScene(
-            gaussians=results.gaussians,
-            views=results.views,
-            orientations={photo.name: photo.orientation for photo in results.manifest.photos},
-            background=results.protocol.background,
-            antialias=results.antialias,
-            near=results.protocol.near,
-            normalization=Georeference.normalization_of(results.folders["poses"]),
-        ),
-        coverage=_coverage(results.folders["coverage"]),
-        blocks=_blocks(results.plan, results.folders["inspect"].parent),
-        points_xyz=points.xyz,
-        points_rgb=points.rgb,
-        reprojection_errors=points.error[points.error >= 0],
-        track_lengths=points.track_length,
+    scene = folders["inspect"].parent
+    return SceneResults(
+        metrics=metrics,
+        plan=plan,
+        trained=trained,
+        points=points,
+        coverage=_coverage(folders["coverage"]),
+        decisions=_decisions(plan, scene),
+        curve=_curve(folders["train"]),
+        comparisons=[
+            _comparison(label, measured, trained, folders["evaluate"] / "renders")
+            for label, measured in ranked(metrics.per_view, shown)
+        ],
+        blocks=_blocks(plan, scene),
     )
 
 
-def _comparisons(results: SceneResults, evaluation: Evaluation, shown: int) -> list[Comparison]:
-    """The views to show, worst to best, each beside its photograph."""
-    photos = {photo.name: photo for photo in results.manifest.photos}
-    by_name = {view.name: view for view in results.views}
-    comparisons = []
-    for label, measured in ranked(evaluation.per_view, shown):
-        view = by_name[measured.name]
-        pixels = load_view(view)
-        with Image.open(results.folders["evaluate"] / "renders" / measured.render) as render:
-            comparisons.append(
-                Comparison(
-                    label=label,
-                    name=view.name,
-                    photograph=pixels.over(results.protocol.background),
-                    render=np.asarray(render),
-                    mask=pixels.mask,
-                    psnr=measured.psnr,
-                    ssim=measured.ssim,
-                    orientation=photos[view.name].orientation,
-                )
-            )
-    return comparisons
+def _comparison(
+    label: Rank, measured: ViewMetrics, trained: TrainedScene, renders: Path
+) -> Comparison:
+    """A measured view beside its photograph."""
+    view = next(view for view in trained.views if view.name == measured.name)
+    pixels = load_view(view)
+    with Image.open(renders / measured.render) as render:
+        return Comparison(
+            label=label,
+            name=view.name,
+            photograph=pixels.over(trained.background),
+            render=np.asarray(render),
+            mask=pixels.mask,
+            psnr=measured.psnr,
+            ssim=measured.ssim,
+            orientation=trained.orientations[view.name],
+        )
 
 
 def _coverage(folder: Path) -> CoverageSection:

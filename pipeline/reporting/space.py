@@ -6,18 +6,20 @@ The viewer is ``viewer/viewer.js``; the page holds it as one script, built befor
 from __future__ import annotations
 
 import base64
-import json
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
+from jinja2.utils import htmlsafe_json_dumps
+from markupsafe import Markup
 from numpy.typing import NDArray
 
-from pipeline.reporting.data import ReportData, TrainedScene
+from pipeline.reporting.data import SceneResults
 from pipeline.reporting.fit import Packed, fit
-from pipeline.reporting.text import count, escape
+from pipeline.reporting.text import count
 from pipeline.scene.views import View
+from pipeline.splats.arrays import GaussianArrays
 
 Array = NDArray[np.float64]
 
@@ -31,61 +33,50 @@ _STEP = _REACH / 32767
 _SPZ_RADII = (0.1, 100.0)
 
 
-def viewer_script() -> str:
+class ViewerContent(NamedTuple):
+    """What the section of the viewer shows.
+
+    Attributes:
+        shown: A sentence on the Gaussians in the page.
+        data: The viewer's input as JSON (``viewer_data``).
+        spz: The Gaussians as SPZ in base64.
+    """
+
+    shown: str
+    data: Markup
+    spz: str
+
+
+def viewer_script() -> Markup:
     """JavaScript of the viewer, to be placed after the elements of the section."""
-    return _VIEWER.read_text("utf-8")
+    return Markup(_VIEWER.read_text("utf-8"))
 
 
-def space_section(data: ReportData, max_bytes: int) -> str:
-    """HTML of the section.
+def viewer_content(results: SceneResults, max_bytes: int) -> ViewerContent:
+    """The content of the section.
 
     Args:
-        max_bytes: size limit of the Gaussians in the page.
+        max_bytes: The size limit of the Gaussians in the page.
     """
-    data = sized_for_spz(data)
-    scene = data.trained
-    if scene is None:
-        return '<p class="hint">There is no trained scene.</p>'
-    centres = np.array([view.centre for view in scene.views]).reshape(-1, 3)
-    packed = fit(scene.gaussians, centres, max_bytes * 3 // 4)  # base64 makes 4 bytes of 3
-    names = "".join(
-        f'<option value="{i}">{escape(view.name)}{" (test view)" if view.is_test else ""}</option>'
-        for i, view in enumerate(scene.views)
-    )
-    test = sum(view.is_test for view in scene.views)
-    return (
-        '<p class="hint">Drag to rotate; drag with the right button or two fingers to pan; click '
-        "the scene once to zoom with the wheel. Click a camera to look through it. Keys: "
-        "arrows, with Shift to pan, + and \u2212.</p>"
-        '<div id="space"><canvas tabindex="0" aria-label="the trained scene"></canvas>'
-        '<output></output><p role="status">Loading the scene\u2026</p></div>'
-        '<form id="space-tools"><fieldset disabled>'
-        f'<label>View <select name="view"><option value="">overview</option>{names}</select>'
-        '</label><button type="button" name="previous" aria-label="previous view">\u2039</button>'
-        '<button type="button" name="next" aria-label="next view">\u203a</button>'
-        '<label><input type="checkbox" name="cameras" checked> Cameras</label>'
-        '<span class="choice"><label><input type="radio" name="show" value="splats" checked>'
-        'Gaussians</label><label><input type="radio" name="show" value="points">Sparse points'
-        '</label></span><button type="button" name="full">Full screen</button></fieldset></form>'
-        f'<div class="keys"><span>{_shown(scene, packed)}</span>'
-        f'<span><i style="background: var(--train)"></i>{count(len(scene.views) - test)} training '
-        f'cameras</span><span><i style="background: var(--test)"></i>{count(test)} test '
-        f"cameras</span><span>{count(len(data.points_xyz))} sparse points</span></div>"
-        f'<script type="application/json" id="space-data">{_json(viewer_data(data, scene))}'
-        f'</script><script type="text/plain" id="splats">{_base64(packed.spz)}</script>'
+    results = sized_for_spz(results)
+    centres = np.array([view.centre for view in results.trained.views]).reshape(-1, 3)
+    # base64 makes 4 characters of 3 bytes.
+    packed = fit(results.trained.gaussians, centres, max_bytes * 3 // 4)
+    return ViewerContent(
+        shown=_shown(results.trained.gaussians, packed),
+        data=htmlsafe_json_dumps(viewer_data(results), separators=(",", ":")),
+        spz=_base64(packed.spz),
     )
 
 
-def sized_for_spz(data: ReportData) -> ReportData:
+def sized_for_spz(results: SceneResults) -> SceneResults:
     """The same scene, scaled to radius 1 if SPZ cannot represent its radius."""
-    scene = data.trained
-    if scene is None:
-        return data
+    scene, points = results.trained, results.points
     centres = np.array([view.centre for view in scene.views]).reshape(-1, 3)
-    finite = np.isfinite(data.points_xyz).all(axis=1)
-    _, radius = _robust_box(data.points_xyz[finite], centres)
+    finite = np.isfinite(points.xyz).all(axis=1)
+    _, radius = _robust_box(points.xyz[finite], centres)
     if _SPZ_RADII[0] <= radius <= _SPZ_RADII[1]:
-        return data
+        return results
     views = []
     for view in scene.views:
         pose = view.world_to_camera.copy()
@@ -97,12 +88,11 @@ def sized_for_spz(data: ReportData) -> ReportData:
         views=views,
         near=scene.near / radius,
     )
-    return replace(data, trained=trained, points_xyz=data.points_xyz / radius)
+    return replace(results, trained=trained, points=replace(points, xyz=points.xyz / radius))
 
 
-def _shown(scene: TrainedScene, packed: Packed) -> str:
-    """Text: the number of Gaussians, and the part of them in the page."""
-    whole = scene.gaussians
+def _shown(whole: GaussianArrays, packed: Packed) -> str:
+    """The number of Gaussians, and the part of them in the page."""
     text = f"{count(len(whole))} Gaussians"
     left_out = []
     if packed.count < len(whole):
@@ -114,7 +104,7 @@ def _shown(scene: TrainedScene, packed: Packed) -> str:
     return text
 
 
-def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
+def viewer_data(results: SceneResults) -> dict[str, Any]:
     """Input of the viewer besides the Gaussians.
 
     The frame of the page has y up; its unit box contains the scene.
@@ -127,11 +117,12 @@ def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
         the page's frame in units of ``step``; ``colours``: base64 of uint8 (P, 3); ``size`` of a
         camera.
     """
+    scene, points = results.trained, results.points
     cameras = [upright_camera(v, scene.orientations.get(v.name, 1)) for v in scene.views]
     centres = np.array([view.centre for view in scene.views]).reshape(-1, 3)
     poses = np.array([c["world_to_camera"] for c in cameras]).reshape(-1, 3, 4)
-    finite = np.isfinite(data.points_xyz).all(axis=1)
-    xyz, rgb = data.points_xyz[finite], data.points_rgb[finite]
+    finite = np.isfinite(points.xyz).all(axis=1)
+    xyz, rgb = points.xyz[finite], points.rgb[finite]
     middle, radius = _robust_box(xyz, centres)
     rotation = upright_frame(poses[:, :, :3])
     frame = np.eye(4)
@@ -150,7 +141,7 @@ def viewer_data(data: ReportData, scene: TrainedScene) -> dict[str, Any]:
         "background": scene.background,
         "antialias": scene.antialias,
         "cameras": cameras,
-        "start": _start(data, scene),
+        "start": _start(results),
         "points": _base64(np.rint(xyz / _STEP).astype("<i2").tobytes()),
         "step": _STEP,
         "colours": _base64(np.ascontiguousarray(rgb, np.uint8).tobytes()),
@@ -183,10 +174,10 @@ def upright_camera(view: View, orientation: int) -> dict[str, Any]:
     }
 
 
-def _start(data: ReportData, scene: TrainedScene) -> int | None:
+def _start(results: SceneResults) -> int | None:
     """Index of the view of median PSNR, else of the middle view; None without views."""
-    names = [view.name for view in scene.views]
-    for comparison in data.comparisons:
+    names = [view.name for view in results.trained.views]
+    for comparison in results.comparisons:
         if comparison.label == "median" and comparison.name in names:
             return names.index(comparison.name)
     return len(names) // 2 if names else None
@@ -231,8 +222,3 @@ def _camera_size(centres: Array) -> float:
 
 def _base64(data: bytes) -> str:
     return base64.b64encode(data).decode()
-
-
-def _json(value: Any) -> str:
-    """JSON that is safe inside a script element."""
-    return json.dumps(value, separators=(",", ":")).replace("<", "\\u003c")

@@ -1,17 +1,12 @@
-"""Formats values for display, escaped for HTML."""
+"""Formats values for display."""
 
 from __future__ import annotations
 
-import html
 import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
 MISSING = "n/a"
-
-
-def escape(text: object) -> str:
-    return html.escape(str(text), quote=True)
 
 
 def fixed(value: float | None, digits: int) -> str:
@@ -38,7 +33,7 @@ def duration(seconds: float | None) -> str:
 
 
 def plain(value: Any) -> str:
-    """Any JSON value on one line, not escaped."""
+    """Any JSON value on one line."""
     match value:
         case None:
             return MISSING

@@ -39,6 +39,9 @@ NATIVE = {
     "pipeline.mvs.patchmatch": "pipeline/mvs/csrc",
 }
 
+# The module that fills in the templates of pages.
+PAGES = "pipeline.reporting.html"
+
 # Cache: module -> digest of its file, names that it imports, hash of its syntax tree. Parsing all
 # modules takes longer than the rest of Snakemake's start.
 RECORD = "sources.json"
@@ -52,7 +55,8 @@ def stage_source_hash(module: str) -> str:
 
     Python files are hashed by their syntax trees without docstrings, C++ files by their text
     without comments and whitespace, so that comments and formatting do not change the hash; the
-    report's viewer by its bytes. Hashes of modules are cached beside the compiled libraries.
+    templates and the viewer of pages by their bytes. Hashes of modules are cached beside the
+    compiled libraries.
     """
     digest = hashlib.sha256()
     for name in sorted(_reachable(module)):
@@ -112,8 +116,10 @@ def _module_hash(module: str) -> str:
             if file.suffix in (".cpp", ".h"):
                 text = _COMMENT.sub(lambda m: m.group(1) or " ", file.read_text())
                 digest.update(f"{file.name}={' '.join(text.split())}\n".encode())
-    if module == "pipeline.reporting.space":
-        digest.update((ROOT / "pipeline/reporting/viewer/viewer.min.js").read_bytes())
+    if module == PAGES:
+        folder = ROOT.joinpath(*module.split(".")).parent
+        for file in sorted([*folder.rglob("templates/**/*.*"), folder / "viewer/viewer.min.js"]):
+            digest.update(file.read_bytes())
     return digest.hexdigest()
 
 

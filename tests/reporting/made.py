@@ -24,14 +24,17 @@ from pipeline.metrics.evaluation import (
     ProtocolDescription,
     ViewMetrics,
 )
+from pipeline.metrics.pose import PoseError
 from pipeline.plan.values import StagePlan
 from pipeline.reporting.data import (
     Comparison,
     CoverageSection,
-    ReportData,
+    SceneResults,
     TrainedScene,
     TrainingRecord,
 )
+from pipeline.reporting.metrics import TimedMetrics
+from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianArrays
 from pipeline.splats.gaussians import Gaussians
@@ -162,47 +165,67 @@ def evaluation(*views: ViewMetrics) -> Evaluation:
     )
 
 
-def metrics() -> dict:
-    names = ("inspect", "decode", "train")
-    return {
+def metrics(**changes) -> TimedMetrics:
+    """Of a scene whose stages are inspect, decode (skipped) and train."""
+    views = (("a.jpg", 21.987, 0.7123, 0.2345), ("b.jpg", 33.456, 0.9321, 0.0456))
+    measured = [
+        ViewMetrics(name=name, psnr=psnr, ssim=ssim, lpips=lpips, render=f"{i}.png")
+        for i, (name, psnr, ssim, lpips) in enumerate(views)
+    ]
+    quality = evaluation(*measured).model_dump(exclude={"model", "warnings", "schema_version"})
+    quality["protocol"] |= {"resolution": ("640x480",), "ssim": "a window"}
+    facts = {
         "scene": "barn",
+        "input": "49 photographs",
+        "device": "cpu",
         "psnr": 27.3456,
         "ssim": 0.87654,
         "lpips": 0.12347,
         "lpips_reason": "",
-        "per_view": [
-            {"name": "a.jpg", "psnr": 21.987, "ssim": 0.7123, "lpips": 0.2345, "render": "0.png"},
-            {"name": "b.jpg", "psnr": 33.456, "ssim": 0.9321, "lpips": 0.0456, "render": "1.png"},
-        ],
-        "protocol": {"resolution": ["640x480"], "split": "every 8th", "ssim": "a window"},
         "num_gaussians": 123456,
         "registered_images": 47,
         "total_images": 49,
         "reprojection_error_px": 0.4567,
-        "pose_error": {"rotation_median_deg": 0.0321, "centre_median": 0.00456, "auc": {"1": 0.9}},
+        "sfm_verdict": "good",
+        "georeference": None,
+        "pose_error": PoseError(
+            rotation_median_deg=0.0321,
+            rotation_mean_deg=0.04,
+            centre_median=0.00456,
+            centre_mean=0.005,
+            centre_relative_median=0.001,
+            radius=4.56,
+            scale=1.0,
+            auc={1.0: 0.9},
+            num_common=47,
+            num_truth=49,
+        ).model_dump(),
         "stages": {
-            name: {
-                "wall_s": 0.0 if name == "decode" else 12.5 + i,
-                "cpu_s": 0.0 if name == "decode" else 23.4 + i,
-                "peak_rss_mb": 0.0 if name == "decode" else 345.0 + i,
-                "skipped": name == "decode",
-                "reason": f"because of {name}",
-            }
-            for i, name in enumerate(names)
+            "inspect": {"wall_s": 12.5, "cpu_s": 23.4, "peak_rss_mb": 345.0, "skipped": False},
+            "decode": {"skipped": True},
+            "train": {"wall_s": 14.5, "cpu_s": 25.4, "peak_rss_mb": 347.0, "skipped": False},
         },
         "versions": {"torch": "2.13.0"},
         "seed": 17,
-        "warnings": ["one photograph was left out", "it is dark"],
+        "warnings": ["it is dark", "one photograph was left out", "it is dark"],
     }
+    for name, stage in facts["stages"].items():
+        stage["reason"] = f"because of {name}"
+    return TimedMetrics.model_validate(quality | facts | changes)
 
 
-def report(**changes) -> ReportData:
+def sparse(xyz: np.ndarray, rgb: np.ndarray | None = None) -> Points:
+    """Points without errors and tracks."""
+    return Points.without_tracks(xyz, np.zeros(xyz.shape, np.uint8) if rgb is None else rgb)
+
+
+def report(**changes) -> SceneResults:
     rng = np.random.default_rng(0)
     photograph, render = rng.integers(0, 256, (2, 24, 32, 3), dtype=np.uint8)
     mask = np.ones((24, 32), np.uint8)
     mask[:4] = 0
-    data = ReportData(
-        scene="barn",
+    lengths = rng.integers(2, 9, 300)
+    data = SceneResults(
         metrics=metrics(),
         plan=record_of({"decode": StagePlan(run=False, reason="no RAW")}, ["it is dark"]),
         decisions={"sfm": ["incremental mapper: 49 images"], "train": []},
@@ -216,9 +239,13 @@ def report(**changes) -> ReportData:
         ],
         trained=trained(),
         coverage=coverage(),
-        points_xyz=rng.normal(size=(300, 3)),
-        points_rgb=rng.integers(0, 256, (300, 3), dtype=np.uint8),
-        reprojection_errors=rng.random(300),
-        track_lengths=rng.integers(2, 9, 300),
+        points=Points(
+            xyz=rng.normal(size=(300, 3)),
+            rgb=rng.integers(0, 256, (300, 3), dtype=np.uint8),
+            error=rng.random(300),
+            track_start=np.concatenate([[0], np.cumsum(lengths)]),
+            track_image_id=np.zeros(lengths.sum(), np.int64),
+            track_xy=np.zeros((lengths.sum(), 2)),
+        ),
     )
     return dataclasses.replace(data, **changes)

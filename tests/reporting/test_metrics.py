@@ -108,9 +108,9 @@ def test_damaged_counters_are_one_clear_error(folder, name):
 
 def test_times_are_those_of_the_runs_and_of_killed_ones_before(folder):
     found = read_metrics(folder)
-    stages = with_times(found, read_runs(found, folder))["stages"]
-    assert stages["train"]["wall_s"] == 5.0 and stages["sfm"]["wall_s"] == 3.0
-    assert stages["decode"]["wall_s"] == 0.0 and stages["sfm"]["cpu_s"] == 6.0
+    stages = with_times(found, read_runs(found, folder)).stages
+    assert stages["train"].wall_s == 5.0 and stages["sfm"].wall_s == 3.0
+    assert stages["decode"].wall_s == 0.0 and stages["sfm"].cpu_s == 6.0
 
 
 def test_the_headline_has_quality_size_poses_and_time(folder, capsys):

@@ -10,11 +10,12 @@ import numpy as np
 import pytest
 
 from pipeline.coverage.record import CoverageRecord, ErrorByTrust
+from pipeline.metrics.evaluation import PublishedProtocol
 from pipeline.plan.values import StagePlan
-from pipeline.reporting.data import CoverageSection, ReportData
+from pipeline.reporting.data import CoverageSection
 from pipeline.reporting.page import report_html, write_report
 from tests.plans import record_of
-from tests.reporting.made import coverage, metrics, report, ring, trained
+from tests.reporting.made import coverage, metrics, report, ring, sparse, trained
 
 VOID = {"meta", "link", "img", "input", "br", "hr"}
 NASTY = "</script><script>alert(1)</script><img src=x onerror=alert(2)>\"'&"
@@ -69,7 +70,7 @@ def test_every_number_is_on_the_page() -> None:
         *("0.77% of pixels", "13 Gaussians, near 3.jpg (13)", "\u22120.57 over 1,234 blocks"),
         *("0.222 (11.1% of blocks)", "Between 1.jpg and 2.jpg, 0.4 m higher."),
         *("63 % of this view is unknown", "add 17 % of the trust that is missing"),
-        *("1 test cameras", "4 training", "1: 0.9", "one photograph was left out"),
+        *("1 test cameras", "4 training", "1.0: 0.9", "one photograph was left out"),
     ]
     assert [s for s in shown if s not in text] == []
 
@@ -78,7 +79,7 @@ def test_metrics_and_plan_are_embedded_verbatim() -> None:
     data = report()
     page = Page(report_html(data))
     found = [json.loads(t) for t in page.text if t.startswith("{\n")]
-    assert found == [data.metrics, data.plan and data.plan.model_dump(mode="json")]
+    assert found == [record.model_dump(mode="json") for record in (data.metrics, data.plan)]
 
 
 def test_no_network_requests() -> None:
@@ -114,16 +115,24 @@ def test_viewpoints_are_on_the_map_of_cameras() -> None:
 
 
 def test_no_string_of_the_user_becomes_markup() -> None:
-    nasty = metrics()
-    nasty["per_view"][0]["name"] = NASTY
-    nasty["warnings"] = [NASTY]
-    nasty["lpips"], nasty["lpips_reason"] = None, NASTY
-    nasty["protocol"] = {NASTY: NASTY, "resolution": [NASTY], "split": NASTY}
-    nasty["pose_error"] = {NASTY: NASTY}
-    nasty["stages"]["train"]["reason"] = NASTY
-    nasty["stages"][NASTY] = nasty["stages"]["decode"]
-    data = report(
+    plain = metrics()
+    stages = {
+        name: stage.model_copy(update={"reason": NASTY}) for name, stage in plain.stages.items()
+    }
+    published = PublishedProtocol(benchmark=NASTY, scene=NASTY, deviations=(NASTY,))
+    changes = {"resolution": (NASTY,), "split": NASTY, "ssim": NASTY, "published": published}
+    nasty = metrics(
         scene=NASTY,
+        input=NASTY,
+        per_view=[view.model_copy(update={"name": NASTY}) for view in plain.per_view],
+        warnings=[NASTY],
+        lpips=None,
+        lpips_reason=NASTY,
+        protocol=plain.protocol.model_copy(update=changes),
+        stages={**stages, NASTY: stages["decode"]},
+        versions={NASTY: NASTY},
+    )
+    data = report(
         metrics=nasty,
         plan=record_of({NASTY: StagePlan(run=True, reason=NASTY)}, [NASTY]),
         decisions={NASTY: [NASTY]},
@@ -160,48 +169,44 @@ NO_SURFACE = CoverageRecord(
     [
         {"comparisons": ()},
         {"curve": ()},
-        {"decisions": {}, "plan": None},
-        {"points_xyz": np.zeros((0, 3)), "points_rgb": np.zeros((0, 3), np.uint8)},
-        {"trained": None},
-        {"coverage": None},
+        {"decisions": {}},
+        {"points": sparse(np.zeros((0, 3)))},
+        {"points": sparse(np.full((300, 3), np.nan))},
         {"coverage": CoverageSection(NO_SURFACE, {})},
         {"coverage": no_test_views()},
         {"trained": trained(views=[])},
-        {"reprojection_errors": np.full(7, -1.0), "track_lengths": np.zeros(0)},
-        {"points_xyz": np.full((300, 3), np.nan)},
-        {"trained": trained(views=ring()[:1] * 5), "points_xyz": np.zeros((300, 3))},
-        {"metrics": {}},
-        {"metrics": metrics() | {"per_view": [], "pose_error": None, "lpips": None}},
-        {"metrics": metrics() | {"registered_images": None, "reprojection_error_px": None}},
+        {"trained": trained(views=ring()[:1] * 5), "points": sparse(np.zeros((300, 3)))},
+        {"metrics": metrics(per_view=[], pose_error=None, lpips=None)},
+        {"metrics": metrics(registered_images=None, reprojection_error_px=None)},
     ],
 )
 def test_missing_values_are_accepted(changes) -> None:
     html = report_html(report(**changes))
     Page(html)
-    apart = re.sub(r"&quot;.*?&quot;", "", html)
+    apart = re.sub(r"&#34;.*?&#34;", "", html)
     assert ">nan<" not in html and not re.search(r"(?<![\w+/])NaN(?![\w+/=])", apart)
 
 
-def test_an_empty_page(tmp_path: Path) -> None:
-    write_report(ReportData("empty", {}), tmp_path / "r.html")
-    assert "No warnings" in Page((tmp_path / "r.html").read_text()).all_text()
+def test_a_scene_without_warnings_says_so() -> None:
+    assert "No warnings" in Page(report_html(report(metrics=metrics(warnings=[])))).all_text()
 
 
 def test_missing_lpips_shows_the_reason() -> None:
-    changed = metrics() | {"lpips": None, "lpips_reason": "weights not found: put them there"}
+    changed = metrics(lpips=None, lpips_reason="weights not found: put them there")
     text = Page(report_html(report(metrics=changed))).all_text()
     assert "LPIPS n/a weights not found: put them there" in text
 
 
 def test_a_deviation_from_a_published_protocol_is_at_the_top() -> None:
-    shown = metrics()
-    benchmark = {"benchmark": "NeRF-synthetic", "scene": "lego"}
-    shown["protocol"]["published"] = {**benchmark, "deviations": ["40 test views, not 200"]}
+    def lead(*deviations: str) -> str:
+        benchmark = {"benchmark": "NeRF-synthetic", "scene": "lego", "deviations": deviations}
+        published = PublishedProtocol.model_validate(benchmark)
+        protocol = metrics().protocol.model_copy(update={"published": published})
+        return report_html(report(metrics=metrics(protocol=protocol))).split("<nav>")[0]
+
     text = "lego of NeRF-synthetic, NOT as published: 40 test views, not 200"
-    assert text in report_html(report(metrics=shown)).split("<nav>")[0]
-    shown["protocol"]["published"]["deviations"] = []
-    html = report_html(report(metrics=shown))
-    assert "lego of NeRF-synthetic, measured as published" in html.split("<nav>")[0]
+    assert text in lead("40 test views, not 200")
+    assert "lego of NeRF-synthetic, measured as published" in lead()
 
 
 def test_warnings_come_first_and_once() -> None:

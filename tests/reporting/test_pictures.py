@@ -72,5 +72,6 @@ def test_pictures_of_a_page_stay_within_its_budget() -> None:
     """Noise compresses worst; ten such views stay within a few megabytes."""
     views = [view(700, 900, seed) for seed in range(4)]
     pictures = page_pictures(views)
-    assert sum(len(uri) for row in pictures for uri, _, _ in row) < 4_700_000
-    assert all(width / height == pytest.approx(9 / 7, rel=0.02) for _, width, height in pictures[0])
+    assert sum(len(picture.uri) for row in pictures for picture in row.values()) < 4_700_000
+    shapes = [picture.width / picture.height for picture in pictures[0].values()]
+    assert shapes == pytest.approx([9 / 7] * 3, rel=0.02)

@@ -18,14 +18,14 @@ from pipeline.reporting.page import report_html
 from pipeline.reporting.pictures import upright
 from pipeline.reporting.space import (
     sized_for_spz,
-    space_section,
     upright_camera,
+    viewer_content,
     viewer_data,
     viewer_script,
 )
 from pipeline.scene.views import View
 from pipeline.splats.arrays import GaussianRows
-from tests.reporting.made import gaussians, report, ring, trained
+from tests.reporting.made import gaussians, report, ring, sparse, trained
 
 VIEWER = Path(__file__).parents[2] / "pipeline" / "reporting" / "viewer"
 
@@ -47,8 +47,7 @@ def test_the_frame_is_upright_robust_and_keeps_shapes() -> None:
     rng, tilt = np.random.default_rng(0), rotation(0)
     points = np.concatenate([rng.normal(0, 0.5, (200, 3)) @ tilt.T, [[1e6, 0, 0]]])
     scene = trained(views=tilted(ring(12), tilt))
-    data = report(trained=scene, points_xyz=points, points_rgb=np.zeros((201, 3), np.uint8))
-    made = viewer_data(data, scene)
+    made = viewer_data(report(trained=scene, points=sparse(points)))
     frame = np.array(made["frame"]).reshape(4, 4).T
     scale = np.cbrt(np.linalg.det(frame[:3, :3]))
     np.testing.assert_allclose(frame[:3, :3] @ frame[:3, :3].T, scale**2 * np.eye(3), atol=1e-9)
@@ -79,12 +78,9 @@ def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
         pose[:3, 3] *= unit
         views.append(dataclasses.replace(view, world_to_camera=pose))
     points = rng.normal(size=(300, 3)) * 0.5
-    data = report(
-        trained=trained(gaussians=large, views=views, near=0.03 * unit), points_xyz=points * unit
-    )
-    made = sized_for_spz(data)
+    scene = trained(gaussians=large, views=views, near=0.03 * unit)
+    made = sized_for_spz(report(trained=scene, points=sparse(points * unit)))
     scene = made.trained
-    assert scene is not None
     found = decode_spz(encode_spz(scene.gaussians))
     assert (found.log_scales > -9).all() and (found.log_scales < 4).all()
     scale = scene.near / 0.03
@@ -92,7 +88,7 @@ def test_a_scene_of_any_unit_keeps_its_digits(unit: float) -> None:
     np.testing.assert_allclose(scene.gaussians.means, scale * whole.means, rtol=1e-4, atol=1e-6)
     for ours, view in zip(scene.views, ring(), strict=True):
         np.testing.assert_allclose(ours.centre, scale * view.centre, atol=1e-6)
-    np.testing.assert_allclose(made.points_xyz, scale * points, rtol=1e-6)
+    np.testing.assert_allclose(made.points.xyz, scale * points, rtol=1e-6)
     assert sized_for_spz(made) is made
 
 
@@ -105,15 +101,14 @@ def test_aerial_images_up_is_opposite_to_the_viewing_direction() -> None:
         pose[:3, 3] = -pose[:3, :3] @ [i, 0.0, 10.0]
         views.append(dataclasses.replace(ring()[0], world_to_camera=pose))
     scene = trained(views=views)
-    frame = np.array(viewer_data(report(), scene)["frame"]).reshape(4, 4).T
+    frame = np.array(viewer_data(report(trained=scene))["frame"]).reshape(4, 4).T
     up = frame[:3, :3] @ [0, 0, 1]
     np.testing.assert_allclose(up / np.linalg.norm(up), [0, 1, 0], atol=1e-9)
 
 
 def test_many_points_are_thinned() -> None:
     rng, many = np.random.default_rng(0), np.zeros((60_000, 3), np.uint8)
-    data = report(points_xyz=rng.normal(size=many.shape), points_rgb=many)
-    made = viewer_data(data, trained())
+    made = viewer_data(report(points=sparse(rng.normal(size=many.shape), many)))
     assert len(base64.b64decode(made["points"])) == 25_000 * 6
     assert len(base64.b64decode(made["colours"])) == 25_000 * 3
 
@@ -142,9 +137,9 @@ def test_cameras_are_rotated_with_their_photographs(orientation: int) -> None:
 
 def test_the_start_is_the_view_of_median_quality() -> None:
     median = dataclasses.replace(report().comparisons[0], label="median", name="3.jpg")
-    assert viewer_data(report(comparisons=[median]), trained())["start"] == 3
-    assert viewer_data(report(), trained())["start"] == 2
-    assert viewer_data(report(), trained(views=[]))["start"] is None
+    assert viewer_data(report(comparisons=[median]))["start"] == 3
+    assert viewer_data(report())["start"] == 2
+    assert viewer_data(report(trained=trained(views=[])))["start"] is None
 
 
 MANY = gaussians(5000)
@@ -191,10 +186,10 @@ def test_prominence_is_opacity_times_the_angle_seen() -> None:
 
 def test_the_page_reports_what_was_dropped() -> None:
     data = report(trained=trained(gaussians=MANY))
-    assert "5,000 Gaussians</span>" in space_section(data, 10_000_000)
-    small = space_section(data, size(0) * 3 // 2)
+    assert viewer_content(data, 10_000_000).shown == "5,000 Gaussians"
+    small = viewer_content(data, size(0) * 3 // 2).shown
     assert "5,000 Gaussians (to limit its size, this page has SH of degree 0 instead of 3" in small
-    smaller = space_section(data, size(0) // 2)
+    smaller = viewer_content(data, size(0) // 2).shown
     assert "most prominent with SH of degree 0 instead of 3)" in smaller
 
 

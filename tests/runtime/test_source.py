@@ -82,15 +82,19 @@ def test_the_matchers_sources_count_for_what_matches(project):
     assert hash_of("match") != before[0] and hash_of("draw") == before[1]
 
 
-def test_the_viewer_counts_for_what_makes_pages(project):
+def test_the_viewer_and_the_templates_count_for_what_makes_pages(project):
     root, hash_of = project
     viewer = root / "pipeline/reporting/viewer/viewer.min.js"
     viewer.parent.mkdir(parents=True)
     viewer.write_text("one")
-    (root / "pipeline/reporting/space.py").write_text("")
-    (root / "stages/page.py").write_text("import pipeline.reporting.space\n")
+    (root / "pipeline/reporting/html.py").write_text("")
+    (root / "stages/page.py").write_text("import pipeline.reporting.html\n")
     before = hash_of("page"), hash_of("draw")
     viewer.write_text("two")
+    assert hash_of("page") != before[0] and hash_of("draw") == before[1]
+    before = hash_of("page"), hash_of("draw")
+    (root / "pipeline/reporting/templates/scene").mkdir(parents=True)
+    (root / "pipeline/reporting/templates/scene/page.html.jinja").write_text("three")
     assert hash_of("page") != before[0] and hash_of("draw") == before[1]
 
 

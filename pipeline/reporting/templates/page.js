@@ -1,6 +1,4 @@
-"""JavaScript of the report page: sliders and sorting. The page is complete without it."""
-
-JS = """
+// Sliders and sorting. The page is complete without this script.
 "use strict";
 for (const input of document.querySelectorAll("[data-toggle]"))
   input.addEventListener("change", () =>
@@ -28,4 +26,3 @@ for (const button of document.querySelectorAll("th button"))
     });
     table.tBodies[0].append(...rows);
   });
-"""

@@ -28,16 +28,16 @@ def work(job: Job) -> None:
 
     views, train = inputs.trained_views(job), job.section(Train)
     use_device(train.device)
+    protocol = choose_protocol(views, job.section(Split), train)
     measure_coverage(
         job.out,
         inputs.trained_gaussians(job),
         views,
-        choose_protocol(views, job.section(Split), train),
-        train,
+        protocol,
+        protocol.options(train, job.threads),
         Evaluation.read_for(job.inputs["evaluate"], [view.name for view in views]),
         job.inputs["evaluate"] / "renders",
         world_frame(views, inputs.read_manifest(job, "views"), inputs.georeference(job)),
-        threads=job.threads,
     )
 
 

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-from pipeline.config.schema import Train
 from pipeline.coverage.defects import floating, holes, near_floaters
 from pipeline.coverage.probe_views import (
     Bools,
@@ -41,6 +40,7 @@ from pipeline.coverage.viewpoints import NextBestViews, propose_viewpoints
 from pipeline.metrics.evaluation import Evaluation
 from pipeline.metrics.protocol import Protocol
 from pipeline.photos.load import load_view, resize_area
+from pipeline.render import RasterOptions
 from pipeline.render.views import Render, render_view, to_bytes
 from pipeline.runtime.atomic import write_bytes
 from pipeline.runtime.progress import track
@@ -133,24 +133,23 @@ def measure_coverage(
     gaussians: Gaussians,
     views: Sequence[View],
     protocol: Protocol,
-    train: Train,
+    options: RasterOptions,
     evaluation: Evaluation,
     renders: Path,
     world: WorldFrame,
-    threads: int,
 ) -> CoverageRecord:
     """Write ``coverage.json`` and ``coverage/*.png`` into the folder ``out``.
 
     Args:
-        views: all views with a pose.
-        evaluation: the result of ``evaluate_views``.
-        renders: folder of the renders that ``evaluation`` names.
-        threads: number of threads; does not affect results.
+        views: All views with a pose.
+        options: How views are rendered. The number of threads does not affect results.
+        evaluation: The result of ``evaluate_views``.
+        renders: The folder of the renders that ``evaluation`` names.
 
     Returns:
         The content of ``coverage.json``.
     """
-    options = protocol.options(train, threads)
+    threads = options.threads
 
     def render(view: View) -> Render:
         return render_view(gaussians, view, options)

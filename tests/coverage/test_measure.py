@@ -44,11 +44,10 @@ def measured(folder: Path, *, threads: int = 1, with_test_view: bool = True) -> 
         scene,
         views,
         protocol,
-        TRAIN,
+        protocol.options(TRAIN, threads),
         evaluation,
         folder / "renders",
         WorldFrame(UP, None),
-        threads=threads,
     )
     assert CoverageRecord.read(folder) == found
     return found

@@ -12,8 +12,9 @@ import pytest
 from pipeline.coverage.record import CoverageRecord, ErrorByTrust
 from pipeline.metrics.evaluation import PublishedProtocol
 from pipeline.plan.values import StagePlan
-from pipeline.reporting.data import CoverageSection
+from pipeline.reporting.data import BlockRun, BlocksSection, CoverageSection
 from pipeline.reporting.page import report_html, write_report
+from pipeline.scene.blocks import Block, BlockView, Partition
 from tests.plans import record_of
 from tests.reporting.made import coverage, metrics, report, ring, sparse, trained
 
@@ -220,3 +221,28 @@ def test_the_same_data_gives_the_same_bytes(tmp_path: Path) -> None:
     write_report(report(), tmp_path / "b.html")
     assert (tmp_path / "a.html").read_bytes() == (tmp_path / "b.html").read_bytes()
     assert sorted(p.name for p in tmp_path.iterdir()) == ["a.html", "b.html"]
+
+
+def test_blocks_are_on_their_map_and_in_their_table() -> None:
+    """Two blocks side by side; the outer faces of both are at infinity."""
+    middle = (0.0, None, None)
+    view = BlockView(name="1.jpg", window=(0, 0, 200, 150), size=(200, 150), share=0.5)
+    common = {"gaussians": 9, "max_gaussians": 9, "steps": 9, "views": (view,), "overviews": ()}
+    margins = {"margin_below": (0.2,) * 3, "margin_above": (0.2,) * 3}
+    partition = Partition(
+        axes=np.eye(3).tolist(),
+        lower=(-2.0,) * 3,
+        upper=(2.0,) * 3,
+        blocks=(
+            Block(lower=(None,) * 3, upper=middle, **common, **margins),
+            Block(lower=middle, upper=(None,) * 3, **common, **margins),
+        ),
+    )
+    runs = [BlockRun(1234, 21.5, 61.0, 345.0), BlockRun(5678, 22.5, 62.0, 346.0)]
+    page = Page(report_html(report(blocks=BlocksSection(partition, runs))))
+    boxes = [attrs for tag, attrs in page.tags if attrs.get("class") in ("region", "block")]
+    assert [box["class"] for box in boxes] == ["region", "block"] * 2
+    assert all(float(box["width"] or 0) > 0 and float(box["height"] or 0) > 0 for box in boxes)
+    cameras = [attrs for _, attrs in page.tags if attrs.get("class") == "camera"]
+    assert len(cameras) == sum(not view.is_test for view in ring())
+    assert "1,234 21.50 dB 1 min 01 s 345 MB" in page.all_text()

@@ -41,13 +41,13 @@ class Result:
     """Outcome of one run of a batch.
 
     Attributes:
-        run: the run.
+        run: The run.
         status: "left out": the folder is no scene; "not run": the run was not started.
-        stage: name of the failed stage; empty otherwise.
-        message: reason, if status is not "ok".
+        stage: The name of the failed stage; empty otherwise.
+        message: The reason, if the status is not "ok".
         metrics: The content of ``metrics.json`` with times; None unless status is "ok".
-        size_mb: size of the exported Gaussians (PLY) in MB (10^6 bytes); None if there are none.
-        machine: fields ``MACHINE`` of its training.
+        size_mb: The size of the exported Gaussians (PLY) in MB (10^6 bytes), or None.
+        machine: The fields ``MACHINE`` of its training.
     """
 
     run: Run

@@ -183,7 +183,7 @@ def trade_off_chart(
 
 
 def _free(x: float, y: float, taken: Sequence[tuple[float, float]]) -> bool:
-    """Whether a dot's name at height ``y`` keeps clear of those that stand already."""
+    """Whether a dot's name at height ``y`` keeps clear of the names that are placed."""
     return all(abs(x - other) > 90 or abs(y - height) > 11 for other, height in taken)
 
 
@@ -199,7 +199,7 @@ def pareto_front(points: Sequence[ChartPoint]) -> list[ChartPoint]:
 def histogram(
     values: NDArray[Any], *, title: str, x_title: str, whole: bool = False, bins: int = 40
 ) -> Markup:
-    """Counts of the values; those above the 99th percentile stand in the last bar.
+    """Counts of the values; those above the 99th percentile are in the last bar.
 
     Args:
         values: finite, at least one.

@@ -28,12 +28,12 @@ class Comparison:
     """A test view with its photograph, both on the stored pixel grid.
 
     Attributes:
-        label: its rank by PSNR.
-        name: the photograph's name.
-        photograph, render: (H, W, 3) uint8.
-        mask: (H, W), zero pixels are excluded; or None.
-        psnr, ssim: of this view.
-        orientation: EXIF orientation, 1 to 8; rotates the images for display only.
+        label: The rank of the view by PSNR.
+        name: The photograph's name.
+        photograph, render: The images, (H, W, 3) uint8.
+        mask: The mask, (H, W), whose zero pixels are excluded; or None.
+        psnr, ssim: The measures of this view.
+        orientation: The EXIF orientation, 1 to 8; it rotates the images for display only.
     """
 
     label: Rank
@@ -51,12 +51,13 @@ class TrainedScene:
     """The trained scene with what is needed to display it.
 
     Attributes:
-        gaussians: in the world frame of the views.
-        views: training and test views.
-        orientations: name of a view -> EXIF orientation of its photograph; 1 if there is none.
-        background: RGB in [0, 1] behind the Gaussians. antialias, near: as in training.
-        normalization: from the world of the given poses, which positions of proposed viewpoints
-            refer to, to that of the views.
+        gaussians: The Gaussians in the world frame of the views.
+        views: The training and test views.
+        orientations: The EXIF orientation of each view's photograph; 1 if there is none.
+        background: The RGB colour in [0, 1] behind the Gaussians.
+        antialias, near: The options of the training.
+        normalization: The similarity from the world of the given poses, which positions of
+            proposed viewpoints refer to, to that of the views.
     """
 
     gaussians: GaussianArrays
@@ -72,9 +73,9 @@ class BlockRun(NamedTuple):
     """The training of one block, both rounds together.
 
     Attributes:
-        gaussians: number of trained Gaussians, its margin included.
-        psnr: of its training views at the end, dB, over its windows.
-        wall_s, peak_rss_mb: time, and largest memory.
+        gaussians: The number of trained Gaussians, including the margin.
+        psnr: The PSNR of its training views at the end, dB, over their windows.
+        wall_s, peak_rss_mb: The time and the largest memory.
     """
 
     gaussians: int
@@ -96,9 +97,9 @@ class CoverageSection:
     """Coverage of the scene by its photographs.
 
     Attributes:
-        record: the measures.
-        pictures: images by the names in ``record``: (H, W, 3) renders and (H, W) trust maps,
-            uint8.
+        record: The measures.
+        pictures: The images by the names in ``record``: (H, W, 3) renders and (H, W) trust
+            maps, uint8.
     """
 
     record: CoverageRecord

@@ -1,6 +1,6 @@
 """``metrics.json``: a scene's result in numbers, the same for the same work on any machine.
 
-How long the stages took stands in their ``run.json``; ``with_times`` brings both together.
+The times of the stages are in their ``run.json``; ``with_times`` adds them.
 """
 
 from __future__ import annotations

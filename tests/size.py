@@ -1,8 +1,8 @@
 """``python -m tests.size``: the size of the code, and a ratchet: ``--check`` fails if a figure of
 ``tests/size.json`` has grown, ``--update`` stores the figures of today.
 
-Lines are all lines of Python, C++, WGSL and JavaScript files that git tracks, without the minified
-viewer.
+Lines are all lines of Python, C++, WGSL, JavaScript, style sheets and templates that git tracks,
+without the minified viewer.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 STORED = Path(__file__).with_suffix(".json")
-SUFFIXES = (".py", ".cpp", ".h", ".wgsl", ".js")
+SUFFIXES = (".py", ".cpp", ".h", ".wgsl", ".js", ".css", ".jinja")
 FOLDERS = {
     "product": ("pipeline", "stages", "splatmake", "Snakefile"),
     "benchmarks": ("benchmarks",),

@@ -103,12 +103,18 @@ def plan_record(plan: Plan) -> PlanRecord:
 
 
 def describe(plan: Plan) -> str:
-    """The plan as a table for the terminal."""
+    """The plan for the terminal: the stages that run, and the skipped ones by their reason."""
     lines = [f"{plan.scene}: {found(plan.facts)}"]
+    skipped: dict[str, list[str]] = {}
     for name, stage in plan.stages.items():
-        lines.append(f"  {name:<10} {'run ' if stage.run else 'skip'}  {stage.reason}")
         if stage.run:
-            lines += [f"  {'':<10}       - {decision}" for decision in stage.decisions]
+            lines.append(f"  {name:<10} {stage.reason}")
+            lines += [f"  {'':<10} - {decision}" for decision in stage.decisions]
+        else:
+            skipped.setdefault(stage.reason, []).append(name)
+    if skipped:
+        grouped = [f"{', '.join(names)} ({reason})" for reason, names in skipped.items()]
+        lines.append(f"  skipped: {'; '.join(grouped)}")
     lines += [f"  warning: {warning}" for warning in plan.warnings]
     return "\n".join(lines)
 

@@ -108,7 +108,7 @@ def test_a_second_run_does_nothing_and_a_dry_run_shows_the_plan(project):
     assert "Nothing to be done" in done.stdout
     dry = snakemake(project, "-n", TARGET, config=TINY)
     assert rules_run(dry) == set()
-    for text in ("decode", "skip", "no RAW"):
+    for text in ("decode", "skipped: ", "no RAW"):
         assert text in dry.stdout
 
 

@@ -9,12 +9,15 @@ import sys
 from collections.abc import Callable, Sequence
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from pipeline.config.presets import PRESETS
 from pipeline.render.registry import DEVICE
 from pipeline.runtime.errors import EXIT_INTERRUPTED, EXIT_USER_ERROR, UserError, as_user_error
 from pipeline.runtime.machine import usable_cores
+
+if TYPE_CHECKING:
+    from pipeline.commands import Rendering
 
 MODEL = "file of Gaussians: .ply, .spz, .splat, .glb, or the pipeline's own .npz"
 EXAMPLES = """examples:
@@ -39,24 +42,22 @@ _MAX_NUMBER = 1_000_000
 def main(arguments: list[str] | None = None) -> int:
     """Run a command and return the exit code: 2 after a ``UserError``."""
     options = _parse(sys.argv[1:] if arguments is None else arguments)
-    command: Callable[..., int | None] = options.pop("command")
+    run: Callable[..., int | None] = options.pop("command")
     try:
-        code = command(**options)
-    except UserError as error:
-        return _fail(error)
+        return run(**options) or 0
     except KeyboardInterrupt:
         print("interrupted", file=sys.stderr)
         return EXIT_INTERRUPTED
-    except OSError as error:
-        known = as_user_error(error)
+    except (UserError, OSError) as error:
+        known = error if isinstance(error, UserError) else as_user_error(error)
         if known is None:
             raise
-        return _fail(known)
-    return code or 0
+        print(f"error: {known}", file=sys.stderr)
+        return EXIT_USER_ERROR
 
 
 def _parse(arguments: list[str]) -> dict[str, Any]:
-    parser = _parser()
+    parser = make_parser()
     if arguments[:1] and arguments[0] in WORKFLOW_COMMANDS:
         # "--" before Snakemake's options is optional.
         mark = arguments.index("--") if "--" in arguments else len(arguments)
@@ -65,12 +66,88 @@ def _parse(arguments: list[str]) -> dict[str, Any]:
     return vars(parser.parse_args(arguments))
 
 
-def _fail(error: UserError) -> int:
-    print(f"error: {error}", file=sys.stderr)
-    return EXIT_USER_ERROR
+def make_parser() -> argparse.ArgumentParser:
+    """The parser of the command line."""
+    parser = argparse.ArgumentParser(
+        prog="splatmake",
+        description="Reconstruct a scene from photographs; convert, render, measure and view "
+        "Gaussians of any program; compare batches; examine the machine.",
+        epilog=EXAMPLES,
+        formatter_class=argparse.RawDescriptionHelpFormatter,
+    )
+    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
+    commands = parser.add_subparsers(metavar="COMMAND", required=True)
+
+    def command(
+        name: str, run: Callable[..., int | None], text: str, about: str | None = None, **more: Any
+    ) -> Callable[..., object]:
+        """Add a command; returns the ``add_argument`` of its parser."""
+        sub = commands.add_parser(name, help=text, description=about, **more)
+        sub.set_defaults(command=run)
+        return sub.add_argument
+
+    for name, run, text in (
+        ("run", _run, "reconstruct a scene from a folder of photographs"),
+        ("plan", _plan, "show the stages that run would execute, with reasons, and the jobs"),
+    ):
+        about = (
+            f"{text[0].upper()}{text[1:]}. Results are in results/ of the current folder, and "
+            "config/config.yaml there is read if it exists. All other options are Snakemake's; "
+            "they follow the folder."
+        )
+        _add_workflow(command(name, run, text, about, allow_abbrev=False))
+    text = "convert Gaussians to another format, optionally with fewer coefficients"
+    _add_convert(command("convert", _convert, text))
+    _add_render(command("render", _render, "render Gaussians from given cameras, to PNG"))
+    text = "PSNR and SSIM of each view against its photograph"
+    about = f"Evaluate a model on the scene's test views: {text}, and their means."
+    _add_evaluate(command("evaluate", _evaluate, text, about))
+    text = "show a scene in the browser, also during training (needs viser)"
+    about = (
+        "Show a scene in the browser, rendered by the rasterizer of the training. During training, "
+        "the newest checkpoint is shown and updated twice a minute."
+    )
+    _add_view(command("view", _view, text, about))
+    text = "tables of a batch (results/benchmark.json), or of two"
+    about = (
+        "Tables of batches in Markdown: each configuration compared with --base, each run, or the "
+        "differences between two batches of the same runs."
+    )
+    _add_compare(command("compare", _compare, text, about))
+    text = "write training curves for TensorBoard (needs tensorboard)"
+    _add_tensorboard(command("tensorboard", _tensorboard, text))
+    text = "show what this machine has, what is used, and what is missing"
+    about = (
+        "Report processor, instruction set, compilers, memory, graphics cards, packages and disk "
+        "(+ used, - optional and absent, ! required and missing), and what to do. The exit code is "
+        "2 if something required is missing."
+    )
+    _add_doctor(command("doctor", _doctor, text, about))
+    return parser
 
 
-# Commands import what they need, so that --help and wrong options do not import torch.
+# Each command: its arguments, added by the function that it is given, and what it does. Commands
+# import what they need, so that --help and wrong options do not import torch.
+
+
+def _add_workflow(add: Callable[..., object]) -> None:
+    add("scene", type=Path, metavar="FOLDER", help="the scene's photographs")
+    add("--preset", choices=tuple(PRESETS), help="(default: the configuration file's)")
+    add("-c", "--cores", default="all", metavar="N", help="processor cores to use (default: all)")
+    add(
+        *("-C", "--config"),
+        nargs="+",
+        action="extend",
+        default=[],
+        metavar="NAME=VALUE",
+        help="options of the pipeline, such as 'train={steps: 2000}'",
+    )
+    add(
+        "--workflow-profile",
+        dest="profile",
+        metavar="PROFILE",
+        help="Snakemake profile: a folder, or one of the program's: ci, slurm",
+    )
 
 
 def _run(**options: Any) -> None:
@@ -83,10 +160,14 @@ def _plan(options: list[str], **others: Any) -> None:
     _run(options=["--dry-run", *options], **others)
 
 
-def _compare(**options: Any) -> None:
-    from pipeline.reporting.compare import compare
-
-    _print(compare(**options), [])
+def _add_convert(add: Callable[..., object]) -> None:
+    add("source", type=Path, metavar="MODEL", help=MODEL)
+    add("target", type=Path, metavar="OUT", help="file to write, by its suffix")
+    add("--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)")
+    text = "remove Gaussians with a lower opacity, 0 to 1 (default 0)"
+    add("--min-opacity", type=_share, default=0.0, metavar="SHARE", help=text)
+    text = "sort along a Z-order curve: smaller files"
+    add("--morton-order", action="store_true", help=text)
 
 
 def _convert(**options: Any) -> None:
@@ -96,41 +177,106 @@ def _convert(**options: Any) -> None:
     _print(convert(**options, warnings=warnings), warnings)
 
 
-def _render(
-    device: str, threads: int, background: str, antialias: bool, max_side: int, **options: Any
-) -> None:
-    from pipeline.commands import Rendering, render
-    from pipeline.render.registry import use_device
+def _add_render(add: Callable[..., object]) -> None:
+    add("model", type=Path, metavar="MODEL", help=MODEL)
+    text = "COLMAP model (its folder, or one with sparse/0), transforms.json, or results/NAME"
+    add("--cameras", type=Path, required=True, metavar="PATH", help=text)
+    text = "folder for the images"
+    add("-o", "--out", type=Path, required=True, metavar="FOLDER", help=text)
+    text = "only this view, with or without suffix; can be repeated"
+    add("--view", dest="names", action="append", default=[], metavar="NAME", help=text)
+    _add_rendering(add, "black", "without")
 
-    use_device(device)
+
+def _render(**options: Any) -> None:
+    from pipeline.commands import render
 
     warnings: list[str] = []
-    how = Rendering(background, antialias, max_side, threads)
+    how = _rendering(options)
     _print(render(**options, how=how, warnings=warnings), warnings)
 
 
-def _evaluate(
-    device: str, threads: int, background: str, antialias: bool, max_side: int, **options: Any
-) -> None:
-    from pipeline.commands import Rendering, evaluate
-    from pipeline.render.registry import use_device
+def _add_evaluate(add: Callable[..., object]) -> None:
+    add("model", type=Path, metavar="MODEL", help=MODEL)
+    text = (
+        "finished scene (results/NAME), or photographs with poses (COLMAP's sparse/0, "
+        "transforms.json, poses_bounds.npy) without lens distortion"
+    )
+    add("--scene", type=Path, required=True, metavar="FOLDER", help=text)
+    text = "folder for renders and evaluation.json"
+    add("-o", "--out", type=Path, metavar="FOLDER", help=text)
+    text = (
+        "every N-th view, sorted by name, is a test view; 0: evaluate all views (default: as the "
+        "scene was trained, else 8)"
+    )
+    add("--every", type=_every, metavar="N", help=text)
+    _add_rendering(add, "the scene's", "as the scene was trained")
 
-    use_device(device)
 
-    found = evaluate(**options, how=Rendering(background, antialias, max_side, threads))
+def _evaluate(**options: Any) -> None:
+    from pipeline.commands import evaluate
+
+    how = _rendering(options)
+    found = evaluate(**options, how=how)
     width = max(len(view.name) for view in found.per_view)
+    lines = [
+        f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}"
+        for view in found.per_view
+    ]
     protocol = found.protocol
     lpips = "" if found.lpips is None else f", LPIPS {found.lpips:.4f}"
     means = f"PSNR {found.psnr:.2f} dB, SSIM {found.ssim:.4f}{lpips}"
-    lines = [
-        *(
-            f"{view.name:<{width}}  {view.psnr:6.2f} dB  SSIM {view.ssim:.4f}"
-            for view in found.per_view
-        ),
-        f"{means}, {protocol.num_views} views",
-        f"({protocol.split}; {', '.join(protocol.resolution)} pixels)",
-    ]
+    lines.append(f"{means}, {protocol.num_views} views")
+    lines.append(f"({protocol.split}; {', '.join(protocol.resolution)} pixels)")
     _print(lines, found.warnings)
+
+
+def _add_rendering(add: Callable[..., object], background: str, antialias: str) -> None:
+    text = f"behind the scene (default: {background})"
+    add("--background", choices=("black", "white"), help=text)
+    text = f"Mip-Splatting's opacity compensation (default: {antialias})"
+    add("--antialias", action=argparse.BooleanOptionalAction, help=text)
+    _add_device(add)
+    add("--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this")
+    add("--threads", type=_positive, default=usable_cores(), help="(default: all cores)")
+
+
+def _rendering(options: dict[str, Any]) -> Rendering:
+    """Take the arguments of ``_add_rendering`` out of ``options``, and use their device."""
+    from pipeline.commands import Rendering
+    from pipeline.render.registry import use_device
+
+    use_device(options.pop("device"))
+    names = ("background", "antialias", "max_side", "threads")
+    return Rendering(**{name: options.pop(name) for name in names})
+
+
+def _add_device(add: Callable[..., object]) -> None:
+    add("--device", type=_device, default="cpu", help="cpu, gpu or gpu:N (default: cpu)")
+
+
+def _add_view(add: Callable[..., object]) -> None:
+    text = "results/NAME, or with --cameras a " + MODEL
+    add("model", type=Path, metavar="SCENE", help=text)
+    text = "as for render (default: the scene's own)"
+    add("--cameras", type=Path, metavar="PATH", help=text)
+    text = "0.0.0.0: accessible to others (default: %(default)s)"
+    add("--host", default="127.0.0.1", help=text)
+    add(
+        "--allow-host",
+        dest="allowed_hosts",
+        action="append",
+        default=[],
+        metavar="NAME",
+        help="answer requests that name this host or come from its pages, as behind a proxy; can "
+        "be repeated (default: only localhost, this machine's name and addresses in numbers)",
+    )
+    add("--port", type=_positive, default=8080, help="(default: %(default)s)")
+    text = "longer side (default: 800)"
+    add("--side", type=_positive, default=800, metavar="PIXELS", help=text)
+    _add_device(add)
+    text = "(default: 1, leaving the others to training)"
+    add("--threads", type=_positive, default=1, help=text)
 
 
 def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> None:
@@ -142,232 +288,55 @@ def _view(model: Path, cameras: Path | None, device: str, **options: Any) -> Non
     serve(Source(model, cameras), **options)
 
 
+def _add_compare(add: Callable[..., object]) -> None:
+    add("batches", type=Path, nargs="+", metavar="BENCHMARK_JSON", help="one or two")
+    text = "configuration that others are compared with (default: the default preset)"
+    add("--base", metavar="CONFIG", help=text)
+    text = "list each run of one batch, without comparison"
+    add("--each", action="store_true", help=text)
+
+
+def _compare(**options: Any) -> None:
+    from pipeline.reporting.compare import compare
+
+    _print(compare(**options))
+
+
+def _add_tensorboard(add: Callable[..., object]) -> None:
+    text = "results/NAME, or results for all"
+    add("folders", type=Path, nargs="+", metavar="FOLDER", help=text)
+    text = "folder for the files"
+    add("-o", "--out", type=Path, required=True, metavar="FOLDER", help=text)
+    text = "continue with running trainings, until Ctrl-C"
+    add("--follow", action="store_true", help=text)
+
+
 def _tensorboard(**options: Any) -> None:
     from pipeline.watching.tensorboard import write_events
 
-    _print(write_events(**options), [])
+    _print(write_events(**options))
+
+
+def _add_doctor(add: Callable[..., object]) -> None:
+    add("--json", dest="json_wanted", action="store_true", help="print JSON")
+    text = "folder of the results, whose disk is examined (default: %(default)s)"
+    add("--results", type=Path, default=Path("results"), metavar="FOLDER", help=text)
 
 
 def _doctor(json_wanted: bool, results: Path) -> int:
     from pipeline import doctor
 
     found = doctor.examine(results)
-    text = json.dumps(doctor.as_data(found), indent=2) if json_wanted else None
-    _print([text] if text else doctor.as_text(found), [])
+    data = doctor.as_data(found)
+    _print([json.dumps(data, indent=2)] if json_wanted else doctor.as_text(found))
     return 0 if doctor.is_ready(found) else EXIT_USER_ERROR
 
 
-def _print(lines: Sequence[str], warnings: Sequence[str]) -> None:
+def _print(lines: Sequence[str], warnings: Sequence[str] = ()) -> None:
     for text in warnings:
         print(f"warning: {text}", file=sys.stderr)
     for line in lines:
         print(line)
-
-
-def _parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="splatmake",
-        description="Reconstruct a scene from photographs; convert, render, measure and view "
-        "Gaussians of any program; compare batches; examine the machine.",
-        epilog=EXAMPLES,
-        formatter_class=argparse.RawDescriptionHelpFormatter,
-    )
-    parser.add_argument("--version", action="version", version=f"%(prog)s {_version()}")
-    commands = parser.add_subparsers(metavar="COMMAND", required=True)
-
-    for name, command, text in (
-        ("run", _run, "reconstruct a scene from a folder of photographs"),
-        ("plan", _plan, "show the stages that run would execute, with reasons, and the jobs"),
-    ):
-        sub = commands.add_parser(
-            name,
-            help=text,
-            description=f"{text[0].upper()}{text[1:]}. Results are in results/ of the current "
-            "folder, and config/config.yaml there is read if it exists. All other options are "
-            "Snakemake's; they follow the folder.",
-            allow_abbrev=False,
-        )
-        sub.set_defaults(command=command)
-        _add_workflow(sub)
-
-    sub = commands.add_parser(
-        "convert", help="convert Gaussians to another format, optionally with fewer coefficients"
-    )
-    sub.set_defaults(command=_convert)
-    sub.add_argument("source", type=Path, metavar="MODEL", help=MODEL)
-    sub.add_argument("target", type=Path, metavar="OUT", help="file to write, by its suffix")
-    sub.add_argument(
-        "--sh-degree", type=int, choices=range(4), default=3, help="largest degree (default 3)"
-    )
-    sub.add_argument(
-        "--min-opacity",
-        type=_share,
-        default=0.0,
-        metavar="SHARE",
-        help="remove Gaussians with a lower opacity, 0 to 1 (default 0)",
-    )
-    sub.add_argument(
-        "--morton-order", action="store_true", help="sort along a Z-order curve: smaller files"
-    )
-
-    sub = commands.add_parser("render", help="render Gaussians from given cameras, to PNG")
-    sub.set_defaults(command=_render)
-    sub.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
-    sub.add_argument(
-        "--cameras",
-        type=Path,
-        required=True,
-        metavar="PATH",
-        help="COLMAP model (its folder, or one with sparse/0), transforms.json, or results/NAME",
-    )
-    sub.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the images"
-    )
-    sub.add_argument(
-        "--view",
-        dest="names",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="only this view, with or without suffix; can be repeated",
-    )
-    _add_rendering(sub, "black", "without")
-
-    sub = commands.add_parser(
-        "evaluate",
-        help="PSNR and SSIM of each view against its photograph",
-        description="Evaluate a model on the scene's test views: PSNR and SSIM of each view "
-        "against its photograph, and their means.",
-    )
-    sub.set_defaults(command=_evaluate)
-    sub.add_argument("model", type=Path, metavar="MODEL", help=MODEL)
-    sub.add_argument(
-        "--scene",
-        type=Path,
-        required=True,
-        metavar="FOLDER",
-        help="finished scene (results/NAME), or photographs with poses (COLMAP's sparse/0, "
-        "transforms.json, poses_bounds.npy) without lens distortion",
-    )
-    sub.add_argument(
-        "-o", "--out", type=Path, metavar="FOLDER", help="folder for renders and evaluation.json"
-    )
-    sub.add_argument(
-        "--every",
-        type=_every,
-        metavar="N",
-        help="every N-th view, sorted by name, is a test view; 0: evaluate all views "
-        "(default: as the scene was trained, else 8)",
-    )
-    _add_rendering(sub, "the scene's", "as the scene was trained")
-
-    sub = commands.add_parser(
-        "view",
-        help="show a scene in the browser, also during training (needs viser)",
-        description="Show a scene in the browser, rendered by the rasterizer of the training. "
-        "During training, the newest checkpoint is shown and updated twice a minute.",
-    )
-    sub.set_defaults(command=_view)
-    sub.add_argument(
-        "model", type=Path, metavar="SCENE", help="results/NAME, or with --cameras a " + MODEL
-    )
-    sub.add_argument(
-        "--cameras", type=Path, metavar="PATH", help="as for render (default: the scene's own)"
-    )
-    sub.add_argument(
-        "--host", default="127.0.0.1", help="0.0.0.0: accessible to others (default: %(default)s)"
-    )
-    sub.add_argument(
-        "--allow-host",
-        dest="allowed_hosts",
-        action="append",
-        default=[],
-        metavar="NAME",
-        help="answer requests that name this host or come from its pages, as behind a proxy; can "
-        "be repeated (default: only localhost, this machine's name and addresses in numbers)",
-    )
-    sub.add_argument("--port", type=_positive, default=8080, help="(default: %(default)s)")
-    sub.add_argument(
-        "--side", type=_positive, default=800, metavar="PIXELS", help="longer side (default: 800)"
-    )
-    _add_device(sub)
-    sub.add_argument(
-        "--threads", type=_positive, default=1, help="(default: 1, leaving the others to training)"
-    )
-
-    sub = commands.add_parser(
-        "compare",
-        help="tables of a batch (results/benchmark.json), or of two",
-        description="Tables of batches in Markdown: each configuration compared with --base, each "
-        "run, or the differences between two batches of the same runs.",
-    )
-    sub.set_defaults(command=_compare)
-    sub.add_argument("batches", type=Path, nargs="+", metavar="BENCHMARK_JSON", help="one or two")
-    sub.add_argument(
-        "--base",
-        metavar="CONFIG",
-        help="configuration that others are compared with (default: the default preset)",
-    )
-    sub.add_argument(
-        "--each", action="store_true", help="list each run of one batch, without comparison"
-    )
-
-    sub = commands.add_parser(
-        "tensorboard", help="write training curves for TensorBoard (needs tensorboard)"
-    )
-    sub.set_defaults(command=_tensorboard)
-    sub.add_argument(
-        "folders", type=Path, nargs="+", metavar="FOLDER", help="results/NAME, or results for all"
-    )
-    sub.add_argument(
-        "-o", "--out", type=Path, required=True, metavar="FOLDER", help="folder for the files"
-    )
-    sub.add_argument(
-        "--follow", action="store_true", help="continue with running trainings, until Ctrl-C"
-    )
-
-    sub = commands.add_parser(
-        "doctor",
-        help="show what this machine has, what is used, and what is missing",
-        description="Report processor, instruction set, compilers, memory, graphics cards, "
-        "packages and disk (+ used, - optional and absent, ! required and missing), and what to "
-        "do. The exit code is 2 if something required is missing.",
-    )
-    sub.set_defaults(command=_doctor)
-    sub.add_argument("--json", dest="json_wanted", action="store_true", help="print JSON")
-    sub.add_argument(
-        "--results",
-        type=Path,
-        default=Path("results"),
-        metavar="FOLDER",
-        help="folder of the results, whose disk is examined (default: %(default)s)",
-    )
-    return parser
-
-
-def _add_workflow(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("scene", type=Path, metavar="FOLDER", help="the scene's photographs")
-    parser.add_argument(
-        "--preset", choices=tuple(PRESETS), help="(default: the configuration file's)"
-    )
-    parser.add_argument(
-        "-c", "--cores", default="all", metavar="N", help="processor cores to use (default: all)"
-    )
-    parser.add_argument(
-        "-C",
-        "--config",
-        nargs="+",
-        action="extend",
-        default=[],
-        metavar="NAME=VALUE",
-        help="options of the pipeline, such as 'train={steps: 2000}'",
-    )
-    parser.add_argument(
-        "--workflow-profile",
-        dest="profile",
-        metavar="PROFILE",
-        help="Snakemake profile: a folder, or one of the program's: ci, slurm",
-    )
 
 
 def _version() -> str:
@@ -375,30 +344,6 @@ def _version() -> str:
         return metadata.version("splatmake")
     except metadata.PackageNotFoundError:
         return "(a checkout)"
-
-
-def _add_rendering(parser: argparse.ArgumentParser, background: str, antialias: str) -> None:
-    parser.add_argument(
-        "--background", choices=("black", "white"), help=f"behind the scene (default: {background})"
-    )
-    parser.add_argument(
-        "--antialias",
-        action=argparse.BooleanOptionalAction,
-        help=f"Mip-Splatting's opacity compensation (default: {antialias})",
-    )
-    _add_device(parser)
-    parser.add_argument(
-        "--max-side", type=_positive, metavar="PIXELS", help="reduce larger views to this"
-    )
-    parser.add_argument(
-        "--threads", type=_positive, default=usable_cores(), help="(default: all cores)"
-    )
-
-
-def _add_device(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument(
-        "--device", type=_device, default="cpu", help="cpu, gpu or gpu:N (default: cpu)"
-    )
 
 
 def _device(text: str) -> str:

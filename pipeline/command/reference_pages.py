@@ -13,7 +13,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from pipeline.command.main import WORKFLOW_COMMANDS, _parser
+from pipeline.command.main import WORKFLOW_COMMANDS, make_parser
 from pipeline.runtime.atomic import write_text
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -101,7 +101,7 @@ def _one_line(text: str) -> str:
 
 def command_line() -> str:
     """The options of each command."""
-    parser = _parser()
+    parser = make_parser()
     lines = [_INTRO]
     for name, help_text, command in _commands(parser):
         positional = [a for a in command._actions if not a.option_strings]

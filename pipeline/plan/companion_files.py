@@ -7,7 +7,6 @@ from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
-from pipeline.config.schema import Config
 from pipeline.io.companions import (
     DEPTHS,
     MASKS,
@@ -16,20 +15,16 @@ from pipeline.io.companions import (
     find_companions,
     several_beside,
 )
-from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import GivenPoses
-from pipeline.plan.photo_folder import uses_masks
+from pipeline.plan.depth_maps import check_depth_maps
+from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.errors import UserError
 
 
 def without_companions(
-    folder: Path,
-    config: Config,
-    chosen: PhotoFolder,
-    poses: GivenPoses | None,
-    warnings: list[str],
+    at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None
 ) -> PhotoFolder:
     """The folder's photographs without the masks and depth maps that lie beside them.
 
@@ -49,8 +44,8 @@ def without_companions(
             for photo, names in beside_photographs(kind, chosen.names).items()
             if (unposed := [name for name in names if name not in posed])
         }
-        error = several_beside(kind, folder / chosen.path, beside)
-        if error is not None and (kind is DEPTHS or uses_masks(config)):
+        error = several_beside(kind, at.path / chosen.path, beside)
+        if error is not None and (kind is DEPTHS or at.uses_masks):
             raise error
         found[kind.noun] = {
             photo: (Path(chosen.path) / names[0]).as_posix() for photo, names in beside.items()
@@ -58,7 +53,7 @@ def without_companions(
         files = {name for names in beside.values() for name in names}
         taken |= files
         if files:
-            warnings.append(
+            at.warnings.append(
                 f"{len(files)} images beside the photographs are used as {kind.noun}s, for their "
                 f"names (first: {min(files)}); rename them if they are photographs"
             )
@@ -72,23 +67,18 @@ def without_companions(
 
 
 def masks_of(
-    folder: Path,
-    config: Config,
-    chosen: PhotoFolder,
-    facts: Mapping[str, FileFacts],
-    cache: FactCache,
-    warnings: list[str],
+    at: SceneFolder, chosen: PhotoFolder, facts: Mapping[str, FileFacts]
 ) -> dict[str, Path]:
     """Photograph -> its mask.
 
     Raises:
         UserError: a mask of another size than its photograph, or a name that is ambiguous.
     """
-    if not uses_masks(config):
+    if not at.uses_masks:
         return {}
-    masks = _files_of(MASKS, folder, chosen, chosen.masks, facts)
+    masks = _files_of(MASKS, at, chosen, chosen.masks, facts)
     for name, path in masks.items():
-        mask = cache.get(path, "mask", FileFacts, partial(read_facts, path))
+        mask = at.cache.get(path, "mask", FileFacts, partial(read_facts, path))
         photo = facts[name]
         if (mask.width, mask.height) != (photo.width, photo.height):
             raise UserError(
@@ -99,22 +89,26 @@ def masks_of(
                 "applied), or set views.masks: ignore",
             )
     if masks and len(masks) < len(facts):
-        warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
+        at.warnings.append(f"{len(facts) - len(masks)} of {len(facts)} photographs have no mask")
     return masks
 
 
-def depths_of(folder: Path, chosen: PhotoFolder, facts: Mapping[str, FileFacts]) -> dict[str, Path]:
+def depths_of(
+    at: SceneFolder, chosen: PhotoFolder, facts: Mapping[str, FileFacts]
+) -> dict[str, Path]:
     """Photograph -> its depth map.
 
     Raises:
-        UserError: a name that is ambiguous.
+        UserError: a name that is ambiguous, or see ``check_depth_maps``.
     """
-    return _files_of(DEPTHS, folder, chosen, chosen.depths, facts)
+    depths = _files_of(DEPTHS, at, chosen, chosen.depths, facts)
+    check_depth_maps(depths, facts, at.cache)
+    return depths
 
 
 def _files_of(
     kind: CompanionKind,
-    folder: Path,
+    at: SceneFolder,
     chosen: PhotoFolder,
     listed: Mapping[str, str],
     facts: Mapping[str, FileFacts],
@@ -122,8 +116,8 @@ def _files_of(
     """The files that ``listed`` names, or that lie beside the photographs; otherwise those in
     folders."""
     copy = chosen.path[len(chosen.base) :] if chosen.path.startswith(chosen.base) else ""
-    named = {name: folder / listed[name] for name in sorted(facts) if name in listed}
+    named = {name: at.path / listed[name] for name in sorted(facts) if name in listed}
     others = [name for name in sorted(facts) if name not in named]
     if not others:
         return named
-    return named | find_companions(kind, folder, kind.places(chosen.path, copy), others)
+    return named | find_companions(kind, at.path, kind.places(chosen.path, copy), others)

@@ -2,20 +2,20 @@
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Sequence
-from functools import partial
 
 import numpy as np
 
-from pipeline.io.fact_cache import FactCache
-from pipeline.io.posefiles import pose_files
-from pipeline.io.recorded import digest_of
+from pipeline.io.folders import PhotoFolder
+from pipeline.io.posefiles import GivenPoses
 from pipeline.plan.given_poses import GivenFiles, read_fitted
+from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.scene.manifest import Photo
 
 
-def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) -> float:
+def check_given(
+    at: SceneFolder, poses: GivenPoses, chosen: PhotoFolder, photos: Sequence[Photo]
+) -> float:
     """Check the given cameras of the photographs: sizes, focal lengths, principal points and
     distortion. The result is cached, since large models take seconds to read.
 
@@ -25,14 +25,15 @@ def check_given(files: GivenFiles, photos: Sequence[Photo], cache: FactCache) ->
     Raises:
         UserError: as ``load_given``.
     """
+    files = GivenFiles(at.path / poses.path, poses.kind, tuple(chosen.names), chosen.base)
     sizes = "\n".join(f"{photo.name}\0{photo.width}x{photo.height}" for photo in photos)
-    state = [hashlib.blake2b(sizes.encode(), digest_size=16).hexdigest(), files.base_folder]
-    for file in pose_files(files.path, files.kind):
-        state += [file.name, cache.get(file, "digest", str, partial(digest_of, file))]
+    state = [digest_of_text(sizes), files.base_folder]
+    for file in at.pose_files(poses):
+        state += [file.name, at.digest(file)]
 
     def extent() -> float:
         model = read_fitted(files, photos, points=False)
         centres = [image.centre for image in model.images.values()]
         return float(np.ptp(centres, axis=0).max()) if centres else 0.0
 
-    return cache.get_for_state(f"cameras:{files.path}", state, float, extent)
+    return at.cache.get_for_state(f"cameras:{files.path}", state, float, extent)

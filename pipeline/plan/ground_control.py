@@ -7,8 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from pipeline.config.schema import Config
 from pipeline.io.gcp import ground_control_file, read_ground_control
+from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.text import shortened
 from pipeline.scene.manifest import Photo
 
@@ -22,36 +22,28 @@ class GroundControlFile:
 
 
 def find_ground_control(
-    folder: Path,
-    config: Config,
-    photos: Sequence[Photo],
-    warnings: list[str],
-    *,
-    posed: bool,
-    complete: bool,
+    at: SceneFolder, photos: Sequence[Photo], *, posed: bool, complete: bool
 ) -> GroundControlFile:
     """The scene's ``gcp_list.txt`` (in any case), checked as far as that is possible without poses.
 
     Args:
-        config: The configuration. Only ``sfm.georeference`` is used.
-        warnings: Sentences about the file are added to this list.
         posed: Whether poses are given. These are not georeferenced.
         complete: Whether ``photos`` are all photographs; False if frames of videos will follow.
 
     Raises:
         UserError: there are two files, or its content cannot be used; see ``read_ground_control``.
     """
-    path = ground_control_file(folder)
+    path = ground_control_file(at.path)
     if path is None:
         return GroundControlFile()
-    wanted = config.sfm.georeference
+    wanted = at.config.sfm.georeference
     if posed or wanted not in ("auto", "gcp"):
         why = "poses are given" if posed else f"sfm.georeference is {wanted}"
-        warnings.append(f"{path.name} is not used, because {why}")
+        at.warnings.append(f"{path.name} is not used, because {why}")
         return GroundControlFile(path, path.name)
     sizes = {photo.name: (photo.width, photo.height) for photo in photos}
     control = read_ground_control(path, sizes, complete=complete)
-    warnings += control.warnings
+    at.warnings.extend(control.warnings)
     projection = control.projection
     text = f"{path.name}: {len(control.points)} points in {shortened(projection.name)}"
     if not projection.in_metres:
@@ -61,7 +53,7 @@ def find_ground_control(
         else:
             text += f" ({projection.unit}, {heights}), converted to metres"
     if not projection.vertical_known and not projection.geographic and projection.vertical != 1:
-        warnings.append(
+        at.warnings.append(
             f"{path.name}: {projection.name} does not say the unit of heights; they are read in "
             f"{projection.unit} units as x and y are"
         )

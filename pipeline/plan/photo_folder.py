@@ -5,39 +5,29 @@ from __future__ import annotations
 import posixpath
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path, PurePosixPath
 
-from pipeline.config.schema import Config
-from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import PhotoFolder, pictures_in, relative_folders
 from pipeline.io.names import NameIndex, compare_names
 from pipeline.io.photofile import FileFacts, read_facts
 from pipeline.io.posefiles import GivenPoses, listed_photos
 from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
+from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.errors import UserError
 
 # Suffixes of folders with full-size photographs and with copies at 1/2, 1/4 and 1/8.
 _COPY_SUFFIXES = ("", "_2", "_4", "_8")
 
 
-def choose_photo_folder(
-    folder: Path,
-    config: Config,
-    poses: GivenPoses | None,
-    cache: FactCache,
-    warnings: list[str],
-) -> PhotoFolder:
+def choose_photo_folder(at: SceneFolder, poses: GivenPoses | None) -> PhotoFolder:
     """The folder of ``inspect.image_folder``; with "auto" that of the photographs that
     the pose files list, else ``images`` or a smaller copy of it, else the scene folder.
-
-    Args:
-        folder: the scene folder.
-        warnings: warnings are added to this list.
 
     Raises:
         UserError: ``inspect.image_folder`` is not a folder inside ``folder``.
     """
-    configured = config.inspect.image_folder
+    folder, configured = at.path, at.config.inspect.image_folder
     if configured != "auto":
         configured = PurePosixPath(configured).as_posix()
         inside = not configured.startswith("/") and ".." not in configured.split("/")
@@ -47,7 +37,7 @@ def choose_photo_folder(
                 file=folder / configured,
                 fix=f"choose one of: {', '.join(relative_folders(folder)) or 'none there'}",
             )
-    listed = listed_photos(folder, poses, warnings)
+    listed = listed_photos(folder, poses, at.warnings)
     if listed is not None and configured in ("auto", listed.path):
         return listed
     if configured not in ("auto", "."):
@@ -57,7 +47,7 @@ def choose_photo_folder(
     copies = [f"images{suffix}" for suffix in _COPY_SUFFIXES]
     copies = [name for name in copies if (folder / name).is_dir()]
     if configured == "auto" and copies:
-        return _choose_copy(folder, copies, config, poses, cache)
+        return _choose_copy(at, copies, poses)
     return _scene_folder(folder)
 
 
@@ -74,31 +64,25 @@ def _scene_folder(folder: Path) -> PhotoFolder:
     return PhotoFolder(base or ".", base or ".", f"no images/; photographs are in {where}", names)
 
 
-def _choose_copy(
-    folder: Path,
-    copies: Sequence[str],
-    config: Config,
-    poses: GivenPoses | None,
-    cache: FactCache,
-) -> PhotoFolder:
+def _choose_copy(at: SceneFolder, copies: Sequence[str], poses: GivenPoses | None) -> PhotoFolder:
     """The smallest of images/ and its reduced copies that is not smaller than training and feature
     extraction need; for scenes of Mip-NeRF 360 the copy that papers use."""
-    needed = config.views.max_long_side_px
+    needed = at.config.views.max_long_side_px
     if poses is None:
-        needed = max(needed, config.features.max_long_side_px)
+        needed = max(needed, at.config.features.max_long_side_px)
     found: list[tuple[int, PhotoFolder]] = []
     for path in copies:
-        names = pictures_in(folder / path)
+        names = pictures_in(at.path / path)
         if names:
-            facts = read_all(folder, path, names[:1], cache, [])
+            facts = read_all(replace(at, warnings=[]), path, names[:1])
             longest = max((max(f.width, f.height) for f in facts.values()), default=0)
             found.append((longest, PhotoFolder(path, "images", "", names)))
     if not found:
         return PhotoFolder("images", "images", "images/ holds no photograph", [])
     longest, full = found[0]
-    usable = [entry for entry in found if _is_complete(folder, entry[1], full, poses, config)]
+    usable = [entry for entry in found if _is_complete(at, entry[1], full, poses)]
     large_enough = [entry for entry in usable if entry[0] >= needed]
-    published = PUBLISHED_SCENES.get(benchmark_scene(folder.name))
+    published = PUBLISHED_SCENES.get(benchmark_scene(at.path.name))
     wanted = published.image_folder if published and published.image_folder != "images" else None
     of_papers = [entry for entry in usable if entry[1].path == wanted]
     if of_papers:
@@ -118,15 +102,15 @@ def _choose_copy(
 
 
 def _is_complete(
-    folder: Path, copy: PhotoFolder, full: PhotoFolder, poses: GivenPoses | None, config: Config
+    at: SceneFolder, copy: PhotoFolder, full: PhotoFolder, poses: GivenPoses | None
 ) -> bool:
     """Whether ``copy`` has all photographs of ``full`` that are used, with masks and depth maps."""
     if copy is full:
         return True
     suffix = copy.path[len("images") :]
     for kind in ("masks", "depths"):
-        used = kind == "depths" or uses_masks(config)
-        if used and (folder / kind).is_dir() and not (folder / f"{kind}{suffix}").is_dir():
+        used = kind == "depths" or at.uses_masks
+        if used and (at.path / kind).is_dir() and not (at.path / f"{kind}{suffix}").is_dir():
             return False
     if poses is not None and poses.format.names == "scene":
         return False  # Without w and h, the focal length may refer to the full size.
@@ -137,20 +121,13 @@ def _is_complete(
     return all(in_copy.find(name) for name in needed)
 
 
-def uses_masks(config: Config) -> bool:
-    """Whether masks in the scene folder are used: not for measures as published."""
-    return config.views.masks == "use" and config.split.source != "published"
-
-
-def read_all(
-    folder: Path, image_folder: str, names: Sequence[str], cache: FactCache, warnings: list[str]
-) -> dict[str, FileFacts]:
+def read_all(at: SceneFolder, image_folder: str, names: Sequence[str]) -> dict[str, FileFacts]:
     """Name -> metadata of the photographs that can be read; the others add a warning each."""
     facts: dict[str, FileFacts] = {}
     for name in names:
-        found = cache.read(folder / image_folder / name, "photo", FileFacts, read_facts)
+        found = at.cache.read(at.path / image_folder / name, "photo", FileFacts, read_facts)
         if isinstance(found, str):
-            warnings.append(f"{name}: left out: {found}")
+            at.warnings.append(f"{name}: left out: {found}")
         else:
             facts[name] = found
     return facts

@@ -12,14 +12,13 @@ import numpy as np
 from numpy.typing import NDArray
 from pydantic import BaseModel, ConfigDict, Field
 
-from pipeline.config.schema import Config
 from pipeline.io.clouds.files import CLOUD_SUFFIXES, count_points, is_cloud, read_clouds
 from pipeline.io.clouds.values import PointCloud
-from pipeline.io.fact_cache import FactCache
 from pipeline.io.names import is_inside
 from pipeline.io.posefiles import GivenPoses
 from pipeline.io.transforms import read_points_entry
 from pipeline.plan.given_poses import GivenModel
+from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.text import is_plain
 
@@ -51,33 +50,24 @@ class PointCloudFiles(BaseModel):
 
 
 def find_point_cloud(
-    folder: Path,
-    config: Config,
-    poses: GivenPoses | None,
-    has_control: bool,
-    cache: FactCache,
-    warnings: list[str],
+    at: SceneFolder, poses: GivenPoses | None, has_control: bool
 ) -> PointCloudFiles | None:
     """The scene's point cloud according to ``init.points_file``.
 
     Args:
-        config: of which ``init.points_file`` and ``sfm.georeference`` are used.
-        has_control: whether the scene has ground control points.
-        warnings: a warning is added for a cloud that cannot be used.
+        has_control: Whether the scene has ground control points.
 
     Raises:
         UserError: several clouds; a configured one that does not exist or cannot be placed; a
             damaged header.
     """
-    wanted = config.init.points_file
+    folder, wanted = at.path, at.config.init.points_file
     if wanted == "none":
         return None
-    path = (
-        _found(folder, poses, cache, warnings) if wanted == "auto" else _configured(folder, wanted)
-    )
+    path = _found(at, poses) if wanted == "auto" else _configured(folder, wanted)
     if path is None:
         return None
-    placed = has_control and config.sfm.georeference in ("auto", "gcp")
+    placed = has_control and at.config.sfm.georeference in ("auto", "gcp")
     if poses is None and not placed:
         what = (
             "the point cloud cannot be placed: poses are estimated in a frame of their own, "
@@ -86,11 +76,11 @@ def find_point_cloud(
         fix = f"give poses in the frame of the cloud, or gcp_list.txt in its projection, or {_NONE}"
         if wanted != "auto":
             raise UserError(what, file=folder / path, fix=fix)
-        warnings.append(f"{path} is not used: {what}; {fix}")
+        at.warnings.append(f"{path} is not used: {what}; {fix}")
         return None
     files = _files(folder, path)
     counts = [
-        cache.get(
+        at.cache.get(
             folder / file,
             "points",
             cast("type[int | None]", int | None),
@@ -135,33 +125,31 @@ def _transformed(xyz: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArr
     return np.asarray(np.einsum("ij,nj->ni", matrix[:3, :3], xyz) + matrix[:3, 3])
 
 
-def _found(
-    folder: Path, poses: GivenPoses | None, cache: FactCache, warnings: list[str]
-) -> str | None:
+def _found(at: SceneFolder, poses: GivenPoses | None) -> str | None:
     """``points.*`` or ``points/``, else the cloud that the pose file names."""
     found = sorted(
         entry.name
-        for entry in folder.iterdir()
+        for entry in at.path.iterdir()
         if (_is_usable(entry) and entry.stem.casefold() == _STEM)
-        or (entry.is_dir() and entry.name == _STEM and _files(folder, entry.name))
+        or (entry.is_dir() and entry.name == _STEM and _files(at.path, entry.name))
     )
     if len(found) > 1:
         raise UserError(
             f"expected one point cloud, found {len(found)}: {', '.join(found[:5])}",
-            file=folder,
+            file=at.path,
             fix=f"remove the others, or set init.points_file: {found[0]}",
         )
     if found or poses is None or poses.kind != "transforms":
         return found[0] if found else None
-    return _named(folder, poses, cache, warnings)
+    return _named(at, poses)
 
 
-def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str]) -> str | None:
+def _named(at: SceneFolder, poses: GivenPoses) -> str | None:
     """``ply_file_path`` of transforms.json; a warning if there is no such file in the scene."""
-    source = folder / poses.path
+    source = at.path / poses.path
     if source.is_dir():  # Splits of a synthetic scene, whose files name no cloud.
         return None
-    name = cache.get(
+    name = at.cache.get(
         source,
         "ply_file_path",
         cast("type[str | None]", str | None),
@@ -169,8 +157,8 @@ def _named(folder: Path, poses: GivenPoses, cache: FactCache, warnings: list[str
     )
     if name is None:
         return None
-    if not is_inside(name) or not is_cloud(name) or not (folder / name).is_file():
-        warnings.append(
+    if not is_inside(name) or not is_cloud(name) or not (at.path / name).is_file():
+        at.warnings.append(
             f"{poses.path}: its ply_file_path is not used: expected a point cloud in the scene "
             f"folder, found {name[:80]}"
         )

@@ -7,7 +7,7 @@ builds the DAG, so facts about files are cached.
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Collection, Mapping, Sequence
 from pathlib import Path
 from typing import NoReturn
 
@@ -15,6 +15,7 @@ from pydantic import BaseModel, ConfigDict
 
 from pipeline.config.schema import Config
 from pipeline.io.fact_cache import FactCache
+from pipeline.io.folders import PhotoFolder
 from pipeline.io.gcp import ground_control_file
 from pipeline.io.gps import fault_warnings
 from pipeline.io.photofile import FileFacts
@@ -28,26 +29,18 @@ from pipeline.io.posefiles import (
 )
 from pipeline.plan.colours import unread_colours
 from pipeline.plan.companion_files import depths_of, masks_of, without_companions
-from pipeline.plan.depth_maps import check_depth_maps
-from pipeline.plan.faults import Faults
-from pipeline.plan.fingerprint import cached_digest, digest_of_files, fingerprint_of
 from pipeline.plan.given_cameras import check_given
-from pipeline.plan.given_poses import GivenFiles
 from pipeline.plan.ground_control import GroundControlFile, find_ground_control
 from pipeline.plan.inventory import Inventory
-from pipeline.plan.listed_split import Part
 from pipeline.plan.panoramas import partial_panoramas
-from pipeline.plan.photo_folder import choose_photo_folder, read_all, uses_masks
+from pipeline.plan.photo_folder import choose_photo_folder, read_all
 from pipeline.plan.point_cloud import PointCloudFiles, find_point_cloud
-from pipeline.plan.pose_names import check_pose_names, split_of, without_linear_pairs
+from pipeline.plan.pose_names import Part, check_pose_names, split_of, without_linear_pairs
+from pipeline.plan.scene_folder import SceneFolder, digest_of_text
 from pipeline.plan.sequence import why_ordered
 from pipeline.plan.video_files import find_videos, planned_frames, read_videos
 from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
-
-_ADD_PHOTOS = (
-    "put photographs into images/ inside the scene folder, or a video into the scene folder"
-)
 
 
 class Scan(BaseModel):
@@ -176,11 +169,11 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
     """Scan a scene folder.
 
     Args:
-        folder: the scene folder: photographs or videos, and optionally poses, masks, depth maps.
-        scene: the scene's name.
+        folder: The scene folder: photographs or videos, and optionally poses, masks, depth maps.
+        scene: The scene's name.
         config: The configuration. Only ``inspect``, ``views``, ``features``, ``poses``, ``split``,
             ``init.points_file`` and ``sfm.georeference`` are used.
-        cache: JSON file that caches facts about files; None for no cache. A file that cannot be
+        cache: A JSON file that caches facts about files; None for no cache. A file that cannot be
             written is no error.
 
     Raises:
@@ -189,113 +182,50 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
             used, folders that cannot be read.
     """
     try:
-        return _scan(folder, scene, config, cache)
+        _check_folder(folder)
+        at = SceneFolder(folder, config, FactCache(cache))
+        result = _scan(at, scene)
     except OSError as error:
         raise UserError(
             f"cannot be read: {error.strerror}",
             file=error.filename or folder,
             fix="give yourself the permission to read it, or move it out of the scene folder",
         ) from None
+    at.cache.save()
+    return result
 
 
-def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
-    _check_folder(folder)
-    facts_cache = FactCache(cache)
-    faults = Faults()
-    warnings: list[str] = []
-    poses = None
-    if config.poses != "ignore":
-        with faults.of("poses", "models", "unlisted"):
-            poses = find_poses(folder, facts_cache)
-        warnings += [*incomplete_models(folder), *other_models(folder, poses)]
-
-    chosen = choose_photo_folder(folder, config, poses, facts_cache, warnings)
-    chosen = without_companions(folder, config, chosen, poses, warnings)
-    photographs = [folder / chosen.path / name for name in chosen.names]
-    facts = read_all(folder, chosen.path, chosen.names, facts_cache, warnings)
-    facts = {name: facts[name] for name in without_linear_pairs(sorted(facts), poses, warnings)}
-    listed_videos = find_videos(
-        folder, chosen.path, recursive=not chosen.names and chosen.path == "."
+def _scan(at: SceneFolder, scene: str) -> Scan:
+    poses = _find_poses(at)
+    chosen = without_companions(at, choose_photo_folder(at, poses), poses)
+    at.used.extend(at.path / chosen.path / name for name in chosen.names)
+    facts = read_all(at, chosen.path, chosen.names)
+    facts = {name: facts[name] for name in without_linear_pairs(at, sorted(facts), poses)}
+    videos, listed_videos = _find_videos(at, chosen, poses, facts)
+    if not videos and len(facts) < max(at.config.inspect.min_images, 1):
+        _raise_too_few(at, chosen, poses, len(facts), [*chosen.names, *listed_videos])
+    posed = poses is not None or bool(at.faults)
+    photos, facts = _used_photographs(at, chosen, poses, facts)
+    extent = _check_headers(at, chosen, poses, photos, facts, posed=posed)
+    control = GroundControlFile()
+    with at.faults.of():
+        control = find_ground_control(at, photos, posed=posed, complete=not videos)
+    cloud = None
+    with at.faults.of("clouds"):
+        cloud = find_point_cloud(at, poses, control.path is not None)
+    truth = truth_folder(at.path)
+    truth_files = pose_files(truth, "colmap") if truth is not None else []
+    inputs = at.pose_files(poses)
+    inputs += [control.path] if control.path is not None else []
+    inputs += [at.path / name for name in cloud.files] if cloud is not None else []
+    at.used.extend([*inputs, *truth_files])
+    unused = _unused(at, chosen, poses)
+    at.faults.check([*unused, *at.warnings])
+    manifest = Manifest(
+        scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(at.warnings)
     )
-    found_videos = listed_videos
-    if poses is not None and listed_videos:
-        warnings.append(
-            f"{len(listed_videos)} videos are not used, because poses are given (first: "
-            f"{listed_videos[0]}); poses: ignore uses them"
-        )
-        listed_videos = []
-    videos = read_videos(folder, listed_videos, facts, facts_cache, warnings)
-    if not videos and len(facts) < max(config.inspect.min_images, 1):
-        given = [file] if (file := ground_control_file(folder)) is not None else []
-        given += pose_files(folder / poses.path, poses.kind) if poses is not None else []
-        named = [*photographs, *given, *(folder / name for name in found_videos), *faults.files]
-        ignored = _ignored(config) | faults.kinds
-        warnings += Inventory(folder, chosen, poses, named, ignored).unused()
-        faults.check(warnings)
-        if not facts:
-            _no_photographs(folder, [*chosen.names, *listed_videos], warnings)
-        raise UserError(
-            f"only {len(facts)} readable photographs, at least {config.inspect.min_images} are "
-            "needed" + "".join(f"\n  {line}" for line in warnings),
-            file=folder / chosen.path,
-            fix="add photographs, or lower inspect.min_images",
-        )
-    posed = poses is not None or bool(faults)
-    split: dict[str, Part | None] = {}
-    with faults.of("unlisted"):
-        if poses is not None:
-            check_pose_names(folder, poses, chosen, sorted(facts), warnings)
-        split = split_of(poses, chosen, sorted(facts), config, warnings)
-    facts = {name: found for name, found in facts.items() if not split or split[name]}
-
-    masks: dict[str, Path] = {}
-    depths: dict[str, Path] = {}
-    with faults.of("masks"):
-        masks = masks_of(folder, config, chosen, facts, facts_cache, warnings)
-    with faults.of("depths"):
-        depths = depths_of(folder, chosen, facts)
-        check_depth_maps(depths, facts, facts_cache)
-    photos = [
-        _photo(
-            folder, chosen.path, name, facts[name], masks.get(name), depths.get(name), facts_cache
-        ).model_copy(update={"split": split.get(name)})
-        for name in sorted(facts)
-    ]
-    warnings += unread_colours(facts)
-    extent = None
-    if not posed:
-        warnings += partial_panoramas(facts)
-    elif poses is not None and not faults:
-        with faults.of("unlisted"):
-            extent = check_given(
-                GivenFiles(folder / poses.path, poses.kind, tuple(chosen.names), chosen.base),
-                photos,
-                facts_cache,
-            )
-    if not posed and config.sfm.georeference != "none":
-        warnings += fault_warnings(facts)
-    truth = truth_folder(folder)
-    control, cloud = GroundControlFile(), None
-    with faults.of():
-        control = find_ground_control(
-            folder, config, photos, warnings, posed=posed, complete=not videos
-        )
-    with faults.of("clouds"):
-        cloud = find_point_cloud(
-            folder, config, poses, control.path is not None, facts_cache, warnings
-        )
-    manifest = Manifest(scene=scene, photos=tuple(photos), videos=videos, warnings=tuple(warnings))
-    used = [*photographs, *masks.values(), *depths.values()]
-    used += [folder / name for name in found_videos]
-    used += pose_files(folder / poses.path, poses.kind) if poses is not None else []
-    used += [control.path] if control.path is not None else []
-    used += [folder / name for name in cloud.files] if cloud is not None else []
-    used += pose_files(truth, "colmap") if truth is not None else []
-    ignored = _ignored(config) | faults.kinds
-    unused = Inventory(folder, chosen, poses, [*used, *faults.files], ignored).unused()
-    faults.check([*unused, *warnings])
-    result = Scan(
-        folder=folder,
+    return Scan(
+        folder=at.path,
         manifest=manifest,
         image_folder=chosen.path,
         base_folder=chosen.base,
@@ -310,21 +240,161 @@ def _scan(folder: Path, scene: str, config: Config, cache: Path | None) -> Scan:
         given_extent=extent,
         maybe_panoramas=tuple(n for n in sorted(facts) if facts[n].panorama == "maybe"),
         truth=truth,
-        truth_digest=digest_of_files(folder, pose_files(truth, "colmap"), facts_cache)
-        if truth
-        else None,
-        fingerprint=fingerprint_of(
-            folder,
-            manifest,
-            [*sorted(chosen.names), *listed_videos],
-            poses,
-            control.path,
-            [folder / file for file in cloud.files] if cloud else [],
-            facts_cache,
-        ),
+        truth_digest=at.digest_of_files(truth_files) if truth is not None else None,
+        fingerprint=_fingerprint(at, manifest, [*sorted(chosen.names), *listed_videos], inputs),
     )
-    facts_cache.save()
-    return result
+
+
+def _find_poses(at: SceneFolder) -> GivenPoses | None:
+    if at.config.poses == "ignore":
+        return None
+    poses = None
+    with at.faults.of("poses", "models", "unlisted"):
+        poses = find_poses(at.path, at.cache)
+    at.warnings.extend([*incomplete_models(at.path), *other_models(at.path, poses)])
+    return poses
+
+
+def _find_videos(
+    at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None, photos: Collection[str]
+) -> tuple[tuple[VideoFile, ...], list[str]]:
+    """The videos that are used, and the names of all videos that would be."""
+    recursive = not chosen.names and chosen.path == "."
+    names = find_videos(at.path, chosen.path, recursive=recursive)
+    at.used.extend(at.path / name for name in names)
+    if poses is not None and names:
+        at.warnings.append(
+            f"{len(names)} videos are not used, because poses are given (first: {names[0]}); "
+            "poses: ignore uses them"
+        )
+        names = []
+    return read_videos(at, names, photos), names
+
+
+def _raise_too_few(
+    at: SceneFolder,
+    chosen: PhotoFolder,
+    poses: GivenPoses | None,
+    found: int,
+    listed: Sequence[str],
+) -> NoReturn:
+    """Raises: UserError: there are too few photographs, or an error about a file explains that."""
+    control = ground_control_file(at.path)
+    at.used.extend([*at.pose_files(poses), *([control] if control is not None else [])])
+    warnings = [*at.warnings, *_unused(at, chosen, poses)]
+    at.faults.check(warnings)
+    details = "".join(f"\n  {line}" for line in warnings)
+    if found:
+        least = at.config.inspect.min_images
+        raise UserError(
+            f"only {found} readable photographs, at least {least} are needed{details}",
+            file=at.path / chosen.path,
+            fix="add photographs, or lower inspect.min_images",
+        )
+    if not listed:
+        raise UserError(
+            f"no photograph and no video found{details}",
+            file=at.path,
+            fix="put photographs into images/ inside the scene folder, or a video into the scene "
+            "folder",
+        )
+    raise UserError(
+        f"none of the {len(listed)} photographs and videos can be read{details}",
+        file=at.path,
+        fix="replace the files by intact copies, or convert them to a supported format",
+    )
+
+
+def _used_photographs(
+    at: SceneFolder,
+    chosen: PhotoFolder,
+    poses: GivenPoses | None,
+    facts: dict[str, FileFacts],
+) -> tuple[list[Photo], dict[str, FileFacts]]:
+    """The photographs that have a pose, if any has, and a part in the scene's own split, if there
+    is one, with their masks and depth maps; and those of ``facts`` that are theirs."""
+    split: dict[str, Part | None] = {}
+    with at.faults.of("unlisted"):
+        if poses is not None:
+            check_pose_names(at, poses, chosen, sorted(facts))
+        split = split_of(at, poses, chosen, sorted(facts))
+    facts = {name: facts[name] for name in sorted(facts) if not split or split[name]}
+    masks: dict[str, Path] = {}
+    depths: dict[str, Path] = {}
+    with at.faults.of("masks"):
+        masks = masks_of(at, chosen, facts)
+    with at.faults.of("depths"):
+        depths = depths_of(at, chosen, facts)
+    at.used.extend([*masks.values(), *depths.values()])
+    shared = Photo.model_fields.keys() - {"panorama"}
+    photos = []
+    for name, found in facts.items():
+        mask, depth = masks.get(name), depths.get(name)
+        photo = Photo(
+            **found.model_dump(include=set(shared)),
+            name=name,
+            path=str(at.path / chosen.path / name),
+            mask=str(mask) if mask else None,
+            mask_digest=at.digest(mask) if mask else None,
+            depth=str(depth) if depth else None,
+            depth_digest=at.digest(depth) if depth else None,
+            camera_group=found.camera_group,
+            panorama=found.panorama == "full",
+            split=split.get(name),
+        )
+        photos.append(photo)
+    return photos, facts
+
+
+def _check_headers(
+    at: SceneFolder,
+    chosen: PhotoFolder,
+    poses: GivenPoses | None,
+    photos: Sequence[Photo],
+    facts: Mapping[str, FileFacts],
+    *,
+    posed: bool,
+) -> float | None:
+    """Compare the photographs' headers with the given cameras, and warn of those that are not used
+    as they say; returns the extent of the given cameras (``check_given``), if any."""
+    at.warnings.extend(unread_colours(facts))
+    if not posed:
+        at.warnings.extend(partial_panoramas(facts))
+        if at.config.sfm.georeference != "none":
+            at.warnings.extend(fault_warnings(facts))
+    elif poses is not None and not at.faults:
+        with at.faults.of("unlisted"):
+            return check_given(at, poses, chosen, photos)
+    return None
+
+
+def _unused(at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None) -> list[str]:
+    """The warnings of files that are not used, but for those that the configuration leaves out."""
+    ignored = set(at.faults.kinds)
+    if at.config.poses == "ignore":
+        ignored |= {"poses", "models"}
+    if not at.uses_masks:
+        ignored.add("masks")
+    if at.config.init.points_file == "none":
+        ignored.add("clouds")
+    return Inventory(at.path, chosen, poses, [*at.used, *at.faults.files], ignored).unused()
+
+
+def _fingerprint(
+    at: SceneFolder, manifest: Manifest, listed: Sequence[str], inputs: Sequence[Path]
+) -> str:
+    """See ``Scan.fingerprint``.
+
+    Args:
+        listed: The names of all photographs and videos. Those that cannot be read are part of the
+            fingerprint by their names, because warnings mention them.
+        inputs: The files beside the manifest's.
+    """
+    files: list[Photo | VideoFile] = [*manifest.photos, *manifest.videos]
+    others = [Path(p) for photo in manifest.photos for p in (photo.mask, photo.depth) if p]
+    lines = [f"{Path(f.path).relative_to(at.path).as_posix()}\0{f.digest}" for f in files]
+    lines += [*listed, at.digest_of_files([*others, *inputs])]
+    return digest_of_text("\n".join(lines))
 
 
 def _check_folder(folder: Path) -> None:
@@ -342,59 +412,4 @@ def _check_folder(folder: Path) -> None:
         "no such scene folder" if not folder.exists() else "expected a scene folder, found a file",
         file=folder,
         fix=f"choose one of the scenes in {root}: {', '.join(scenes) or 'none'}",
-    )
-
-
-def _ignored(config: Config) -> frozenset[str]:
-    """The kinds of files that the configuration leaves out."""
-    ignored = set()
-    if config.poses == "ignore":
-        ignored |= {"poses", "models"}
-    if not uses_masks(config):
-        ignored.add("masks")
-    if config.init.points_file == "none":
-        ignored.add("clouds")
-    return frozenset(ignored)
-
-
-def _no_photographs(folder: Path, listed: Sequence[str], warnings: Sequence[str]) -> NoReturn:
-    details = "".join(f"\n  {line}" for line in warnings)
-    if not listed:
-        raise UserError(f"no photograph and no video found{details}", file=folder, fix=_ADD_PHOTOS)
-    raise UserError(
-        f"none of the {len(listed)} photographs and videos can be read{details}",
-        file=folder,
-        fix="replace the files by intact copies, or convert them to a supported format",
-    )
-
-
-def _photo(
-    folder: Path,
-    image_folder: str,
-    name: str,
-    facts: FileFacts,
-    mask: Path | None,
-    depth: Path | None,
-    cache: FactCache,
-) -> Photo:
-    return Photo(
-        name=name,
-        path=str(folder / image_folder / name),
-        width=facts.width,
-        height=facts.height,
-        digest=facts.digest,
-        linear=facts.linear,
-        alpha=facts.alpha,
-        bits=facts.bits,
-        orientation=facts.orientation,
-        colours=facts.colours,
-        mask=str(mask) if mask else None,
-        mask_digest=cached_digest(mask, cache) if mask else None,
-        depth=str(depth) if depth else None,
-        depth_digest=cached_digest(depth, cache) if depth else None,
-        focal_px=facts.focal_px,
-        camera_group=facts.camera_group,
-        panorama=facts.panorama == "full",
-        gps=facts.gps,
-        taken=facts.taken,
     )

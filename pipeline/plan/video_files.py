@@ -6,9 +6,9 @@ from collections import Counter
 from collections.abc import Collection, Sequence
 from pathlib import Path, PurePosixPath
 
-from pipeline.io.fact_cache import FactCache
 from pipeline.io.folders import videos_in
 from pipeline.io.videofile import VideoFacts, read_video_facts
+from pipeline.plan.scene_folder import SceneFolder
 from pipeline.scene.manifest import Photo, VideoFile
 
 # A folder of videos beside images/.
@@ -34,33 +34,29 @@ def find_videos(folder: Path, image_folder: str, *, recursive: bool) -> list[str
 
 
 def read_videos(
-    folder: Path,
-    names: Sequence[str],
-    photos: Collection[str],
-    cache: FactCache,
-    warnings: list[str],
+    at: SceneFolder, names: Sequence[str], photos: Collection[str]
 ) -> tuple[VideoFile, ...]:
     """The videos whose header can be read; the others add a warning each.
 
     Args:
-        names: files relative to ``folder``, the scene folder.
-        photos: names of the photographs, which the names of frames must differ from.
+        names: The files, relative to the scene folder.
+        photos: The names of the photographs, which the names of frames must differ from.
     """
     found: dict[str, VideoFacts] = {}
     for name in names:
-        facts = cache.read(folder / name, "video", VideoFacts, read_video_facts)
+        facts = at.cache.read(at.path / name, "video", VideoFacts, read_video_facts)
         if isinstance(facts, str):
-            warnings.append(f"{name}: left out: {facts}")
+            at.warnings.append(f"{name}: left out: {facts}")
         else:
             found[name] = facts
-            warnings += [f"{name}: {text}" for text in _doubts(facts)]
+            at.warnings.extend(f"{name}: {text}" for text in _doubts(facts))
     taken = {str(parent) for photo in photos for parent in PurePosixPath(photo).parents}
     stems = {name: str(PurePosixPath(name).with_suffix("")) for name in found}
     count = Counter(stems.values())
     return tuple(
         VideoFile(
             name=stem if count[stem] == 1 and stem not in taken else name,
-            path=str(folder / name),
+            path=str(at.path / name),
             **found[name].model_dump(),
         )
         for name, stem in stems.items()

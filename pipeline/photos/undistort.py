@@ -5,8 +5,10 @@ A panorama or a wide fisheye photograph becomes several views (``faces``).
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path, PurePosixPath
 
 import numpy as np
@@ -14,13 +16,7 @@ import numpy as np
 from pipeline.config import schema
 from pipeline.geometry.cameras import Camera
 from pipeline.io.colmap import write_model
-from pipeline.photos.faces import (
-    Face,
-    WideCamera,
-    face_lens,
-    split,
-    used_share,
-)
+from pipeline.photos.faces import Face, WideCamera, face_lens, split, used_share
 from pipeline.photos.image_circle import image_circle
 from pipeline.photos.lens import Lens, pinhole_lens
 from pipeline.photos.naming import rename
@@ -38,6 +34,9 @@ _PHOTO_BYTES, _MAP_BYTES = 12.0, 14.0
 # Largest relative difference of the aspect ratio between a photograph and its camera, which
 # differ by rounding.
 SHAPE_TOLERANCE = 0.02
+
+#: The camera's number in the model, and the width and height of photographs in pixels.
+Key = tuple[int, int, int]
 
 
 @dataclass(frozen=True)
@@ -83,7 +82,7 @@ def undistort(
     """
     registered = model.by_name()
     photos = [photo for photo in manifest.photos if photo.name in registered]
-    groups: dict[tuple[int, int, int], list[Photo]] = {}
+    groups: dict[Key, list[Photo]] = {}
     for photo in photos:
         key = (registered[photo.name].camera_id, photo.width, photo.height)
         groups.setdefault(key, []).append(photo)
@@ -93,7 +92,7 @@ def undistort(
 
     progress = Progress("undistorting", len(photos), "photographs")
     cameras: dict[int, Camera] = {}
-    shares: dict[tuple[int, int, int], float] = {}
+    shares: dict[Key, float] = {}
     parts: dict[str, list[Part]] = {}
     done: list[Photo] = []
     decisions: list[str] = []
@@ -117,14 +116,7 @@ def undistort(
                     for number, face in enumerate(faces[key], start=len(cameras) + 1)
                 ]
             cameras |= {target.camera_id: target.lens.target for target in targets}
-
-            def work(photo: Photo, targets: list[Target] = targets) -> list[Photo]:
-                loaded = load_source(photo, targets[0])
-                return [
-                    write_view(photo, loaded, names[_key(photo, t.face)], t, config, out)
-                    for t in targets
-                ]
-
+            work = partial(_write_views, targets=targets, names=names, config=config, out=out)
             for photo, new in zip(group, pool.map(work, group), strict=True):
                 parts[photo.name] = [
                     Part(view.name, target.camera_id, target.rotation)
@@ -140,16 +132,37 @@ def undistort(
         warnings=manifest.warnings,
     )
     undistorted.write(out / "images.json")
-    sizes = {key: len(groups[key]) * key[1] * key[2] for key in faces}
-    used = sum(shares[key] * size for key, size in sizes.items())
     return UndistortReport(
         manifest=undistorted,
         photographs=len(photos),
         split=sum(len(groups[key]) for key in faces),
-        used_share=used / sum(sizes.values()) if sizes else None,
+        used_share=_mean_share(shares, groups),
         decisions=tuple(decisions),
         warnings=tuple(warnings),
     )
+
+
+def _mean_share(shares: Mapping[Key, float], groups: Mapping[Key, list[Photo]]) -> float | None:
+    """The mean of ``shares`` over the pixels of the photographs; None without any."""
+    sizes = {key: len(groups[key]) * key[1] * key[2] for key in shares}
+    used = sum(shares[key] * size for key, size in sizes.items())
+    return used / sum(sizes.values()) if sizes else None
+
+
+def _write_views(
+    photo: Photo,
+    *,
+    targets: Sequence[Target],
+    names: Mapping[str, str],
+    config: schema.Undistort,
+    out: Path,
+) -> list[Photo]:
+    """Write the views of a photograph; returns their entries in the manifest."""
+    loaded = load_source(photo, targets[0])
+    return [
+        write_view(photo, loaded, names[_key(photo, target.face)], target, config, out)
+        for target in targets
+    ]
 
 
 def _wide_camera(
@@ -166,9 +179,7 @@ def _wide_camera(
 
 
 def _names(
-    groups: dict[tuple[int, int, int], list[Photo]],
-    faces: dict[tuple[int, int, int], list[Face]],
-    config: schema.Undistort,
+    groups: Mapping[Key, list[Photo]], faces: Mapping[Key, list[Face]], config: schema.Undistort
 ) -> dict[str, str]:
     """File names of the views, by ``_key``."""
     suffixes = {}

@@ -14,10 +14,9 @@ from pathlib import Path
 from typing import Any
 
 from pipeline.command.main import WORKFLOW_COMMANDS, make_parser
-from pipeline.runtime.atomic import write_text
+from pipeline.config.docs import ROOT, SCHEMAS, write_pages
 
-ROOT = Path(__file__).resolve().parents[2]
-REFERENCE, SCHEMAS = ROOT / "docs" / "reference", ROOT / "docs" / "schemas"
+REFERENCE = ROOT / "docs" / "reference"
 
 _INTRO = """# Command line
 
@@ -141,18 +140,5 @@ def _row(action: argparse.Action) -> str:
     return f"| `{' '.join(filter(None, [names, value]))}` | {text.replace('|', chr(92) + '|')} |"
 
 
-def main() -> int:
-    """Write the pages, or with ``--check`` only say whether they are current."""
-    check = "--check" in sys.argv[1:]
-    stale = [
-        path for path, text in pages().items() if not path.exists() or path.read_text() != text
-    ]
-    for path in stale:
-        if not check:
-            write_text(path, pages()[path])
-        print(f"{path.relative_to(ROOT)}: {'not current: run make docs' if check else 'written'}")
-    return 1 if check and stale else 0
-
-
 if __name__ == "__main__":
-    sys.exit(main())
+    sys.exit(write_pages(pages()))

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import json
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import import_module
 from pathlib import Path
 from types import NoneType, UnionType
@@ -283,19 +283,27 @@ def _counters() -> type[BaseModel]:
     return create_model("Counters", __doc__=about, **fields)
 
 
+def write_pages(pages: Mapping[Path, str]) -> int:
+    """Write the pages that are not current, or with ``--check`` only report them.
+
+    Returns:
+        The exit code: 1 if a page that was only reported is not current.
+    """
+    check = "--check" in sys.argv[1:]
+    stale = [path for path, text in pages.items() if not path.exists() or path.read_text() != text]
+    for path in stale:
+        if not check:
+            write_text(path, pages[path])
+        print(f"{path.relative_to(ROOT)}: {'not current: run make docs' if check else 'written'}")
+    return 1 if check and stale else 0
+
+
 def main() -> int:
     """Write the files, or with ``--check`` only report those that are not current."""
-    stale = []
     pages = {PAGE: page(), EXPERIMENTS_PAGE: experiments_page(), DEFAULTS: defaults()}
-    for path, text in (pages | json_schemas()).items():
-        if not path.exists() or path.read_text() != text:
-            stale.append(path.relative_to(ROOT))
-            if "--check" not in sys.argv[1:]:
-                write_text(path, text)
-    for path in stale:
-        print(f"{path}: {'not current: run make docs' if '--check' in sys.argv else 'written'}")
+    code = write_pages(pages | json_schemas())
     print(f"{num_options()} options of the product, {num_experiments()} of experiments")
-    return 1 if stale and "--check" in sys.argv[1:] else 0
+    return code
 
 
 if __name__ == "__main__":

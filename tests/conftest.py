@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Generator, Iterator
+from collections.abc import Generator
 
 import pytest
 from hypothesis import HealthCheck, settings
 
-from tests.forked import forked_spawns
 from tests.tools import fail_skipped
 
 # torch's own threads would spin beside the other worker's, and the references' arrays are small.
@@ -35,12 +34,6 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             for group in groups
             for item in group[len(group) * worker // workers : len(group) * (worker + 1) // workers]
         ]
-
-
-@pytest.fixture(scope="session", autouse=True)
-def forks() -> Iterator[None]:
-    with forked_spawns():
-        yield
 
 
 @pytest.hookimpl(wrapper=True)

@@ -10,36 +10,13 @@ import shutil
 import signal
 import subprocess
 import sys
-import tempfile
 import time
 from collections import Counter
-from collections.abc import Sequence
-from functools import cache
 from pathlib import Path
 
-from tests.e2e.forking import Fork, ForkServer, write_python
+from pipeline.demo.__main__ import main as write_demo
 
 ROOT = Path(__file__).resolve().parents[2]
-
-# What each run of Snakemake and each of its jobs would import anew. Stages with pycolmap share no
-# process with those with torch, and cv2 comes first: see CONTRIBUTING.md.
-COMMON = ("cv2", "PIL.Image", "pydantic", "numpy.random", "scipy.sparse.csgraph", "scipy.spatial")
-RUNS = ForkServer("snakemake.cli", "numpy", "pydantic", "stages.workflow.project")
-TORCH_JOBS = ForkServer(
-    *("torch", *COMMON, "scipy.ndimage", "stages.workflow.blocks", "pipeline.training.scene"),
-    *("pipeline.metrics.evaluate", "pipeline.coverage.measure", "pipeline.export.write"),
-    *("pipeline.reporting.collect", "pipeline.reporting.page", "pipeline.reporting.scene"),
-)
-OTHER_JOBS = ForkServer(
-    *(*COMMON, "pycolmap", "stages.workflow.inputs", "pipeline.photos.verify"),
-    *("pipeline.sfm.features", "pipeline.sfm.matching", "pipeline.sfm.mapping"),
-    *("pipeline.photos.undistort", "pipeline.splats.init", "pipeline.demo.write"),
-)
-TORCH_STAGES = ("train", "evaluate", "coverage", "export", "report")
-OTHER_STAGES = (
-    *("inspect", "decode", "extract", "features", "pairs", "match", "matches", "sfm"),
-    *("refine", "undistort", "dense", "init"),
-)
 
 SOURCES = ("Snakefile", "pipeline", "stages", "profiles", "pyproject.toml")
 
@@ -71,10 +48,8 @@ def copy_sources(project: Path) -> None:
 
 def make_scene(project: Path, scene: str, *options: str) -> None:
     """Make a tiny demo scene in ``data/<scene>`` of a project."""
-    # One process: starting more takes longer than they save.
-    words = [f"data/{scene}", *TINY_DEMO, "--processes", "1", *options]
-    code, said = run_fork(OTHER_JOBS, "pipeline.demo", words, project, Path(sys.executable))
-    assert code == 0, said
+    words = [str(project / "data" / scene), *TINY_DEMO, "--processes", "1", *options]
+    assert write_demo(words) == 0
 
 
 def copy_run(source: Path, target: Path) -> Path:
@@ -106,68 +81,37 @@ def command(*args: str, config: dict | None = None, cores: int = 2) -> list[str]
     return [sys.executable, "-m", "snakemake", *arguments(*args, config=config, cores=cores)]
 
 
-@cache
-def forking_python() -> Path:
-    """The ``python`` of Snakemake's jobs."""
-    folder = TORCH_JOBS.address.parent / "bin"
-    folder.mkdir()
-    return write_python(
-        folder / "python",
-        TORCH_JOBS.handles([f"-m stages {stage}" for stage in TORCH_STAGES]),
-        OTHER_JOBS.handles(
-            [
-                *("-m stages.workflow.plan --out", "-m stages.workflow.batch --results"),
-                *(f"-m stages {stage}" for stage in OTHER_STAGES),
-            ]
-        ),
-    )
-
-
 def start_snakemake(
-    project: Path, *args: str, output: int, config: dict | None = None, cores: int = 2
-) -> Fork:
-    """Start Snakemake in ``project``; ``output`` receives stdout and stderr.
-
-    It and its jobs are forks of processes that have imported large packages. If Snakemake and the
-    rest of its process group are killed, so is its job.
-    """
-    return RUNS.start(
-        "snakemake",
-        arguments(*args, config=config, cores=cores),
-        folder=project,
-        environment=environment(project),
-        output=output,
-        python=forking_python(),
+    project: Path, *args: str, config: dict | None = None, cores: int = 2
+) -> subprocess.Popen[bytes]:
+    """Start Snakemake in ``project``, in a session of its own; its output is dropped."""
+    return subprocess.Popen(
+        command(*args, config=config, cores=cores),
+        cwd=project,
+        env=environment(project),
+        stdout=subprocess.DEVNULL,
+        stderr=subprocess.DEVNULL,
+        start_new_session=True,
     )
-
-
-def run_fork(
-    server: ForkServer, module: str, words: Sequence[str], project: Path, python: Path
-) -> tuple[int, str]:
-    """The exit status of a module, and its stdout and stderr together."""
-    with tempfile.TemporaryFile("w+", encoding="utf-8") as output:
-        run = server.start(
-            module,
-            words,
-            folder=project,
-            environment=environment(project),
-            output=output.fileno(),
-            python=python,
-        )
-        code = run.wait(timeout_s=900)
-        output.seek(0)
-        return code, output.read()
 
 
 def snakemake(
     project: Path, *args: str, config: dict | None = None, cores: int = 2, check: bool = True
 ) -> subprocess.CompletedProcess[str]:
     """Run Snakemake in ``project`` to its end; stdout and stderr together in ``stdout``."""
-    words = arguments(*args, config=config, cores=cores)
-    code, said = run_fork(RUNS, "snakemake", words, project, forking_python())
-    if check and code != 0:
-        raise AssertionError(f"snakemake ended with {code}:\n{said}")
-    return subprocess.CompletedProcess(words, code, said)
+    done = subprocess.run(
+        command(*args, config=config, cores=cores),
+        cwd=project,
+        env=environment(project),
+        stdin=subprocess.DEVNULL,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.STDOUT,
+        text=True,
+        timeout=900,
+    )
+    if check and done.returncode != 0:
+        raise AssertionError(f"snakemake ended with {done.returncode}:\n{done.stdout}")
+    return done
 
 
 def rules_run(done: subprocess.CompletedProcess[str], scene: str | None = None) -> set[str]:
@@ -196,11 +140,10 @@ def start_and_kill(
 ) -> None:
     """Start Snakemake and SIGKILL it, with its jobs or alone, once a file matching ``ready``
     (a glob below the project) exists."""
-    with open(os.devnull, "w") as nothing:
-        run = start_snakemake(project, target, output=nothing.fileno(), config=config, cores=cores)
+    run = start_snakemake(project, target, config=config, cores=cores)
     deadline = time.monotonic() + 300
     while not any(project.glob(ready)):
-        assert not run.ended(), f"snakemake ended before {ready} appeared"
+        assert run.poll() is None, f"snakemake ended before {ready} appeared"
         assert time.monotonic() < deadline, f"{ready} never appeared"
         time.sleep(0.01)
     if only_snakemake:

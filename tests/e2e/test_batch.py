@@ -6,11 +6,13 @@ import csv
 import json
 import re
 import shutil
+from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from tests.e2e.harness import TINY, make_project, make_scene, rules_run, snakemake
-from tests.e2e.test_bad_input import noise
+from tests.videos import texture
 
 pytestmark = pytest.mark.slow
 
@@ -26,11 +28,19 @@ def rows(project) -> dict[str, dict[str, str]]:
         return {f"{row['scene']}@{row['config']}": row for row in csv.DictReader(file)}
 
 
+def strip(folder: Path, count: int) -> None:
+    """Photographs of which each overlaps with the next by two pixels."""
+    folder.mkdir(parents=True)
+    wide = texture(size=(160 * count, 120))
+    for i in range(count):
+        Image.fromarray(wide[:, 158 * i : 158 * i + 160]).save(folder / f"{i}.png")
+
+
 def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path):
     project = make_project(tmp_path / "project")
     small = ("--views", "15", "--size", "100x76")
     make_scene(project, "good", "--poses", "colmap", "--distortion", "none", *small)
-    noise(project / "data/broken/images", 4)
+    strip(project / "data/broken/images", 4)
     (project / "data/notes").mkdir()
 
     failed = snakemake(project, TABLE, config=CONFIG, check=False)
@@ -38,6 +48,8 @@ def test_a_batch_goes_on_when_a_scene_fails_and_shares_what_is_the_same(tmp_path
     assert "Traceback" not in failed.stdout, failed.stdout
     blamed = set(re.findall(r"^error in \w+ of (\S+):", failed.stdout, re.M))
     assert blamed == {"broken@plain", "broken@sh0"}
+    assert not list(project.glob("results/broken*/metrics.json"))
+    assert not list(project.glob("results/broken*/.scratch/*/*/out")), "half output was left"
     found = rows(project)
     assert {name: row["status"] for name, row in found.items()} == {
         "broken@plain": "failed",

@@ -11,7 +11,7 @@ import pytest
 
 from pipeline.io.colmap import read_model, write_model
 from pipeline.scene.normalization import Normalization
-from tests.e2e.harness import TINY, make_project, make_scene, rules_run, snakemake
+from tests.e2e.harness import TINY, make_project, make_scene, metrics, rules_run, snakemake
 from tests.once import made_once
 from tests.videos import write_video
 
@@ -22,6 +22,7 @@ ALWAYS = {"plan", "inspect", "init", "train", "evaluate", "coverage", "export", 
 FEW = ALWAYS | {"dense"}
 PINHOLE = ("--distortion", "none")
 SFM = {"features", "matches", "sfm"}
+METRICS = "results/{}/metrics.json"
 SHORT = TINY | {"train": TINY["train"] | {"steps": 120}}
 MASKED = ("--poses", "colmap", "--masks", *PINHOLE)
 
@@ -33,10 +34,9 @@ def project(tmp_path_factory):
 
 @pytest.fixture(scope="session")
 def masked(tmp_path_factory):
-    """The folder of a scene with poses and masks."""
+    """The folder of a scene with exact poses and masks."""
 
     def make(project):
-        make_project(project)
         make_scene(project, "masked", *MASKED)
 
     return made_once(tmp_path_factory, "e2e-masked", make) / "data/masked"
@@ -45,39 +45,37 @@ def masked(tmp_path_factory):
 # For scenes with poses: too small for structure from motion.
 SMALL = ("--views", "15", "--size", "100x76")
 SCENES = {
-    "raw": (("--format", "dng"), FEW | SFM | {"decode", "undistort"}),
-    "raw_posed": (
-        ("--format", "dng", "--poses", "colmap", *PINHOLE, *SMALL),
-        FEW | {"decode", "refine"},
-    ),
+    "raw": (("--format", "dng", "--views", "3"), FEW | SFM | {"decode", "undistort"}),
     "bare": (("--poses", "transforms", "--no-points", *PINHOLE, *SMALL), FEW),
-    "lens": (
-        ("--poses", "colmap", "--distortion", "opencv", *SMALL),
-        FEW | {"refine", "undistort"},
+    "raw_lens": (
+        ("--format", "dng", "--poses", "colmap", "--distortion", "opencv", *SMALL),
+        FEW | {"decode", "refine", "undistort"},
     ),
-    "masked": (MASKED, ALWAYS | {"refine"}),
     "alpha": (("--poses", "transforms", "--format", "png", "--alpha", *PINHOLE, *SMALL), ALWAYS),
 }
 
 
-@pytest.mark.parametrize("scenes", [("raw", "bare"), ("raw_posed", "lens"), ("masked", "alpha")])
-def test_the_plan_runs_what_each_scene_needs(project, masked, scenes):
-    for scene in scenes:
-        if scene == "masked":
-            shutil.copytree(masked, project / "data" / scene)
-        else:
-            make_scene(project, scene, *SCENES[scene][0])
-    done = snakemake(project, *(f"results/{s}/metrics.json" for s in scenes), config=SHORT)
-    for scene in scenes:
+def test_the_plan_runs_what_each_scene_needs(project):
+    for scene, (options, _) in SCENES.items():
+        make_scene(project, scene, *options)
+    planned = snakemake(project, "-n", *map(METRICS.format, SCENES), config=SHORT)
+    for scene, (_, expected) in SCENES.items():
+        assert rules_run(planned, scene) == expected
+    ran = ("raw_lens", "alpha")
+    done = snakemake(project, *map(METRICS.format, ran), config=SHORT)
+    for scene in ran:
         expected = SCENES[scene][1]
         assert rules_run(done, scene) == expected
-        found = json.loads((project / f"results/{scene}/metrics.json").read_text())
-        ran = {name for name, s in found["stages"].items() if not s["skipped"]}
-        assert ran == expected - {"plan"}
-        assert all(s["reason"] for s in found["stages"].values() if s["skipped"])
-        assert found["registered_images"] == found["total_images"]
-        assert found["psnr"] > 18
-        assert found["pose_error"]["rotation_median_deg"] < 0.3
+        check_metrics(project, scene, expected)
+
+
+def check_metrics(project, scene, expected) -> None:
+    found = metrics(project, scene)
+    assert {name for name, s in found["stages"].items() if not s["skipped"]} == expected - {"plan"}
+    assert all(s["reason"] for s in found["stages"].values() if s["skipped"])
+    assert found["registered_images"] == found["total_images"]
+    assert found["psnr"] > 18
+    assert found["pose_error"]["rotation_median_deg"] < 0.3
 
 
 def test_a_cloud_and_poses_in_millimetres_far_away_become_a_scene(project, masked):
@@ -94,7 +92,7 @@ def test_a_cloud_and_poses_in_millimetres_far_away_become_a_scene(project, maske
     results = project / "results" / "far"
     reason = json.loads((results / "plan.json").read_text())["stages"]["init"]["reason"]
     assert reason.startswith("Gaussians from") and "points.xyz" in reason
-    assert json.loads((results / "metrics.json").read_text())["psnr"] > 18
+    assert metrics(project, "far")["psnr"] > 18
     found = read_model(results / "export" / "sparse" / "0").by_name()
     for image in given.images.values():
         np.testing.assert_allclose(found[image.name].centre, image.centre, rtol=1e-9)
@@ -104,12 +102,16 @@ def test_frames_of_a_video_become_a_scene(project, masked):
     """A photograph is one frame of the video; the camera moves far between them."""
     views = [cv2.imread(str(path)) for path in sorted((masked / "images").iterdir())]
     write_video(project / "data" / "video" / "walk.mp4", views)
-    done = snakemake(project, "results/video/metrics.json", config=SHORT)
-    assert rules_run(done) == FEW | SFM | {"decode", "undistort"}
-    found = json.loads((project / "results/video/metrics.json").read_text())
-    assert found["total_images"] == len(views)
-    assert found["registered_images"] >= 0.9 * len(views)
-    plan = json.loads((project / "results/video/plan.json").read_text())
+    planned = snakemake(project, "-n", "results/video/metrics.json", config=SHORT)
+    assert rules_run(planned) == FEW | SFM | {"decode", "undistort"}
+    snakemake(
+        project, "results/video/undistort/stage.json", "results/video/plan.json", config=SHORT
+    )
+    results = project / "results" / "video"
+    sfm = json.loads((results / "sfm" / "stage.json").read_text())["counters"]
+    assert sfm["total"] == len(views)
+    assert sfm["registered"] >= 0.9 * len(views)
+    plan = json.loads((results / "plan.json").read_text())
     assert plan["stages"]["decode"]["reason"] == f"1 video: at most {len(views)} frames"
 
 
@@ -123,7 +125,7 @@ def test_panoramas_and_photographs_become_one_scene(project):
             photo.rename(folder / f"{part}_{photo.name}")
     done = snakemake(project, "results/mixed/metrics.json", config=SHORT)
     assert rules_run(done) == ALWAYS | SFM | {"undistort"}
-    found = json.loads((project / "results/mixed/metrics.json").read_text())
+    found = metrics(project, "mixed")
     assert found["input"].startswith("24 photographs (8 panoramas)")
     assert found["registered_images"] == 24 and found["psnr"] > 18
     views = {view["name"].split("_")[0] for view in found["per_view"]}
@@ -132,24 +134,20 @@ def test_panoramas_and_photographs_become_one_scene(project):
     assert sfm["counters"]["verdict"] == "good"
 
 
-def test_given_poses_can_be_ignored(project, masked):
-    shutil.copytree(masked, project / "data/ignored")
-    done = snakemake(project, "-n", "results/ignored/metrics.json", config={"poses": "ignore"})
-    assert rules_run(done) >= SFM
-
-
 def test_cameras_that_training_moves_are_what_comes_out(project, masked):
-    """On the masked scene: its poses are exact, so that what moves them must do no harm."""
+    """The scene's poses are exact, so that what moves them must do no harm."""
     shutil.copytree(masked, project / "data/moving")
+    ignored = snakemake(project, "-n", METRICS.format("moving"), config={"poses": "ignore"})
+    assert rules_run(ignored) >= SFM
     moves = {"refine_poses": True, "refine_intrinsics": True}
     limits = {"max_pose_change": 0.003, "max_intrinsics_change": 0.003}
     config = {**SHORT, "train": {**SHORT["train"], **moves}, "experiments": {"train": limits}}
-    snakemake(project, "results/moving/metrics.json", config=config)
-    results = project / "results" / "moving"
-    found = json.loads((results / "metrics.json").read_text())
+    done = snakemake(project, METRICS.format("moving"), config=config)
+    assert rules_run(done) == ALWAYS | {"refine"}
+    check_metrics(project, "moving", ALWAYS | {"refine"})
+    results, found = project / "results" / "moving", metrics(project, "moving")
     assert "pose of each test camera is optimised" in found["protocol"]["poses"]
-    assert found["psnr"] > 18
-    assert 0 < found["pose_error"]["rotation_median_deg"] < 0.3
+    assert found["pose_error"]["rotation_median_deg"] > 0
     told = read_model(project / "data" / "moving" / "sparse" / "0")
     model = read_model(results / "export" / "sparse" / "0")
     given, exported = told.by_name(), model.by_name()

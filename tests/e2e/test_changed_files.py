@@ -90,11 +90,10 @@ def test_copied_results_are_made_again_where_options_have_changed(project):
     assert rules_run(done) == set()
 
 
-@pytest.mark.parametrize("content", ["", '{"stage": "sfm"}'])
-def test_a_damaged_record_is_one_clear_error(project, content):
+def test_a_damaged_record_is_one_clear_error(project):
     record = project / "results" / "tiny" / "sfm" / "stage.json"
     whole = record.read_text()
-    record.write_text(content)
+    record.write_text('{"stage": "sfm"}')
     target = "results/tiny/undistort/stage.json"
     done = snakemake(project, target, config=TINY, check=False)
     assert done.returncode != 0 and "Traceback" not in done.stdout

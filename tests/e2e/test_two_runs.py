@@ -9,22 +9,27 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
+from stages.workflow.project import SnakemakeProject
 from tests.e2e.harness import (
     TINY,
     command,
     copy_run,
     environment,
+    make_project,
     model_digests,
     rules_run,
     snakemake,
     start_and_kill,
     start_snakemake,
 )
-from tests.e2e.starts import start_pairs, two_scenes
+from tests.pictures import photos
+from tests.stages.flow import dry_run
 
 pytestmark = pytest.mark.slow
 
@@ -43,40 +48,33 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
+def two_scenes(folder: Path) -> Path:
+    """A project with two scenes of three photographs."""
+    project = make_project(folder)
+    for scene in ("garden", "patio"):
+        photos(project / "data" / scene / "images", 3)
+    return project
+
+
 def test_two_scenes_started_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    assert start_pairs(two_scenes(tmp_path / "project"), 4) == []
-
-
-@pytest.mark.parametrize("profile", [(), ("--workflow-profile", "profiles/ci"), ("none",)])
-def test_lock_files_of_a_dead_snakemake_block_nothing(
-    tmp_path: Path, profile: tuple[str, ...]
-) -> None:
+    """The first pair also creates Snakemake's own folder at the same time."""
     project = two_scenes(tmp_path / "project")
-    target = "results/garden/plan.json"
-    if profile == ("none",):
-        (project / "own").mkdir()
-        (project / "own/config.yaml").write_text("keep-going: true\n")
-        profile = ("--workflow-profile", "own")
-    locks = project / ".snakemake" / "locks"
-    locks.mkdir(parents=True)
-    for kind in ("input", "output"):
-        (locks / f"0.{kind}.lock").write_text(f"{target}\n")
-    assert "locked" not in snakemake(project, "-n", target, *profile).stdout
-    snakemake(project, target, *profile)
-    assert (project / target).is_file()
-    snakemake(project, target, "--unlock", *profile)
-    assert not list(project.glob(".snakemake/locks/*"))
+    for _ in range(2):
+        shutil.rmtree(project / "results", ignore_errors=True)
+        with ThreadPoolExecutor(2) as pool:
+            plans = [f"results/{scene}/plan.json" for scene in ("garden", "patio")]
+            runs = [*pool.map(lambda plan: snakemake(project, plan, cores=1), plans)]
+        assert not any("Traceback" in run.stdout for run in runs)
+        assert all((project / plan).exists() for plan in plans)
 
 
-@pytest.mark.parametrize("only_snakemake", [False, True], ids=["with its job", "alone"])
-def test_kill_9_and_the_same_command_continues(
-    project: Path, finished: Path, only_snakemake: bool
+def test_a_job_that_lost_its_snakemake_goes_on_and_the_next_one_waits(
+    project: Path, finished: Path
 ) -> None:
-    """A job that lost its Snakemake goes on; the new one waits for its stage."""
     (project / "results/tiny/metrics.json").unlink()
     shutil.rmtree(project / "results/tiny/evaluate")
     ready = "results/tiny/.scratch/evaluate/*/out"
-    start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=only_snakemake)
+    start_and_kill(project, TARGET, ready, config=TINY, only_snakemake=True)
     done = snakemake(project, TARGET, config=TINY)
     assert "evaluate" in rules_run(done) and "train" not in rules_run(done)
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
@@ -90,7 +88,6 @@ def test_a_closed_terminal_and_the_same_command_continues(project: Path) -> None
     log, progress = (logs / name for name in ("train.log", "train.metrics.jsonl"))
     for file in (log, progress):
         file.unlink()
-    # Not in a fork: its job would end with the process that represents it.
     with subprocess.Popen(
         command(TARGET, config=TINY),
         cwd=project,
@@ -114,11 +111,10 @@ def test_the_second_run_of_a_scene_is_refused_with_the_name_of_the_first(
     project: Path, finished: Path
 ) -> None:
     shutil.rmtree(project / "results/tiny/export")
-    with open(os.devnull, "w") as nothing:
-        first = start_snakemake(project, TARGET, output=nothing.fileno(), config=TINY)
+    first = start_snakemake(project, TARGET, config=TINY)
     lock = project / "results/tiny/.scratch/run.lock"
     while not lock.is_file() or f"process {first.pid}\n" not in lock.read_text():
-        assert not first.ended()
+        assert first.poll() is None
         time.sleep(0.01)
     os.killpg(first.pid, signal.SIGSTOP)
     try:
@@ -131,44 +127,44 @@ def test_the_second_run_of_a_scene_is_refused_with_the_name_of_the_first(
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
 
 
-def test_two_batches_do_not_write_the_tables_at_once(tmp_path: Path) -> None:
+def test_two_batches_do_not_write_the_tables_at_once(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
     """The tables are in one folder, even if the batches have no run in common."""
-    project = two_scenes(tmp_path / "project")
-    held = project / "results" / ".scratch" / "run.lock"
+    monkeypatch.chdir(tmp_path)
+    held = Path("results/.scratch/run.lock")
     held.parent.mkdir(parents=True)
+    tables = SimpleNamespace(wildcards=SimpleNamespace(), output=["results/benchmark.csv"])
+    dag = SimpleNamespace(needrun_jobs=lambda: [tables])
     with open(held, "w") as lock:
         lock.write("someone on a machine, process 1\n")
         lock.flush()
         fcntl.flock(lock, fcntl.LOCK_EX)
-        done = snakemake(project, "results/benchmark.csv", check=False)
-    assert done.returncode == 2
-    assert "results: another run is writing these results (someone" in done.stdout
+        with pytest.raises(SystemExit):
+            SnakemakeProject({}, dry_run(dag=dag, scheduler=SimpleNamespace())).before_jobs()
+    said = capfd.readouterr().err
+    assert "results: another run is writing these results (someone" in said
 
 
-@pytest.mark.parametrize(
-    "lost, rerun",
-    [
-        ("train", {"train", "evaluate", "coverage", "export", "report"}),
-        ("train/gaussians.npz", {"train", "evaluate", "coverage", "export", "report"}),
-        ("export", {"export", "report"}),
-    ],
-)
-def test_deleted_output_is_made_again(
-    project: Path, finished: Path, lost: str, rerun: set[str]
-) -> None:
+def test_deleted_output_is_made_again(project: Path, finished: Path) -> None:
     """Snakemake alone says "Nothing to be done" if an intermediate output is missing."""
-    path = project / "results" / "tiny" / lost
-    if path.is_dir():
-        shutil.rmtree(path)
-    else:
-        path.unlink()
-    message = f"results/tiny/{lost} is missing: {lost.split('/')[0]} runs again"
-    planned = snakemake(project, "-n", TARGET, config=TINY)
-    assert planned.stdout.count(message) == 1
-    assert rules_run(planned) == rerun
+    after_training = {"train", "evaluate", "coverage", "export", "report"}
+    results = project / "results" / "tiny"
+    aside = project / "aside"
+    for lost, rerun in (
+        ("train", after_training),
+        ("train/gaussians.npz", after_training),
+        ("export", {"export", "report"}),
+    ):
+        (results / lost).rename(aside)
+        planned = snakemake(project, "-n", TARGET, config=TINY)
+        message = f"results/tiny/{lost} is missing: {lost.split('/')[0]} runs again"
+        assert planned.stdout.count(message) == 1
+        assert rules_run(planned) == rerun
+        if lost != "export":
+            aside.rename(results / lost)
     earlier = "results/tiny/init/stage.json"
     assert rules_run(snakemake(project, "-n", earlier, config=TINY)) == set()
-    done = snakemake(project, TARGET, config=TINY)
-    assert "evaluate: up to date, nothing to do" in done.stdout or "evaluate" not in rerun
+    snakemake(project, TARGET, config=TINY)
     assert model_digests(project, "tiny") == model_digests(finished, "tiny")
     assert rules_run(snakemake(project, "-n", TARGET, config=TINY)) == set()

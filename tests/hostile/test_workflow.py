@@ -9,21 +9,17 @@ import subprocess
 import time
 from pathlib import Path
 
-import numpy as np
 import pytest
-from PIL import Image
 
 from tests.e2e.harness import (
     TINY,
     command,
     copy_run,
     environment,
-    make_project,
     metrics,
     rules_run,
     snakemake,
 )
-from tests.videos import texture
 
 pytestmark = pytest.mark.slow
 
@@ -35,23 +31,17 @@ def project(finished, tmp_path) -> Path:
     return copy_run(finished, tmp_path / "project")
 
 
-def fails(project: Path, *args: str, config: dict | None = TINY) -> str:
-    done = snakemake(project, *args, config=config, check=False)
-    assert done.returncode != 0 and "Traceback" not in done.stdout, done.stdout
-    assert "what to do" in done.stdout
-    return done.stdout
-
-
-@pytest.mark.parametrize("file", ["train/gaussians.npz", "undistort/images/view_000.png"])
-def test_the_remedy_for_a_damaged_file_makes_it_again(project, finished, file):
-    damaged = project / "results" / "tiny" / file
+def test_the_remedy_for_a_damaged_file_makes_it_again(project, finished):
+    damaged = project / "results" / "tiny" / "train" / "gaussians.npz"
     whole = damaged.read_bytes()
     data = bytearray(whole)
     data[len(data) // 2] ^= 0xFF
     damaged.write_bytes(data)
-    said = fails(project, TARGET, config=TINY | {"export": {"formats": ["ply"]}})
-    stage = file.split("/")[0]
-    assert f"{file}: has changed since stage {stage} wrote it" in said
+    formats = {"export": {"formats": ["ply"]}}
+    done = snakemake(project, TARGET, config=TINY | formats, check=False)
+    said = done.stdout
+    assert done.returncode != 0 and "Traceback" not in said and "what to do" in said
+    assert "train/gaussians.npz: has changed since stage train wrote it" in said
     (advice,) = set(re.findall(r"as in: snakemake --cores all (.*)", said))
     snakemake(project, *advice.split(), config=TINY)
     assert damaged.read_bytes() == whole
@@ -67,12 +57,9 @@ def test_a_deleted_report_is_made_again_by_the_next_batch(project):
     assert page.is_file()
 
 
-def test_clocks_that_were_set_back(project, finished):
-    """Photographs and results from the future change nothing."""
+def test_results_from_the_future_change_nothing(project, finished):
+    """As after a clock that was set back."""
     later = time.time() + 10 * 86400
-    for photo in (project / "data" / "tiny" / "images").iterdir():
-        os.utime(photo, (later, later))
-    assert rules_run(snakemake(project, TARGET, config=TINY)) == set()
     os.utime(project / "results" / "tiny" / "undistort" / "stage.json", (later, later))
     done = snakemake(project, TARGET, config=TINY)
     assert not rules_run(done) or "train: up to date, nothing to do" in done.stdout
@@ -106,23 +93,3 @@ def test_an_interrupted_training_leaves_no_traceback_and_no_half_output(project)
     assert process.returncode != 0
     assert "Traceback" not in said, said
     assert not list(project.glob("results/tiny/.scratch/train/*/out"))
-
-
-def test_a_configuration_in_utf_16(project):
-    (project / "config" / "config.yaml").write_bytes("preset: fast\n".encode("utf-16"))
-    said = fails(project, "-n", TARGET, config=None)
-    assert "config/config.yaml: expected text in UTF-8" in said
-
-
-def test_photographs_that_overlap_by_two_pixels(tmp_path):
-    project = make_project(tmp_path / "project")
-    folder = project / "data" / "strip"
-    folder.mkdir(parents=True)
-    wide = texture(size=(160 * 4, 120))
-    for i in range(4):
-        Image.fromarray(np.ascontiguousarray(wide[:, 158 * i : 158 * i + 160])).save(
-            folder / f"{i}.png"
-        )
-    said = fails(project, "results/strip/metrics.json")
-    assert "of strip" in said
-    assert not (project / "results" / "strip" / "sfm").exists()

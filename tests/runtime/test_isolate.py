@@ -7,21 +7,12 @@ import os
 import socket
 import sys
 import time
-from collections.abc import Iterator
-from multiprocessing.context import SpawnContext
 
 import pytest
 
 from pipeline.runtime.errors import UserError
 from pipeline.runtime.isolate import Limits, OverLimitError, run_isolated, run_limited
-from tests.forked import spawning
 from tests.sfm import jobs
-
-
-@pytest.fixture(autouse=True)
-def new_processes() -> Iterator[None]:
-    with spawning(SpawnContext()):
-        yield
 
 
 def test_the_value_is_returned():

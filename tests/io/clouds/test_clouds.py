@@ -11,6 +11,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
+from pipeline.io.clouds import files
 from pipeline.io.clouds.files import count_points, read_clouds
 from pipeline.io.clouds.text_points import MAX_LINE
 from pipeline.runtime.errors import UserError
@@ -46,6 +47,13 @@ def assert_same(path: Path, rgb: np.ndarray | None = RGB, atol: float = 1e-4) ->
         assert (cloud.rgb == rgb).all()
 
 
+@pytest.fixture
+def in_this_process(monkeypatch):
+    """Files are read in this process, which is faster."""
+    monkeypatch.setattr(files, "run_limited", lambda limits, function, *args: function(*args))
+
+
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("coloured", [True, False])
 @pytest.mark.parametrize("suffix", [".ply", ".las", ".laz", ".e57", ".xyz", ".csv", ".pts", ".LAZ"])
 def test_every_format_gives_its_points(tmp_path, suffix, coloured):
@@ -55,6 +63,7 @@ def test_every_format_gives_its_points(tmp_path, suffix, coloured):
     assert count_points(path) == (len(XYZ) if suffix.lower() in COUNTED else None)
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize("form", ["ascii", "binary_little_endian", "binary_big_endian"])
 @pytest.mark.parametrize("kind", ["float", "double"])
 def test_ply_of_any_byte_order_and_precision(tmp_path, form, kind):
@@ -67,6 +76,7 @@ def test_eight_bit_colours_in_las(tmp_path):
     assert_same(tmp_path / "p.las")
 
 
+@pytest.mark.usefixtures("in_this_process")
 @pytest.mark.parametrize(
     ("name", "text", "colour"),
     [
@@ -188,10 +198,11 @@ def test_a_small_laz_that_expands_to_much_is_refused(tmp_path):
         read_clouds([tmp_path / "p.laz"])
 
 
+@pytest.mark.usefixtures("in_this_process")
 @given(st.data())
 @settings(max_examples=25, suppress_health_check=[HealthCheck.function_scoped_fixture])
 def test_flipped_bytes_give_points_or_one_error(tmp_path, data):
-    """In this process: text and PLY have no native reader."""
+    """Of text and PLY, which have no native reader."""
     suffix = data.draw(st.sampled_from([".ply", ".xyz", ".pts", ".csv"]))
     path = write(tmp_path / f"p{suffix}")
     content = bytearray(path.read_bytes())

@@ -9,7 +9,6 @@ import signal
 import subprocess
 import time
 from collections.abc import Callable
-from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -21,14 +20,13 @@ from tests.e2e.harness import (
     command,
     copy_run,
     environment,
-    make_project,
     model_digests,
     rules_run,
     snakemake,
     start_and_kill,
     start_snakemake,
 )
-from tests.pictures import photos
+from tests.e2e.starts import start_pairs, two_scenes
 from tests.stages.flow import dry_run
 
 pytestmark = pytest.mark.slow
@@ -48,24 +46,8 @@ def wait_until(condition: Callable[[], bool]) -> None:
         time.sleep(0.02)
 
 
-def two_scenes(folder: Path) -> Path:
-    """A project with two scenes of three photographs."""
-    project = make_project(folder)
-    for scene in ("garden", "patio"):
-        photos(project / "data" / scene / "images", 3)
-    return project
-
-
 def test_two_scenes_started_at_once_do_not_disturb_each_other(tmp_path: Path) -> None:
-    """The first pair also creates Snakemake's own folder at the same time."""
-    project = two_scenes(tmp_path / "project")
-    for _ in range(2):
-        shutil.rmtree(project / "results", ignore_errors=True)
-        with ThreadPoolExecutor(2) as pool:
-            plans = [f"results/{scene}/plan.json" for scene in ("garden", "patio")]
-            runs = [*pool.map(lambda plan: snakemake(project, plan, cores=1), plans)]
-        assert not any("Traceback" in run.stdout for run in runs)
-        assert all((project / plan).exists() for plan in plans)
+    assert start_pairs(two_scenes(tmp_path / "project"), 2) == []
 
 
 def test_a_job_that_lost_its_snakemake_goes_on_and_the_next_one_waits(

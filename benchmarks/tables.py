@@ -25,6 +25,11 @@ from pipeline.runtime.errors import EXIT_USER_ERROR, UserError
 ROOT = Path(__file__).parents[1]
 RECORDS = ROOT / "benchmarks" / "records"
 Record = dict[str, Any]
+# The stages of a scene of one block, in the order of the DAG.
+STAGES = (
+    *("inspect", "decode", "extract", "features", "pairs", "match", "matches", "sfm", "refine"),
+    *("undistort", "dense", "init", "train", "evaluate", "coverage", "export", "report"),
+)
 
 
 def pages() -> list[Path]:
@@ -35,8 +40,9 @@ def pages() -> list[Path]:
 def scenes(records: Sequence[Record]) -> str:
     """A row for each scene: quality, pose errors and CPU minutes."""
     head = [
-        *("scene", "photographs", "test views, pixels", "seeds", "PSNR (dB)", "SSIM", "Gaussians"),
-        *("with a pose", "rotation, centre error", "CPU min: poses, training, all", "memory"),
+        *("scene", "training", "photographs", "test views, pixels", "seeds", "PSNR (dB)", "SSIM"),
+        *("Gaussians", "with a pose", "rotation, centre error", "CPU min: poses, training, all"),
+        *("memory", "where"),
     ]
     rows = [head]
     for record in records:
@@ -55,6 +61,7 @@ def scenes(records: Sequence[Record]) -> str:
         rows.append(
             [
                 record["scene"],
+                record["training"],
                 str(record["photographs"]),
                 f"{protocol['num_views']}, {', '.join(protocol['resolution'])}",
                 str(len(runs)),
@@ -65,6 +72,7 @@ def scenes(records: Sequence[Record]) -> str:
                 poses,
                 ", ".join(minutes),
                 _memory(runs),
+                f"{record['cores']} cores, {record['instruction_set']}",
             ]
         )
     return markdown.table(rows)
@@ -151,12 +159,22 @@ def _minutes(runs: Sequence[Record], stages: Sequence[str]) -> str:
     return markdown.middle(sums, "{:.1f}")
 
 
+def stages(records: Sequence[Record]) -> str:
+    """CPU seconds of each stage of one scene, in the order of the DAG, and their sum."""
+    (record,) = records
+    seconds = record["runs"][0]["cpu_s"]
+    order = [name for name in STAGES if name in seconds]
+    rows = [["stage", "CPU s"], *([name, f"{seconds[name]:.0f}"] for name in order)]
+    return markdown.table([*rows, ["all", f"{sum(seconds.values()):.0f}"]])
+
+
 KINDS: dict[str, Callable[[Sequence[Record]], str]] = {
     "raster": table,
     "raster-steps": steps_table,
     "scenes": scenes,
     "headline": headline,
     "sources": sources,
+    "stages": stages,
     **{kind: partial(record_tables.table_of, kind) for kind in record_tables.TABLES},
 }
 MARKER = re.compile(

@@ -1,4 +1,4 @@
-"""The rooms of the library, from the ground floor up: ``python -m tests.rooms`` writes their list
+"""The rooms of the library, lowest layer first: ``python -m tests.rooms`` writes their list
 into the design page, ``--check`` compares it."""
 
 from __future__ import annotations
@@ -10,7 +10,7 @@ from pathlib import Path
 PAGE = Path(__file__).parents[1] / "docs" / "explanation" / "design.md"
 _LIST = re.compile(r"<!-- rooms -->.*?<!-- end of rooms -->", re.DOTALL)
 
-#: Room -> what it is for. A room imports only itself and the rooms above it.
+#: Room -> what it is for. A room imports only itself and the rooms listed before it.
 ROOMS = {
     "runtime": "identity, locks, atomic outputs, progress, errors, isolation, native libraries",
     "config": "schemas of the options, presets, settled options",
@@ -29,10 +29,10 @@ ROOMS = {
     "training.cameras": "refinement of poses and intrinsics",
     "training.appearance": "exposure gains and appearance embeddings",
     "training.density": "density strategies, removal of floaters",
-    "training.run": "what a training is given besides its inputs",
+    "training.run": "the settings of a training: options, seed, threads, memory",
     "training.checkpoints": "files that resume a killed run",
     "training.loop": "the optimisation, step by step",
-    "training.scene": "the training of a scene, described",
+    "training.scene": "entry point: trains a scene and reports on it",
     "training.blocks": "division of large scenes into blocks",
     "metrics": "PSNR, SSIM, LPIPS, protocols, pose errors",
     "coverage": "what the photographs did not see",

@@ -1,4 +1,4 @@
-"""Imports go one way: a room imports itself and the rooms above it in this list, and no module
+"""Imports go one way: a room imports itself and the rooms listed before it, and no module
 imports itself through others."""
 
 from __future__ import annotations

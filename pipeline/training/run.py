@@ -1,4 +1,4 @@
-"""What a training is given besides its inputs."""
+"""The settings of a training: everything that it is given besides the inputs."""
 
 from __future__ import annotations
 

@@ -35,12 +35,12 @@ from pipeline.training.loop.result import TrainResult
 from pipeline.training.loop.train import train
 from pipeline.training.run import TrainingRun
 
-# Epochs (passes over the training views) below which no scene is sharp.
+# A warning says that a training of fewer epochs (passes over its views) is short.
 MIN_EPOCHS = 3.0
 FITS = {
-    "factor": "depths in a unit of their own",
-    "depth": "depths up to factor and shift",
-    "inverse": "inverse depths up to factor and shift",
+    "factor": "depths of unknown scale",
+    "depth": "depths of unknown scale and shift",
+    "inverse": "inverse depths of unknown scale and shift",
 }
 
 
@@ -49,10 +49,10 @@ class TrainedScene:
     """A finished training.
 
     Attributes:
-        model: the reconstruction with refined cameras, None where none was refined.
-        gains: of all views; empty if the photographs are exposed alike.
-        decisions, warnings, counters: recorded in ``stage.json``.
-        timings: recorded in ``run.json``.
+        model: The reconstruction with refined cameras; None if none was refined.
+        gains: The exposure gains of all views; empty if exposure is not modelled.
+        decisions, warnings, counters: What ``stage.json`` records.
+        timings: What ``run.json`` records.
     """
 
     result: TrainResult
@@ -91,7 +91,7 @@ def train_scene(
         dense: The folder with the dense stage's depth maps. Ignored if the user gave depth maps.
 
     Raises:
-        UserError: see ``training.loop.train``.
+        UserError: As ``training.loop.train.train``.
     """
     notes, manifest = Notes(), scene.manifest
     appearance = choose_appearance(
@@ -122,10 +122,13 @@ def train_scene(
 
 
 def run_training(inputs: Inputs, run: TrainingRun, notes: Notes | None = None) -> TrainedScene:
-    """Train, and describe the result; errors as of ``train_scene``.
+    """Train, and describe the result.
 
     Args:
         notes: Messages and counters of the inputs.
+
+    Raises:
+        UserError: As ``training.loop.train.train``.
     """
     notes = notes or Notes()
     start = time.perf_counter()
@@ -232,7 +235,7 @@ def _describe(result: TrainResult, num_views: int, run: TrainingRun, notes: Note
     if minutes is not None:
         notes.decisions.append(
             f"{result.steps} steps fitted into {minutes:g} minutes; the number depends on the "
-            "machine and its load, so another run gives other bits"
+            "machine and its load, so another run differs a little"
         )
     if unseen := result.counters["unseen"]:
         notes.decisions.append(f"{unseen} Gaussians that no training view sees were removed")

@@ -1,4 +1,9 @@
-"""The interface of density strategies: two hooks, before and after each optimiser step."""
+"""The interface of density strategies.
+
+``OperatorStep`` calls ``before_step`` after the backward pass. ``Trainer.control_density`` calls
+``after_step`` after the update of the parameters, if ``is_due``. On a GPU, ``DeviceStep``
+accumulates ``statistics`` in place of ``before_step``.
+"""
 
 from __future__ import annotations
 
@@ -90,8 +95,8 @@ class Strategy:
 
     @property
     def statistics(self) -> tuple[Tensor, Tensor] | None:
-        """``gradient_sum`` and ``seen`` of ``render.resident.Optimised``, if ``before_step`` only
-        accumulates these, so that a device can do it; else None."""
+        """The tensors ``gradient_sum`` and ``seen`` (``render.resident.Optimised``), if
+        ``before_step`` does no more than accumulate them, so that a device can do it; else None."""
         return None
 
     def is_due(self, steps: range) -> bool:

@@ -70,7 +70,8 @@ class StepEngine(ABC):
 
     @abstractmethod
     def invalidate(self) -> None:
-        """The tensors of ``state`` were changed, or will be before the next step."""
+        """Make the tensors of ``state`` current, and read them again before the next step. To be
+        called before they are changed."""
 
     def require_finite(self, loss: float, view: StepView) -> None:
         if not math.isfinite(loss):

@@ -29,7 +29,8 @@ PSNR_INTERVAL = 10
 
 
 class Trainer:
-    """The steps of the optimisation; ``step`` and ``finish`` change ``state``."""
+    """Runs the optimisation. ``training.loop.train.train`` calls ``step`` until the schedule ends,
+    then ``finish`` once; both change ``state``."""
 
     def __init__(
         self, scene: TrainingScene, state: TrainState, run: TrainingRun, backend: Backend
@@ -46,6 +47,7 @@ class Trainer:
         """Render a view, compare it with its photograph, update the parameters, and densify or
         prune if due."""
         state = self.state
+        # The steps of the schedule that this optimiser step covers: one, without a time budget.
         steps = self.clock.advance(state)
         self.raise_sh_degree()
         self.clock.observe(state, self.factor())
@@ -70,7 +72,8 @@ class Trainer:
         state.counters.max_gaussians = max(state.counters.max_gaussians, len(state.gaussians))
 
     def finish(self) -> None:
-        """After the last step, remove the Gaussians that no training view constrains."""
+        """Remove the Gaussians that had no gradient in the last epoch, and those on the path
+        between cameras that hide the scene from there."""
         self.engine.fetch()
         self.backend.release_memory()
         state = self.state

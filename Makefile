@@ -13,11 +13,12 @@ READERS := tests/io/independent
 
 help:
 	@echo "make demo   reconstruct the demo scene into results/demo (sets everything up first)"
-	@echo "make test   run the tests;  make test-native  those of the C++ code alone"
+	@echo "make test   run the tests;  make test-fast  those without Snakemake and training"
+	@echo "make test-native  the tests of the C++ code alone"
 	@echo "make test-slurm  those of faults on a Slurm cluster (root; Debian's slurm-wlm and munge)"
 	@echo "make test-packages  other projects' packages that some tests compare with (needs Node)"
 	@echo "make setup  only set up .venv and the extension"
-	@echo "make lint   what CI checks beside the tests;  make format  mends most of it"
+	@echo "make lint   what CI checks beside the tests;  make format  repairs most of it"
 	@echo "make docs   regenerate the generated pages of docs/ and config/config.yaml"
 	@echo "make site   build the docs as a site in build/site; broken links are errors"
 	@echo "make lock   write requirements/ from the ranges in pyproject.toml (needs uv)"

@@ -18,11 +18,11 @@ if TYPE_CHECKING:
 
 
 def decide(scan: Scan, settled: Settled) -> StagePlan:
-    config, why = settled.config, settled.why
+    config, reasons = settled.config, settled.why
     reason = "no poses are given"
     if config.poses == "ignore":
         reason = "given poses are ignored, as configured (poses: ignore)"
-    choices = [why[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")]
+    choices = [reasons[f"sfm.{name}"] for name in ("mapper", "camera_model", "share_cameras")]
     return unless_posed(scan, reason, [*choices, _frame(scan, config)])
 
 
@@ -31,8 +31,8 @@ def _frame(scan: Scan, config: Config) -> str:
     if wanted == "gcp" and scan.ground_control is not None:
         return f"georeferenced by the ground control points in {scan.ground_control_text}"
     if wanted == "gps" and scan.num_gps:
-        level = sum(photo.gps is not None and photo.gps[2] is None for photo in scan.photos)
-        unknown = f" ({level} without an altitude)" if level else ""
+        flat = sum(photo.gps is not None and photo.gps[2] is None for photo in scan.photos)
+        unknown = f" ({flat} without an altitude)" if flat else ""
         return (
             f"georeferenced by GPS positions of {scan.num_gps} photographs{unknown}, if these "
             "suffice"

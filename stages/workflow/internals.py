@@ -24,7 +24,7 @@ from pipeline.runtime.errors import EXIT_USER_ERROR
 
 
 class Flow:
-    """Snakemake's ``workflow``: how jobs run, and which.
+    """Reads and changes undocumented parts of Snakemake's ``workflow``.
 
     Attributes:
         folder: The folder of the Snakefile.
@@ -96,17 +96,17 @@ class Flow:
 
 # Snakemake's executor names the jobs of a run by a UUID, after the prefix of the profile, if any.
 JOB_NAME = re.compile(r"(?:.+_)?[0-9a-f]{8}(?:-[0-9a-f]{4}){3}-[0-9a-f]{12}")
-# Seconds between two checks of jobs: at least so many, and this share of the time since a job has
-# started or ended, so that the wait for the check is short beside the job.
+# Seconds between two checks of jobs: a tenth of the time since a job last started or ended, so that
+# the wait for a check is short beside the job, but at least five.
 SHORTEST_INTERVAL, INTERVAL_SHARE = 5.0, 0.1
 
 
 def watch_jobs(executor: Any, seconds: float) -> None:
-    """Let an executor of Snakemake check its jobs at this interval at most, more often while they
-    are young, and each until it has reported the job's end.
+    """Let an executor of Snakemake check its jobs at this interval at most, more often after one
+    has started or ended, and each job until it has reported its end.
 
-    The one for Slurm increases its interval up to three minutes. It forgets its jobs when Slurm
-    does not answer, as while the controller is started again: Snakemake would never end.
+    Slurm's executor increases its interval up to three minutes. It forgets its jobs when Slurm does
+    not answer, as while the controller is started again: Snakemake would never end.
     """
     check, finished = executor.check_active_jobs, set()
     known: set[int] = set()

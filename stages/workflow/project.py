@@ -146,7 +146,8 @@ class SnakemakeProject:
         return files
 
     def _run_if_outdated(self, spec: StageSpec, wildcards: Any) -> None:
-        """Run a stage whose output is missing, or whose record has another key.
+        """Run a stage whose output is missing, or whose record has another key. Snakemake evaluates
+        the stage's input function, which calls this, before it decides which jobs run.
 
         Snakemake does not make an intermediate file again if the results that follow from it
         exist. It compares keys with records of its own, in .snakemake, which a copied folder of
@@ -272,6 +273,7 @@ class SnakemakeProject:
         plan = make_plan(found, config, STAGES, str(folder), self._device(config))
         if not self._is_on_cluster() and self._will_use_gpu(plan, name):
             check_device(config.train.device)
+        # Runs with the same plan are printed once.
         first = self._described.setdefault(describe(plan), name)
         plan = plan.model_copy(update={"scene": name})
         print(describe(plan) if first == name else f"{name}: as {first}", file=sys.stderr)
@@ -347,16 +349,17 @@ class SnakemakeProject:
         return runs, left_out
 
     def every_run(self, wildcards: Any) -> list[str]:
-        """Input function: the published files of all runs, so that a deleted one is made again."""
+        """Input function: the published files of all runs. Snakemake makes a deleted file again
+        only if it is asked for."""
         runs, left_out = self._batch
         targets = [
-            RESULTS / run.name / file
+            str(RESULTS / run.name / file)
             for run in runs
             if run not in left_out
             for spec in STAGES.values()
             for file in spec.publishes
         ]
-        return [str(path) for path in (*targets, FAILURES) if path in targets or path.exists()]
+        return [*targets, str(FAILURES)] if FAILURES.exists() else targets
 
     def outcomes(self, wildcards: Any) -> str:
         """Params function: the outcomes of all runs, when none has failed."""
@@ -369,12 +372,12 @@ class SnakemakeProject:
             }
         )
 
-    # --- clusters -------------------------------------------------------------------------
+    # --- before and after the jobs --------------------------------------------------------
 
     def before_jobs(self) -> None:
-        """Check that the jobs can write and that no other run does, and compile the native
-        libraries before jobs are submitted: a compiler takes more memory than a job may use, and
-        nodes may have none."""
+        """Check that the folders of results can be written, and lock them. On a cluster, compile
+        the native libraries before jobs are submitted: a compiler takes more memory than a job may
+        use, and nodes may have none."""
         needed = self._flow.needed_jobs()
         # The tables of a batch are in the folder of all results.
         written = {RESULTS / getattr(job.wildcards, "scene", "") for job in needed if job.output}
@@ -393,8 +396,6 @@ class SnakemakeProject:
             wait_for_earlier_jobs(Path.cwd())
             compile_for_all_nodes()
 
-    # --- failures -------------------------------------------------------------------------
-
     def after_failure(self) -> None:
         """Print the messages of the stages that failed, and write a batch's tables with the runs
         that succeeded."""
@@ -403,7 +404,7 @@ class SnakemakeProject:
             if message:
                 run = log.parents[1].name
                 print(f"\nerror in {log.stem} of {run}: {message}", file=sys.stderr)
-        if "_batch" in self.__dict__:
+        if "_batch" in self.__dict__:  # Computed only if the target needs all runs.
             runs, left_out = self._batch
             outcomes = [
                 outcome(run, left_out[run]) if run in left_out else self._ended(run) for run in runs

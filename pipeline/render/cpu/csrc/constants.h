@@ -21,9 +21,9 @@ constexpr float kLog2AlphaMin = -7.994353436858858f;
 // be practically opaque.
 constexpr float kAlphaMax = 0.999f;
 
-// As in 3DGS, the Gaussian that would lower a pixel's transmittance below this is not drawn, and the
-// pixel stops. What remains is below kTransmittanceMin / (1 - kAlphaMax) = 0.1, and usually near
-// kTransmittanceMin, since few Gaussians are that opaque.
+// As in 3DGS, the Gaussian that would lower a pixel's transmittance below this is not drawn, and
+// the pixel stops. What remains is below kTransmittanceMin / (1 - kAlphaMax) = 0.1, and usually
+// near kTransmittanceMin, since few Gaussians are that opaque.
 constexpr float kTransmittanceMin = 1e-4f;
 
 // Squared norm below which a quaternion is invalid: its direction is lost in float32.

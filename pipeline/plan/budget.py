@@ -13,12 +13,13 @@ from pipeline.plan.training_memory import gaussians_in, in_blocks_mb, memory_mb
 from pipeline.runtime.errors import UserError
 from pipeline.scene.views import view_size
 
-# Side of the windows of SSIM, pixels.
+# The side of the windows of SSIM in pixels.
 SSIM_WINDOW = 11
-# Pixels of a view per Gaussian, for training by steps and with a time budget. Fewer pixels improve
-# quality but cost time; a time budget limits the time by itself.
+# The pixels of a view per Gaussian, for training by steps and with a time budget. Fewer pixels
+# improve quality but cost time; a time budget limits the time by itself.
 PIXELS_PER_GAUSSIAN, PIXELS_PER_GAUSSIAN_WITH_TIME_BUDGET = 2.0, 0.5
-# Lower bound on the budget, and training pixels of all photographs per Gaussian: fewer overfit.
+# The lower bound on the budget, and the training pixels of all photographs per Gaussian: fewer
+# overfit.
 MIN_GAUSSIANS = 20_000
 TRAINING_PIXELS_PER_GAUSSIAN = 40
 # More Gaussians do not converge within a time budget. Training lowers the number further on slow
@@ -29,7 +30,7 @@ GAUSSIANS_PER_MINUTE = 50_000
 def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
     """The maximum number of Gaussians, and the sentence that gives the reason.
 
-    The smallest of the bounds by the size of a view, by the training pixels, by
+    The number is the smallest of the bounds by the size of a view, by the training pixels, by
     ``train.budget_minutes``, by ``density.max_gaussians`` and, for one block,
     ``partition.memory_mb``.
 
@@ -65,8 +66,8 @@ def gaussian_budget(scan: Scan, config: Config) -> tuple[int, str]:
 
 
 def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:
-    """The number of Gaussians that fit into ``partition.memory_mb`` as one block and the reason;
-    None if ``wanted`` fit, or may be divided. Photographs count nothing, since those that do not
+    """The number of Gaussians that fit into ``partition.memory_mb`` as one block, and the reason;
+    None if ``wanted`` fit, or may be divided. Photographs are not counted, since those that do not
     fit are read from disk."""
     limit = config.partition.memory_mb
     if limit is None or config.partition.blocks != 1 or memory_mb(0, wanted) <= limit:
@@ -82,8 +83,8 @@ def _by_memory(config: Config, wanted: int) -> tuple[int, str] | None:
 
 
 def training_memory_mb(scan: Scan, config: Config) -> int:
-    """Estimated peak memory of training in MB, at most ``partition.memory_mb``: photographs that do
-    not fit are read from disk."""
+    """The estimated peak memory of training in MB, at most ``partition.memory_mb``: photographs
+    that do not fit are read from disk."""
     needed = memory_mb(_pixels(scan, config), config.train.density.max_gaussians)
     return min(needed, config.partition.memory_mb or needed)
 
@@ -105,7 +106,7 @@ class _Planned(NamedTuple):
 
 
 def _planned(scan: Scan, config: Config) -> list[_Planned]:
-    """The views of each photograph, as far as they are known before the cameras are: six of a
+    """The views of each photograph, as far as they are known before the cameras are: six views of a
     panorama, one of each other photograph."""
     cap, given = config.views.max_long_side_px, scan.poses
     everywhere = (
@@ -124,7 +125,7 @@ def _planned(scan: Scan, config: Config) -> list[_Planned]:
 
 
 def _typical(scan: Scan, config: Config) -> _Planned:
-    """The views of the photographs that have most views together."""
+    """The views of those photographs whose size has the most views."""
     planned = _planned(scan, config)
     if all(photo.views == 1 for photo in planned):
         return _Planned(*view_size(*scan.sizes[0], config.views.max_long_side_px), 1)
@@ -135,7 +136,7 @@ def _typical(scan: Scan, config: Config) -> _Planned:
 
 
 def typical_view(scan: Scan, config: Config) -> tuple[int, int]:
-    """Width and height of most views."""
+    """The width and height of most views."""
     typical = _typical(scan, config)
     return typical.width, typical.height
 
@@ -162,10 +163,10 @@ def resolution_line(scan: Scan, config: Config) -> str:
 
 
 def small_views_line(scan: Scan, config: Config) -> str:
-    """The plan's sentence about views that are smaller than SSIM's window; empty without any.
+    """The plan's sentence about views that are smaller than SSIM's window; empty if there are none.
 
     Raises:
-        UserError: all views are smaller than the window.
+        UserError: All views are smaller than the window.
     """
     planned = _planned(scan, config)
     small = [i for i, view in enumerate(planned) if min(view.width, view.height) < SSIM_WINDOW]

@@ -19,7 +19,7 @@ def converted_colours(photos: Sequence[Photo]) -> list[str]:
 
 
 def unread_colours(facts: Mapping[str, FileFacts]) -> list[str]:
-    """A warning for each reason why colours are used as sRGB that are not."""
+    """A warning for each reason why colours that are not sRGB are used as if they were."""
     first: dict[str, str] = {}
     counts: Counter[str] = Counter()
     for name in sorted(facts):

@@ -69,10 +69,10 @@ def without_companions(
 def masks_of(
     at: SceneFolder, chosen: PhotoFolder, facts: Mapping[str, FileFacts]
 ) -> dict[str, Path]:
-    """Photograph -> its mask.
+    """The mask of each photograph, by the photograph's name.
 
     Raises:
-        UserError: a mask of another size than its photograph, or a name that is ambiguous.
+        UserError: A mask has another size than its photograph, or a name is ambiguous.
     """
     if not at.uses_masks:
         return {}
@@ -96,10 +96,10 @@ def masks_of(
 def depths_of(
     at: SceneFolder, chosen: PhotoFolder, facts: Mapping[str, FileFacts]
 ) -> dict[str, Path]:
-    """Photograph -> its depth map.
+    """The depth map of each photograph, by the photograph's name.
 
     Raises:
-        UserError: a name that is ambiguous, or see ``check_depth_maps``.
+        UserError: A name is ambiguous, or a depth map fails ``check_depth_maps``.
     """
     depths = _files_of(DEPTHS, at, chosen, chosen.depths, facts)
     check_depth_maps(depths, facts, at.cache)

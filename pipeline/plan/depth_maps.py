@@ -14,8 +14,8 @@ from pipeline.io.photofile import FileFacts
 from pipeline.runtime.errors import UserError
 
 _OPTIONAL_HEADER = cast("type[DepthHeader | None]", DepthHeader | None)
-# Relative difference of the aspect ratios of a depth map and its photograph; rounding of reduced
-# maps causes less.
+# The relative difference of the aspect ratios of a depth map and its photograph; rounding of
+# reduced maps causes less.
 _ASPECT_TOLERANCE = 0.02
 _FIX = (
     "save depths of the whole photograph as 16-bit grey PNG, float TIFF or .npy, or remove "
@@ -29,8 +29,8 @@ def check_depth_maps(
     """Check the form of the depth map of each photograph.
 
     Raises:
-        UserError: a format that cannot be read, several channels, values that are no numbers, or
-            another aspect ratio than the photograph's.
+        UserError: A map has a format that cannot be read, several channels, values that are no
+            numbers, or another aspect ratio than its photograph.
     """
     for name, path in sorted(depths.items()):
         if suffix_of(path.name) in UNREAD:

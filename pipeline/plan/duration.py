@@ -11,20 +11,20 @@ from collections.abc import Callable, Mapping
 
 from pipeline.plan.values import Plan
 
-# Time limits are this many times the estimate, and at least so many minutes: nodes differ, and a
+# Time limits are this many times the estimate, and at least this many minutes: nodes differ, and a
 # job that is killed for its time starts again from its checkpoint.
 MARGIN, MIN_MINUTES = 4, 10
-# Pairs per photograph where not all are matched.
+# The number of pairs per photograph where not all pairs are matched.
 NEIGHBOURS = 40
 
 
 def minutes(stage: str, plan: Plan) -> int:
-    """Time limit of a stage in minutes."""
+    """The time limit of a stage in minutes."""
     return max(MIN_MINUTES, math.ceil(MARGIN * seconds(stage, plan) / 60))
 
 
 def seconds(stage: str, plan: Plan) -> float:
-    """Estimated duration of a stage in seconds."""
+    """The estimated duration of a stage in seconds."""
     estimate = _ESTIMATES.get(stage)
     return estimate(plan) if estimate is not None else _PROGRAM
 
@@ -76,7 +76,7 @@ def _train(plan: Plan) -> float:
 
 
 def _steps(plan: Plan) -> float:
-    """Training of a whole scene."""
+    """The duration of training a whole scene in seconds."""
     train = plan.config.train
     width, height = plan.facts.view_size
     step = 0.005 + 1e-7 * train.density.max_gaussians + 6e-8 * width * height

@@ -16,14 +16,14 @@ from pipeline.scene.manifest import Photo
 def check_given(
     at: SceneFolder, poses: GivenPoses, chosen: PhotoFolder, photos: Sequence[Photo]
 ) -> float:
-    """Check the given cameras of the photographs: sizes, focal lengths, principal points and
-    distortion. The result is cached, since large models take seconds to read.
+    """Check the sizes, focal lengths, principal points and distortion of the photographs' given
+    cameras. The result is cached, since large models take seconds to read.
 
     Returns:
         The extent of the cameras in the given unit: the longest side of the box around them.
 
     Raises:
-        UserError: as ``load_given``.
+        UserError: See ``load_given``.
     """
     files = GivenFiles(at.path / poses.path, poses.kind, tuple(chosen.names), chosen.base)
     sizes = "\n".join(f"{photo.name}\0{photo.width}x{photo.height}" for photo in photos)

@@ -22,7 +22,7 @@ from pipeline.scene.normalization import Normalization
 from pipeline.scene.reconstruction import Points, PosedImage, Reconstruction
 from pipeline.scene.unrounded import Rounding, Unrounded
 
-# Relative difference of the aspect ratios of a photograph and its camera; rounding in reduced
+# The relative difference of the aspect ratios of a photograph and its camera; rounding in reduced
 # copies causes less.
 _ASPECT_TOLERANCE = 0.02
 # Gaussians are float32 with 24 bits. A scene farther from the origin than this many times its own
@@ -32,12 +32,12 @@ _MAX_DISTANCE = 100.0
 # from the mean camera) from this up to 1000 times this. Millimetres, metres and kilometres
 # therefore give the same numbers, and scenes of moderate size are not scaled.
 _MIN_SIZE = 0.1
-# Accepted focal lengths divided by the longer side: fields of view of 175 to 0.06 degrees.
+# The accepted focal lengths divided by the longer side: fields of view of 175 to 0.06 degrees.
 _FOCAL_RANGE = (0.02, 1000.0)
-# Accepted distance of the principal point from the image's centre divided by the longer side: a
+# The accepted distance of the principal point from the image's centre divided by the longer side: a
 # crop from the border of a much larger image has one outside of it.
 _MAX_SHIFT = 10.0
-# Accepted distance of a camera from the origin, in any unit: its square is in the range of float32.
+# The accepted distance of a camera from the origin, in any unit: its square fits into float32.
 MAX_COORDINATE = 1e18
 
 
@@ -46,10 +46,10 @@ class GivenModel:
     """A scene's given poses and points, near the origin, of moderate size and rounded.
 
     Attributes:
-        model: in the scene's world, rounded.
-        normalization: from the given world to the scene's; the identity if the given poses are
-            near their origin and of moderate size.
-        unrounded: in the given world.
+        model: The model in the scene's world, rounded.
+        normalization: The transformation from the given world to the scene's; the identity if the
+            given poses are near their origin and of moderate size.
+        unrounded: The model in the given world.
     """
 
     model: Reconstruction
@@ -61,14 +61,14 @@ class GivenModel:
         """The model of the given world, read from ``path``.
 
         Raises:
-            UserError: positions that overflow.
+            UserError: Positions overflow.
         """
         normalization, rounding = _frame(given, path)
         model = rounding.model(normalization.model_to_scene(given))
         return cls(model, normalization, Unrounded.of(given, rounding))
 
     def to_scene(self, points: NDArray[np.float64]) -> NDArray[np.float64]:
-        """(..., 3) points of the given world, in the scene's world and rounded."""
+        """The (..., 3) points of the given world, in the scene's world and rounded."""
         return self.unrounded.rounding.points(self.normalization.to_scene(points))
 
     def georeference(self) -> Georeference | None:
@@ -147,12 +147,12 @@ def load_given(
     Points keep their observations in these photographs; points observed in none are dropped.
 
     Args:
-        path, kind, listed, base_folder: see ``GivenFiles``.
+        path, kind, listed, base_folder: The fields of ``GivenFiles``.
         photos: The photographs that are used.
 
     Raises:
-        UserError: malformed pose files; a camera with another aspect ratio than its photograph,
-            or with an impossible focal length.
+        UserError: A pose file is malformed, or a camera has another aspect ratio than its
+            photograph or an impossible focal length.
     """
     files = GivenFiles(path, kind, tuple(listed), base_folder)
     return GivenModel.of(read_fitted(files, photos), path)
@@ -167,7 +167,7 @@ def read_fitted(
         points: Whether to read the points of a COLMAP model, which takes longest.
 
     Raises:
-        UserError: as ``load_given``.
+        UserError: See ``load_given``.
     """
     by_name = {photo.name: photo for photo in photos}
     entry = format_of(files.kind)
@@ -191,7 +191,7 @@ def _frame(model: Reconstruction, path: Path) -> tuple[Normalization, Rounding]:
     rounding in the scene's world.
 
     Raises:
-        UserError: positions that overflow.
+        UserError: Positions overflow.
     """
     if not model.images:
         return Normalization(), Rounding()
@@ -206,10 +206,10 @@ def _frame(model: Reconstruction, path: Path) -> tuple[Normalization, Rounding]:
             file=path,
             fix="give the poses in another unit, or set poses: ignore",
         )
-    # Cameras in one place without points: rounding errors are no size.
+    # For cameras in one place without points, rounding errors are no size.
     if size <= 1e-12 * np.abs(mean).max():
         return Normalization(), Rounding()
-    # Rounded, so that it is readable and rarely changes when photographs are added.
+    # The size is rounded, so that it is readable and rarely changes when photographs are added.
     step = 10.0 ** np.ceil(np.log10(size))
     far = np.abs(mean).max() > _MAX_DISTANCE * size
     origin = np.round(mean / step) * step if far else np.zeros(3)
@@ -228,12 +228,12 @@ def fit_to_photos(
     and further ones get new ids, without observations.
 
     Args:
-        photos: name -> photograph.
-        source: the pose file, for error messages.
+        photos: The photographs by name.
+        source: The pose file, for error messages.
 
     Raises:
-        UserError: names that are ambiguous, a camera with another aspect ratio than its photograph,
-            or with an impossible focal length.
+        UserError: Names are ambiguous, or a camera has another aspect ratio than its photograph or
+            an impossible focal length.
     """
     matched: dict[str, list[str]] = {}
     for name, listed in match_names(_names(model), photos, source).items():
@@ -318,7 +318,7 @@ def _check_camera(photo: Photo, camera: Camera, source: str) -> None:
 
 
 def _other_unit(focal: float) -> str:
-    """The unit that an impossibly short focal length looks like."""
+    """The unit that an impossibly short focal length is probably given in."""
     if focal < 4:
         return "; it looks like a fraction of the image's side"
     return "; it looks like millimetres" if focal < 100 else ""
@@ -338,8 +338,8 @@ def _check_centre(image: PosedImage, source: str) -> None:
 
 
 def _check_distortion(photo: Photo, camera: Camera, source: str) -> None:
-    """Check that the distortion can be undone in a tenth of the image; undistorted images would be
-    blank, and masked everywhere."""
+    """Check that the distortion can be undone in at least a tenth of the image; otherwise
+    undistorted images would be almost blank."""
     if camera.is_pinhole:
         return
     share = (np.arange(9) + 0.5) / 9
@@ -357,7 +357,7 @@ def _check_distortion(photo: Photo, camera: Camera, source: str) -> None:
 
 
 def _points_in(points: Points, scale: Mapping[int, tuple[float, float]]) -> Points:
-    """The points observed in images of ``scale``, pixels multiplied by its (x, y) factors."""
+    """The points observed in images of ``scale``, with pixels multiplied by its (x, y) factors."""
     if not len(points):
         return points
     numbers, inverse = np.unique(points.track_image_id, return_inverse=True)

@@ -15,7 +15,7 @@ from pipeline.scene.manifest import Photo
 
 @dataclass(frozen=True)
 class GroundControlFile:
-    """The path of the scene's file, None without one, and a description of its content."""
+    """The path of the scene's file (None if there is none), and a description of its content."""
 
     path: Path | None = None
     text: str = ""
@@ -31,7 +31,7 @@ def find_ground_control(
         complete: Whether ``photos`` are all photographs; False if frames of videos will follow.
 
     Raises:
-        UserError: there are two files, or its content cannot be used; see ``read_ground_control``.
+        UserError: There are two files, or the content cannot be used; see ``read_ground_control``.
     """
     path = ground_control_file(at.path)
     if path is None:

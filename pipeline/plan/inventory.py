@@ -23,7 +23,8 @@ from pipeline.io.poses.kinds import POSE_LABELS
 from pipeline.io.walk import TooManyFilesError, walk
 from pipeline.runtime.text import is_plain
 
-# Not for reconstruction (docs/guides/inputs.md): texts, side-cars and databases of other programs.
+# These files are not for reconstruction (docs/guides/inputs.md): texts, side-cars and databases of
+# other programs.
 _TEXTS = frozenset({"readme", "license", "licence", "copying", "notice", "source", "citation"})
 _SIDE_CARS = frozenset({".md", ".thm", ".lrv", ".xmp", ".aae", ".pp3", ".dop", ".db", ".ini"})
 _COPIES = frozenset({"images", "images_2", "images_4", "images_8"})
@@ -132,11 +133,11 @@ class Inventory:
     def unused(self) -> list[str]:
         """A warning for each kind of files that are not used, with their number and first names.
 
-        Files that are not for reconstruction have none: hidden ones, texts, side-cars, previews,
-        and reduced copies of the photographs.
+        Files that are not for reconstruction have no warning: hidden ones, texts, side-cars,
+        previews, and reduced copies of the photographs.
 
         Raises:
-            OSError: the scene folder cannot be read.
+            OSError: The scene folder cannot be read.
         """
         # Links lead to the same folder by several paths; their files are the same.
         real: dict[str, str] = {}

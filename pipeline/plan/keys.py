@@ -13,13 +13,13 @@ from pipeline.plan.values import Plan
 from pipeline.runtime.record import canonical
 from pipeline.runtime.source import gpu_source_hash, stage_source_hash
 
-# Computed once for all runs of a batch.
+# The versions are computed once for all runs of a batch.
 _version = cache(version)
 _source_hash = cache(stage_source_hash)
 
 
 def installed_version(package: str) -> str | None:
-    """None if it is not installed, which the job reports."""
+    """The version of a package; None if it is not installed, which the job reports."""
     try:
         return _version(package)
     except PackageNotFoundError:
@@ -35,7 +35,7 @@ def stage_key(spec: StageSpec, plan: Plan, job: int = 1) -> str:
     because Snakemake compares parameters as a set of ``repr(value)``, which would miss changes.
 
     Args:
-        job: number of the job, from 1. Only of stages with several jobs it is part of the key.
+        job: The number of the job, from 1. The key contains it only for stages with several jobs.
     """
     key: dict[str, Any] = {
         "stage": spec.name,

@@ -12,8 +12,8 @@ from pipeline.runtime.errors import UserError
 _LEVEL_EXTENT = 2.0
 # A voxel that is this many times the extent of the cameras is larger than anything that they see.
 _TOO_LARGE = 1000.0
-# The voxels, per squared extent, of a surface as large as a cube around the cameras: six sides,
-# each in a layer of two truncation distances and a block.
+# The number of voxels, per squared extent, of a surface as large as a cube around the cameras: six
+# sides, each in a layer of two truncation distances and a block.
 _VOXELS_PER_AREA = 6 * 20
 _BYTES_PER_VOXEL = 8
 
@@ -25,7 +25,7 @@ def check_mesh_voxel(scan: Scan, config: Config) -> list[str]:
         A sentence about the number of voxels if they will be larger than configured.
 
     Raises:
-        UserError: the voxels are larger than the scene.
+        UserError: The voxels are larger than the scene.
     """
     voxel = config.export.mesh_voxel
     extent, unit = _camera_extent(scan, config)

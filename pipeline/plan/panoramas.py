@@ -23,7 +23,7 @@ def partial_panoramas(facts: Mapping[str, FileFacts]) -> list[str]:
 
 
 def panorama_hints(maybe: Sequence[str], config: Config) -> list[str]:
-    """A warning about the photographs of which only the aspect ratio is that of a panorama."""
+    """A warning about photographs that only their aspect ratio suggests to be panoramas."""
     if not maybe or config.sfm.camera_model != "auto":
         return []
     return [

@@ -16,13 +16,13 @@ from pipeline.plan.protocols import PUBLISHED_SCENES, benchmark_scene
 from pipeline.plan.scene_folder import SceneFolder
 from pipeline.runtime.errors import UserError
 
-# Suffixes of folders with full-size photographs and with copies at 1/2, 1/4 and 1/8.
+# The suffixes of folders with full-size photographs and with copies at 1/2, 1/4 and 1/8.
 _COPY_SUFFIXES = ("", "_2", "_4", "_8")
 
 
 def choose_photo_folder(at: SceneFolder, poses: GivenPoses | None) -> PhotoFolder:
-    """The folder of ``inspect.image_folder``; with "auto" that of the photographs that
-    the pose files list, else ``images`` or a smaller copy of it, else the scene folder.
+    """The folder of ``inspect.image_folder``; with "auto" the folder of the photographs that the
+    pose files list, else ``images`` or a smaller copy of it, else the scene folder.
 
     Raises:
         UserError: ``inspect.image_folder`` is not a folder inside ``folder``.
@@ -122,7 +122,7 @@ def _is_complete(
 
 
 def read_all(at: SceneFolder, image_folder: str, names: Sequence[str]) -> dict[str, FileFacts]:
-    """Name -> metadata of the photographs that can be read; the others add a warning each."""
+    """The metadata of each readable photograph by its name; the others add a warning each."""
     facts: dict[str, FileFacts] = {}
     for name in names:
         found = at.cache.read(at.path / image_folder / name, "photo", FileFacts, read_facts)

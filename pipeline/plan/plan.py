@@ -22,7 +22,7 @@ from pipeline.plan.stage_memory import memory_warnings
 from pipeline.plan.summary import found
 from pipeline.plan.values import Plan, SceneFacts
 
-# Limits the length of lists in the plan, which is passed on command lines.
+# The maximum length of lists in the plan, which is passed on command lines.
 MAX_LISTED = 20
 
 
@@ -36,10 +36,10 @@ def make_plan(
     """Decide which of ``stages`` a scene needs, and settle its options.
 
     Args:
-        device: the machine's, for ``train.device: auto``.
+        device: The machine's device, for ``train.device: auto``.
 
     Raises:
-        UserError: see ``settle`` and the stages' ``decide``.
+        UserError: See ``settle`` and the stages' ``decide``.
     """
     scan = scan.with_frames(config.video.max_frames)
     settled = settle(scan, config, device)
@@ -62,7 +62,7 @@ def make_plan(
 
 
 def upstream(spec: StageSpec, plan: Plan) -> dict[str, str]:
-    """Role of the stage's input -> the stage that provides it, according to the plan."""
+    """The stage that provides each input according to the plan, by the input's role."""
     running = {name for name, stage in plan.stages.items() if stage.run}
     return _upstream(spec, running, plan.config)
 
@@ -79,8 +79,8 @@ def _upstream(spec: StageSpec, running: Collection[str], config: Config) -> dict
 
 
 def input_folders(spec: StageSpec, plan: Plan) -> dict[str, str]:
-    """Role of the stage's input -> folder in ``results/<scene>/``. A stage with several jobs
-    has a role for each: with the number of the job."""
+    """The folder in ``results/<scene>/`` of each input, by the input's role. An input from a stage
+    with several jobs has a role for each job, which ends in the job's number."""
     found = {}
     for role, stage in upstream(spec, plan).items():
         folders = plan.stages[stage].folders(stage)
@@ -103,7 +103,7 @@ def plan_record(plan: Plan) -> PlanRecord:
 
 
 def describe(plan: Plan) -> str:
-    """The plan for the terminal: the stages that run, and the skipped ones by their reason."""
+    """The plan for the terminal: the stages that run, and the skipped stages by their reason."""
     lines = [f"{plan.scene}: {found(plan.facts)}"]
     skipped: dict[str, list[str]] = {}
     for name, stage in plan.stages.items():

@@ -43,7 +43,7 @@ class PointCloudFiles(BaseModel):
 
     @property
     def text(self) -> str:
-        """Number of points and name."""
+        """The number of points and the file's name."""
         what = f"{self.megabytes:g} MB of" if self.points is None else f"{self.points:,} points of"
         many = f" ({len(self.files)} files)" if len(self.files) > 1 else ""
         return f"{what} {self.path}{many}"
@@ -58,8 +58,8 @@ def find_point_cloud(
         has_control: Whether the scene has ground control points.
 
     Raises:
-        UserError: several clouds; a configured one that does not exist or cannot be placed; a
-            damaged header.
+        UserError: There are several clouds, the configured cloud does not exist or cannot be
+            placed, or a header is damaged.
     """
     folder, wanted = at.path, at.config.init.points_file
     if wanted == "none":
@@ -104,10 +104,10 @@ def read_point_cloud(
     """A subsample of the cloud in the scene's world, if poses are given; else as stored.
 
     Args:
-        given: the given poses; None without given poses.
+        given: The given poses; None if there are none.
 
     Raises:
-        UserError: see ``read_clouds``.
+        UserError: See ``read_clouds``.
     """
     read = read_clouds([folder / file for file in cloud.files])
     if poses is None or given is None:
@@ -126,7 +126,7 @@ def _transformed(xyz: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArr
 
 
 def _found(at: SceneFolder, poses: GivenPoses | None) -> str | None:
-    """``points.*`` or ``points/``, else the cloud that the pose file names."""
+    """The path of ``points.*`` or ``points/``, else of the cloud that the pose file names."""
     found = sorted(
         entry.name
         for entry in at.path.iterdir()
@@ -145,7 +145,7 @@ def _found(at: SceneFolder, poses: GivenPoses | None) -> str | None:
 
 
 def _named(at: SceneFolder, poses: GivenPoses) -> str | None:
-    """``ply_file_path`` of transforms.json; a warning if there is no such file in the scene."""
+    """The ``ply_file_path`` of transforms.json; adds a warning if the scene lacks the file."""
     source = at.path / poses.path
     if source.is_dir():  # Splits of a synthetic scene, whose files name no cloud.
         return None

@@ -90,7 +90,7 @@ def check_pose_names(
 def split_of(
     at: SceneFolder, poses: GivenPoses | None, chosen: PhotoFolder, names: Sequence[str]
 ) -> dict[str, Part | None]:
-    """Photograph -> its part of the scene's own split; empty where that is not used."""
+    """The part of the scene's own split that each photograph is in; empty if it is not used."""
     if poses is None or not poses.splits or at.config.split.source == "every":
         return {}
     prefix = poses.format.prefix(chosen.base)
@@ -101,17 +101,17 @@ def split_of(
 def _listed_split(
     splits: Mapping[str, ListedSplit], photos: Sequence[str], warnings: list[str]
 ) -> dict[str, Part | None]:
-    """Photograph -> its part of the split; None for photographs in neither part.
+    """The part of the split that each photograph is in; None for photographs in neither part.
 
     Without a list of test views that exist, the validation views are the test views.
 
     Args:
-        splits: name in the pose files -> list that it is in; empty without a split.
-        photos: the photographs that have a pose, named as in the pose files.
-        warnings: warnings are added to this list.
+        splits: The list that each name in the pose files is in; empty without a split.
+        photos: The photographs that have a pose, named as in the pose files.
+        warnings: The list that warnings are added to.
 
     Returns:
-        Empty if the scene has no split with training and test views.
+        The parts by photograph; empty if the scene has no split with training and test views.
     """
     lists = {
         photo: splits.get(name) for photo, name in compare_names(list(splits), photos).names.items()

@@ -24,7 +24,7 @@ from pipeline.scene.normalization import IDENTITY
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View, load_views
 
-# Stages with photographs, in the order of preference.
+# The stages with photographs, in the order of preference.
 _STAGES_WITH_PHOTOS = ("undistort", "decode", "inspect")
 # A folder with one of these has results, finished or not.
 _RESULTS = ("plan.json", ".scratch")
@@ -35,8 +35,8 @@ class PosedScene:
     """Views with their photographs, and the settings for rendering them.
 
     Attributes:
-        gains: exposure gains of all views; empty if exposure is not modelled.
-        warnings: of the scan.
+        gains: The exposure gains of all views; empty if exposure is not modelled.
+        warnings: The warnings of the scan.
     """
 
     views: list[View]
@@ -62,18 +62,18 @@ def posed_scene(
     """The views to evaluate a model on.
 
     Args:
-        folder: a finished scene (``results/NAME``), whose settings apply, or a scene folder with
+        folder: A finished scene (``results/NAME``), whose settings apply, or a scene folder with
             given poses.
-        max_long_side: of views, in pixels; None: as in the finished scene, else that of the
-            photographs.
-        every: every this-many-th view is a test view, 0: none; None: as in the finished scene,
-            else the scene's own split or the default.
-        exported: whether the model is an exported file: in the unit of the given poses. Otherwise
+        max_long_side: The longest side of views in pixels; None for that of the finished scene,
+            else that of the photographs.
+        every: Every this-many-th view is a test view, none if 0; None for the value of the finished
+            scene, else the scene's own split or the default.
+        exported: Whether the model is an exported file, in the unit of the given poses. Otherwise
             the views are in the world that the scene was trained in.
 
     Raises:
-        UserError: no such scene, an unfinished one, damaged records of a finished one, no poses,
-            cameras with lens distortion.
+        UserError: There is no such scene, it is unfinished or its records are damaged, it has no
+            poses, or its cameras have lens distortion.
     """
     if any((folder / name).exists() for name in _RESULTS):
         return _finished(folder, max_long_side, every, exported)
@@ -124,7 +124,7 @@ def _finished(
     if exported:
         model = results_normalization(folder).without_origin().model_to_given(model)
     _check_pinhole(model, folder)
-    # Paths of photographs may be relative to the folder in which Snakemake ran.
+    # The paths of photographs may be relative to the folder in which Snakemake ran.
     root = folder.absolute().parent.parent
     found = [
         replace(

@@ -7,7 +7,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from typing import Literal
 
-# Common prefixes of scene names.
+# The common prefixes of scene names.
 _PREFIX = re.compile(
     r"^(mip[_-]?(nerf)?[_-]?360|m?360(_v2)?|nerf([_-]synthetic)?|blender|tandt|tnt|t2|db|dtu)[_-]"
 )
@@ -21,15 +21,15 @@ class PublishedScene:
     """A scene of a published benchmark, as the papers of 3D Gaussian splatting measure it.
 
     Attributes:
-        benchmark: name of the data set.
-        scene: name of the scene, lower case.
-        photographs: possible numbers of photographs; empty if ``every`` is None.
-        size: width and height of the views, pixels.
-        image_folder: folder of the photographs that papers use; None if pose files list them.
-        every: every this-many-th view, sorted by name, is a test view; 0: all views are training
-            views and are measured; None: the data set lists its test views.
-        num_test: number of the listed test views; 0 if ``every`` is not None.
-        background: behind transparent photographs; None if the photographs are opaque.
+        benchmark: The name of the data set.
+        scene: The name of the scene in lower case.
+        photographs: The possible numbers of photographs; empty if ``every`` is None.
+        size: The width and height of the views in pixels.
+        image_folder: The folder of the photographs that papers use; None if pose files list them.
+        every: Every this-many-th view, sorted by name, is a test view; if 0, all views are training
+            views and are measured; None if the data set lists its test views.
+        num_test: The number of the listed test views; 0 if ``every`` is not None.
+        background: The colour behind transparent photographs; None if the photographs are opaque.
     """
 
     benchmark: str
@@ -46,7 +46,7 @@ class PublishedScene:
         return f"{self.scene} of {self.benchmark}"
 
     def has(self, photographs: Sequence[str]) -> bool:
-        """Whether these may be the scene's photographs, by their number or names."""
+        """Whether these may be the scene's photographs, according to their number or names."""
         if self.every is not None:
             return len(photographs) in self.photographs
         stems = [name.rpartition(".")[0] or name for name in photographs]
@@ -95,7 +95,7 @@ def _released_with_3dgs() -> list[PublishedScene]:
 
 
 def _nerf_synthetic() -> list[PublishedScene]:
-    """NeRF-synthetic (Mildenhall et al. 2020), on white."""
+    """The scenes of NeRF-synthetic (Mildenhall et al. 2020), which are measured on white."""
     names = ("chair", "drums", "ficus", "hotdog", "lego", "materials", "mic", "ship")
     tested = NUM_SYNTHETIC["test"]
     return [
@@ -105,8 +105,8 @@ def _nerf_synthetic() -> list[PublishedScene]:
 
 
 def _dtu() -> list[PublishedScene]:
-    """DTU as Huang et al. 2024 (2DGS) released it, with masks as alpha: half of the size, and the
-    PSNR of the training views."""
+    """The scenes of DTU as Huang et al. 2024 (2DGS) released it, with masks as alpha: they are
+    measured at half of the size, by the PSNR of the training views."""
     scans = (24, 37, 40, 55, 63, 65, 69, 83, 97, 105, 106, 110, 114, 118, 122)
     return [
         PublishedScene("DTU", f"scan{n}", (49, 64), (777, 581), every=0, background="black")
@@ -123,7 +123,7 @@ PUBLISHED_SCENES = {
 def benchmark_scene(folder: str) -> str:
     """The scene's name in lower case without the data set's prefix: mip360_Bonsai -> bonsai.
 
-    A number in the name of the size of a copy is no part of it: nerf_lego_800 -> lego.
+    A number that gives the size of a copy is no part of the name: nerf_lego_800 -> lego.
     """
     name = _PREFIX.sub("", folder.casefold())
     return re.sub(r"_(400|800)$", "", name)
@@ -133,8 +133,8 @@ def recognise(folder: str, photographs: Sequence[str]) -> PublishedScene | None:
     """The published scene that a folder is by its name and its photographs; None for others.
 
     Args:
-        folder: name of the scene folder.
-        photographs: names of the photographs that are used.
+        folder: The name of the scene folder.
+        photographs: The names of the photographs that are used.
     """
     scene = PUBLISHED_SCENES.get(benchmark_scene(folder))
     return scene if scene is not None and scene.has(photographs) else None

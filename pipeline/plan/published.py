@@ -1,5 +1,5 @@
-"""``split.source: published``: the options with which a scene is measured as papers measure it, and
-what the plan knows of deviations from that."""
+"""``split.source: published``: the options with which papers measure a scene, and the deviations
+from that which the plan can tell."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ from pipeline.plan.scan import Scan
 from pipeline.plan.values import Plan
 from pipeline.runtime.errors import UserError
 
-# What stages that change photographs or given poses deviate by.
+# The deviations of stages that change photographs or given poses.
 _DEVIATIONS = {
     "sfm": "poses are estimated, not those of the data set",
     "refine": "the given poses are adjusted",
@@ -30,7 +30,7 @@ def as_published(scan: Scan, config: Config) -> Config:
     Options with the value "auto" and those of size, masks and test views are replaced.
 
     Raises:
-        UserError: the folder is no scene of a published benchmark.
+        UserError: The folder is no scene of a published benchmark.
     """
     if config.split.source != "published":
         return config
@@ -71,7 +71,7 @@ def published_line(scan: Scan, config: Config) -> str:
 
 
 def planned_deviations(plan: Plan) -> list[str]:
-    """What the plan does otherwise than the published protocol of its scene, in words."""
+    """The deviations of the plan from the published protocol of its scene, in words."""
     scene = PUBLISHED_SCENES[plan.facts.published_scene or ""]
     found = [text for stage, text in _DEVIATIONS.items() if plan.runs(stage)]
     folder = plan.facts.image_folder
@@ -81,7 +81,7 @@ def planned_deviations(plan: Plan) -> list[str]:
 
 
 def _unknown(scan: Scan) -> str:
-    """Why the folder is no published scene."""
+    """The reason why the folder is no published scene."""
     known = PUBLISHED_SCENES.get(benchmark_scene(scan.folder.name))
     if known is None:
         return f"expected a folder named as a scene ({', '.join(PUBLISHED_SCENES)})"

@@ -39,7 +39,7 @@ def read_plan(folder: Path) -> PlanRecord:
     """The plan of a finished scene's folder (``results/<scene>``).
 
     Raises:
-        UserError: it is missing, damaged or from another version of the program.
+        UserError: The file is missing, damaged or from another version of the program.
     """
     # The rule that writes it is named "plan", as if it were a stage.
     return read_record(folder / NAME, PlanRecord, fix=rerun(folder / "plan"))

@@ -47,20 +47,20 @@ class Scan(BaseModel):
     """The content of a scene folder.
 
     Attributes:
-        folder: the scene folder.
-        manifest: the photographs and videos that are used; names of photographs are relative to
+        folder: The scene folder.
+        manifest: The photographs and videos that are used; the names of photographs are relative to
             ``image_folder``.
-        image_folder: relative to ``folder``, "." for itself.
-        base_folder: the folder that the given poses refer to ("images" for "images_4").
-        image_folder_reason: why it was chosen.
-        listed: names of all photographs found, with those left out of the manifest.
-        poses: None without given poses, or if they are ignored (``poses: ignore``).
-        ordered: the reason to treat the photographs as a sequence, or None.
+        image_folder: The path relative to ``folder``; "." is the scene folder itself.
+        base_folder: The folder that the given poses refer to ("images" for "images_4").
+        image_folder_reason: The reason why ``image_folder`` was chosen.
+        listed: The names of all photographs found, with those left out of the manifest.
+        poses: The given poses; None if there are none, or if they are ignored (``poses: ignore``).
+        ordered: The reason to treat the photographs as a sequence, or None.
         ground_control: The scene's ``gcp_list.txt``, if any.
         ground_control_text: A description of the content of ``ground_control``.
-        cloud: the point cloud that the Gaussians are initialised from, or None.
-        truth, truth_digest: folder and digest of ground truth poses, for evaluation only.
-        fingerprint: digest of the names and contents of photographs, videos, masks, depth maps,
+        cloud: The point cloud that the Gaussians are initialised from, or None.
+        truth, truth_digest: The folder and digest of ground truth poses, for evaluation only.
+        fingerprint: The digest of the names and contents of photographs, videos, masks, depth maps,
             pose files, ground control points and point cloud; independent of times and of the
             folder's location.
     """
@@ -115,7 +115,7 @@ class Scan(BaseModel):
         """Compare with the fingerprint of an earlier scan.
 
         Raises:
-            UserError: they differ.
+            UserError: The fingerprints differ.
         """
         if self.fingerprint != fingerprint:
             raise ChangedFileError(
@@ -147,7 +147,7 @@ class Scan(BaseModel):
 
     @property
     def num_test(self) -> int:
-        """Number of test views of the scene's own split; 0 without one."""
+        """The number of test views of the scene's own split; 0 if it has none."""
         return sum(photo.split == "test" for photo in self.photos)
 
     @property
@@ -160,7 +160,7 @@ class Scan(BaseModel):
 
     @property
     def sizes(self) -> list[tuple[int, int]]:
-        """Distinct (width, height), the most frequent first."""
+        """The distinct (width, height), with the most frequent first."""
         counts = Counter((photo.width, photo.height) for photo in self.planned)
         return [size for size, _ in sorted(counts.items(), key=lambda item: (-item[1], item[0]))]
 
@@ -177,9 +177,9 @@ def scan(folder: Path, scene: str, config: Config, *, cache: Path | None) -> Sca
             written is no error.
 
     Raises:
-        UserError: no such folder, too few photographs, malformed pose files, poses of other
-            photographs, masks of another size than their photographs, a point cloud that cannot be
-            used, folders that cannot be read.
+        UserError: There is no such folder, it has too few photographs, pose files are malformed or
+            of other photographs, a mask has another size than its photograph, a point cloud cannot
+            be used, or a folder cannot be read.
     """
     try:
         _check_folder(folder)
@@ -258,7 +258,7 @@ def _find_poses(at: SceneFolder) -> GivenPoses | None:
 def _find_videos(
     at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None, photos: Collection[str]
 ) -> tuple[tuple[VideoFile, ...], list[str]]:
-    """The videos that are used, and the names of all videos that would be."""
+    """The videos that are used, and the names of all that were tried: none if poses are given."""
     recursive = not chosen.names and chosen.path == "."
     names = find_videos(at.path, chosen.path, recursive=recursive)
     at.used.extend(at.path / name for name in names)
@@ -312,7 +312,7 @@ def _used_photographs(
     facts: dict[str, FileFacts],
 ) -> tuple[list[Photo], dict[str, FileFacts]]:
     """The photographs that have a pose, if any has, and a part in the scene's own split, if there
-    is one, with their masks and depth maps; and those of ``facts`` that are theirs."""
+    is one, with their masks and depth maps; and those entries of ``facts`` that describe them."""
     split: dict[str, Part | None] = {}
     with at.faults.of("unlisted"):
         if poses is not None:
@@ -355,8 +355,8 @@ def _check_headers(
     *,
     posed: bool,
 ) -> float | None:
-    """Compare the photographs' headers with the given cameras, and warn of those that are not used
-    as they say; returns the extent of the given cameras (``check_given``), if any."""
+    """Compare the photographs' headers with the given cameras, and warn of photographs that are
+    used otherwise than their headers say. Returns the extent of the given cameras, if any."""
     at.warnings.extend(unread_colours(facts))
     if not posed:
         at.warnings.extend(partial_panoramas(facts))
@@ -369,7 +369,7 @@ def _check_headers(
 
 
 def _unused(at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None) -> list[str]:
-    """The warnings of files that are not used, but for those that the configuration leaves out."""
+    """The warnings about unused files, except those that the configuration leaves out."""
     ignored = set(at.faults.kinds)
     if at.config.poses == "ignore":
         ignored |= {"poses", "models"}
@@ -383,7 +383,7 @@ def _unused(at: SceneFolder, chosen: PhotoFolder, poses: GivenPoses | None) -> l
 def _fingerprint(
     at: SceneFolder, manifest: Manifest, listed: Sequence[str], inputs: Sequence[Path]
 ) -> str:
-    """See ``Scan.fingerprint``.
+    """The value of ``Scan.fingerprint``.
 
     Args:
         listed: The names of all photographs and videos. Those that cannot be read are part of the

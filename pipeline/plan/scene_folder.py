@@ -1,4 +1,4 @@
-"""A scene folder while it is scanned: what the scan of each kind of file reads and adds to."""
+"""A scene folder while it is scanned: what the scans of all kinds of files read and add to."""
 
 from __future__ import annotations
 
@@ -81,11 +81,11 @@ class SceneFolder:
 
     @property
     def uses_masks(self) -> bool:
-        """Whether masks in the folder are used: not for measures as published."""
+        """Whether masks in the folder are used; they are not for measures as published."""
         return self.config.views.masks == "use" and self.config.split.source != "published"
 
     def pose_files(self, poses: GivenPoses | None) -> list[Path]:
-        """The files of the given poses; none without given poses."""
+        """The files of the given poses; empty without given poses."""
         return [] if poses is None else pose_files(self.path / poses.path, poses.kind)
 
     def digest(self, file: Path) -> str:

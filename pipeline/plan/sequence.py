@@ -12,8 +12,8 @@ from pipeline.scene.manifest import Photo
 
 # With longer intervals, consecutive photographs need not overlap.
 MAX_GAP_SECONDS = 10.0
-# Names of video frames: frame_0001, video-12. A number alone is no evidence: unordered collections
-# are numbered too.
+# The names of video frames: frame_0001, video-12. A number alone is no evidence, because unordered
+# collections are numbered too.
 _FRAME_PREFIX = re.compile(r"(frame|video|vid)[ _-]?$")
 
 

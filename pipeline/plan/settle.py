@@ -31,17 +31,17 @@ MAX_EXHAUSTIVE_PHOTOS = 40
 # and positions of most photographs.
 MIN_SPATIAL_EXTENT_M = 50.0
 MIN_SPATIAL_SHARE = 0.9
-# Up to this many photographs, depths improve test views: depth maps, or those of sparse points.
+# Up to this many photographs, depths improve test views: those of depth maps, or of sparse points.
 FEW_PHOTOS, SPARSE_DEPTH_WEIGHT = 30, 0.03
 DEPTH_MAP_WEIGHT = 0.3
-# Scenes of more photographs are trained in blocks, one for so many.
+# Scenes of more photographs are trained in blocks, one for each PHOTOS_PER_BLOCK.
 MAX_PHOTOS_OF_ONE_BLOCK, PHOTOS_PER_BLOCK = 1000, 250
 # Two photographs are the fewest that show a part of a scene from several sides.
 MIN_PHOTOS_OF_A_BLOCK = 2
-# Features and matches of more photographs are computed in several jobs, one for so many. A job of
-# 250 photographs takes minutes on two cores; to start one takes seconds.
+# Features and matches of more photographs are computed in several jobs, one for each
+# PHOTOS_PER_JOB. A job of 250 photographs takes minutes on two cores; to start one takes seconds.
 MAX_PHOTOS_OF_ONE_JOB, PHOTOS_PER_JOB = 500, 250
-# Jobs of matching depend on all jobs of extraction: Snakemake plans more of them for minutes.
+# Jobs of matching depend on all jobs of extraction: Snakemake would plan more of them for minutes.
 MAX_JOBS = 200
 
 _EARTH_RADIUS_M = 6_371_000.0
@@ -56,7 +56,7 @@ class Settled:
     """A config whose options are no longer "auto".
 
     Attributes:
-        why: dotted path of an option -> the sentence that gives its value and the reason.
+        why: The sentence that gives an option's value and the reason, by the option's dotted path.
     """
 
     config: settled.Config
@@ -67,12 +67,12 @@ def settle(scan: Scan, config: Config, device: Choice = PROCESSOR) -> Settled:
     """Settle the options for a scene.
 
     Args:
-        device: the machine's, for ``train.device: auto``.
+        device: The machine's device, for ``train.device: auto``.
 
     Raises:
-        UserError: ``partition.memory_mb`` is too small, more ``partition.blocks`` than the
-            photographs allow, ``split.source: published`` for a scene of no published benchmark,
-            or appearance embeddings for a scene in blocks.
+        UserError: ``partition.memory_mb`` is too small, there are more ``partition.blocks`` than
+            the photographs allow, the scene of ``split.source: published`` is in no published
+            benchmark, or appearance embeddings are set for a scene in blocks.
     """
     config = as_published(scan, config)
     chosen = {
@@ -149,12 +149,12 @@ def _pairs(scan: Scan, config: Config) -> Choice:
 
 
 def gps_extent_m(scan: Scan) -> float:
-    """Diagonal of the GPS positions' bounding box in metres; 0 without positions."""
+    """The diagonal of the GPS positions' bounding box in metres; 0 without positions."""
     positions = [photo.gps for photo in scan.photos if photo.gps is not None]
     if not positions:
         return 0.0
     north = [math.radians(position[0]) * _EARTH_RADIUS_M for position in positions]
-    # Longitudes relative to the first: a scene may lie on both sides of the date line.
+    # Longitudes are relative to the first: a scene may lie on both sides of the date line.
     cos_latitude = math.cos(math.radians(positions[0][0]))
     east = [
         math.radians((position[1] - positions[0][1] + 180) % 360 - 180)
@@ -169,7 +169,7 @@ def _mapper(config: Config) -> Choice:
     wanted = config.sfm.mapper
     if wanted != "auto":
         return wanted, f"{wanted} mapper, as configured"
-    # Its time is linear in the number of photographs, the global mapper's quadratic.
+    # Incremental mapping takes time linear in the number of photographs, global mapping quadratic.
     return "incremental", "incremental mapper; the global mapper if its model is not good"
 
 
@@ -259,8 +259,8 @@ def _device(config: Config, device: Choice) -> Choice:
 
 
 def _init_method(scan: Scan, config: Config) -> str:
-    """What Gaussians are initialised from: depth maps of few photographs, unless points or depths
-    are given. Alpha, masks and panoramas exclude them: whether they pay there is not known."""
+    """What Gaussians are initialised from: depth maps for few photographs, unless points or depths
+    are given. Scenes with alpha, masks or panoramas use none: their benefit there is not known."""
     if config.init.method != "auto":
         return config.init.method
     other = scan.cloud is not None or scan.num_alpha or scan.num_masks or scan.num_depths
@@ -269,10 +269,10 @@ def _init_method(scan: Scan, config: Config) -> str:
 
 
 def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
-    """The number of blocks of the scene, of at most so many Gaussians.
+    """The number of blocks of a scene that has at most ``gaussians`` Gaussians, and the reason.
 
     Raises:
-        UserError: more blocks are configured than there are photographs for, or
+        UserError: More blocks are configured than there are photographs for, or
             ``partition.memory_mb`` is not enough for this number, or for any.
     """
     wanted, count, limit = config.partition.blocks, len(scan.planned), config.partition.memory_mb
@@ -283,7 +283,7 @@ def _blocks(scan: Scan, config: Config, gaussians: int) -> tuple[int, str]:
     elif count > MAX_PHOTOS_OF_ONE_BLOCK:
         blocks = min(math.ceil(count / PHOTOS_PER_BLOCK), MAX_BLOCKS)
         reason = f"{blocks} blocks: one for every {PHOTOS_PER_BLOCK} of {count} photographs"
-    # With one block as configured, the number of Gaussians is what fits.
+    # If one block is configured, the number of Gaussians is already what fits.
     one_fits = wanted == 1 or MEMORY_MARGIN * memory_mb(0, gaussians) <= (limit or math.inf)
     if limit is None or (blocks == 1 and one_fits):
         return blocks, reason
@@ -331,10 +331,10 @@ def _masks(scan: Scan, config: Config) -> str:
 
 
 def _depth_loss_weight(scan: Scan, config: Config, dense: bool) -> tuple[float, str]:
-    """The weight of the depth loss; with many photographs it is not needed.
+    """The weight of the depth loss, which is 0 for many photographs without depths, and the reason.
 
     Args:
-        dense: whether depths by multi-view stereo are known.
+        dense: Whether depths by multi-view stereo are known.
     """
     wanted = config.train.depth_loss_weight
     if wanted != "auto":

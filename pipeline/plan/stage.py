@@ -1,4 +1,4 @@
-"""The declaration of a stage, which its Snakemake rule, key and plan are made from."""
+"""The declaration of a stage, from which its Snakemake rule, key and plan are made."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ def if_several_jobs(
     """The plan of a stage that runs only if features and matches are computed in several jobs.
 
     Args:
-        scattered: whether this stage is what has several jobs.
+        scattered: Whether it is this stage that has several jobs.
     """
     jobs = math.ceil(len(scan.planned) / int(settled.config.features.photos_per_job))
     why = settled.why["features.photos_per_job"]
@@ -45,7 +45,7 @@ def if_blocks(settled: Settled, reason: str, *, scattered: bool = False) -> Stag
     """The plan of a stage that runs only if the scene is trained in blocks.
 
     Args:
-        scattered: whether each block is a job.
+        scattered: Whether each block is a job.
     """
     blocks = int(settled.config.partition.blocks)
     if blocks == 1:
@@ -62,27 +62,27 @@ class StageSpec:
     """The declaration of a stage, in ``stages/<name>.py``.
 
     Attributes:
-        name: name of the rule, of the module in ``stages/`` and of the folder in
+        name: The name of the rule, of the module in ``stages/`` and of the folder in
             ``results/<scene>/``.
-        work: writes the stage's output into ``Job.out``. It must import heavy modules itself,
-            because the Snakefile imports every declaration.
-        decide: whether a scene needs the stage, and why. Pure.
-        inputs: role -> the stages that can provide this input; the first that the plan runs does.
-        counters: model of the counters that ``work`` records.
-        options: dotted paths of the options or sections that the stage reads; others cannot be
+        work: The function that writes the stage's output into ``Job.out``. It must import heavy
+            modules itself, because the Snakefile imports every declaration.
+        decide: The pure function that decides whether a scene needs the stage, and why.
+        inputs: The stages that can provide each role; the first that the plan runs does.
+        counters: The model of the counters that ``work`` records.
+        options: The dotted paths of the options or sections that the stage reads; others cannot be
             read (see ``pipeline.config.options``).
-        packages: packages whose version affects the result.
-        seeded: whether the stage draws random numbers. Only these keys contain the seed, so that
-            runs with different seeds share the results of the other stages.
-        publishes: output that is copied to ``results/<scene>/`` -> its caption in Snakemake's
-            report.
-        shows_plan: whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
-        facts: facts that affect the result besides code, options, packages, seed and inputs.
-        scattered: whether the stage has several jobs, as many as the plan says, each with a folder
+        packages: The packages whose version affects the result.
+        seeded: Whether the stage draws random numbers. Only the keys of such stages contain the
+            seed, so that runs with different seeds share the results of the other stages.
+        publishes: The caption in Snakemake's report of each output that is copied to
+            ``results/<scene>/``.
+        shows_plan: Whether the stage reads the plan (``Job.key["plan"]``, as in plan.json).
+        facts: The facts that affect the result besides code, options, packages, seed and inputs.
+        scattered: Whether the stage has several jobs, as many as the plan says, each with a folder
             and a log of its own. The key contains the number of the job and of all jobs.
-        only_if: role -> whether the stage reads this input under a configuration. The result of a
+        only_if: Whether the stage reads the input of a role under a configuration. The result of a
             stage that does not read it stays valid when the input's stage runs for another one.
-        optional: roles that have no input if the plan runs none of their stages.
+        optional: The roles that have no input if the plan runs none of their stages.
     """
 
     name: str

@@ -1,6 +1,7 @@
 """Estimates of the stages' memory, which clusters reserve for their jobs.
 
-Fitted to the peaks in the ``run.json`` of scenes of 20 to 128 photographs of up to 20 megapixels.
+They are fitted to the peaks in the ``run.json`` of scenes of 20 to 128 photographs of up to
+20 megapixels.
 """
 
 from __future__ import annotations
@@ -13,31 +14,31 @@ from pipeline.plan.training_memory import MEMORY_MARGIN, block_mb, coarse_mb
 from pipeline.plan.values import Plan
 from pipeline.scene.views import view_size
 
-# Python with numpy and OpenCV or pycolmap; with numpy alone; with torch; with torch and the
-# rasterizer's kernels.
+# MB of a process of Python with numpy and OpenCV or pycolmap; with numpy alone; with torch; with
+# torch and the rasterizer's kernels.
 _PROGRAM, _NUMPY, _TORCH, _RASTERIZER = 140.0, 70.0, 270.0, 290.0
 # Bytes per pixel of a photograph in one thread: decoded and reduced; scanned; undistorted;
-# developed by LibRaw. Bytes per pixel of SIFT's scale space.
+# developed by LibRaw. The last value is the bytes per pixel of SIFT's scale space.
 _DECODED, _SCANNED, _UNDISTORTED, _DEVELOPED, _SCALE_SPACE = 3.2, 5.5, 9.5, 30.0, 195.0
-# Bytes per pixel of a panorama of the maps of its views, which all threads share.
+# Bytes per pixel of a panorama for the maps of its views, which all threads share.
 _VIEW_MAPS = 15.0
-# MB per photograph of features and matches, and of the mapper's model, for 3000 features.
+# MB per photograph of features and matches, and of the mapper's model, both for 3000 features.
 _MATCHES, _MAPPING, _FEATURES = 0.95, 1.7, 3000
-# Bytes per Gaussian that is held; held and rendered; rendered with gradients.
+# Bytes per Gaussian that is held; that is held and rendered; that is rendered with gradients.
 _HELD, _RENDERED, _PARTITIONED = 250.0, 400.0, 720.0
-# Bytes per pixel of a view: rendered; measured in one thread. MB of a band of a thread.
+# Bytes per pixel of a rendered view; of a view measured in one thread. MB of a thread's band.
 _IMAGE, _MEASURED, _BAND = 60.0, 50.0, 12.0
 # MB of the report's page with its parts, and of a mesh.
 _PAGE, _MESH = 110.0, 450.0
-# MB per photograph of a sparse model: read; read, with views; written; copied.
+# MB per photograph of a sparse model that is read; read with views; written; copied.
 _MODEL_READ, _MODEL_VIEWS, _MODEL_WRITTEN, _MODEL_COPIED = 0.1, 0.5, 0.45, 0.6
-# Bytes per pixel of a view of multi-view stereo: matched in a thread; fused in a thread; of the
+# Bytes per pixel of a view in multi-view stereo: matched in a thread; fused in a thread; of the
 # views that are cached.
 _STEREO, _FUSION, _CACHED_VIEWS = 320.0, 150.0, 170.0
-# Points of the fused cloud: share of the pixels, and maximum in millions. Bytes of a point, and of
-# one of the sample that is thinned.
+# The points of the fused cloud as a share of the pixels, and their maximum in millions. Bytes of a
+# point, and of a point of the sample that is thinned.
 _FUSED_SHARE, _MAX_FUSED, _FUSED, _SAMPLED = 0.25, 5.0, 30.0, 150.0
-# Number of photographs whose features are in memory at a time while pairs are matched; MB per
+# The number of photographs whose features are in memory at a time while pairs are matched; MB per
 # photograph of the list of pairs; MB of the comparison of photographs by which pairs are chosen.
 _KEYPOINT_FILES, _LISTED, _COMPARED = 200, 0.03, 80
 
@@ -45,7 +46,7 @@ Estimate = Callable[[Plan, int], float]
 
 
 def memory_mb(stage: str, plan: Plan, threads: int) -> int:
-    """Memory in MB that the stage's job may use: what is configured, else the estimate with a
+    """The memory in MB that the stage's job may use: the configured value, else the estimate with a
     margin."""
     needed, most = _needed(stage, plan, threads), plan.config.partition.memory_mb
     return needed if most is None else min(needed, most)
@@ -83,20 +84,20 @@ def _needed(stage: str, plan: Plan, threads: int) -> int:
 
 
 def _largest(plan: Plan) -> tuple[int, int]:
-    """Width and height of the largest photographs among the most frequent sizes."""
+    """The width and height of the largest photographs among the most frequent sizes."""
     sizes = [tuple(map(int, size.split("x"))) for size in plan.facts.sizes if size != "others"]
     width, height = max(sizes, key=lambda size: size[0] * size[1], default=(0, 0))
     return width, height
 
 
 def _pixels(plan: Plan) -> float:
-    """Megapixels of the largest photographs."""
+    """The megapixels of the largest photographs."""
     width, height = _largest(plan)
     return width * height / 1e6
 
 
 def _view_pixels(plan: Plan) -> float:
-    """Megapixels of a view."""
+    """The megapixels of a view."""
     width, height = plan.facts.view_size
     return width * height / 1e6
 
@@ -106,14 +107,14 @@ def _photos(plan: Plan) -> int:
 
 
 def _gaussians(plan: Plan) -> float:
-    """The largest number of trained Gaussians, millions. Views show several blocks, each of which
+    """The largest number of trained Gaussians in millions. Views show several blocks, each of which
     has fewer Gaussians than the whole scene as one block."""
     blocks = int(plan.config.partition.blocks)
     return plan.config.train.density.max_gaussians * (1 + blocks) / 2 / 1e6
 
 
 def _with_model(plan: Plan) -> float:
-    """A program that copies the given poses with their points, where there are any."""
+    """The memory of a program that copies the given poses with their points, if there are any."""
     poses = plan.facts.given_poses
     if poses is None or not poses.num_points:
         return _PROGRAM
@@ -156,7 +157,7 @@ def _gathered_matches(plan: Plan) -> float:
 
 
 def _match(plan: Plan, threads: int) -> float:
-    """Keypoints and matches of a limited number of photographs are in memory at a time."""
+    """The memory of matching, which holds the features of a limited number of photographs."""
     share = plan.config.features.max_features / _FEATURES
     in_memory = min(plan.photos_per_job, _KEYPOINT_FILES)
     return _gathered_matches(plan) + _MATCHES * share * in_memory
@@ -177,7 +178,7 @@ def _dense(plan: Plan, threads: int) -> float:
 
 
 def _fused_points(plan: Plan) -> float:
-    """Points of the fused cloud, millions."""
+    """The number of points of the fused cloud in millions."""
     return min(_FUSED_SHARE * _photos(plan) * _view_pixels(plan), _MAX_FUSED)
 
 
@@ -193,12 +194,12 @@ def _init(plan: Plan, threads: int) -> float:
 def _train(plan: Plan, threads: int) -> float:
     if plan.config.partition.blocks == 1:
         return plan.facts.training_memory_mb
-    # The union of blocks holds one of them.
+    # Uniting the blocks holds one of them at a time.
     return _NUMPY + _HELD * plan.config.train.density.max_gaussians / 1e6
 
 
 def _trained(plan: Plan) -> tuple[int, int]:
-    """Pixels of a view, and the maximum number of Gaussians of the scene."""
+    """The pixels of a view, and the maximum number of Gaussians of the scene."""
     width, height = plan.facts.view_size
     return width * height, plan.config.train.density.max_gaussians
 

@@ -6,10 +6,10 @@ from pipeline.plan.values import SceneFacts
 
 
 def found(facts: SceneFacts, frames_chosen: int | None = None) -> str:
-    """What was found, in words: "1 video, at most 38 of 412 frames; 12 photographs; poses: none".
+    """A sentence such as "1 video, at most 38 of 412 frames; 12 photographs; poses: none".
 
     Args:
-        frames_chosen: number of frames of the videos that are used; None before they are chosen.
+        frames_chosen: The number of video frames that are used; None before they are chosen.
     """
     parts = []
     if facts.videos:

@@ -6,16 +6,16 @@ import math
 
 from pipeline.runtime.machine import usable_memory
 
-#: The Python process with torch.
+#: MB of the Python process with torch.
 PROGRAM_MB = 400
-#: Parameters, Adam moments, gradients and the renderer's buffers per Gaussian.
+#: Bytes per Gaussian of parameters, Adam moments, gradients and the renderer's buffers.
 GAUSSIAN_BYTES = 2500
-#: 8-bit RGB, and a quarter more for reduced copies.
+#: Bytes per pixel of 8-bit RGB, and a quarter more for reduced copies.
 PIXEL_BYTES = 1.25 * 3
-#: A process that trains a part of a scene in blocks; images are on disk. Bytes per pixel of a view:
-#: of the coarse run; with the layers around a block. Bytes per Gaussian: of the whole scene in the
-#: coarse run; of the whole scene while layers are rendered; of a block, whose region extends beyond
-#: its box.
+#: MB of a process that trains a part of a scene in blocks, with images on disk. Bytes per pixel of
+#: a view: in the coarse run; with the layers around a block. Bytes per Gaussian: of the whole scene
+#: in the coarse run; of the whole scene while layers are rendered; of a block, whose region extends
+#: beyond its box.
 PART_MB = 290
 COARSE_PIXEL_BYTES, BLOCK_PIXEL_BYTES = 150, 240
 COARSE_GAUSSIAN_BYTES, SCENE_GAUSSIAN_BYTES, BLOCK_GAUSSIAN_BYTES = 900, 450, 2200
@@ -26,11 +26,11 @@ OTHERS_SHARE = 0.25
 
 
 def memory_mb(pixels: int, gaussians: int) -> int:
-    """Estimated peak memory of training in MB.
+    """The estimated peak memory of training in MB.
 
     Args:
-        pixels: total number of pixels of the views that are kept in memory.
-        gaussians: maximum number of Gaussians.
+        pixels: The total number of pixels of the views that are kept in memory.
+        gaussians: The maximum number of Gaussians.
     """
     return round(PROGRAM_MB + (PIXEL_BYTES * pixels + GAUSSIAN_BYTES * gaussians) / 1e6)
 
@@ -47,30 +47,30 @@ def machine_mb() -> int:
 
 
 def coarse_mb(pixels: int, gaussians: int) -> float:
-    """Estimated peak memory of the coarse run of a scene in blocks, MB.
+    """The estimated peak memory in MB of the coarse run of a scene in blocks.
 
     Args:
-        pixels: of a view.
-        gaussians: maximum number of Gaussians of the scene.
+        pixels: The number of pixels of a view.
+        gaussians: The maximum number of Gaussians of the scene.
     """
     return PART_MB + (COARSE_PIXEL_BYTES * pixels + COARSE_GAUSSIAN_BYTES * gaussians) / 1e6
 
 
 def block_mb(pixels: int, gaussians: int, blocks: int) -> float:
-    """Estimated peak memory of the training of one of ``blocks`` blocks, MB; see ``coarse_mb``."""
+    """The estimated peak memory in MB of training one of ``blocks`` blocks; see ``coarse_mb``."""
     held = max(SCENE_GAUSSIAN_BYTES, BLOCK_GAUSSIAN_BYTES / blocks)
     return PART_MB + (BLOCK_PIXEL_BYTES * pixels + held * gaussians) / 1e6
 
 
 def in_blocks_mb(pixels: int, gaussians: int, blocks: int) -> float:
-    """Estimated peak memory of the largest job that trains a scene in blocks, MB."""
+    """The estimated peak memory in MB of the largest job that trains a scene in blocks."""
     return max(coarse_mb(pixels, gaussians), block_mb(pixels, gaussians, blocks))
 
 
 def blocks_in(megabytes: float, pixels: int, gaussians: int) -> int:
-    """The smallest number of blocks, 2 or more, that are trained in this memory; if no number is
-    enough, one that takes least."""
-    # More take no less memory.
+    """The smallest number of blocks, 2 or more, that can be trained in this memory; if no number is
+    small enough, one that takes the least memory."""
+    # More blocks take no less memory.
     most = math.ceil(BLOCK_GAUSSIAN_BYTES / SCENE_GAUSSIAN_BYTES)
     fitting = (n for n in range(2, most + 1) if in_blocks_mb(pixels, gaussians, n) <= megabytes)
     return next(fitting, most)

@@ -1,4 +1,4 @@
-"""What a plan holds. ``pipeline.plan.plan`` makes it from the declarations of the stages."""
+"""The values of a plan. ``pipeline.plan.plan`` makes it from the declarations of the stages."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ class StagePlan(BaseModel):
     jobs: int = Field(1, description="Number of its jobs, which share its work.")
 
     def folders(self, stage: str) -> list[str]:
-        """Names of its folders in ``results/<scene>/``: the stage's, with the number of the job if
-        it has several."""
+        """The names of the stage's folders in ``results/<scene>/``: its own, with the number of the
+        job if it has several."""
         return job_folders(stage, self.jobs)
 
 
 def job_folders(stage: str, jobs: int) -> list[str]:
-    """See ``StagePlan.folders``."""
+    """The folders of a stage with ``jobs`` jobs (see ``StagePlan.folders``)."""
     return [stage] if jobs == 1 else [f"{stage}_{job}" for job in range(1, jobs + 1)]
 
 
@@ -99,11 +99,11 @@ class Plan(BaseModel):
     """The plan of a scene.
 
     Attributes:
-        scene: name of the scene or run.
-        stages: name -> plan of the stage, in the order of the DAG.
-        config: the settled options.
-        facts: facts about the scene that the plan depends on.
-        folder: the scene folder, relative to the working directory or absolute.
+        scene: The name of the scene or run.
+        stages: The plan of each stage by its name, in the order of the DAG.
+        config: The settled options.
+        facts: The facts about the scene that the plan depends on.
+        folder: The scene folder, relative to the working directory or absolute.
     """
 
     model_config = ConfigDict(extra="forbid", frozen=True)
@@ -117,7 +117,7 @@ class Plan(BaseModel):
 
     @property
     def photos_per_job(self) -> int:
-        """Number of photographs of a job of feature extraction."""
+        """The number of photographs of a job of feature extraction."""
         count = self.facts.photographs + self.facts.max_frames
         wanted = self.config.features.photos_per_job
         return count if wanted == "auto" else min(wanted, count)

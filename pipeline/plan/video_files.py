@@ -11,20 +11,20 @@ from pipeline.io.videofile import VideoFacts, read_video_facts
 from pipeline.plan.scene_folder import SceneFolder
 from pipeline.scene.manifest import Photo, VideoFile
 
-# A folder of videos beside images/.
+# The name of a folder of videos beside images/.
 VIDEO_FOLDER = "videos"
 # The largest number of unused streams that the plan names.
 SHOWN_STREAMS = 4
 
 
 def find_videos(folder: Path, image_folder: str, *, recursive: bool) -> list[str]:
-    """Names of the videos in the scene folder itself, in the folder of the photographs and in
-    ``videos/``, relative to the scene folder, sorted.
+    """The sorted names of the videos in the scene folder itself, in the folder of the photographs
+    and in ``videos/``, relative to the scene folder.
 
     Args:
-        folder: the scene folder.
-        image_folder: relative to it.
-        recursive: search all subfolders of the scene folder.
+        folder: The scene folder.
+        image_folder: The folder of the photographs, relative to ``folder``.
+        recursive: Whether to search all subfolders of the scene folder.
     """
     names = set(videos_in(folder, recursive=recursive))
     for place in {image_folder, VIDEO_FOLDER} - {"."}:
@@ -36,7 +36,7 @@ def find_videos(folder: Path, image_folder: str, *, recursive: bool) -> list[str
 def read_videos(
     at: SceneFolder, names: Sequence[str], photos: Collection[str]
 ) -> tuple[VideoFile, ...]:
-    """The videos whose header can be read; the others add a warning each.
+    """The videos whose header can be read; each of the others adds a warning.
 
     Args:
         names: The files, relative to the scene folder.
@@ -64,7 +64,7 @@ def read_videos(
 
 
 def _doubts(facts: VideoFacts) -> list[str]:
-    """What makes a video that can be read less useful."""
+    """The properties that make a video less useful although it can be read."""
     found = []
     if facts.truncated:
         found.append("its end is missing: the file is shorter than its header says; copy it again")
@@ -91,7 +91,7 @@ def contents(photos: int, videos: int) -> str:
 
 
 def description(video: VideoFile) -> str:
-    """The number of frames, size and length of a video by its header, in words."""
+    """The number of frames, size and length of a video according to its header, in words."""
     count = video.frames or "an unknown number of"
     length = f", {video.frames / video.fps:.0f} s" if video.frames and video.fps else ""
     largest = ""

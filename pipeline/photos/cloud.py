@@ -1,4 +1,4 @@
-"""Point clouds of other programs as sparse points: those that the views see, with colours."""
+"""Point clouds of other programs as sparse points: the points that the views see, with colours."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ from pipeline.scene.reconstruction import Points
 from pipeline.scene.views import View
 from pipeline.scene.visibility import projected, visible
 
-# A cloud with fewer points in the views is somewhere else.
+# A cloud with fewer points in the views is probably in another place.
 MIN_POINTS = 100
-# Views that points without colour are compared with, and views that decide the size of voxels.
+# The number of views that points without colour are compared with, and that set the voxel size.
 _COLOUR_VIEWS, _RESOLUTION_VIEWS = 60, 30
 _GREY = 128
 
@@ -38,12 +38,12 @@ def placed_points(
     placed there.
 
     Args:
-        cloud: in the scene's world, if poses are given, else in the projection of the ground
-            control points.
-        georeference: of the poses; None for given poses in their own world.
+        cloud: The cloud, in the scene's world if poses are given, else in the projection of the
+            ground control points.
+        georeference: The georeference of the poses; None for given poses in their own world.
 
     Raises:
-        UserError: the views see too few points: the cloud is in another frame.
+        UserError: The views see too few points: the cloud is in another frame.
     """
     xyz, frame = cloud.xyz, IN_POSES
     if georeference is not None and georeference.method != "given":
@@ -70,7 +70,7 @@ def points_of_cloud(
     Points without a colour get that of the nearest view that sees them, else grey.
 
     Args:
-        xyz: (N, 3) the cloud's points in the world of the views.
+        xyz: The (N, 3) points of the cloud in the world of the views.
     """
     chosen = sampled(xyz, views, max_points)
     xyz, rgb = xyz[chosen], cloud.rgb[chosen].copy()
@@ -88,7 +88,7 @@ def sampled(xyz: NDArray[np.float64], views: Sequence[View], max_points: int) ->
 
 
 def _in_frustums(xyz: NDArray[np.float64], views: Sequence[View]) -> NDArray[np.bool_]:
-    """(N,) whether a view's image contains the point, be it occluded or not."""
+    """(N,) whether a view's image contains the point, occluded or not."""
     seen = np.zeros(len(xyz), bool)
     for view in views:
         rest = np.flatnonzero(~seen)

@@ -41,7 +41,7 @@ def develop(manifest: Manifest, config: Decode, out: Path, *, threads: int) -> D
     Other photographs are unchanged.
 
     Raises:
-        UserError: none of the files could be read.
+        UserError: None of the files could be read.
     """
     linear = [photo for photo in manifest.photos if photo.linear]
     names = rename({photo.name: ".png" if photo.linear else "" for photo in manifest.photos})

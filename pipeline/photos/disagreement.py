@@ -1,6 +1,6 @@
-"""How much photographs disagree on the colours of the same points, apart from exposure.
+"""The disagreement of photographs on the colours of the same points, apart from exposure.
 
-Photographs of one scene in one light agree but for noise, highlights and inaccurate points. In
+Photographs of one scene in one light agree except for noise, highlights and inaccurate points. In
 photographs of another time of day, weather or processing, colours differ from point to point.
 
 Photographs in very different light have few matches, so that tracks hardly connect them. Points
@@ -21,26 +21,26 @@ from pipeline.photos.load import load_view
 from pipeline.scene.reconstruction import Reconstruction
 from pipeline.scene.views import View
 
-# Photographs are from the same place if their centres are no farther apart than this share of the
+# Photographs are from the same place if the distance of their centres is at most this share of the
 # depth of the nearest tenth of what they see, and their viewing directions differ by less than this
-# angle: features move by a few pixels.
+# angle: features then move by a few pixels.
 SAME_PLACE, SAME_DIRECTION = 0.005, np.radians(3.0)
-# Colours are means over squares of this size, in pixels: points are not more accurate.
+# Colours are means over squares of this side in pixels: points are not more accurate.
 WINDOW = 5
-# Ratio of the standard deviation to the median absolute value of a normal distribution.
+# The ratio of the standard deviation to the median absolute value of a normal distribution.
 TO_DEVIATION = 1.4826
 
 Array = NDArray[np.float64]
 
 
 def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Array) -> float:
-    """Robust standard deviation of log2 of the colours of a point over the photographs, after gains
-    that compensate exposure and white balance; the median over a sample of the views. 0 if too few
-    points are seen by several views.
+    """The robust standard deviation of log2 of the colours of a point over the photographs, after
+    gains that compensate exposure and white balance; the median over a sample of the views. The
+    value is 0 if too few points are seen by several views.
 
     Args:
-        views: views of images of ``model``, matched by name.
-        points: (N, 3) of the scene, for a model without points.
+        views: The views of images of ``model``, matched by name.
+        points: The (N, 3) points of the scene, for a model without points.
     """
     views = sample_views(views)
     tracked = len(model.points) > 0
@@ -58,7 +58,7 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
     point, view_index, colours = [], [], []
     for index, (view, place) in enumerate(zip(views, _same_places(views, depths), strict=True)):
         if not tracked and len(place) == 1:
-            continue  # What hides a point from one of two places is not known.
+            continue  # It is unknown what hides a point from one of two places.
         rows = np.unique(np.concatenate([observed[other] for other in place]))
         rows = rows[_inside(view, projected[index][rows])]
         usable, values = _log_colours(view, projected[index][rows])
@@ -73,7 +73,7 @@ def colour_disagreement(views: Sequence[View], model: Reconstruction, points: Ar
 
 
 def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int) -> float:
-    """See ``colour_disagreement``; arguments as of ``solve_gains``."""
+    """The value of ``colour_disagreement``; the arguments are those of ``solve_gains``."""
     _, point, observed = np.unique(point, return_inverse=True, return_counts=True)
     several = observed[point] >= 2
     point, view, y = point[several], view[several], y[several]
@@ -90,7 +90,7 @@ def _spread(point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: 
 
 
 def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int64]]:
-    """Rows of the points that each view observes."""
+    """The rows of the points that each view observes."""
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
     numbers = {image.name: number for number, image in model.images.items()}
@@ -98,7 +98,7 @@ def _tracks(views: Sequence[View], model: Reconstruction) -> list[NDArray[np.int
 
 
 def _same_places(views: Sequence[View], depths: Sequence[float]) -> list[list[int]]:
-    """For each view, the views from the same place, itself among them."""
+    """For each view, the views from the same place, including itself."""
     centres = np.array([view.centre for view in views])
     axes = np.array([view.world_to_camera[2, :3] for view in views])
     result = []
@@ -110,7 +110,7 @@ def _same_places(views: Sequence[View], depths: Sequence[float]) -> list[list[in
 
 
 def _project(view: View, points: Array) -> Array:
-    """(N, 3) pixel coordinates and depth."""
+    """(N, 3) pixel coordinates and depths of points."""
     pose = view.world_to_camera
     x, y, z = np.einsum("ij,nj->in", pose[:3, :3], points) + pose[:3, 3:]
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -118,14 +118,14 @@ def _project(view: View, points: Array) -> Array:
 
 
 def _inside(view: View, projected: Array) -> NDArray[np.bool_]:
-    """(N,) True for points in the image."""
+    """(N,) whether each point is in the image."""
     x, y, z = projected.T
     with np.errstate(invalid="ignore"):
         return (z > 0) & (x >= 0) & (y >= 0) & (x < view.width) & (y < view.height)
 
 
 def _log_colours(view: View, projected: Array) -> tuple[NDArray[np.bool_], Array]:
-    """(M,) True for the usable ones of the points (M, 3), and (K, 3) log2 of their colours."""
+    """(M,) whether each of the points (M, 3) is usable, and (K, 3) log2 of the colours of those."""
     pixels = load_view(view)
     column, row = projected[:, 0].astype(int), projected[:, 1].astype(int)
     colours = cv2.blur(pixels.rgb, (WINDOW, WINDOW))[row, column] / 255.0

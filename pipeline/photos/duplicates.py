@@ -15,31 +15,31 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image
 
-# Side in pixels of the thumbnails that are compared.
+# The side in pixels of the thumbnails that are compared.
 SIDE = 96
-# Side of the neighbourhood in which contrast is normalised, and a standard deviation in grey levels
-# below which it is noise. Without it, what never changes (the black border of a fisheye image)
-# would outweigh what does.
+# The side of the neighbourhood in which contrast is normalised, and the standard deviation in grey
+# levels below which it is noise. Without it, parts that never change (the black border of a fisheye
+# image) would outweigh those that do.
 NEIGHBOURHOOD, NOISE = 9, 2.0
-# Largest difference of duplicates: the root mean square of the difference of thumbnails over that
-# of a thumbnail. A copy at half the size or as JPEG of quality 70 differs by 0.03 to 0.15, a shift
-# by a thousandth of the width by 0.1 to 0.2; different photographs of one scene by 0.8 or more,
-# renders of nearly symmetric objects by 0.25.
+# The largest difference of duplicates: the root mean square of the difference of thumbnails over
+# that of a thumbnail. A copy at half the size or as JPEG of quality 70 differs by 0.03 to 0.15, a
+# shift by a thousandth of the width by 0.1 to 0.2; different photographs of one scene by 0.8 or
+# more, renders of nearly symmetric objects by 0.25.
 MAX_DIFFERENCE = 0.15
-# Long side in pixels at which sharpness is measured.
+# The long side in pixels at which sharpness is measured.
 SHARPNESS_PX = 640
-# Rows of the matrix of differences that are computed at a time.
+# The number of rows of the matrix of differences that are computed at a time.
 _ROWS = 256
 
 
 @dataclass(frozen=True)
 class Signature:
-    """What duplicates are recognised by.
+    """The properties by which duplicates are recognised.
 
     Attributes:
-        thumbnail: (SIDE, SIDE) int8, an image with locally normalised contrast.
-        pixels: number of pixels of the photograph.
-        sharpness: variance of the Laplacian; comparable between duplicates only.
+        thumbnail: (SIDE, SIDE) int8 image with locally normalised contrast.
+        pixels: The number of pixels of the photograph.
+        sharpness: The variance of the Laplacian, which is comparable between duplicates only.
     """
 
     thumbnail: NDArray[np.int8]
@@ -63,7 +63,7 @@ def signature(image: Image.Image) -> Signature:
 
 
 def find_duplicates(signatures: Mapping[str, Signature]) -> dict[str, str]:
-    """Name of a duplicate -> name of the photograph that is kept instead.
+    """The name of the photograph that is kept instead of each duplicate, by the duplicate's name.
 
     The largest is kept, of equally large ones the sharpest, of these the first by name. No two kept
     photographs are duplicates of each other.
@@ -73,7 +73,7 @@ def find_duplicates(signatures: Mapping[str, Signature]) -> dict[str, str]:
     )
     if not order:
         return {}
-    # Sums of integers: exact in float64, whatever the order of summation.
+    # Sums of integers are exact in float64, whatever the order of summation.
     thumbnails = np.stack([signatures[name].thumbnail.ravel() for name in order]).astype(np.float64)
     power = (thumbnails**2).sum(axis=1)
     kept: list[int] = []
@@ -93,7 +93,7 @@ def find_duplicates(signatures: Mapping[str, Signature]) -> dict[str, str]:
 
 def _grey(image: Image.Image) -> NDArray[np.uint8]:
     """(H, W) grey levels of an image of any mode."""
-    if image.mode.startswith("I"):  # 16 bits, which PIL would clip
+    if image.mode.startswith("I"):  # PIL would clip images of 16 bits.
         values = np.asarray(image).astype(np.float32) / 257
         return np.asarray(values.clip(0, 255), np.uint8)
     if "A" in image.mode:

@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 
 def write_picture(path: Path, picture: NDArray[Any], options: Sequence[int] = ()) -> None:
-    """Write an image in OpenCV's layout, in the format of the path's suffix; makes the folder.
+    """Write an image in OpenCV's layout, in the format of the path's suffix, and make its folder.
 
     Args:
-        options: of OpenCV's encoder.
+        options: The options of OpenCV's encoder.
     """
     path.parent.mkdir(parents=True, exist_ok=True)
-    # Encoded and written separately: cv2.imwrite does not report a full disk.
+    # The image is encoded and written separately: cv2.imwrite does not report a full disk.
     _, data = cv2.imencode(path.suffix, picture, list(options))
     path.write_bytes(data.tobytes())

@@ -20,13 +20,13 @@ from pipeline.scene.views import View
 
 #: Stops per unit of log2 in display values: the sRGB curve is close to a power of 1 / 2.2.
 GAMMA = 2.2
-#: Range of usable display values: darker and brighter ones are clipped or noisy.
+#: The range of usable display values: darker and brighter ones are clipped or noisy.
 DARK, BRIGHT = 0.04, 0.96
 #: Views with fewer usable observations keep a gain of 1.
 MIN_OBSERVATIONS = 20
-#: Number of views that are measured.
+#: The number of views that are measured.
 SAMPLE = 64
-#: Number of alternations of the solver.
+#: The number of alternations of the solver.
 ROUNDS = 20
 
 Array = NDArray[np.float64]
@@ -34,13 +34,13 @@ Array = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Exposures:
-    """Gains of views.
+    """The gains of views.
 
     Attributes:
         gains: (V, 3) float64 RGB factors of a view's display values relative to the average view.
-        spread: standard deviation of the gains over the views, in stops; the largest of the
+        spread: The standard deviation of the gains over the views in stops; the largest of the
             channels.
-        measured: number of photographs with at least ``MIN_OBSERVATIONS`` usable observations.
+        measured: The number of photographs with at least ``MIN_OBSERVATIONS`` usable observations.
     """
 
     gains: Array
@@ -54,8 +54,8 @@ def measure_exposures(views: Sequence[View], model: Reconstruction) -> Exposures
     Views of one photograph have the same gains.
 
     Args:
-        views: views of images of ``model``, matched by name. They may have another resolution than
-            the model's cameras.
+        views: The views of images of ``model``, matched by name. They may have another resolution
+            than the model's cameras.
     """
     points = model.points
     owner = np.repeat(np.arange(len(points)), points.track_length)
@@ -88,8 +88,8 @@ def sample_views(views: Sequence[View]) -> list[View]:
 
 
 def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
-    """(M,) True for the usable ones of the pixels ``xy`` (M, 2), and (K, 3) log2 of their display
-    values."""
+    """(M,) whether each of the pixels ``xy`` (M, 2) is usable, and (K, 3) log2 of the display
+    values of those."""
     pixels = load_view(view)
     usable = np.isfinite(xy).all(axis=1)
     column, row = np.nan_to_num(xy).astype(int).T
@@ -104,12 +104,12 @@ def _log_colours(view: View, xy: Array) -> tuple[NDArray[np.bool_], Array]:
 def solve_gains(
     point: NDArray[np.int64], view: NDArray[np.int64], y: Array, count: int
 ) -> Exposures:
-    """Solve for the gains.
+    """Solve for the gains of views.
 
     Args:
         point, view: (M,) indices of the point and the view of each observation.
         y: (M, 3) log2 display values.
-        count: number of views.
+        count: The number of views.
     """
     _, point = np.unique(point, return_inverse=True)
     observed = np.bincount(point)

@@ -21,15 +21,15 @@ from pipeline.photos.lens import Lens, mapped_lens
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 
-# Largest field of view along a side of a photograph that becomes one pinhole view.
+# The largest field of view along a side of a photograph that becomes one pinhole view.
 MAX_FIELD_DEGREES = 110.0
-# Smallest side of a cropped face, as a share of the whole face: narrower views are hardly of use.
+# The smallest side of a cropped face as a share of the whole face: narrower views are useless.
 MIN_SIDE = 0.25
 # A face is left out if a smaller share of the photograph's pixels is in no other face.
 MIN_SHARE = 0.001
-# Numbers of samples along the longer side of a photograph by which faces are chosen and cropped.
+# The number of samples along the longer side of a photograph by which faces are chosen and cropped.
 SAMPLES = 512
-# Pixels by which a panorama is extended beyond its borders, for interpolation across them.
+# The number of pixels by which a panorama is extended beyond its borders, for interpolation there.
 PADDING = 4
 
 
@@ -38,10 +38,10 @@ class WideCamera:
     """A camera and the part of its image that the lens fills.
 
     Attributes:
-        camera: of the photograph's size.
-        radius: of the image circle around the principal point, pixels; infinity if it covers the
-            whole image.
-        nadir: rays closer than this to the camera's downward axis are masked, radians.
+        camera: The camera at the photograph's size.
+        radius: The radius of the image circle around the principal point in pixels; infinity if it
+            covers the whole image.
+        nadir: The angle in radians around the camera's downward axis within which rays are masked.
     """
 
     camera: Camera
@@ -92,9 +92,9 @@ class Face:
     """A pinhole view of a wide photograph.
 
     Attributes:
-        name: of the direction: "front", "right", ...
-        rotation: (3, 3) float64, the photograph's camera to the view's.
-        camera: PINHOLE, with the angular resolution of the photograph's centre.
+        name: The name of the direction: "front", "right", ...
+        rotation: (3, 3) float64 rotation from the photograph's camera to the view's.
+        camera: The PINHOLE camera, with the angular resolution of the photograph's centre.
     """
 
     name: str
@@ -121,7 +121,7 @@ def split(wide: WideCamera) -> list[Face]:
 
 
 def used_share(wide: WideCamera, faces: list[Face]) -> float:
-    """Share of the photograph's pixels inside the image circle that are in some view."""
+    """The share of the photograph's pixels inside the image circle that are in some view."""
     directions = wide.samples()
     if not len(directions):
         return 0.0
@@ -141,8 +141,8 @@ def face_lens(wide: WideCamera, face: Face, max_long_side: int) -> Lens:
 
 def depth_factor(wide: WideCamera, face: Face) -> Floats:
     """(height, width) factors from stored depths to depths along the view's axis, at the pixels of
-    the view's camera. Depths of panoramas are distances, of others along the axis of the lens; 0
-    where the lens looks sideways or backwards."""
+    the view's camera. Stored depths of panoramas are distances, those of others are along the
+    lens's axis. The factor is 0 where the lens looks sideways or backwards."""
     fx, fy, cx, cy = face.camera.pinhole
     x = (np.arange(face.camera.width) + 0.5 - cx) / fx
     y = (np.arange(face.camera.height) + 0.5 - cy) / fy
@@ -154,8 +154,8 @@ def depth_factor(wide: WideCamera, face: Face) -> Floats:
 
 
 def padded(picture: NDArray) -> NDArray:
-    """A panorama extended by ``PADDING`` pixels: the other side at the left and right, the opposite
-    meridian beyond the poles."""
+    """A panorama extended by ``PADDING`` pixels: by the other side at the left and right, and by
+    the opposite meridian beyond the poles."""
     turned = np.roll(picture, picture.shape[1] // 2, axis=1)
     top, bottom = turned[:PADDING][::-1], turned[-PADDING:][::-1]
     tall = np.concatenate([top, picture, bottom], axis=0)

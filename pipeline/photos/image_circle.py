@@ -1,4 +1,4 @@
-"""The image circle of a fisheye lens that does not fill the sensor: black in every photograph
+"""The image circle of a fisheye lens that does not fill the sensor: every photograph is black
 beyond it."""
 
 from __future__ import annotations
@@ -12,28 +12,28 @@ from pipeline.geometry.cameras import Camera
 from pipeline.photos.load import load_rgb, to_8bit
 from pipeline.scene.manifest import Photo
 
-# The brightest values over an even sample of photographs decide, at a reduced size.
+# The circle is found in the brightest values over an even sample of photographs, at a reduced size.
 MAX_PHOTOS, LONG_SIDE = 12, 512
 # Darker 8-bit values are black.
 BLACK = 20
-# A ring is black if at most this share of it is brighter; the ring inside the circle must be
-# bright in most places, or the photographs are just dark.
+# A ring is black if at most this share of it is brighter; the ring inside the circle must be bright
+# in most places, because otherwise the photographs are just dark.
 BLACK_SHARE, BRIGHT_SHARE = 0.02, 0.5
-# The rim is blurred and has colour fringes.
+# The width of the rim, which is blurred and has colour fringes.
 RIM = 0.01
 # A circle farther out than this share of the farthest corner hides nothing of note.
 CORNER = 0.97
 
 
 def image_circle(camera: Camera, photos: Sequence[Photo]) -> float:
-    """The radius of the circle around the principal point, in pixels of the photographs; infinity
-    if there is none.
+    """The radius in pixels of the photographs of the circle around the principal point; infinity if
+    there is none.
 
     Args:
-        camera: of the photographs' size.
+        camera: The camera at the photographs' size.
 
     Raises:
-        UserError: a photograph cannot be read, or changed since it was inspected.
+        UserError: A photograph cannot be read, or changed since it was inspected.
     """
     reduction = min(1.0, LONG_SIDE / max(camera.width, camera.height))
     size = (max(1, round(camera.width * reduction)), max(1, round(camera.height * reduction)))

@@ -14,7 +14,7 @@ from pipeline.geometry.distortion import fold_radius, project, unproject
 from pipeline.photos.load import Picture
 from pipeline.scene.views import view_size
 
-# Number of rows of the undistortion map that are computed at a time.
+# The number of rows of the undistortion map that are computed at a time.
 BATCH_ROWS = 256
 # COLMAP's limits of the undistorted size relative to the size without distortion: the border of a
 # wide lens may be at infinity.
@@ -25,10 +25,10 @@ Floats = NDArray[np.float64]
 
 @dataclass(frozen=True)
 class Lens:
-    """Undistortion map of one camera.
+    """The undistortion map of one camera.
 
     Attributes:
-        target: the pinhole camera at the size that is written.
+        target: The pinhole camera at the size that is written.
         x, y: (height, width) float32 positions in the distorted image, in cv2's pixel coordinates;
             None for a camera without distortion.
         valid: (height, width) bool, False for pixels outside the distorted image; None if all are
@@ -52,8 +52,8 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
 
     Args:
         blank_pixels: 0 crops to the rectangle inside the undistorted image border, 1 contains the
-            whole border; values between interpolate. As COLMAP's undistorter, except that each side
-            is cropped by itself around the principal point.
+            whole border; values between interpolate. This is as in COLMAP's undistorter, except
+            that each side is cropped by itself around the principal point.
     """
     fx, fy, cx, cy = camera.pinhole
     width, height = float(camera.width), float(camera.height)
@@ -64,7 +64,7 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
         (np.stack([x, np.zeros_like(x)], -1), 1, -fy, cy),
         (np.stack([x, np.full_like(x, height)], -1), 1, fy, height - cy),
     )
-    extents = []  # pixels from the principal point to the left, right, top and bottom
+    extents = []  # The pixels from the principal point to the left, right, top and bottom.
     for border, axis, focal, distorted in sides:
         undistorted = unproject(camera, border)[:, axis] * focal
         finite = undistorted[np.isfinite(undistorted)]
@@ -80,7 +80,7 @@ def pinhole_camera(camera: Camera, blank_pixels: float) -> Camera:
 
 
 def pinhole_lens(source: Camera, blank_pixels: float, max_long_side: int) -> Lens:
-    """Undistortion map of ``source``, to an image of at most ``max_long_side`` pixels."""
+    """The undistortion map of ``source``, to an image of at most ``max_long_side`` pixels."""
     if source.is_pinhole:
         size = (source.width, source.height)
         fx, fy, cx, cy = source.pinhole
@@ -104,10 +104,10 @@ def mapped_lens(
     """The map of a pinhole image.
 
     Args:
-        pinhole: the camera of the image at full resolution.
-        sample: normalised coordinates (..., 2) of the pinhole camera -> pixels (..., 2) of the
-            photograph, and whether they are valid (...).
-        max_long_side: largest side of the image that is written, pixels.
+        pinhole: The camera of the image at full resolution.
+        sample: The function that maps normalised coordinates (..., 2) of the pinhole camera to
+            pixels (..., 2) of the photograph, and whether they are valid (...).
+        max_long_side: The largest side in pixels of the image that is written.
     """
     size = (pinhole.width, pinhole.height)
     fx, fy, cx, cy = pinhole.pinhole

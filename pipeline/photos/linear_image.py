@@ -35,7 +35,7 @@ def develop_exr(photo: Photo, config: Decode) -> Developed:
     sRGB; values outside are clipped.
 
     Raises:
-        ValueError: the file is not a readable image.
+        ValueError: The file is not a readable image.
     """
     rgb, alpha = exr.read_pixels(io.BytesIO(read_recorded(photo.path, photo.digest)))
     rgb = np.nan_to_num(rgb, nan=0.0, posinf=1.0, neginf=0.0)

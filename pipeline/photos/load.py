@@ -1,8 +1,7 @@
 """Load images, masks and depth maps, as stored: no orientation is ever applied
 (``pipeline.io.pictures``).
 
-If a recorded digest is given, the bytes that are decoded are the ones whose digest is compared: the
-file is read once.
+If a recorded digest is given, the file is read once: its digest is that of the decoded bytes.
 """
 
 from __future__ import annotations
@@ -28,7 +27,7 @@ from pipeline.scene.views import Crop, View
 Picture = NDArray[Any]
 T = TypeVar("T")
 FIX = "Replace the file by an undamaged one, or remove it from the folder."
-# Largest relative difference of aspect ratios: sizes of downscaled images are rounded.
+# The largest relative difference of aspect ratios: sizes of downscaled images are rounded.
 ASPECT_TOLERANCE = 0.02
 
 
@@ -60,10 +59,10 @@ def load_rgb(path: str | Path, digest: str | None = None) -> Picture:
     """Read an image as (H, W, 3) RGB, uint8 or uint16 as stored; alpha is dropped.
 
     Args:
-        digest: the file's recorded digest (``recorded.digest_of``).
+        digest: The file's recorded digest (``recorded.digest_of``).
 
     Raises:
-        UserError: the file is missing, truncated, not a readable image, or its digest differs.
+        UserError: The file is missing, truncated, not a readable image, or its digest differs.
     """
     return _split(read_picture(path, digest))[0]
 
@@ -74,7 +73,7 @@ def load_rgba(
     """Read an image as (H, W, 3) uint8 RGB and (H, W) uint8 alpha, None without alpha.
 
     Raises:
-        UserError: as ``load_rgb``.
+        UserError: See ``load_rgb``.
     """
     rgb, alpha = _split(read_picture(path, digest))
     return to_8bit(rgb), None if alpha is None else to_8bit(alpha)
@@ -84,7 +83,7 @@ def load_mask(path: str | Path, digest: str | None = None) -> NDArray[np.bool_]:
     """Read a mask as (H, W) bool, True for the pixels that count (``masks.valid_pixels``).
 
     Raises:
-        UserError: as ``load_rgb``.
+        UserError: See ``load_rgb``.
     """
     return read_mask(path, digest).valid
 
@@ -93,7 +92,7 @@ def read_mask(path: str | Path, digest: str | None = None) -> MaskPixels:
     """Read a mask, with what was found of its values.
 
     Raises:
-        UserError: as ``load_rgb``.
+        UserError: See ``load_rgb``.
     """
     return _decoded(path, digest, decode_mask)
 
@@ -102,7 +101,7 @@ def read_depth(path: str | Path, digest: str | None = None) -> Picture:
     """Read a depth map (PNG, TIFF, .npy, or the first array of an .npz) as stored.
 
     Raises:
-        UserError: the file cannot be read, or its digest differs.
+        UserError: The file cannot be read, or its digest differs.
     """
     path = Path(path)
     data = read_recorded(path, digest)
@@ -128,10 +127,10 @@ def load_depth(path: str | Path, aspect: float, digest: str | None = None) -> ND
     """Read a depth map with one channel as (H, W) float64, values as stored.
 
     Args:
-        aspect: expected ratio of width to height.
+        aspect: The expected ratio of width to height.
 
     Raises:
-        UserError: as ``read_depth``, or it has several channels or another aspect ratio.
+        UserError: See ``read_depth``, or the map has several channels or another aspect ratio.
     """
     path = Path(path)
     depth = read_depth(path, digest)
@@ -160,7 +159,7 @@ def load_view(view: View) -> ViewPixels:
     pixel is valid only if all source pixels that it covers are valid.
 
     Raises:
-        UserError: as ``load_rgb``, or the image or mask has another aspect ratio than the view.
+        UserError: See ``load_rgb``, or the image or mask has another aspect ratio than the view.
     """
     crop = view.crop
     width, height = (
@@ -204,8 +203,8 @@ def resize_rgba(
 
 
 def resize_mask(mask: NDArray[np.bool_], width: int, height: int) -> NDArray[np.bool_]:
-    """Resize an (H, W) mask; a pixel is valid only if all source pixels that it covers are: its
-    colour is their mean."""
+    """Resize an (H, W) mask. A pixel is valid only if all source pixels that it covers are, because
+    its colour is their mean."""
     return np.asarray(resize_area(mask.astype(np.float32), width, height) > 0.999)
 
 
@@ -217,7 +216,7 @@ def resize_area(picture: Picture, width: int, height: int) -> Picture:
 
 
 def to_8bit(values: Picture) -> NDArray[np.uint8]:
-    """uint8 unchanged; uint16 scaled from 65535 to 255 and rounded."""
+    """The image with uint8 values unchanged, uint16 scaled from 65535 to 255 and rounded."""
     if values.dtype == np.uint8:
         return values
     return ((values.astype(np.uint32) + 128) // 257).astype(np.uint8)
@@ -227,7 +226,7 @@ def read_picture(path: str | Path, digest: str | None = None) -> Picture:
     """Read a photograph in OpenCV's layout, in sRGB (``pictures.decode_photograph``).
 
     Raises:
-        UserError: as ``load_rgb``.
+        UserError: See ``load_rgb``.
     """
     return _decoded(path, digest, decode_photograph)
 

@@ -8,10 +8,11 @@ from pathlib import PurePosixPath
 
 
 def rename(suffixes: Mapping[str, str]) -> dict[str, str]:
-    """New, distinct names: the suffix is replaced, or appended if two names would become equal.
+    """The new, distinct name of each image. The suffix is replaced, or appended if two names would
+    become equal.
 
     Args:
-        suffixes: name -> new suffix (".png"); "" for a name that does not change.
+        suffixes: The new suffix (".png") of each name; "" for a name that does not change.
     """
     replaced = {
         name: str(PurePosixPath(name).with_suffix(suffix)) if suffix else name

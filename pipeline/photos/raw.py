@@ -31,10 +31,10 @@ SRGB_GAMMA = (2.4, 12.92)  # LibRaw's default is the curve of BT.709.
 
 @dataclass(frozen=True)
 class _Balance:
-    """White balances of a RAW file.
+    """The white balances of a RAW file.
 
     Attributes:
-        body: identifies the camera body (its colour matrix).
+        body: The identity of the camera body (its colour matrix).
         as_shot, daylight: (4,) float64 factors relative to green; ``as_shot`` is None if the file
             has none.
     """
@@ -48,8 +48,8 @@ class RawDeveloper:
     """Develops RAW files with common settings.
 
     Args:
-        photos: the scene's RAW files, of which the common white balances are taken.
-        pool: reads the files; does not change the result.
+        photos: The scene's RAW files, from which the common white balances are computed.
+        pool: The executor that reads the files. It does not change the result.
     """
 
     def __init__(self, photos: Sequence[Photo], config: Decode, pool: ThreadPoolExecutor):
@@ -73,7 +73,7 @@ class RawDeveloper:
 
 
 def _balance(photo: Photo) -> _Balance | str:
-    """White balances of a RAW file, or the reason why it cannot be read."""
+    """The white balances of a RAW file, or the reason why it cannot be read."""
     try:
         with rawpy.imread(_bytes_of(photo)) as raw:
             body = np.asarray(raw.rgb_xyz_matrix).tobytes()

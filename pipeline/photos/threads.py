@@ -1,4 +1,4 @@
-"""Work on many photographs, each on a thread of its own and OpenCV on that thread alone."""
+"""Work on many photographs, each on a thread of its own in which OpenCV starts no more."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ R = TypeVar("R")
 
 @contextmanager
 def one_thread_of_opencv() -> Iterator[None]:
-    """OpenCV starts no threads: what it computes does not depend on their number."""
+    """Let OpenCV start no threads, so that its results do not depend on their number."""
     before = cv2.getNumThreads()
     cv2.setNumThreads(1)
     try:

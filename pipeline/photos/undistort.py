@@ -28,11 +28,11 @@ from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo
 from pipeline.scene.reconstruction import Reconstruction
 
-# Peak memory per pixel of a photograph: as decoded, as extended beyond its borders, and its views.
-# Maps are kept for all photographs of a camera.
+# The peak memory in bytes per pixel of a photograph: as decoded, as extended beyond its borders,
+# and its views. Maps are kept for all photographs of a camera.
 _PHOTO_BYTES, _MAP_BYTES = 12.0, 14.0
-# Largest relative difference of the aspect ratio between a photograph and its camera, which
-# differ by rounding.
+# The largest relative difference of the aspect ratios of a photograph and its camera, which differ
+# by rounding.
 SHAPE_TOLERANCE = 0.02
 
 #: The camera's number in the model, and the width and height of photographs in pixels.
@@ -41,15 +41,15 @@ Key = tuple[int, int, int]
 
 @dataclass(frozen=True)
 class UndistortReport:
-    """Result of ``undistort``.
+    """The result of ``undistort``.
 
     Attributes:
-        manifest: the undistorted photographs, or their views.
-        photographs: number of photographs that were undistorted or split.
-        split: number of photographs that were split into views.
-        used_share: share of the pixels of split photographs, inside the lens's image circle, that
-            are in some view; None if none was split.
-        decisions, warnings: sentences for the log.
+        manifest: The undistorted photographs, or their views.
+        photographs: The number of photographs that were undistorted or split.
+        split: The number of photographs that were split into views.
+        used_share: The share of the pixels of split photographs, inside the lens's image circle,
+            that are in some view; None if none was split.
+        decisions, warnings: Sentences for the log.
     """
 
     manifest: Manifest
@@ -78,7 +78,7 @@ def undistort(
     with composed poses; each observation belongs to the view in whose middle it is.
 
     Raises:
-        UserError: a photograph cannot be read, or its aspect ratio differs from its camera's.
+        UserError: A photograph cannot be read, or its aspect ratio differs from its camera's.
     """
     registered = model.by_name()
     photos = [photo for photo in manifest.photos if photo.name in registered]
@@ -100,7 +100,7 @@ def undistort(
     largest = max((photo.width * photo.height for photo in photos), default=0)
     threads = threads_within(threads, _PHOTO_BYTES * largest, _MAP_BYTES * largest)
     with ThreadPoolExecutor(threads) as pool:
-        # One camera at a time: its maps are as large as an image.
+        # One camera is processed at a time: its maps are as large as an image.
         for key, group in sorted(groups.items()):
             camera = wide[key]
             if camera is None:
@@ -157,7 +157,7 @@ def _write_views(
     config: schema.Undistort,
     out: Path,
 ) -> list[Photo]:
-    """Write the views of a photograph; returns their entries in the manifest."""
+    """Write the views of a photograph, and return their entries in the manifest."""
     loaded = load_source(photo, targets[0])
     return [
         write_view(photo, loaded, names[_key(photo, target.face)], target, config, out)
@@ -181,7 +181,7 @@ def _wide_camera(
 def _names(
     groups: Mapping[Key, list[Photo]], faces: Mapping[Key, list[Face]], config: schema.Undistort
 ) -> dict[str, str]:
-    """File names of the views, by ``_key``."""
+    """The file names of the views, by ``_key``."""
     suffixes = {}
     for key, group in groups.items():
         for photo in group:

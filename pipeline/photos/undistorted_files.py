@@ -35,9 +35,9 @@ class Target:
     """One of the views that a camera's photographs become.
 
     Attributes:
-        lens: its undistortion map.
-        camera_id: of the written model.
-        face, wide: of a photograph that is split, else None.
+        lens: The undistortion map of the view.
+        camera_id: The camera's id in the written model.
+        face, wide: The face and the wide camera of a photograph that is split, else None.
     """
 
     lens: Lens
@@ -47,7 +47,7 @@ class Target:
 
     @property
     def rotation(self) -> NDArray[np.float64] | None:
-        """(3, 3) the photograph's camera to the view's; None if the photograph is not split."""
+        """(3, 3) rotation from the photograph's camera to the view's; None if it is not split."""
         return None if self.face is None else self.face.rotation
 
 
@@ -59,7 +59,7 @@ class Source:
         picture: (H, W, 3) uint8 or uint16.
         alpha: (H, W) uint8, or None.
         mask: (H, W) uint8, or None.
-        depth: (H, W) as stored, or None.
+        depth: (H, W) values as stored, or None.
     """
 
     picture: Picture
@@ -98,7 +98,7 @@ def write_view(
     config: schema.Undistort,
     out: Path,
 ) -> Photo:
-    """Write one view with its mask and depth map; returns its entry in the manifest."""
+    """Write one view with its mask and depth map, and return its entry in the manifest."""
     lens = target.lens
     width, height = lens.target.width, lens.target.height
     picture, alpha = _picture(source, lens)
@@ -202,7 +202,7 @@ def _nearest(picture: Picture, width: int, height: int) -> Picture:
 
 
 def _bgr(rgb: Picture) -> Picture:
-    """Convert by cv2: its encoders are several times slower for a reversed view of an array."""
+    """Convert to BGR by cv2: its encoders are slower for a reversed view of an array."""
     return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR))
 
 

@@ -21,10 +21,10 @@ class Part:
     """A view that was made of a photograph.
 
     Attributes:
-        name: the view's name.
-        camera_id: its camera.
-        rotation: (3, 3) the photograph's camera to the view's; None if the view is the whole
-            photograph.
+        name: The view's name.
+        camera_id: The id of the view's camera.
+        rotation: (3, 3) rotation from the photograph's camera to the view's; None if the view is
+            the whole photograph.
     """
 
     name: str
@@ -41,13 +41,13 @@ def undistorted_model(
     order of their photographs' ids.
 
     Args:
-        cameras: of the views.
-        parts: photograph's name -> its views.
+        cameras: The cameras of the views.
+        parts: The views of each photograph by its name.
     """
     sources = {number: parts[i.name] for number, i in model.images.items() if i.name in parts}
     whole = all(part.rotation is None for views in sources.values() for part in views)
     images: dict[int, PosedImage] = {}
-    first: dict[int, int] = {}  # photograph's id -> id of its first view
+    first: dict[int, int] = {}  # The id of a photograph's first view by the photograph's id.
     for number in sources if whole else sorted(sources):
         source = model.images[number]
         first[number] = number if whole else len(images) + 1
@@ -92,7 +92,7 @@ def _inside(camera: Camera, xy: Floats) -> Floats:
 def _in_views(
     camera: Camera, xy: Floats, views: Sequence[Part], cameras: Mapping[int, Camera]
 ) -> tuple[NDArray[np.int64], Floats]:
-    """Of each pixel (N, 2) of a photograph: the index of the view in which it is nearest to the
+    """For each pixel (N, 2) of a photograph, the index of the view in which it is nearest to the
     optical axis, and its pixel there; NaN if no view shows it."""
     directions = rays(camera, xy)
     placed, ahead = [], []

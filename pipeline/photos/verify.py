@@ -23,19 +23,19 @@ from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
 
-# Peak memory per pixel of a photograph while it is decoded.
+# The peak memory in bytes per pixel of a photograph while it is decoded.
 _PHOTO_BYTES = 7.0
-# Smaller images are no photographs: reduced ones would have no pixels.
+# Smaller images are no photographs: reduced copies of them would have no pixels.
 _MIN_SIDE = 4
 
 
 def verify_manifest(
     manifest: Manifest, *, threads: int, min_photos: int, keep_duplicates: bool
 ) -> tuple[Manifest, list[str]]:
-    """``verify_videos``, ``verify_photos``, then ``verify_masks``.
+    """Apply ``verify_videos``, ``verify_photos`` and ``verify_masks`` in this order.
 
     Args:
-        min_photos: smallest number of photographs; 0 if there are videos, which add frames.
+        min_photos: The smallest number of photographs; 0 if there are videos, which add frames.
     """
     manifest, warnings = verify_videos(manifest)
     least = 0 if manifest.videos else min_photos
@@ -52,18 +52,18 @@ def verify_photos(
     """Decode all photographs and remove damaged ones and duplicates from the manifest.
 
     Args:
-        manifest: the photographs to decode.
-        threads: number of threads; does not change the result.
-        min_photos: smallest number of photographs that can be decoded.
-        keep_duplicates: keep photographs that show the same as others; copies of files are a
-            warning then.
+        manifest: The photographs to decode.
+        threads: The number of threads, which does not change the result.
+        min_photos: The smallest number of photographs that can be decoded.
+        keep_duplicates: Whether to keep photographs that show the same as others; copies of files
+            are then a warning.
 
     Returns:
         The manifest without these photographs and with the new warnings, and these warnings: one
         for each damaged photograph, and one for all duplicates.
 
     Raises:
-        UserError: fewer than ``min_photos`` remain (the message says why), or a photograph has
+        UserError: Fewer than ``min_photos`` remain (the message says why), or a photograph has
             changed since it was scanned.
     """
     largest = max((photo.width * photo.height for photo in manifest.photos), default=0)
@@ -101,7 +101,7 @@ def verify_videos(manifest: Manifest) -> tuple[Manifest, list[str]]:
         The manifest without the damaged videos and with the new warnings, and these warnings.
 
     Raises:
-        UserError: there are no photographs, and no video can be decoded.
+        UserError: There are no photographs, and no video can be decoded.
     """
     good, warnings = [], []
     for video in manifest.videos:
@@ -156,7 +156,7 @@ def _duplicates(replaced: Mapping[str, str]) -> list[str]:
 
 @dataclass(frozen=True)
 class _Check:
-    """Why a photograph cannot be decoded, or its signature (None for RAW files)."""
+    """The reason why a photograph cannot be decoded, or its signature (None for RAW files)."""
 
     fault: str | None = None
     signature: Signature | None = None

@@ -13,7 +13,7 @@ from pipeline.runtime.machine import threads_within
 from pipeline.runtime.progress import track
 from pipeline.scene.manifest import Manifest, Photo
 
-# Peak memory per pixel of a mask while it is decoded.
+# The peak memory in bytes per pixel of a mask while it is decoded.
 _MASK_BYTES = 12.0
 _FIX = (
     "black and transparent pixels are excluded: invert the masks if white is what they exclude, "
@@ -23,7 +23,7 @@ _FIX = (
 
 @dataclass(frozen=True)
 class _Found:
-    """What one mask keeps.
+    """The pixels that one mask keeps.
 
     Attributes:
         file: The path of the mask.
@@ -43,11 +43,11 @@ def verify_masks(manifest: Manifest, *, threads: int) -> tuple[Manifest, list[st
         threads: The number of threads. It does not change the result.
 
     Returns:
-        The manifest with the new warnings, and these: one of masks that exclude nothing, one of
-        those that exclude everything, and one of those without a bright pixel.
+        The manifest with the new warnings, and these warnings: one for masks that exclude nothing,
+        one for masks that exclude everything, and one for masks without a bright pixel.
 
     Raises:
-        UserError: a mask cannot be decoded, or all photographs have masks that exclude everything.
+        UserError: A mask cannot be decoded, or all photographs have masks that exclude everything.
     """
     masked = [photo for photo in manifest.photos if photo.mask is not None]
     if not masked:

@@ -27,35 +27,35 @@ from pipeline.runtime.errors import ChangedFileError, UserError
 from pipeline.runtime.progress import Progress
 from pipeline.scene.manifest import Manifest, Photo, VideoFile
 
-# Long side in pixels at which frames are measured: blur that a photograph at training resolution
-# shows is visible, noise and compression artefacts hardly are.
+# The long side in pixels at which frames are measured: it shows blur that a photograph at training
+# resolution shows, and hardly any noise and compression artefacts.
 MEASURED_PX = 320
-# Motion between chosen frames as a share of the long side. Neighbours overlap by 95 %, so that
+# The motion between chosen frames as a share of the long side. Neighbours overlap by 95 %, so that
 # features are matched over several frames; larger steps lose frames of cameras that turn quickly.
 STEP = 0.05
-# Share of combed frames from which a video is interlaced: where nothing moves, none are.
+# A video is interlaced from this share of combed frames: where nothing moves, none are.
 COMBED_SHARE = 0.2
 INTERLACED = "; of interlaced frames one field is used"
 # With fewer frames than this the step is lowered, down to MIN_STEP: one pixel of MEASURED_PX, below
 # which motion cannot be told from noise; and not so far that blurred frames are chosen, whose mean
 # log2 of the largest sharpness within half of STEP over their own exceeds MAX_BLUR.
 FEW_FRAMES, MIN_STEP, MAX_BLUR = 60, 0.003, 0.25
-# Smallest and largest distance between chosen frames, in steps: neighbours show different images,
-# and overlap.
+# The smallest and largest distance between chosen frames in steps: neighbours show different
+# images, and overlap.
 MIN_GAP, MAX_GAP = 0.3, 2.0
-# Number of frames per step among which the choice is made, the sharpest of its part of the step.
+# The number of parts of a step. The sharpest frame of each part is a candidate.
 CELLS = 8
 # Motion is measured from an anchor frame, which is replaced after this share of the long side:
 # errors of tracking do not add up while the camera stands.
 ANCHOR = 0.02
-# Percentile of the corners' displacements that counts as motion of the image: around a centred
+# The percentile of the corners' displacements that counts as motion of the image: around a centred
 # subject most of the image hardly moves, and a smaller part may be people or cars.
 PERCENTILE = 80
 # A frame in which less than a third of the corners are found again shows something else, at least
 # as far away as this share of the long side.
 TRACKED_SHARE, JUMP = 1 / 3, 0.25
 MAX_CORNERS, MIN_CORNERS = 100, 12
-# Corners that are not found again at their place, in pixels, when they are tracked back.
+# The largest distance in pixels of a corner from its place when it is tracked back.
 MAX_BACKWARD_ERROR = 1.0
 # A file in which fewer frames than this share of the stored ones can be decoded is damaged.
 COMPLETE = 0.8
@@ -63,13 +63,13 @@ COMPLETE = 0.8
 
 @dataclass(frozen=True)
 class Measured:
-    """Measurements of all frames of a video.
+    """The measurements of all frames of a video.
 
     Attributes:
         motion: (N,) accumulated motion of the image from the first frame, as a share of its long
-            side; does not decrease.
-        sharpness: (N,) variance of the Laplacian; comparable between similar frames only.
-        interlaced: whether even and odd rows were recorded one after the other.
+            side, which does not decrease.
+        sharpness: (N,) variances of the Laplacian, comparable between similar frames only.
+        interlaced: Whether even and odd rows were recorded one after the other.
     """
 
     motion: NDArray[np.float64]
@@ -79,12 +79,12 @@ class Measured:
 
 @dataclass(frozen=True)
 class FramesReport:
-    """Result of ``extract_frames``.
+    """The result of ``extract_frames``.
 
     Attributes:
-        manifest: with the chosen frames as photographs, without videos.
-        chosen, total: numbers of chosen and of decoded frames, by the video's name.
-        decisions, warnings: sentences for the log.
+        manifest: The manifest with the chosen frames as photographs, without videos.
+        chosen, total: The numbers of chosen and of decoded frames, by the video's name.
+        decisions, warnings: Sentences for the log.
     """
 
     manifest: Manifest
@@ -105,11 +105,11 @@ def extract_frames(
     change the result.
 
     Args:
-        min_photos: smallest number of photographs and chosen frames.
+        min_photos: The smallest number of photographs and chosen frames.
 
     Raises:
-        UserError: fewer than ``min_photos`` photographs and frames, or a video has changed since it
-            was scanned.
+        UserError: There are fewer than ``min_photos`` photographs and frames, or a video has
+            changed since it was scanned.
     """
     before = cv2.getNumThreads()
     cv2.setNumThreads(max(threads, 1))
@@ -165,7 +165,7 @@ def extract_frames(
 def choose_all(videos: Sequence[Measured], max_frames: int) -> tuple[float, list[list[int]]]:
     """The step of motion, and the chosen frames of each video in ascending order.
 
-    The step is ``STEP``; smaller if that gives few frames, larger if it gives more than
+    The step is ``STEP``, but smaller if that gives few frames, and larger if it gives more than
     ``max_frames``. Each video has at least one frame.
     """
 
@@ -202,11 +202,11 @@ def _mean_blur(videos: Sequence[Measured], chosen: Sequence[Sequence[int]]) -> f
 def choose_frames(video: Measured, step: float) -> list[int]:
     """Sharp frames, 0.3 to 2 steps of motion apart, in ascending order.
 
-    The path through the video with the smallest cost, by dynamic programming. A chosen frame costs
-    its blur, log2 of the largest sharpness within a step of motion over its own, and the squared
-    deviation of the distance from its predecessor from one step; both are multiplied by that
-    distance, so that few frames are not cheaper than many. Where the image jumps, distances are
-    larger.
+    They are the path of the smallest cost through the video, found by dynamic programming. The cost
+    of a frame is its blur, log2 of the largest sharpness within a step of motion over its own, plus
+    the squared deviation of the distance from its predecessor from one step; both are multiplied by
+    that distance, so that few frames are not cheaper than many. Distances are larger where the
+    image jumps.
     """
     position, frames = _candidates(video, step)
     sharpness = np.log2(np.maximum(video.sharpness[frames], 1e-12))
@@ -238,7 +238,7 @@ def choose_frames(video: Measured, step: float) -> list[int]:
 
 
 def _candidates(video: Measured, step: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Positions in steps and numbers of the sharpest frames of each ``1 / CELLS`` of a step."""
+    """The positions in steps and the numbers of the sharpest frames of each cell of a step."""
     position = video.motion / step
     cell = np.floor(position * CELLS)
     order = np.lexsort((np.arange(len(cell)), -video.sharpness, cell))
@@ -250,7 +250,7 @@ def _candidates(video: Measured, step: float) -> tuple[NDArray[np.float64], NDAr
 
 
 def measure(video: VideoFile, threads: int = 1) -> Measured:
-    """Motion and sharpness of all frames of a video."""
+    """The motion and sharpness of all frames of a video."""
     tracker = _Tracker()
     motion, sharpness, combed = [], [], 0
     scale = min(1.0, MEASURED_PX / max(video.width, video.height))
@@ -259,8 +259,8 @@ def measure(video: VideoFile, threads: int = 1) -> Measured:
     for frame in _frames(Path(video.path), threads):
         if progress.done >= progress.total:  # The header counts too few frames, or none.
             progress.total = progress.done + 2
-        # Reduced before it becomes grey: area averaging of a large frame is the faster of the two.
-        # Also frames of another size than the header's become equally large.
+        # Frames are reduced before they become grey, which is faster than the
+        # reverse; frames of another size than the header's become equally large too.
         small = cv2.resize(frame, size, interpolation=cv2.INTER_AREA)
         grey = np.asarray(cv2.cvtColor(small, cv2.COLOR_BGR2GRAY), np.uint8)
         combed += is_combed(frame)
@@ -306,7 +306,7 @@ class _Tracker:
 def _displacement(
     before: NDArray[np.uint8], after: NDArray[np.uint8], corners: NDArray[np.float32]
 ) -> float | None:
-    """Displacement of the corners in pixels (``PERCENTILE``); None if most of them are lost.
+    """The displacement of the corners in pixels (``PERCENTILE``); None if most of them are lost.
 
     Args:
         before, after: (H, W) grey images.
@@ -325,7 +325,7 @@ def _tracked(
     before: NDArray[np.uint8], after: NDArray[np.uint8], corners: NDArray[np.float32]
 ) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
     """(N, 1, 2) positions of the corners in ``after``, and (N, 1) whether they were found."""
-    # Stubs of OpenCV do not allow None, which lets it allocate the positions.
+    # OpenCV's stubs do not allow None, which lets it allocate the positions.
     there, found, _ = cv2.calcOpticalFlowPyrLK(before, after, corners, None, maxLevel=4)  # type: ignore[call-overload]
     return there, found == 1
 
@@ -334,7 +334,7 @@ def _tracked(
 
 
 def _frames(path: Path, threads: int) -> Iterator[NDArray[np.uint8]]:
-    """All frames, (H, W, 3) BGR."""
+    """All frames of a video, (H, W, 3) BGR."""
     with opened_video(path, threads) as capture:
         while True:
             good, frame = capture.read()
@@ -346,7 +346,7 @@ def _frames(path: Path, threads: int) -> Iterator[NDArray[np.uint8]]:
 def _write_frames(
     video: VideoFile, chosen: Sequence[int], stored: FrameFormat, folder: Path, threads: int
 ) -> list[Photo]:
-    """Write the frames with these numbers, and describe them as photographs."""
+    """Write the frames with these numbers, and return their entries in the manifest."""
     wanted = set(chosen)
     photos: list[Photo] = []
     progress = Progress(f"writing frames of {video.name}", len(chosen), "frames")

@@ -1,4 +1,4 @@
-"""Conversion of a video's decoded frames to photographs: square pixels, all rows of one time."""
+"""Conversion of a video's decoded frames to photographs: square pixels, all rows from one time."""
 
 from __future__ import annotations
 
@@ -11,18 +11,18 @@ from numpy.typing import NDArray
 
 @dataclass(frozen=True)
 class FrameFormat:
-    """How a video's frames are stored.
+    """The format in which a video's frames are stored.
 
     Attributes:
         size: (width, height) of a frame with square pixels.
-        interlaced: whether even and odd rows were recorded one after the other.
+        interlaced: Whether even and odd rows were recorded one after the other.
     """
 
     size: tuple[int, int]
     interlaced: bool
 
     def photograph(self, frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
-        """(H, W, 3) BGR, as decoded, to (height, width, 3) BGR."""
+        """The photograph (height, width, 3) BGR from a frame (H, W, 3) BGR as decoded."""
         if self.interlaced:
             frame = first_field(frame)
         if (frame.shape[1], frame.shape[0]) == self.size:
@@ -48,8 +48,8 @@ def first_field(frame: NDArray[np.uint8]) -> NDArray[np.uint8]:
 
 
 def is_combed(frame: NDArray[np.uint8]) -> bool:
-    """Whether rows resemble those of their own field more than their neighbours, as those of moving
-    things in interlaced video do."""
+    """Whether rows resemble those of their own field more than their neighbours, as the rows of
+    moving things in interlaced video do."""
     rows = frame[:, ::4, 1].astype(np.int16)
     neighbours = np.abs(rows[1:] - rows[:-1]).mean()
     same_field = np.abs(rows[2:] - rows[:-2]).mean()
